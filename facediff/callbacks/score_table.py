@@ -1,0 +1,76 @@
+"""The table that ``facediff test`` prints."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from facediff.files import atomic
+from facediff.systems import SpeechAnimator
+
+METHOD_NAMES = {"model": "model", "still": "still face", "shuffled": "model, shuffled speech"}
+
+
+class ScoreTable(Callback):
+    """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
+
+    Beside the model stand a face that never moves, and the model given another sentence's speech.
+
+    Args:
+        file: name of the CSV file in the run's folder; None writes none.
+    """
+
+    def __init__(self, file: str | None = "test_scores.csv") -> None:
+        self.file = file
+
+    def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Print and write; runs before the system logs and empties its metrics."""
+        if not isinstance(pl_module, SpeechAnimator) or trainer.sanity_checking:
+            return
+        evaluation = pl_module.evaluation
+        rows = [row for split in evaluation.splits for row in evaluation.rows(split)]
+        if not trainer.is_global_zero:
+            return
+        assets = pl_module.assets
+        print(format_table(rows, assets.corpus, synthetic=assets.synthetic))
+        print(evaluation.protocol.describe())
+        if self.file and trainer.log_dir:
+            path = Path(trainer.log_dir) / self.file
+            write_csv(path, rows)
+            print(f"written: {path}")
+        sys.stdout.flush()
+
+
+def format_table(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool) -> str:
+    """The scores as text, with what they were taken over."""
+    names = [name for name in ("mve", "lve", "fdd", "fdd_absolute") if name in rows[0]]
+    kind = "SYNTHETIC corpus" if synthetic else "corpus"
+    lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}"]
+    for region in rows[0]["regions"].values():
+        lines.append(f"region {region['name']}: {region['count']} vertices, hash {region['hash']}")
+    lines.append(f"{'split':<8} {'who':<24}" + "".join(f"{name.upper():>13}" for name in names) + f"{'frames':>9}{'clips':>7}")
+    for row in rows:
+        scores = "".join(f"{row[name]:>13.4e}" for name in names)
+        lines.append(
+            f"{row['split']:<8} {METHOD_NAMES[row['method']]:<24}{scores}{row['frames']:>9}{row['sequences']:>7}"
+        )
+    return "\n".join(lines)
+
+
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """One line per split and method; regions as ``<region>_vertices`` and ``<region>_hash``."""
+    flat = []
+    for row in rows:
+        regions = row["regions"]
+        line = {key: value for key, value in row.items() if key != "regions"}
+        for part, region in regions.items():
+            line |= {f"{part}_vertices": region["count"], f"{part}_hash": region["hash"]}
+        flat.append(line)
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, fieldnames=list(flat[0]))
+        writer.writeheader()
+        writer.writerows(flat)

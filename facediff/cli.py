@@ -1,0 +1,96 @@
+"""The command ``facediff``: finds the subcommand and hands over; imports nothing heavy by itself."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import facediff
+from facediff.errors import FaceDiffError
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand.
+
+    Attributes:
+        module: where its ``run(name, arguments)`` lives; imported only when the command is used.
+        help: one line.
+    """
+
+    module: str
+    help: str
+
+
+COMMANDS = {
+    "demo": Command("facediff.commands.demo", "make a corpus, train, test and render a talking face, in ten minutes"),
+    "animate": Command("facediff.commands.animate", "animate a face with a recording of speech"),
+    "fit": Command("facediff.commands.lightning", "train a system"),
+    "validate": Command("facediff.commands.lightning", "score a system on the validation split"),
+    "test": Command("facediff.commands.lightning", "score a system on the test splits"),
+    "predict": Command("facediff.commands.lightning", "write a system's motion for a split"),
+    "components": Command("facediff.commands.components", "list what can be chosen by name"),
+}
+
+
+def usage() -> str:
+    """The top-level help."""
+    lines = [
+        "usage: facediff <command> [options]",
+        "",
+        "Personalised speech-driven 3D facial animation.",
+        "",
+        "commands:",
+        *(f"  {name:<12}{command.help}" for name, command in COMMANDS.items()),
+        "",
+        "options:",
+        "  -h, --help  this text; `facediff <command> --help` tells a command's options",
+        "  --version   the version",
+    ]
+    return "\n".join(lines)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        args: the words after ``facediff``; those of the process if None.
+
+    Returns:
+        the exit status: 0 for success, 2 for something the user can put right.
+    """
+    words = list(sys.argv[1:] if args is None else args)
+    if not words or words[0] in ("-h", "--help"):
+        print(usage())
+        return 0 if words else 2
+    if words[0] == "--version":
+        print(facediff.__version__)
+        return 0
+    name, rest = words[0], words[1:]
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f'did you mean "{near[0]}"? ' if near else ""
+        return fail(f'there is no command "{name}": {hint}known are {", ".join(COMMANDS)}')
+    try:
+        status: int = importlib.import_module(COMMANDS[name].module).run(name, rest)
+    except FaceDiffError as error:
+        return fail(str(error))
+    except KeyboardInterrupt:
+        return fail("interrupted", 130)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] == "facediff":
+            raise
+        return fail(
+            f'`facediff {name}` needs the package "{error.name}", which is not installed: '
+            f'run  pip install "facediff[all]"'
+        )
+    return status
+
+
+def fail(message: str, status: int = 2) -> int:
+    """Print one sentence to standard error and give back the exit status."""
+    print(f"facediff: error: {message}", file=sys.stderr)
+    return status

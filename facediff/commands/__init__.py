@@ -1,0 +1,1 @@
+"""The subcommands: one module each, with ``run(name, arguments) -> exit status``."""

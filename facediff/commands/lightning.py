@@ -1,0 +1,165 @@
+"""``facediff fit | validate | test | predict``: LightningCLI with components by name."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+from jsonargparse import set_parsing_settings
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+
+from facediff import registry
+from facediff.callbacks import PredictionWriter, ScoreTable
+from facediff.shipped import config_dir
+from facediff.data import SpeechMotionDataModule
+from facediff.errors import FaceDiffError
+from facediff.systems import SpeechAnimator
+from facediff.systems.checkpoint import read_checkpoint
+
+LINKS = ("n_vertices", "identities", "frame_rate")
+"""Constructor arguments of a system that the data module knows."""
+
+
+class Parser(LightningArgumentParser):
+    """Adds to an error about a name the names that exist."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Report a usage error; exits with status 2."""
+        super().error(explain(message), ex)  # type: ignore[misc]
+
+
+def explain(message: str) -> str:
+    """Lead an error about an unknown component name by one sentence with the right names.
+
+    jsonargparse reports an unknown name as an import path that it could not make sense of.
+    """
+    named = re.findall(r'Parser key "(?:[\w.]*\.)?(\w+)":(?:(?!Parser key).)*?dot import path string: (\S+)', message, re.S)
+    for kind, name in named:
+        if kind in registry.KINDS:
+            return f"{registry.KINDS[kind].unknown(name)}\n\n{message}"
+    for kind, name in re.findall(r"[Pp]arser key \"(model|data)\".*?dot import path string: (\S+)", message, re.S):
+        known = [cls.__name__ for cls in subclasses(SpeechAnimator if kind == "model" else SpeechMotionDataModule)]
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f'did you mean "{near[0]}"? ' if near else ""
+        return f'there is no {kind} "{name}": {hint}known are {", ".join(known)}\n\n{message}'
+    return message
+
+
+def subclasses(base: type) -> list[type]:
+    """All concrete subclasses that are imported."""
+    found = []
+    for cls in base.__subclasses__():
+        found += [cls, *subclasses(cls)]
+    return [cls for cls in found if not getattr(cls, "__abstractmethods__", None)]
+
+
+class FaceDiffCLI(LightningCLI):
+    """LightningCLI whose system takes its sizes from the data module."""
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Link sizes, and let ``test`` print our table alone."""
+        for name in LINKS:
+            parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
+
+    def _parse_ckpt_path(self) -> None:
+        """Upstream merges a checkpoint's hyper-parameters over the flags; :func:`run` does it under the flags."""
+
+
+def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
+    """Put a checkpoint's system and data module before the other arguments of validate, test and predict.
+
+    Flags that would change the model are refused: the weights fit the model that they were trained in only.
+    """
+    path = option(arguments, "--ckpt_path")
+    if path in (None, "best", "last", "hpc", "registry"):
+        return arguments
+    checkpoint = read_checkpoint(Path(str(path)))
+    if name == "fit":
+        return arguments
+    given = [word for word in arguments if re.match(r"--model(?!\.init_args\.sampler|\.sampler)\b", word)]
+    if given:
+        raise FaceDiffError(
+            f"{given[0]}: the checkpoint {path} decides the model, and its weights fit no other; leave the flag away "
+            f"(only --model.sampler… may change)"
+        )
+    config = {
+        "model": described(checkpoint["hyper_parameters"], drop=LINKS),
+        "data": described(checkpoint["datamodule_hyper_parameters"], fallback=checkpoint["facediff_data"]),
+    }
+    return ["--config", yaml.safe_dump(config, sort_keys=False), *without_models(arguments)]
+
+
+def described(hparams: dict[str, Any], *, drop: Sequence[str] = (), fallback: str = "") -> dict[str, Any]:
+    """Hyper-parameters in the form of a config file."""
+    arguments = {k: v for k, v in hparams.items() if not k.startswith("_") and k not in drop}
+    return {"class_path": hparams.get("_class_path", fallback), "init_args": arguments}
+
+
+def option(arguments: Sequence[str], flag: str) -> str | None:
+    """Value of a flag written ``--flag value`` or ``--flag=value``."""
+    for i, word in enumerate(arguments):
+        if word == flag and i + 1 < len(arguments):
+            return arguments[i + 1]
+        if word.startswith(f"{flag}="):
+            return word.partition("=")[2]
+    return None
+
+
+def without_models(arguments: list[str]) -> list[str]:
+    """Arguments as they are; configs given beside a checkpoint come after it and may set trainer and data."""
+    return arguments
+
+
+def run(name: str, arguments: Sequence[str]) -> int:
+    """Run one of Lightning's subcommands."""
+    for kind in registry.KINDS.values():
+        kind.load()
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    os.environ.setdefault("WANDB_SILENT", "true")
+    if not os.environ.get("WANDB_API_KEY") and not (Path.home() / ".netrc").exists():
+        # Without a key wandb would ask a question and wait for an answer.
+        os.environ.setdefault("WANDB_MODE", "offline")
+    warnings.filterwarnings("ignore", "The '.*dataloader' does not have many workers")
+    words = resolve_configs(from_checkpoint(name, list(arguments)))
+    callbacks = [ScoreTable()] + ([PredictionWriter()] if name == "predict" else [])
+    logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
+    argv, sys.argv = sys.argv, sys.argv[:1]
+    try:
+        FaceDiffCLI(
+            SpeechAnimator,
+            SpeechMotionDataModule,
+            subclass_mode_model=True,
+            subclass_mode_data=True,
+            auto_configure_optimizers=False,
+            trainer_defaults={"callbacks": callbacks, "logger": logger},
+            parser_class=Parser,
+            parser_kwargs={"parser_mode": "omegaconf+"},
+            save_config_kwargs={"overwrite": True},
+            args=[name, *words],
+        )
+    finally:
+        sys.argv = argv
+    return 0
+
+
+def resolve_configs(arguments: list[str]) -> list[str]:
+    """Let ``--config configs/…`` find the shipped configs from any folder."""
+    for i, word in enumerate(arguments):
+        value = arguments[i + 1] if word in ("-c", "--config") and i + 1 < len(arguments) else None
+        value = word.partition("=")[2] if word.startswith("--config=") else value
+        if value and value.startswith("configs/") and not Path(value).exists():
+            shipped = config_dir() / value.removeprefix("configs/")
+            if not shipped.is_file():
+                raise FaceDiffError(f"--config {value}: no such file, neither here nor among the shipped configs")
+            if word.startswith("--config="):
+                arguments[i] = f"--config={shipped}"
+            else:
+                arguments[i + 1] = str(shipped)
+    return arguments

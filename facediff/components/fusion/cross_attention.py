@@ -1,0 +1,48 @@
+"""Bidirectional cross-attention of the dual-path style diffusion paper, section 1.4 and figure 2."""
+
+from __future__ import annotations
+
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from facediff.components.fusion.base import Fusion
+from facediff.components.layers import Attention
+from facediff.registry import fusion
+
+
+@fusion.register("cross_attention")
+class BidirectionalCrossAttention(Fusion):
+    """Speech attends to motion, then motion attends to the enriched speech; their sum is F_am (eq. 12).
+
+    F'_a = F_a + Attn(query F_a, key/value F_m); F'_m = F_m + Attn(query F_m, key/value F'_a), with the inputs of
+    each attention normalised (pre-norm form of figure 2). Both sequences share one time axis, so queries and keys
+    carry rotary positions; without them the attention could not tell one frame's speech from another's.
+
+    Args:
+        dim: channels; given by the system.
+        num_heads: attention heads.
+        rotary: rotary positions in both attentions.
+        dropout: dropout on each attention's result.
+    """
+
+    def __init__(self, *, dim: int, num_heads: int = 4, rotary: bool = True, dropout: float = 0.1) -> None:
+        super().__init__()
+        self.audio_norm = nn.LayerNorm(dim)
+        self.motion_norm = nn.LayerNorm(dim)
+        self.enriched_norm = nn.LayerNorm(dim)
+        self.audio_from_motion = Attention(dim, dim, num_heads, rotary=rotary)
+        self.motion_from_audio = Attention(dim, dim, num_heads, rotary=rotary)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self,
+        audio: Float[Tensor, "batch frames dim"],
+        motion: Float[Tensor, "batch frames dim"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Float[Tensor, "batch frames dim"]:
+        """F_am = F'_a + F'_m."""
+        normed_motion = self.motion_norm(motion)
+        audio = audio + self.dropout(self.audio_from_motion(self.audio_norm(audio), normed_motion, mask))
+        enriched = self.enriched_norm(audio)
+        motion = motion + self.dropout(self.motion_from_audio(normed_motion, enriched, mask))
+        return audio + motion

@@ -1,0 +1,124 @@
+"""THE data contract: what one clip and one batch of clips are, for every corpus and every system.
+
+Audio is 16 kHz mono float32 and spans exactly the time of the motion. Motion is offsets from the subject's neutral
+template, in the corpus's unit of length. Tensors are padded with zeros; lengths say what is valid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+UNKNOWN_IDENTITY = -1
+
+
+@dataclass
+class Sample:
+    """One clip.
+
+    Attributes:
+        audio: waveform at 16 kHz.
+        motion: offsets from the template.
+        template: neutral face.
+        identity: index into the training identities, −1 for anybody else.
+        reference: motion that carries the speaking style.
+        name: the clip's name, ``<subject>_<sentence>``.
+        subject: whose face it is.
+        sentence: which sentence is spoken.
+        reference_name: the clip that the reference was taken from.
+        decoy_audio: speech of another sentence, as long as ``audio``; only for evaluation against shuffled audio.
+    """
+
+    audio: Float[Tensor, " samples"]
+    motion: Float[Tensor, "frames vertices 3"]
+    template: Float[Tensor, "vertices 3"]
+    identity: int
+    reference: Float[Tensor, "reference_frames vertices 3"]
+    name: str
+    subject: str
+    sentence: str
+    reference_name: str
+    decoy_audio: Float[Tensor, " samples"] | None = None
+
+
+@dataclass
+class Batch:
+    """Several clips, padded to the longest; the fields are those of :class:`Sample` with a batch dimension.
+
+    Attributes:
+        audio: padded waveforms.
+        audio_lengths: valid samples of each clip.
+        motion: padded offsets from the template.
+        frame_lengths: valid frames of each clip.
+        template: neutral faces.
+        identity: indices into the training identities, −1 for anybody else.
+        reference: padded reference motions.
+        reference_lengths: valid frames of each reference.
+        names: clip names.
+        subjects: whose faces.
+        sentences: which sentences.
+        reference_names: the clips that the references were taken from.
+        decoy_audio: padded speech of other sentences, with the lengths of ``audio``; evaluation only.
+    """
+
+    audio: Float[Tensor, "batch samples"]
+    audio_lengths: Int[Tensor, " batch"]
+    motion: Float[Tensor, "batch frames vertices 3"]
+    frame_lengths: Int[Tensor, " batch"]
+    template: Float[Tensor, "batch vertices 3"]
+    identity: Int[Tensor, " batch"]
+    reference: Float[Tensor, "batch reference_frames vertices 3"]
+    reference_lengths: Int[Tensor, " batch"]
+    names: list[str]
+    subjects: list[str]
+    sentences: list[str]
+    reference_names: list[str]
+    decoy_audio: Float[Tensor, "batch samples"] | None = None
+
+    @property
+    def mask(self) -> Bool[Tensor, "batch frames"]:
+        """True on valid frames."""
+        return torch.arange(self.motion.shape[1], device=self.motion.device) < self.frame_lengths[:, None]
+
+    @property
+    def reference_mask(self) -> Bool[Tensor, "batch reference_frames"]:
+        """True on valid frames of the references."""
+        frames = torch.arange(self.reference.shape[1], device=self.reference.device)
+        return frames < self.reference_lengths[:, None]
+
+    def __len__(self) -> int:
+        """Number of clips."""
+        return len(self.names)
+
+    def pin_memory(self) -> Batch:
+        """The same batch in page-locked memory; called by PyTorch's loaders."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                setattr(self, field.name, value.pin_memory())
+        return self
+
+
+def collate(samples: Sequence[Sample]) -> Batch:
+    """Pad samples to a batch."""
+    decoys = [s.decoy_audio for s in samples if s.decoy_audio is not None]
+    return Batch(
+        audio=pad_sequence([s.audio for s in samples], batch_first=True),
+        audio_lengths=torch.tensor([len(s.audio) for s in samples]),
+        motion=pad_sequence([s.motion for s in samples], batch_first=True),
+        frame_lengths=torch.tensor([len(s.motion) for s in samples]),
+        template=torch.stack([s.template for s in samples]),
+        identity=torch.tensor([s.identity for s in samples]),
+        reference=pad_sequence([s.reference for s in samples], batch_first=True),
+        reference_lengths=torch.tensor([len(s.reference) for s in samples]),
+        names=[s.name for s in samples],
+        subjects=[s.subject for s in samples],
+        sentences=[s.sentence for s in samples],
+        reference_names=[s.reference_name for s in samples],
+        decoy_audio=pad_sequence(decoys, batch_first=True) if len(decoys) == len(samples) else None,
+    )

@@ -1,0 +1,139 @@
+"""Clips of one split as samples: windows, style references, decoy speech."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from facediff.data.batch import UNKNOWN_IDENTITY, Sample
+from facediff.data.corpus import Clip, Corpus
+from facediff.errors import FaceDiffError
+
+ReferenceChoice = Literal["same_subject", "self"]
+
+
+@dataclass(frozen=True)
+class ReferencePolicy:
+    """Which clip gives a target its style reference.
+
+    Attributes:
+        candidates: clips that may serve, by subject; never a clip of an evaluated split.
+        same: clip attributes that target and reference share where possible, e.g. the mood.
+        choice: another clip of the same subject, or (in training only) the target itself.
+        max_frames: longest reference; longer clips are cut to a window.
+    """
+
+    candidates: dict[str, list[Clip]]
+    same: tuple[str, ...]
+    choice: ReferenceChoice
+    max_frames: int
+
+    def eligible(self, target: Clip) -> list[Clip]:
+        """The clips that may serve ``target``, the best matching ones, never ``target`` itself.
+
+        Raises:
+            FaceDiffError: if the subject has no other clip outside the evaluated splits.
+        """
+        others = [clip for clip in self.candidates.get(target.subject, []) if clip.name != target.name]
+        if not others:
+            raise FaceDiffError(
+                f"clip {target.name}: subject {target.subject} has no other clip to take a style reference from; "
+                f"add clips outside the test sentences, or train with data.reference=self"
+            )
+        alike = [c for c in others if all(c.attributes.get(k) == target.attributes.get(k) for k in self.same)]
+        return alike or others
+
+
+class MotionDataset(Dataset[Sample]):
+    """Samples of one split.
+
+    Training samples draw their window and their reference at random from torch's global generator; evaluation
+    samples are whole clips with a reference fixed by the clip's name.
+
+    Args:
+        corpus: where the clips are.
+        clips: the clips of the split, in order.
+        identities: training identities in the order of the identity index.
+        policy: how style references are chosen.
+        training: random windows and references.
+        window: longest training window in frames; whole clips if None.
+        decoys: give every clip the speech of another sentence beside its own.
+    """
+
+    def __init__(
+        self,
+        corpus: Corpus,
+        clips: Sequence[Clip],
+        identities: Sequence[str],
+        policy: ReferencePolicy,
+        *,
+        training: bool,
+        window: int | None = None,
+        decoys: bool = False,
+    ) -> None:
+        self.corpus = corpus
+        self.clips = list(clips)
+        self.identities = list(identities)
+        self.policy = policy
+        self.training = training
+        self.window = window
+        self.decoys = decoys
+
+    def __len__(self) -> int:
+        """Number of clips."""
+        return len(self.clips)
+
+    def __getitem__(self, index: int) -> Sample:
+        """Read one clip from disk."""
+        clip = self.clips[index]
+        start, stop = self._window(self.corpus.frames(clip), self.window)
+        reference, reference_name = self._reference(clip)
+        return Sample(
+            audio=self.corpus.read_audio(clip, start, stop),
+            motion=self.corpus.read_motion(clip, start, stop),
+            template=self.corpus.templates[clip.subject],
+            identity=self.identities.index(clip.subject) if clip.subject in self.identities else UNKNOWN_IDENTITY,
+            reference=reference,
+            name=clip.name,
+            subject=clip.subject,
+            sentence=clip.sentence,
+            reference_name=reference_name,
+            decoy_audio=self._decoy(index, stop - start) if self.decoys else None,
+        )
+
+    def _window(self, frames: int, longest: int | None) -> tuple[int, int]:
+        if longest is None or frames <= longest:
+            return 0, frames
+        start = int(torch.randint(frames - longest + 1, ())) if self.training else 0
+        return start, start + longest
+
+    def _reference(self, clip: Clip) -> tuple[Tensor, str]:
+        if self.training and self.policy.choice == "self":
+            source = clip
+        else:
+            eligible = self.policy.eligible(clip)
+            pick = (
+                int(torch.randint(len(eligible), ()))
+                if self.training
+                else zlib.crc32(clip.name.encode()) % len(eligible)
+            )
+            source = eligible[pick]
+        start, stop = self._window(self.corpus.frames(source), self.policy.max_frames)
+        return self.corpus.read_motion(source, start, stop), source.name
+
+    def _decoy(self, index: int, frames: int) -> Tensor | None:
+        """The next clip of the split that says something else, repeated or cut to ``frames``; None if there is none."""
+        own = self.clips[index]
+        order = self.clips[index + 1 :] + self.clips[:index]
+        others = [clip for clip in order if clip.sentence != own.sentence]
+        if not others:
+            return None
+        audio = self.corpus.read_audio(others[0], 0, self.corpus.frames(others[0]))
+        length = len(self.corpus.read_audio(own, 0, frames))
+        return audio.repeat(-(-length // len(audio)))[:length]

@@ -1,0 +1,80 @@
+"""What every sampler is: a thin layer over a scheduler of the library diffusers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from facediff.diffusion.process import NoiseProcess
+from facediff.errors import FaceDiffError
+
+Denoiser = Callable[[Tensor, int], Tensor]
+"""(noisy motion, step counted from 0) to predicted clean motion of the same shape."""
+
+
+class Sampler(ABC):
+    """Runs the reverse process from noise to clean motion (algorithm 2).
+
+    Args:
+        process: the noise process to reverse.
+        steps: denoising steps; at most the process's own number.
+
+    Raises:
+        FaceDiffError: if the number of steps is impossible.
+    """
+
+    def __init__(self, process: NoiseProcess, steps: int) -> None:
+        if not 1 <= steps <= process.steps:
+            raise FaceDiffError(
+                f"sampler.steps: {steps} is impossible with {process.steps} diffusion steps; "
+                f"choose 1 to {process.steps}"
+            )
+        self.process = process
+        self.steps = steps
+
+    @abstractmethod
+    def make_scheduler(self) -> Any:  # noqa: ANN401 - diffusers' schedulers share no typed base class
+        """A fresh scheduler of diffusers with its timesteps set."""
+
+    def step_options(self) -> dict[str, Any]:
+        """Extra keyword arguments for the scheduler's ``step``."""
+        return {}
+
+    def run(
+        self,
+        denoise: Denoiser,
+        start: Float[Tensor, "*shape"],
+        *,
+        generator: torch.Generator | None = None,
+        progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
+    ) -> Float[Tensor, "*shape"]:
+        """Denoise ``start`` to clean motion.
+
+        Args:
+            denoise: predicts the clean motion from the noisy one.
+            start: unit Gaussian noise.
+            generator: source of the noise that stochastic samplers add.
+            progress: wraps the iteration over steps, e.g. in a progress bar.
+        """
+        scheduler = self.make_scheduler()
+        steps: Iterable[int] = [int(step) for step in scheduler.timesteps]
+        noisy = start
+        for step in progress(steps) if progress is not None else steps:
+            clean = denoise(noisy, step)
+            noisy = scheduler.step(
+                clean, step, noisy, generator=generator, return_dict=False, **self.step_options()
+            )[0]
+        return noisy
+
+
+class SamplerFactory(Protocol):
+    """Makes a sampler once the noise process is known."""
+
+    def __call__(self, *, process: NoiseProcess) -> Sampler:
+        """Make one that reverses ``process``."""
+        ...

@@ -1,0 +1,25 @@
+"""The one error that facediff shows to people as a plain sentence instead of a traceback."""
+
+
+class FaceDiffError(Exception):
+    """Something that the user can put right: a file, an argument or an installation.
+
+    The message names the file or the field, says what was expected and what to do next. The command line
+    prints it without a traceback and exits with code 2.
+    """
+
+
+class MissingExtraError(FaceDiffError):
+    """A feature was used whose optional packages are not installed.
+
+    Args:
+        package: import name of what is missing.
+        extra: the extra of facediff that brings it.
+        feature: what needs it, in words.
+    """
+
+    def __init__(self, package: str, extra: str, feature: str) -> None:
+        super().__init__(
+            f'{feature} needs the package "{package}", which is not installed: '
+            f'run  pip install "facediff[{extra}]"'
+        )

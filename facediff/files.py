@@ -1,0 +1,35 @@
+"""Writing files so that a reader sees all of a file or nothing of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from facediff.errors import FaceDiffError
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """A temporary sibling to write to, renamed to ``path`` at the end; removed if anything fails.
+
+    The temporary name keeps the suffix, since many writers choose the format by it.
+
+    Raises:
+        FaceDiffError: if the folder cannot be made or written.
+    """
+    temporary = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch()
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be written ({error.strerror}); choose a folder you may write to") from error
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise FaceDiffError(f"{path}: could not be written ({error.strerror or error})") from error
+    finally:
+        with suppress(FileNotFoundError):
+            temporary.unlink()

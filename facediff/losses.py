@@ -1,0 +1,72 @@
+"""The four training losses of the dual-path style diffusion paper, section 1.5.
+
+All take padded batches with a frame mask; padding never counts, so that a clip's loss does not depend on how far it
+is padded. Motion is (batch, frames, vertices, 3): offsets from the template.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+Motion = Float[Tensor, "batch frames vertices 3"]
+Mask = Bool[Tensor, "batch frames"]
+Scalar = Float[Tensor, ""]
+
+
+def huber(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
+    """Mean Huber loss (δ = 1) over the coordinates of all valid frames; 0 if there is none."""
+    loss = F.huber_loss(prediction, truth, reduction="none").mean((2, 3))
+    return (loss * mask).sum() / mask.sum().clamp_min(1)
+
+
+def reconstruction_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
+    """L_recon = Huber(M⁰, M̂⁰) (eq. 16)."""
+    return huber(prediction, truth, mask)
+
+
+def velocity_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
+    """L_vel: Huber loss of the first differences over time (eq. 17); 0 for a single frame."""
+    both = mask[:, 1:] & mask[:, :-1]
+    return huber(prediction.diff(dim=1), truth.diff(dim=1), both)
+
+
+def acceleration_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
+    """L_acc: Huber loss of the second differences over time (eq. 18); exactly 0 below three frames."""
+    if prediction.shape[1] < 3:
+        return prediction.new_zeros(())
+    all_three = mask[:, 2:] & mask[:, 1:-1] & mask[:, :-2]
+    return huber(prediction.diff(n=2, dim=1), truth.diff(n=2, dim=1), all_three)
+
+
+def masked_std(
+    values: Float[Tensor, "batch frames vertices"], mask: Mask
+) -> Float[Tensor, "batch vertices"]:
+    """Population standard deviation over each clip's valid frames; its gradient is 0 where it is 0."""
+    weight = mask[..., None].to(values.dtype)
+    count = weight.sum(1).clamp_min(1)
+    mean = (values * weight).sum(1) / count
+    variance = ((values - mean[:, None]).square() * weight).sum(1) / count
+    positive = variance > 0
+    return torch.where(positive, variance.where(positive, torch.ones_like(variance)).sqrt(), 0.0)
+
+
+def face_dynamics_loss(
+    prediction: Motion, truth: Motion, mask: Mask, region: Int[Tensor, " upper_face"]
+) -> Scalar:
+    """L_face: mean over upper-face vertices of |σ − σ̂| (eq. 19).
+
+    σ is the standard deviation over time of the length of a vertex's displacement.
+
+    Args:
+        prediction: predicted motion.
+        truth: true motion.
+        mask: valid frames.
+        region: indices of the upper-face vertices R.
+    """
+    deviation = [
+        masked_std(torch.linalg.vector_norm(m[:, :, region], dim=-1), mask) for m in (truth, prediction)
+    ]
+    return (deviation[0] - deviation[1]).abs().mean()

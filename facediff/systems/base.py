@@ -1,0 +1,299 @@
+"""What all systems share: sizes and assets, checkpoints, optimisation, evaluation, animation."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from torch import Tensor
+
+from facediff.data import Assets, Batch, Reference, Sample, SpeechMotionDataModule, collate
+from facediff.data.audio import SAMPLE_RATE, samples_for
+from facediff.errors import FaceDiffError
+from facediff.hparams import plain
+from facediff.systems.checkpoint import ASSETS_KEY
+from facediff.systems.evaluation import Evaluation
+
+Progress = Callable[[Iterable[int]], Iterable[int]]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted motion of one clip.
+
+    Attributes:
+        name: the clip.
+        identity: whose identity conditioned it: a training identity, or ``unknown``.
+        reference_name: the clip that gave the style.
+        vertices: absolute vertices.
+    """
+
+    name: str
+    identity: str
+    reference_name: str
+    vertices: Float[Tensor, "frames vertices 3"]
+
+
+class SpeechAnimator(LightningModule, ABC):
+    """Base of all systems.
+
+    Args:
+        n_vertices: vertices of the topology.
+        identities: training identities in the order of the identity index.
+        frame_rate: motion frames a second.
+        learning_rate: AdamW's learning rate.
+        weight_decay: AdamW's weight decay.
+        lr_schedule: constant, or a cosine down to zero at the end of training.
+        warmup_steps: optimiser steps over which the learning rate rises from zero.
+        protocol: the metrics' protocol for validation and test.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_vertices: int,
+        identities: list[str],
+        frame_rate: float,
+        learning_rate: float,
+        weight_decay: float,
+        lr_schedule: Literal["constant", "cosine"],
+        warmup_steps: int,
+        protocol: str,
+    ) -> None:
+        super().__init__()
+        self.n_vertices = n_vertices
+        self.identities = list(identities)
+        self.frame_rate = frame_rate
+        self.learning_rate = learning_rate
+        self.weight_decay = weight_decay
+        self.lr_schedule = lr_schedule
+        self.warmup_steps = warmup_steps
+        self._assets: Assets | None = None
+        self._datamodule_class = ""
+        self.evaluation = Evaluation(protocol)
+
+    @abstractmethod
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """The loss terms of a batch, unweighted, and their weighted sum ``loss``.
+
+        Args:
+            batch: clips with their true motion.
+            generator: source of whatever the loss draws; torch's global one if None.
+        """
+
+    @abstractmethod
+    def generate(
+        self, batch: Batch, *, generator: torch.Generator | None = None, progress: Progress | None = None
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """Motion for the batch's speech, identity and reference; its true motion is not looked at.
+
+        Args:
+            batch: clips; ``motion`` gives the number of frames only.
+            generator: source of the noise.
+            progress: wraps the iteration over steps, e.g. in a progress bar.
+        """
+
+    def remember(self, arguments: dict[str, Any]) -> None:
+        """Keep constructor arguments as plain hyper-parameters, in the form that Lightning rebuilds a module from."""
+        self.save_hyperparameters(
+            {
+                "_class_path": f"{type(self).__module__}.{type(self).__qualname__}",
+                "_instantiator": "lightning.pytorch.cli.instantiate_module",
+                **plain(arguments),
+            }
+        )
+
+    # -- assets and checkpoints
+
+    @property
+    def assets(self) -> Assets:
+        """Templates, faces, regions, references and scale of the training corpus.
+
+        Raises:
+            FaceDiffError: if neither a corpus nor a checkpoint has been seen yet.
+        """
+        if self._assets is None:
+            raise FaceDiffError(
+                "the system knows no templates yet; train it with a data module or load a checkpoint first"
+            )
+        return self._assets
+
+    def adopt(self, assets: Assets) -> None:
+        """Take over a corpus's assets after checking that they fit the system's sizes.
+
+        Raises:
+            FaceDiffError: naming what differs.
+        """
+        sizes = {template.shape[0] for template in assets.templates.values()}
+        for what, mine, theirs in (
+            ("vertices", {self.n_vertices}, sizes),
+            ("identities", self.identities, assets.identities),
+            ("frames a second", self.frame_rate, assets.frame_rate),
+        ):
+            if mine != theirs:
+                raise FaceDiffError(
+                    f"the model and the corpus {assets.corpus} do not fit: {what} are {mine} in the model and {theirs} "
+                    f"in the corpus; use a checkpoint that was trained on this topology and these people"
+                )
+        self._assets = assets
+
+    def setup(self, stage: str) -> None:
+        """Take the assets from the data module; a checkpoint's own replace them when it is loaded."""
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(data, SpeechMotionDataModule):
+            raise FaceDiffError("facediff's systems train and test on a SpeechMotionDataModule; pass datamodule=…")
+        self._datamodule_class = f"{type(data).__module__}.{type(data).__qualname__}"
+        scale = self._assets.motion_scale if self._assets is not None else None
+        if scale is None and stage == "fit":
+            scale = data.motion_scale()
+        self.adopt(data.assets().with_motion_scale(scale))
+        if stage != "predict":
+            self.evaluation.prepare(self.assets, ["val"] if stage in ("fit", "validate") else data.test_splits)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the assets, so that the checkpoint animates without the corpus."""
+        checkpoint[ASSETS_KEY] = self.assets.state()
+        checkpoint["facediff_data"] = self._datamodule_class
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take the assets from the checkpoint."""
+        if ASSETS_KEY in checkpoint:
+            self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
+            self._datamodule_class = checkpoint.get("facediff_data", "")
+
+    # -- optimisation
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        """AdamW on everything trainable, with the learning-rate schedule per optimiser step."""
+        parameters = [p for p in self.parameters() if p.requires_grad]
+        optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay)
+        if self.lr_schedule == "constant" and not self.warmup_steps:
+            return optimizer
+        total = int(self.trainer.estimated_stepping_batches)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self._lr_factor(step, total))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def _lr_factor(self, step: int, total: int) -> float:
+        warm = min(1.0, (step + 1) / max(1, self.warmup_steps))
+        if self.lr_schedule == "constant":
+            return warm
+        return warm * 0.5 * (1.0 + float(torch.cos(torch.tensor(torch.pi * min(1.0, step / max(1, total))))))
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The weighted loss; every term is logged as ``train/<term>``."""
+        losses = self.losses(batch)
+        logged = {f"train/{name}": value.detach() for name, value in losses.items()}
+        self.log_dict(logged, batch_size=len(batch), prog_bar=False)
+        self.log("loss", losses["loss"].detach(), batch_size=len(batch), prog_bar=True, logger=False)
+        return losses["loss"]
+
+    # -- evaluation
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Loss with fixed draws and the protocol's metrics of sampled motion, so that epochs compare."""
+        losses = self.losses(batch, self._generator(batch_idx))
+        logged = {f"val/{name}": value for name, value in losses.items()}
+        self.log_dict(logged, batch_size=len(batch), sync_dist=True)
+        self.evaluation.update("val", "model", self.generate(batch, generator=self._generator(batch_idx)), batch)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics as ``val/mve`` …."""
+        self.log_dict(self.evaluation.scalars("val"), prog_bar=True)
+
+    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
+        """Score sampled motion, a still face, and the model's motion for another sentence's speech."""
+        split = self.evaluation.splits[dataloader_idx]
+        self.evaluation.update(split, "model", self.generate(batch, generator=self._generator(batch_idx)), batch)
+        self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
+        if batch.decoy_audio is not None:
+            decoy = replace(batch, audio=batch.decoy_audio)
+            shuffled = self.generate(decoy, generator=self._generator(batch_idx))
+            self.evaluation.update(split, "shuffled", shuffled, batch)
+
+    def on_test_epoch_end(self) -> None:
+        """Log ``<split>/lve`` and so on; the table is printed by the callback ``ScoreTable``."""
+        for split in self.evaluation.splits:
+            self.log_dict(self.evaluation.scalars(split))
+
+    def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> list[Prediction]:
+        """Absolute vertices of every clip of the batch."""
+        motion = self.generate(batch, generator=self._generator(batch_idx))
+        vertices = motion + batch.template[:, None]
+        names = [self.identities[i] if i >= 0 else "unknown" for i in batch.identity.tolist()]
+        return [
+            Prediction(name, names[i], batch.reference_names[i], vertices[i, : int(batch.frame_lengths[i])].cpu())
+            for i, name in enumerate(batch.names)
+        ]
+
+    def _generator(self, seed: int) -> torch.Generator:
+        return torch.Generator(self.device).manual_seed(seed)
+
+    # -- animation
+
+    @torch.inference_mode()
+    def animate(
+        self,
+        audio: Float[Tensor, " samples"],
+        *,
+        subject: str,
+        style: Reference | None = None,
+        seed: int = 0,
+        progress: Progress | None = None,
+    ) -> Prediction:
+        """Animate a known face with new speech.
+
+        Args:
+            audio: speech at 16 kHz.
+            subject: whose face and identity; any subject of the training corpus, also one not trained on.
+            style: reference motion; the subject's default one if None.
+            seed: seed of the noise; equal seeds give equal motion on one machine.
+            progress: wraps the iteration over sampling steps.
+
+        Raises:
+            FaceDiffError: if the subject is unknown, the reference does not fit the topology, or the speech is
+                shorter than a frame.
+        """
+        assets = self.assets
+        template = assets.template(subject)
+        style = style or self.default_style(subject)
+        if style.motion.shape[1:] != template.shape:
+            raise FaceDiffError(
+                f"style: the reference {style.clip} has {style.motion.shape[1]} vertices, the checkpoint's faces have "
+                f"{self.n_vertices}; give a motion of the same topology"
+            )
+        frames = round(len(audio) * self.frame_rate / SAMPLE_RATE)
+        if frames < 1:
+            raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s); give more of it")
+        length = samples_for(frames, self.frame_rate)
+        sample = Sample(
+            audio=torch.nn.functional.pad(audio[:length], (0, max(0, length - len(audio)))),
+            motion=torch.zeros(frames, *template.shape),
+            template=template,
+            identity=assets.identity_index(subject),
+            reference=style.motion.float(),
+            name="speech",
+            subject=subject,
+            sentence="",
+            reference_name=style.clip,
+        )
+        batch = collate([sample])
+        batch = Batch(**{k: v.to(self.device) if isinstance(v, Tensor) else v for k, v in vars(batch).items()})
+        motion = self.generate(batch, generator=self._generator(seed), progress=progress)
+        identity = subject if sample.identity >= 0 else "unknown"
+        return Prediction(sample.name, identity, style.clip, (motion + batch.template[:, None])[0].cpu())
+
+    def default_style(self, subject: str) -> Reference:
+        """The stored reference of a subject.
+
+        Raises:
+            FaceDiffError: if the subject has none.
+        """
+        if subject not in self.assets.references:
+            raise FaceDiffError(f"style: the checkpoint holds no reference motion of {subject}; give one with --style")
+        return self.assets.references[subject]

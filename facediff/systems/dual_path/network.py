@@ -1,0 +1,168 @@
+"""The network of dual-path style diffusion: conditions once per clip, one denoising pass per step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff.components.audio_encoder import AudioEncoder
+from facediff.components.decoder import Decoder
+from facediff.components.fusion import Fusion
+from facediff.components.identity_encoder import IdentityEncoder
+from facediff.components.style_encoder import StyleEncoder
+
+TokenForm = Literal["levels", "single"]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What does not change over the denoising steps of a clip.
+
+    Attributes:
+        audio: speech features F_a.
+        style: style tokens, the condition F_s.
+        mask: True on valid frames.
+    """
+
+    audio: Float[Tensor, "batch frames dim"]
+    style: Float[Tensor, "batch tokens dim"]
+    mask: Bool[Tensor, "batch frames"]
+
+
+class StepEmbedding(nn.Module):
+    """t_emb: sinusoids of the diffusion step, then an MLP."""
+
+    frequencies: Tensor
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        half = dim // 2
+        frequencies = torch.exp(-math.log(10_000.0) * torch.arange(half) / half)
+        self.register_buffer("frequencies", frequencies, persistent=False)
+        self.mlp = nn.Sequential(nn.Linear(2 * half, dim), nn.SiLU(), nn.Linear(dim, dim))
+
+    def forward(self, step: Int[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
+        """Embed step numbers counted from 0."""
+        angle = step[:, None].float() * self.frequencies
+        return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))
+
+
+class StyleTokens(nn.Module):
+    """F_s = Concat(F_id, F_dyn) (eq. 14), presented to the decoder as tokens.
+
+    Attention over a single key is constant, so by default each part of F_s (coarse, mid, fine, dynamic) becomes a
+    token with a projection of its own.
+
+    Args:
+        token_dims: widths of the parts; may be empty, then one learnt token stands for "no condition".
+        dim: channels of a token.
+        form: a token per part (``levels``) or one token for all (``single``).
+    """
+
+    def __init__(self, token_dims: tuple[int, ...], dim: int, form: TokenForm) -> None:
+        super().__init__()
+        if form == "single" and token_dims:
+            token_dims = (sum(token_dims),)
+        self.token_dims = token_dims
+        self.projections = nn.ModuleList(nn.Linear(width, dim) for width in token_dims)
+        self.null = None if token_dims else nn.Parameter(torch.zeros(1, 1, dim))
+
+    def forward(self, style: Float[Tensor, "batch style_dim"]) -> Float[Tensor, "batch tokens dim"]:
+        """Split F_s and project each part."""
+        if self.null is not None:
+            return self.null.expand(len(style), -1, -1)
+        parts = style.split(self.token_dims, dim=-1)
+        return torch.stack([p(part) for p, part in zip(self.projections, parts, strict=True)], dim=1)
+
+
+class DualPathNetwork(nn.Module):
+    """Predicts clean motion from noisy motion under speech, identity and style.
+
+    Vertices appear in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V), and ``embed_reference`` in front
+    of the style encoder (X = Linear(M_ref)).
+
+    Args:
+        n_vertices: vertices V of the topology.
+        dim: channels C.
+        audio_encoder: speech to F_a.
+        identity_encoder: identity to F_id.
+        style_encoder: reference motion to F_dyn.
+        fusion: F_a and F_m to F_am.
+        decoder: F_fused and style tokens to F_dec.
+        token_form: how F_s is presented to the decoder.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_vertices: int,
+        dim: int,
+        audio_encoder: AudioEncoder,
+        identity_encoder: IdentityEncoder,
+        style_encoder: StyleEncoder,
+        fusion: Fusion,
+        decoder: Decoder,
+        token_form: TokenForm,
+    ) -> None:
+        super().__init__()
+        self.audio_encoder = audio_encoder
+        self.identity_encoder = identity_encoder
+        self.style_encoder = style_encoder
+        self.style_tokens = StyleTokens(identity_encoder.token_dims + style_encoder.token_dims, dim, token_form)
+        self.embed = nn.Linear(3 * n_vertices, dim)
+        # Without a dynamic style there is nothing to embed, and no idle weights.
+        self.embed_reference = nn.Linear(3 * n_vertices, dim) if style_encoder.token_dims else None
+        self.step_embedding = StepEmbedding(dim)
+        self.fusion = fusion
+        self.fused_norm = nn.LayerNorm(dim)
+        self.decoder = decoder
+        self.unembed = nn.Linear(dim, 3 * n_vertices)
+
+    def conditions(
+        self,
+        audio: Float[Tensor, "batch samples"],
+        audio_lengths: Int[Tensor, " batch"],
+        frame_lengths: Int[Tensor, " batch"],
+        identity: Int[Tensor, " batch"],
+        reference: Float[Tensor, "batch reference_frames coordinates"],
+        reference_mask: Bool[Tensor, "batch reference_frames"],
+    ) -> Conditions:
+        """Everything that is computed once per clip.
+
+        Args:
+            audio: waveforms at 16 kHz.
+            audio_lengths: valid samples.
+            frame_lengths: motion frames wanted.
+            identity: identity indices, −1 for unknown.
+            reference: scaled reference motion, flattened to 3V coordinates.
+            reference_mask: True on valid reference frames.
+        """
+        features = self.audio_encoder(audio, audio_lengths, frame_lengths)
+        style_parts = [self.identity_encoder(identity)]
+        if self.embed_reference is not None:
+            style_parts.append(self.style_encoder(self.embed_reference(reference), reference_mask))
+        frames = torch.arange(features.shape[1], device=features.device)
+        mask = frames < frame_lengths[:, None]
+        return Conditions(features, self.style_tokens(torch.cat(style_parts, dim=-1)), mask)
+
+    def forward(
+        self,
+        noisy: Float[Tensor, "batch frames coordinates"],
+        step: Int[Tensor, " batch"],
+        conditions: Conditions,
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Predict the clean scaled motion M̂⁰ from Mⁿ."""
+        return self.unembed(self.core(self.embed(noisy), step, conditions))
+
+    def core(
+        self, motion: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions
+    ) -> Float[Tensor, "batch frames dim"]:
+        """F_m to F_dec: everything between the two vertex-space maps."""
+        fused = self.fusion(conditions.audio, motion, conditions.mask)
+        fused = self.fused_norm(fused + self.step_embedding(step)[:, None])  # eq. 13
+        return self.decoder(fused, conditions.style, conditions.mask)

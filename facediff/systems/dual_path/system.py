@@ -1,0 +1,191 @@
+"""Dual-path style diffusion as a LightningModule."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from facediff import losses
+from facediff.components.audio_encoder import AudioEncoderFactory
+from facediff.components.audio_encoder.mel import MelEncoder
+from facediff.components.decoder import DecoderFactory
+from facediff.components.decoder.style_transformer import StyleTransformer
+from facediff.components.fusion import FusionFactory
+from facediff.components.fusion.cross_attention import BidirectionalCrossAttention
+from facediff.components.identity_encoder import IdentityEncoderFactory
+from facediff.components.identity_encoder.hierarchical import HierarchicalIdentity
+from facediff.components.style_encoder import StyleEncoderFactory
+from facediff.components.style_encoder.tcn_gru_transformer import TcnGruTransformer
+from facediff.data import Batch
+from facediff.diffusion import NoiseProcess
+from facediff.diffusion.samplers import SamplerFactory
+from facediff.diffusion.samplers.ddim import DdimSampler
+from facediff.errors import FaceDiffError
+from facediff.hparams import describe
+from facediff.systems.base import Progress, SpeechAnimator
+from facediff.systems.dual_path.network import Conditions, DualPathNetwork, TokenForm
+
+
+class DualPathDiffusion(SpeechAnimator):
+    """Personalised speech-driven animation by dual-path style diffusion.
+
+    Speech features, a hierarchical identity embedding and a dynamic style encoder condition a diffusion model over
+    vertex motion. Every part is chosen by name; the ablations of the paper are one override each:
+    ``style_encoder=none``, ``identity_encoder=none``, ``fusion=add``.
+
+    Args:
+        n_vertices: vertices of the topology; taken from the data module on the command line.
+        identities: training identities; taken from the data module on the command line.
+        frame_rate: motion frames a second; taken from the data module on the command line.
+        dim: model width C.
+        audio_encoder: speech to features.
+        identity_encoder: who the face is.
+        style_encoder: how the person moves.
+        fusion: where speech meets noisy motion.
+        decoder: to clean motion.
+        sampler: runs the reverse process in validation, test, prediction and animation.
+        diffusion_steps: noising steps N.
+        noise_schedule: schedule of diffusers; ``squaredcos_cap_v2`` is the cosine schedule.
+        motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
+            leaves it as it is.
+        style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
+        identity_dropout: share of training clips whose identity is hidden, so that unknown people can be animated.
+        velocity_weight: λ_vel.
+        acceleration_weight: λ_acc.
+        face_weight: λ_face.
+        learning_rate: AdamW's learning rate.
+        weight_decay: AdamW's weight decay.
+        lr_schedule: constant, or a cosine down to zero at the end of training.
+        warmup_steps: optimiser steps over which the learning rate rises from zero.
+        protocol: the metrics' protocol for validation and test.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_vertices: int,
+        identities: list[str],
+        frame_rate: float,
+        dim: int = 256,
+        audio_encoder: AudioEncoderFactory = MelEncoder,
+        identity_encoder: IdentityEncoderFactory = HierarchicalIdentity,
+        style_encoder: StyleEncoderFactory = TcnGruTransformer,
+        fusion: FusionFactory = BidirectionalCrossAttention,
+        decoder: DecoderFactory = StyleTransformer,
+        sampler: SamplerFactory = DdimSampler,
+        diffusion_steps: int = 1000,
+        noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
+        motion_scale: Literal["unit", "none"] = "unit",
+        style_tokens: TokenForm = "levels",
+        identity_dropout: float = 0.1,
+        velocity_weight: float = 0.003,
+        acceleration_weight: float = 0.003,
+        face_weight: float = 0.0005,
+        learning_rate: float = 1e-4,
+        weight_decay: float = 0.05,
+        lr_schedule: Literal["constant", "cosine"] = "constant",
+        warmup_steps: int = 0,
+        protocol: str = "paper",
+    ) -> None:
+        arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        super().__init__(
+            n_vertices=n_vertices,
+            identities=identities,
+            frame_rate=frame_rate,
+            learning_rate=learning_rate,
+            weight_decay=weight_decay,
+            lr_schedule=lr_schedule,
+            warmup_steps=warmup_steps,
+            protocol=protocol,
+        )
+        self.motion_scaling = motion_scale
+        self.identity_dropout = identity_dropout
+        self.loss_weights = {
+            "reconstruction": 1.0,
+            "velocity": velocity_weight,
+            "acceleration": acceleration_weight,
+            "face": face_weight,
+        }
+        self.process = NoiseProcess(diffusion_steps, noise_schedule)
+        self.sampler = sampler(process=self.process)
+        self.network = DualPathNetwork(
+            n_vertices=n_vertices,
+            dim=dim,
+            audio_encoder=audio_encoder(dim=dim),
+            identity_encoder=identity_encoder(dim=dim, n_identities=len(identities)),
+            style_encoder=style_encoder(dim=dim),
+            fusion=fusion(dim=dim),
+            decoder=decoder(dim=dim, style_dim=dim),
+            token_form=style_tokens,
+        )
+        for kind in ("audio_encoder", "identity_encoder", "style_encoder", "fusion", "decoder"):
+            arguments[kind] = describe(arguments[kind], getattr(self.network, kind))
+        arguments["sampler"] = describe(sampler, self.sampler)
+        self.remember(arguments)
+
+    @property
+    def scale(self) -> float:
+        """Factor from offsets in the corpus's unit to the motion that is noised.
+
+        Raises:
+            FaceDiffError: if it has not been measured, because the system was never trained.
+        """
+        if self.motion_scaling == "none":
+            return 1.0
+        if self.assets.motion_scale is None:
+            raise FaceDiffError("the model has never been trained: give a checkpoint (--ckpt_path, --checkpoint)")
+        return self.assets.motion_scale
+
+    def use_sampler(self, sampler: SamplerFactory) -> None:
+        """Sample with another sampler from now on; checkpoints keep the one that the system was made with."""
+        self.sampler = sampler(process=self.process)
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """One draw of step and noise per clip (algorithm 1), then the four losses (eq. 15 to 19)."""
+        clean = batch.motion.flatten(2) * self.scale
+        noise = torch.randn(clean.shape, device=clean.device, generator=generator)
+        step = torch.randint(self.process.steps, (len(batch),), device=clean.device, generator=generator)
+        noisy = self.process.add_noise(clean, noise, step)
+        predicted = self.network(noisy, step, self._conditions(batch)).unflatten(-1, (-1, 3))
+        truth, mask = clean.unflatten(-1, (-1, 3)), batch.mask
+        upper = self.assets.regions["upper_face"].to(clean.device)
+        terms = {
+            "reconstruction": losses.reconstruction_loss(predicted, truth, mask),
+            "velocity": losses.velocity_loss(predicted, truth, mask),
+            "acceleration": losses.acceleration_loss(predicted, truth, mask),
+            "face": losses.face_dynamics_loss(predicted, truth, mask, upper),
+        }
+        terms["loss"] = sum((self.loss_weights[name] * term for name, term in terms.items()), clean.new_zeros(()))
+        return terms
+
+    def _conditions(self, batch: Batch) -> Conditions:
+        identity = batch.identity
+        if self.training and self.identity_dropout:
+            hidden = torch.rand(identity.shape, device=identity.device) < self.identity_dropout
+            identity = identity.masked_fill(hidden, -1)
+        return self.network.conditions(
+            batch.audio,
+            batch.audio_lengths,
+            batch.frame_lengths,
+            identity,
+            batch.reference.flatten(2) * self.scale,
+            batch.reference_mask,
+        )
+
+    def generate(
+        self, batch: Batch, *, generator: torch.Generator | None = None, progress: Progress | None = None
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """Algorithm 2 with the system's sampler; conditions are computed once."""
+        conditions = self._conditions(batch)
+        shape = batch.motion.flatten(2).shape
+        start = torch.randn(shape, device=batch.motion.device, generator=generator)
+
+        def denoise(noisy: Tensor, step: int) -> Tensor:
+            steps = torch.full((len(batch),), step, device=noisy.device)
+            return self.network(noisy, steps, conditions)
+
+        motion = self.sampler.run(denoise, start, generator=generator, progress=progress) / self.scale
+        return motion.unflatten(-1, (-1, 3))

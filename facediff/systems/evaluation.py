@@ -1,0 +1,70 @@
+"""Scores of a system beside what a still face and shuffled speech score."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from facediff.data import Assets, Batch
+from facediff.metrics import ProtocolMetrics, Region, protocol
+
+METHODS = ("model", "still", "shuffled")
+"""Who is scored: the model, a face that never moves, the model given another sentence's speech."""
+
+
+class Evaluation:
+    """Metrics of one protocol for every split and method.
+
+    No part of the system's module tree: weight averaging copies that tree before the regions are known.
+
+    Args:
+        protocol_name: the protocol.
+    """
+
+    def __init__(self, protocol_name: str) -> None:
+        self.protocol = protocol(protocol_name)
+        self.splits: list[str] = []
+        self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}
+
+    def prepare(self, assets: Assets, splits: Sequence[str]) -> None:
+        """Make empty metrics for a corpus's regions."""
+        regions = {
+            name: Region.from_indices(f"{assets.corpus}/{name}", indices, n_vertices=assets.n_vertices)
+            for name, indices in assets.regions.items()
+        }
+        self.splits = list(splits)
+        methods = METHODS if self.splits != ["val"] else METHODS[:1]
+        self.metrics = {
+            split: {method: self.protocol.build(regions["lips"], regions["upper_face"]) for method in methods}
+            for split in self.splits
+        }
+
+    def update(self, split: str, method: str, motion: Tensor, batch: Batch) -> None:
+        """Add a batch's motion (offsets from the template)."""
+        metrics = self.metrics[split][method].to(motion.device)
+        metrics.update(motion, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
+
+    def scalars(self, split: str) -> dict[str, Tensor]:
+        """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics."""
+        found: dict[str, Tensor] = {}
+        for row in self.rows(split):
+            for name in self.metrics[split]["model"]:
+                prefix = split if row["method"] == "model" else f"{split}/{row['method']}"
+                found[f"{prefix}/{name}"] = torch.tensor(row[name])
+        for metrics in self.metrics[split].values():
+            metrics.reset()
+        return found
+
+    def rows(self, split: str) -> list[dict[str, Any]]:
+        """One row per method: scores, and what they were taken over; collective under several processes."""
+        table = []
+        for method, metrics in self.metrics[split].items():
+            summary = metrics.summary()
+            if not summary.coverage.sequences:
+                continue  # no clip of the split had speech of another sentence to shuffle with
+            scores = {name: float(value) for name, value in metrics.compute().items()}
+            table.append({"split": split, "method": method, **scores, **summary.as_dict()})
+        return table

@@ -1,0 +1,48 @@
+"""Reading template meshes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError, MissingExtraError
+
+SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh.
+
+    Attributes:
+        vertices: (V, 3) positions, in the order of the file.
+        faces: (F, 3) vertex indices.
+    """
+
+    vertices: npt.NDArray[np.float64]
+    faces: npt.NDArray[np.int32]
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a mesh without merging, dropping or reordering a vertex.
+
+    Raises:
+        FaceDiffError: if the file is missing, unreadable or holds no triangles.
+        MissingExtraError: if trimesh is not installed.
+    """
+    if not path.is_file():
+        raise FaceDiffError(f"{path}: no such mesh file; expected one of {', '.join(SUFFIXES)}")
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MissingExtraError("trimesh", "train", "reading a mesh") from error
+    try:
+        mesh = trimesh.load(path, process=False, maintain_order=True, force="mesh")
+    except Exception as error:
+        raise FaceDiffError(f"{path}: not a readable mesh ({error}); expected PLY or OBJ with triangles") from error
+    if not len(mesh.faces):
+        raise FaceDiffError(f"{path}: holds no triangles; expected a mesh with faces")
+    return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32))

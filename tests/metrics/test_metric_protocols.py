@@ -1,0 +1,136 @@
+"""Protocols: their settings, names, words, and the collection they build."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from facediff.metrics import PROTOCOLS, Protocol, ProtocolMetrics, Region, protocol
+
+Corpus = Any  # the class of that name in conftest.py, which test files cannot import
+SCORES = {
+    "paper": ["mve", "lve", "fdd"],
+    "paper_text": ["mve", "lve", "fdd"],
+    "codetalker": ["lve", "fdd"],
+    "facediffuser": ["mve", "lve", "fdd", "fdd_absolute"],
+    "diffspeaker": ["lve", "fdd"],
+    "meshtalk": ["lve"],
+}
+
+
+def build(name: str, lips: tuple[int, ...], upper: tuple[int, ...]) -> ProtocolMetrics:
+    return protocol(name).build(Region.from_indices("lips", lips), Region.from_indices("upper", upper))
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_scores_follow_the_definitions(
+    name: str,
+    corpus: Corpus,
+    lips: tuple[int, ...],
+    upper: tuple[int, ...],
+    vertex_error_reference: Callable[..., float],
+    dynamics_reference: Callable[..., float],
+) -> None:
+    metrics = build(name, lips, upper)
+    for places in ([0, 1], [2], [3, 4]):
+        metrics.update(**corpus.batch(places))
+    pooling = "sequences" if name == "diffspeaker" else "frames"
+    per_frame = "max" if name == "paper_text" else "mean"
+    squared = name not in ("paper_text", "meshtalk")
+    expected = {
+        "mve": vertex_error_reference(corpus, None, reduction=per_frame, squared=False, pooling=pooling),
+        "lve": vertex_error_reference(corpus, lips, reduction="max", squared=squared, pooling=pooling),
+        "fdd": dynamics_reference(corpus, upper, sign="absolute" if "paper" in name else "signed"),
+        "fdd_absolute": dynamics_reference(corpus, upper, sign="absolute"),
+    }
+    found = {score: value.item() for score, value in metrics.compute().items()}
+    assert list(found) == SCORES[name]
+    assert found == pytest.approx({score: expected[score] for score in SCORES[name]}, rel=1e-6)
+
+
+def test_there_are_six_and_paper_is_the_default() -> None:
+    assert list(PROTOCOLS) == list(SCORES)
+    assert protocol() is PROTOCOLS["paper"]
+    with pytest.raises(ValueError, match=r"unknown protocol 'codtalker'.*meshtalk\. Did you mean 'codetalker'"):
+        protocol("codtalker")
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_a_protocol_says_what_its_numbers_are(name: str) -> None:
+    text = protocol(name).describe()
+    assert [line.split(":")[0].strip() for line in text.splitlines()[1:-1]] == SCORES[name]
+    assert "frames of all sequences" in text or "mean over sequences" in text
+
+
+def test_own_protocols_are_checked() -> None:
+    mine = Protocol("mine", "here", mve="mean", mve_squared=True, fdd=("absolute", "signed"))
+    assert list(mine.build(Region("a", (0,)), Region("b", (1,))).keys()) == [
+        "mve",
+        "lve",
+        "fdd",
+        "fdd_signed",
+    ]
+    with pytest.raises(ValueError, match="unknown sign"):
+        Protocol("mine", "here", fdd=("sined",))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="twice"):
+        Protocol("mine", "here", fdd=("signed", "signed"))
+    with pytest.raises(ValueError, match="give the upper-face region"):
+        mine.build(Region("a", (0,)))
+
+
+def test_summary_names_regions_frames_and_cuts(corpus: Corpus, lips: tuple[int, ...], upper: tuple[int, ...]) -> None:
+    metrics = build("paper", lips, upper)
+    batch = corpus.batch([0, 2])
+    metrics.update(**batch, prediction_lengths=[5, 30])
+    summary = metrics.summary()
+    assert str(summary).startswith("protocol paper: lips lips (4 vertices, ")
+    assert str(summary).endswith("; frames 35, sequences 2; frames cut: prediction 0, truth 2")
+    plain = json.loads(json.dumps(summary.as_dict()))
+    assert plain["regions"]["upper"] == {
+        "name": "upper",
+        "count": 5,
+        "hash": Region.from_indices("", upper).hash,
+        "duplicates": 0,
+    }
+    assert (plain["frames"], plain["sequences"], plain["cut_truth"]) == (35, 2, 2)
+    assert "lips (4 vertices" in metrics.describe()
+
+
+def test_codetalker_refuses_a_shorter_prediction(corpus: Corpus, lips: tuple[int, ...], upper: tuple[int, ...]) -> None:
+    metrics = build("codetalker", lips, upper)
+    with pytest.raises(ValueError, match="'prediction' refuses this"):
+        metrics.update(**corpus.batch([0, 2]), prediction_lengths=[5, 30])
+    assert metrics.summary().coverage.sequences == 0
+
+
+@pytest.mark.parametrize("call", ["update", "forward"])
+def test_a_refused_batch_changes_no_metric(
+    corpus: Corpus, lips: tuple[int, ...], upper: tuple[int, ...], call: str
+) -> None:
+    metrics = build("paper", lips, upper)
+    metrics.update(**corpus.batch([2]))
+    before = metrics.compute()
+    for changes in ({"template": torch.zeros(3)}, {"truth": torch.full((1, 30, 40, 3), float("nan"))}):
+        with pytest.raises(ValueError, match="template has shape|holds NaN"):
+            getattr(metrics, call)(**(corpus.batch([2]) | changes))
+    assert metrics.compute() == before
+    assert metrics.summary().coverage.sequences == 1
+
+
+def test_the_collection_resets_pickles_clones_and_forwards(
+    corpus: Corpus, lips: tuple[int, ...], upper: tuple[int, ...]
+) -> None:
+    metrics = build("facediffuser", lips, upper)
+    batch_scores = metrics(**corpus.batch([2]))
+    assert metrics.compute() == batch_scores
+    twin = pickle.loads(pickle.dumps(metrics))  # noqa: S301
+    assert twin.compute() == batch_scores
+    assert list(metrics.clone(prefix="test/").compute()) == [f"test/{name}" for name in batch_scores]
+    metrics.reset()
+    assert metrics.summary().coverage.frames == 0
+    assert not metrics.state_dict()

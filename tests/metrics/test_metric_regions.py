@@ -1,0 +1,95 @@
+"""Regions: index files, duplicates, hashes and refusals."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from facediff.metrics import LipVertexError, Region, lip_vertex_error
+
+Indices = Any  # right and wrong ones
+
+
+@pytest.mark.parametrize("text", ["5,1,3,1", "5, 1, 3, 1\n", "5 1\n3\t1\n", "5\r\n1\r\n3\r\n1\r\n", "\ufeff5,1,3,1,"])
+def test_files_in_every_separation(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "lve.txt"
+    path.write_text(text, encoding="utf-8", newline="")
+    region = Region.from_file(path, n_vertices=6)
+    assert (region.name, region.indices, region.duplicates, region.count) == ("lve", (1, 3, 5), 1, 3)
+    assert region.hash == hashlib.sha256(b"1,3,5").hexdigest()[:8]
+    assert Region.from_file(str(path), name="biwi/lve").name == "biwi/lve"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"1,2,x3", r"entry 3 is 'x3'; expected vertex indices"),
+        (b"1,-2", r"entry 2 is '-2'"),
+        (b"1.0 2.0", r"entry 1 is '1.0'"),
+        (b" \n", r"holds no vertex index"),
+        (b"1,99", r"index 99, a mesh of 6 vertices ends at 5"),
+        (b"\xff\xfe\x00\x81", r"is not text"),
+    ],
+)
+def test_bad_files_are_named(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "lve.txt"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        Region.from_file(path, n_vertices=6)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"none\.txt: No such file.*check the path"):
+        Region.from_file(tmp_path / "none.txt")
+
+
+@pytest.mark.parametrize("indices", [[4, 2, 4], torch.tensor([4, 2, 4]), np.array([4, 2, 4]), {2, 4}, range(2, 5, 2)])
+def test_any_collection_of_integers(indices: Indices) -> None:
+    assert Region.from_indices("lips", indices).indices == (2, 4)
+
+
+@pytest.mark.parametrize(
+    ("indices", "message"),
+    [
+        ([], "holds no vertex index"),
+        ([1.0, 2.0], "flat list of integers"),
+        ([[1, 2]], "flat list of integers"),
+        (torch.tensor([True, False]), "mask of booleans"),
+        ([-1, 2], "holds the index -1"),
+        (torch.tensor(3), "flat list of integers"),
+    ],
+)
+def test_other_collections_are_refused(indices: Indices, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Region.from_indices("lips", indices)
+
+
+def test_the_plain_constructor_wants_sorted_distinct_indices() -> None:
+    with pytest.raises(ValueError, match=r"use Region\.from_indices"):
+        Region("lips", (2, 1))
+
+
+def test_the_hash_is_of_the_vertices_only() -> None:
+    first, second = Region.from_indices("a", [1, 2]), Region.from_indices("b", [2, 1, 1], n_vertices=9)
+    assert first.hash == second.hash
+    assert first.hash != Region.from_indices("a", [12]).hash
+
+
+def test_a_region_of_another_mesh_is_refused() -> None:
+    with pytest.raises(ValueError, match="belongs to a mesh of 9 vertices, the motion has 10"):
+        Region.from_indices("lips", [1], n_vertices=9).check(10)
+
+
+def test_repeated_lip_indices_change_nothing() -> None:
+    truth, prediction = torch.randn(2, 5, 6, 3, generator=torch.manual_seed(0)).unbind(0)
+    twice = lip_vertex_error(prediction, truth, [1, 3, 3, 1])
+    assert twice == lip_vertex_error(prediction, truth, [1, 3])
+    region = LipVertexError([1, 3, 3, 1]).region
+    assert region is not None
+    assert (region.count, region.duplicates) == (2, 2)
