@@ -20,11 +20,7 @@ def atomic(path: Path) -> Iterator[Path]:
         FaceDiffError: if the folder cannot be made or written.
     """
     temporary = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch()
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be written ({error.strerror}); choose a folder you may write to") from error
+    check_writable(path)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -33,3 +29,24 @@ def atomic(path: Path) -> Iterator[Path]:
     finally:
         with suppress(FileNotFoundError):
             temporary.unlink()
+
+
+def check_writable(path: Path) -> None:
+    """Make sure, before any work is done, that a file can be written; leaves nothing behind but its folder.
+
+    Raises:
+        FaceDiffError: if the folder cannot be made or written, or if the path is a folder.
+    """
+    if path.is_dir():
+        raise FaceDiffError(f"{path}: is a folder; expected the name of a file to write")
+    probe = path.with_name(f".{path.stem}.probe-{os.getpid()}")
+    made = [folder for folder in path.parents if not folder.exists()]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
+        raise FaceDiffError(f"{path}: cannot be written ({error.strerror}); choose a folder you may write to") from error

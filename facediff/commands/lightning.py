@@ -93,7 +93,7 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
         "model": described(checkpoint["hyper_parameters"], drop=LINKS),
         "data": described(checkpoint["datamodule_hyper_parameters"], fallback=checkpoint["facediff_data"]),
     }
-    return ["--config", yaml.safe_dump(config, sort_keys=False), *without_models(arguments)]
+    return ["--config", yaml.safe_dump(config, sort_keys=False), *arguments]
 
 
 def described(hparams: dict[str, Any], *, drop: Sequence[str] = (), fallback: str = "") -> dict[str, Any]:
@@ -112,13 +112,14 @@ def option(arguments: Sequence[str], flag: str) -> str | None:
     return None
 
 
-def without_models(arguments: list[str]) -> list[str]:
-    """Arguments as they are; configs given beside a checkpoint come after it and may set trainer and data."""
-    return arguments
-
-
 def run(name: str, arguments: Sequence[str]) -> int:
-    """Run one of Lightning's subcommands."""
+    """Run one of Lightning's subcommands from the command line."""
+    run_cli(name, arguments)
+    return 0
+
+
+def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
+    """Run one of Lightning's subcommands and hand back what it made: trainer, model, data module."""
     for kind in registry.KINDS.values():
         kind.load()
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
@@ -128,11 +129,13 @@ def run(name: str, arguments: Sequence[str]) -> int:
         os.environ.setdefault("WANDB_MODE", "offline")
     warnings.filterwarnings("ignore", "The '.*dataloader' does not have many workers")
     words = resolve_configs(from_checkpoint(name, list(arguments)))
+    if name == "test":
+        words = ["--verbose=false", *words]  # ScoreTable prints the scores; Lightning's table repeats them per loader
     callbacks = [ScoreTable()] + ([PredictionWriter()] if name == "predict" else [])
     logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
     argv, sys.argv = sys.argv, sys.argv[:1]
     try:
-        FaceDiffCLI(
+        return FaceDiffCLI(
             SpeechAnimator,
             SpeechMotionDataModule,
             subclass_mode_model=True,
@@ -146,7 +149,6 @@ def run(name: str, arguments: Sequence[str]) -> int:
         )
     finally:
         sys.argv = argv
-    return 0
 
 
 def resolve_configs(arguments: list[str]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from facediff.errors import FaceDiffError
@@ -36,6 +36,7 @@ class Assets:
         identities: the training identities, in the order of the identity index.
         templates: neutral face of every subject.
         faces: triangles; None where the corpus has no mesh file.
+        colours: vertex colours (sRGB, 0 to 255) for pictures; None where the mesh file has none.
         regions: vertex indices by region name: ``lips``, ``upper_face``.
         inner_lip_pairs: (upper, lower) vertex pairs on the inner lips, for the mouth's opening.
         references: a default style reference for every subject that has one.
@@ -50,6 +51,7 @@ class Assets:
     templates: dict[str, Float[Tensor, "vertices 3"]]
     faces: Int[Tensor, "faces 3"] | None
     regions: dict[str, Int[Tensor, " region"]]
+    colours: UInt8[Tensor, "vertices 3"] | None = None
     inner_lip_pairs: Int[Tensor, "pairs 2"] | None = None
     references: dict[str, Reference] = field(default_factory=dict)
     motion_scale: float | None = None

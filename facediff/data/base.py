@@ -122,6 +122,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """What a checkpoint keeps of this corpus; the motion scale is left for :meth:`motion_scale` to measure."""
         if self._assets is None:
             corpus = self.corpus
+            mesh = corpus.read_mesh(self.mesh_file)
             self._assets = Assets(
                 corpus=self.corpus_name,
                 synthetic=self.synthetic,
@@ -129,7 +130,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 frame_rate=self.frame_rate,
                 identities=list(self.identities),
                 templates=dict(corpus.templates),
-                faces=corpus.read_faces(self.mesh_file),
+                faces=None if mesh is None else torch.from_numpy(mesh.faces),
+                colours=None if mesh is None or mesh.colours is None else torch.from_numpy(mesh.colours),
                 regions={name: corpus.read_region(file, name).tensor() for name, file in self.region_files.items()},
                 inner_lip_pairs=corpus.read_pairs("inner_lip_pairs.txt"),
                 references=self._default_references(),

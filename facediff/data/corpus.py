@@ -20,7 +20,7 @@ from facediff.data.audio import fit_length, read_speech, samples_for
 from facediff.data.pickles import load_pickle
 from facediff.errors import FaceDiffError
 from facediff.metrics import Region
-from facediff.topology.mesh import read_mesh
+from facediff.topology.mesh import Mesh, read_mesh
 
 
 @dataclass(frozen=True)
@@ -140,15 +140,15 @@ class Corpus:
         first = samples_for(start, self.frame_rate)
         return torch.from_numpy(fit_length(audio[first:], samples_for(stop - start, self.frame_rate)))
 
-    def read_faces(self, file: str) -> Tensor | None:
-        """Triangles (F, 3) of the corpus's mesh file; None if there is no such file."""
+    def read_mesh(self, file: str) -> Mesh | None:
+        """The corpus's mesh file; None if there is no such file."""
         path = self.root / file
         if not path.is_file():
             return None
         mesh = read_mesh(path)
         if len(mesh.vertices) != self.n_vertices:
             raise FaceDiffError(f"{path}: has {len(mesh.vertices)} vertices, expected {self.n_vertices}")
-        return torch.from_numpy(mesh.faces.copy())
+        return mesh
 
     def read_region(self, file: str, name: str) -> Region:
         """A region file: vertex indices separated by "," or ", "."""

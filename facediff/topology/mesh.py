@@ -20,10 +20,12 @@ class Mesh:
     Attributes:
         vertices: (V, 3) positions, in the order of the file.
         faces: (F, 3) vertex indices.
+        colours: (V, 3) vertex colours, sRGB; None if the file has none.
     """
 
     vertices: npt.NDArray[np.float64]
     faces: npt.NDArray[np.int32]
+    colours: npt.NDArray[np.uint8] | None = None
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -45,4 +47,9 @@ def read_mesh(path: Path) -> Mesh:
         raise FaceDiffError(f"{path}: not a readable mesh ({error}); expected PLY or OBJ with triangles") from error
     if not len(mesh.faces):
         raise FaceDiffError(f"{path}: holds no triangles; expected a mesh with faces")
-    return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32))
+    coloured = mesh.visual.kind == "vertex"
+    return Mesh(
+        np.array(mesh.vertices, np.float64),
+        np.array(mesh.faces, np.int32),
+        np.array(mesh.visual.vertex_colors[:, :3], np.uint8) if coloured else None,
+    )

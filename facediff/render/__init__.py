@@ -1,0 +1,31 @@
+"""Meshes to pictures and videos, without display, GPU or system packages.
+
+Importing this costs NumPy only: OpenCV, PyAV and Pillow are loaded by the first call that needs them.
+
+Example:
+    >>> from facediff.render import Renderer, side_by_side, write_video  # doctest: +SKIP
+    >>> renderer = Renderer(faces, template=template)  # doctest: +SKIP
+    >>> frames = side_by_side(renderer, [truth, prediction], ["truth", "facediff"])  # doctest: +SKIP
+    >>> write_video("out.mp4", frames, 25, audio, 16000)  # doctest: +SKIP
+"""
+
+from facediff.render.camera import VIEWS, Camera
+from facediff.render.panels import check_motion, contact_sheet, save_image, side_by_side
+from facediff.render.rasteriser import Renderer
+from facediff.render.shading import EVEN, STUDIO, Light, Look
+from facediff.render.video import write_video
+
+__all__ = [
+    "EVEN",
+    "STUDIO",
+    "VIEWS",
+    "Camera",
+    "Light",
+    "Look",
+    "Renderer",
+    "check_motion",
+    "contact_sheet",
+    "save_image",
+    "side_by_side",
+    "write_video",
+]

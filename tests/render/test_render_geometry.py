@@ -1,0 +1,92 @@
+"""Normals, winding and the refusal of meshes that cannot be drawn."""
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.render.geometry import (
+    check_faces,
+    check_vertices,
+    face_outward,
+    hollowness,
+    is_open,
+    vertex_normals,
+)
+
+MakeSphere = Callable[..., tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]]
+
+
+def test_normals_of_a_sphere_are_its_positions(sphere: MakeSphere) -> None:
+    vertices, faces = sphere(40, 80)
+    normals = vertex_normals(vertices, faces)
+    assert np.degrees(np.arccos(np.clip((normals * vertices).sum(axis=1), -1, 1))).max() < 1.0
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-12)
+
+
+def test_normals_weight_faces_by_area() -> None:
+    # Two faces share vertex 0: one in the plane z = 0 with area 2, one in the plane x = 0 with area 0.5.
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+    normal = vertex_normals(vertices, np.array([[0, 1, 2], [0, 3, 4]], np.int32))[0]
+    np.testing.assert_allclose(normal, np.array([0.5, 0, 2]) / np.hypot(0.5, 2))
+
+
+def test_a_vertex_without_faces_gets_a_finite_normal() -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5]], dtype=float)
+    np.testing.assert_array_equal(vertex_normals(vertices, np.array([[0, 1, 2]], np.int32))[3], [0, 0, 1])
+
+
+def test_either_winding_ends_up_outward(sphere: MakeSphere) -> None:
+    vertices, faces = sphere()
+    vertices = vertices + 7  # the origin is outside: only the flux decides
+    np.testing.assert_array_equal(face_outward(faces, vertices), faces)
+    np.testing.assert_array_equal(face_outward(faces[:, ::-1], vertices), faces)
+    front = faces[vertices[faces][:, :, 2].min(axis=1) > 7.2]
+    np.testing.assert_array_equal(face_outward(front[:, ::-1], vertices), front)
+
+
+def test_open_and_closed(sphere: MakeSphere) -> None:
+    _, faces = sphere()
+    assert not is_open(faces)
+    assert is_open(faces[1:])
+
+
+def test_hollows_are_positive_and_ridges_negative(sphere: MakeSphere) -> None:
+    vertices, faces = sphere()
+    dented = vertices.copy()
+    dented[500] *= 0.8
+    assert hollowness(dented, vertex_normals(dented, faces), faces)[500] > 0.3
+    assert hollowness(vertices, vertex_normals(vertices, faces), faces).max() < 0
+
+
+@pytest.mark.parametrize(
+    ("vertices", "message"),
+    [
+        (np.zeros((4, 2)), "shape"),
+        (np.zeros((0, 3)), "shape"),
+        (np.full((4, 3), np.nan), "NaN"),
+        (np.full((4, 3), np.inf), "infinity"),
+        (np.zeros((5, 3)), "template has 4"),
+        (np.array([["a"] * 3] * 4), "numbers"),
+    ],
+)
+def test_bad_vertices(vertices: np.ndarray, message: str) -> None:
+    with pytest.raises(FaceDiffError, match=message):
+        check_vertices(vertices, "vertices", 4)
+
+
+@pytest.mark.parametrize(
+    ("faces", "message"),
+    [
+        (np.array([[0, 1, 4]]), "vertex 4"),
+        (np.array([[-1, 1, 2]]), "vertex -1"),
+        (np.zeros((0, 3), int), "shape"),
+        (np.array([[0, 1, 2, 3]]), "shape"),
+        (np.array([[0.0, 1.0, 2.0]]), "whole numbers"),
+    ],
+)
+def test_bad_faces(faces: np.ndarray, message: str) -> None:
+    with pytest.raises(FaceDiffError, match=message):
+        check_faces(faces, 4)

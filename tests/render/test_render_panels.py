@@ -1,0 +1,118 @@
+"""Panels, labels and sheets."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from facediff.errors import FaceDiffError
+from facediff.render import Renderer, contact_sheet, save_image, side_by_side
+
+MakeSphere = Callable[..., tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]]
+
+# An octahedron that rises.
+VERTICES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
+FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+MOTION = VERTICES + np.linspace(0, 0.2, 3)[:, None, None] * [0, 1, 0]
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(FACES, template=VERTICES, size=(96, 80))
+
+
+def test_panels_are_the_renderers_pictures_under_their_labels(renderer: Renderer) -> None:
+    frames = list(side_by_side(renderer, [MOTION, MOTION[::-1]], ["truth", "facediff"], footer="synthetic corpus"))
+    assert len(frames) == 3
+    height, width, _ = frames[0].shape
+    assert width == 160
+    assert height > 96
+    top = next(row for row in range(height) if (frames[0][row : row + 96, :80] == renderer.render(MOTION[0])).all())
+    np.testing.assert_array_equal(frames[0][top : top + 96, 80:], renderer.render(MOTION[2]))
+    strip, foot = frames[0][:top], frames[0][top + 96 :]
+    assert strip[:, :80].min() < 100  # dark ink on a light ground
+    assert strip[:, 80:].min() < 100
+    assert foot.min() < 150
+    # The labels differ, and stay the same while the faces move.
+    assert (strip[:, :80] != strip[:, 80:]).any()
+    np.testing.assert_allclose(strip.astype(int), frames[2][:top].astype(int), atol=1)
+
+
+def test_strips_continue_the_background_where_the_face_reaches_the_edge(renderer: Renderer) -> None:
+    (frame,) = side_by_side(renderer, [MOTION[:1] - [0, 0.5, 0]], [""], footer="x")
+    assert (frame[95] != renderer.backdrop[-1]).any()
+    np.testing.assert_array_equal(frame[96], renderer.backdrop[-1])
+
+
+def test_without_labels_and_footer_there_are_no_strips(renderer: Renderer) -> None:
+    (frame,) = side_by_side(renderer, [MOTION[:1]], [""])
+    np.testing.assert_array_equal(frame, renderer.render(MOTION[0]))
+
+
+def test_topologies_and_colours_mix(renderer: Renderer, sphere: MakeSphere) -> None:
+    vertices, faces = sphere(8, 12)
+    other = Renderer(faces, template=vertices, size=(96, 64))
+    still = np.tile(vertices, (3, 1, 1))
+    heat = np.random.default_rng(0).random(MOTION.shape)
+    frames = list(side_by_side([renderer, other], [MOTION, still], ["a", "b"], colours=[heat, None]))
+    assert frames[0].shape[1] == 80 + 64
+    np.testing.assert_array_equal(frames[1][-96:, :80], renderer.render(MOTION[1], colours=heat[1]))
+
+
+def test_a_very_long_label_still_fits(renderer: Renderer) -> None:
+    (frame,) = side_by_side(renderer, [MOTION[:1]], ["a label that is much too long for such a small picture " * 2])
+    assert frame.shape[1] == 80
+
+
+def test_bad_motions_are_refused_before_the_first_frame(renderer: Renderer) -> None:
+    broken = MOTION.copy()
+    broken[1, 3, 2] = np.inf
+    other = Renderer(FACES, template=VERTICES, size=64)
+    calls: list[tuple[Callable[[], object], str]] = [
+        (lambda: side_by_side(renderer, [], []), "0 motions"),
+        (lambda: side_by_side(renderer, [MOTION], ["a", "b"]), "2 labels"),
+        (lambda: side_by_side(renderer, [MOTION[:0]], ["a"]), '"a" has no frames'),
+        (
+            lambda: side_by_side(renderer, [MOTION, broken], ["a", "b"]),
+            '"b" holds NaN or infinity .first in frame 1',
+        ),
+        (lambda: side_by_side(renderer, [MOTION[:, 1:]], ["a"]), "its template has"),
+        (lambda: side_by_side(renderer, [MOTION[0]], ["a"]), "shape"),
+        (lambda: side_by_side(renderer, [MOTION, MOTION[:2]], ["a", "b"]), '"a" 3, "b" 2'),
+        (lambda: side_by_side([renderer, other], [MOTION, MOTION], ["a", "b"]), "differ in height"),
+        (lambda: side_by_side([renderer], [MOTION, MOTION], ["a", "b"]), "1 renderers"),
+        (lambda: side_by_side(renderer, [MOTION], ["a"], colours=[MOTION[:2]]), "colours of"),
+    ]
+    for call, message in calls:
+        with pytest.raises(FaceDiffError, match=message):
+            call()
+
+
+def test_contact_sheet_places_pictures_row_by_row() -> None:
+    pictures = [np.full((10, 12, 3), 10 * index, np.uint8) for index in range(5)]
+    sheet = contact_sheet(iter(pictures), 3, gap=2)
+    assert sheet.shape == (22, 40, 3)
+    assert [int(sheet[5, 5 + 14 * column, 0]) for column in range(3)] == [0, 10, 20]
+    assert [int(sheet[17, 5 + 14 * column, 0]) for column in range(3)] == [30, 40, 255]
+    assert contact_sheet(pictures, 3, labels=list("abcde")).shape[0] > 26
+    for bad, columns in (([], 3), (pictures, 0), ([*pictures, pictures[0][1:]], 3)):
+        with pytest.raises(FaceDiffError, match="contact sheet"):
+            contact_sheet(bad, columns)
+
+
+def test_save_image_round_trip_and_refusals(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (9, 7, 3)).astype(np.uint8)
+    save_image(tmp_path / "new" / "a.png", picture)
+    with Image.open(tmp_path / "new" / "a.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), picture)
+    assert [file.name for file in (tmp_path / "new").iterdir()] == ["a.png"]
+    (tmp_path / "file").touch()
+    with pytest.raises(FaceDiffError, match="cannot write"):
+        save_image(tmp_path / "file" / "a.png", picture)
+    with pytest.raises(FaceDiffError, match="must end in .png"):
+        save_image(tmp_path / "a.jpg", picture)
+    with pytest.raises(ValueError, match="uint8"):
+        save_image(tmp_path / "a.png", picture[..., 0])

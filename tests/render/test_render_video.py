@@ -1,0 +1,167 @@
+"""What is in the video files, read back by readers that are not the writer."""
+
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.render import write_video
+
+Frame = npt.NDArray[np.uint8]
+SAMPLE_RATE = 16000
+
+
+def _frames(count: int, size: tuple[int, int] = (48, 64)) -> Iterator[Frame]:
+    for index in range(count):
+        yield np.full((*size, 3), 40 + index % 100, np.uint8)
+
+
+def _read_sound(path: Path) -> tuple[npt.NDArray[np.float32], int, float]:
+    """Samples, rate, and time of the first sample as a player hears it."""
+    with av.open(str(path)) as container:
+        frames = list(container.decode(audio=0))
+        start = float(frames[0].time or 0.0)
+        samples = np.concatenate([frame.to_ndarray()[0] for frame in frames])
+        return samples.astype(np.float32), frames[0].sample_rate, start
+
+
+@pytest.mark.parametrize("rate", [25, 30, 60, 29.97])
+@pytest.mark.parametrize("count", [1, 2, 37])
+def test_frame_count_and_rate_are_exact(tmp_path: Path, rate: float, count: int) -> None:
+    path = tmp_path / "a.mp4"
+    assert write_video(path, _frames(count), rate, np.zeros(8000, np.float32), SAMPLE_RATE) == count
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert sum(1 for _ in container.decode(video=0)) == count
+        if count > 1:
+            assert stream.average_rate == Fraction(rate).limit_denominator(1001)
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert container.streams.audio[0].codec_context.name == "aac"
+    capture = cv2.VideoCapture(str(path))
+    seen = 0
+    while capture.read()[0]:
+        seen += 1
+    assert seen == count
+    if count > 1:
+        assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(rate, abs=1e-3)
+    capture.release()
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_pictures_come_back_in_order_and_in_colour(tmp_path: Path) -> None:
+    colours = np.array([[200, 60, 40], [50, 180, 70], [40, 80, 210], [128, 128, 128]], np.uint8)
+    write_video(tmp_path / "a.mp4", (np.full((32, 32, 3), colour, np.uint8) for colour in colours), 25)
+    capture = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    for index, colour in enumerate(colours):
+        assert capture.get(cv2.CAP_PROP_POS_MSEC) == pytest.approx(max(index - 1, 0) * 40, abs=1)
+        picture = capture.read()[1][..., ::-1].reshape(-1, 3)
+        np.testing.assert_allclose(np.median(picture, axis=0), colour, atol=6)
+    capture.release()
+
+
+@pytest.mark.parametrize("rate", [16000, 44100, 48000, 11999])
+def test_sound_keeps_its_length(tmp_path: Path, rate: int) -> None:
+    seconds = 1.3
+    tone = 0.5 * np.sin(2 * np.pi * 440 * np.arange(round(seconds * rate)) / rate)
+    write_video(tmp_path / "a.mp4", _frames(33), 25, tone.astype(np.float32), rate)
+    sound, out_rate, start = _read_sound(tmp_path / "a.mp4")
+    assert start == pytest.approx(0, abs=1e-3)
+    assert len(sound) / out_rate == pytest.approx(seconds, abs=2 * 1024 / out_rate)  # whole packets
+    middle = sound[out_rate // 4 : out_rate]
+    assert np.abs(middle).max() == pytest.approx(0.5, abs=0.05)
+
+
+def test_flash_and_click_agree(tmp_path: Path) -> None:
+    moment, frame_rate = 1.5, 30
+    click = np.zeros(3 * SAMPLE_RATE, np.float32)
+    click[round(moment * SAMPLE_RATE)] = 1
+    flash = [np.full((48, 48, 3), 255 if i >= round(moment * frame_rate) else 0, np.uint8) for i in range(90)]
+    path = tmp_path / "a.mp4"
+    write_video(path, iter(flash), frame_rate, click, SAMPLE_RATE)
+    capture = cv2.VideoCapture(str(path))
+    seen = None
+    while seen is None:
+        ok, picture = capture.read()
+        assert ok, "no flash in the video"
+        if picture.mean() > 128:
+            seen = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+    capture.release()
+    sound, rate, start = _read_sound(path)
+    heard = start + int(np.abs(sound).argmax()) / rate
+    assert seen == pytest.approx(moment, abs=0.5 / frame_rate)
+    assert heard == pytest.approx(moment, abs=0.5 / frame_rate)
+    assert abs(seen - heard) < 0.5 / frame_rate
+
+
+def test_two_writes_are_equal_byte_by_byte(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (20, 40, 56, 3)).astype(np.uint8)
+    sound = np.random.default_rng(1).normal(0, 0.1, 12800).astype(np.float32)
+    for name in ("a.mp4", "b.mp4"):
+        write_video(tmp_path / name, iter(noise), 25, sound, SAMPLE_RATE)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+
+
+def test_odd_sizes_are_padded(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", _frames(3, (33, 47)), 25)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.height, stream.width) == (34, 48)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("half-way"), KeyboardInterrupt(), OSError("a reader's own")])
+def test_a_failing_generator_leaves_nothing(tmp_path: Path, error: BaseException) -> None:
+    def failing() -> Iterator[Frame]:
+        yield from _frames(30)
+        raise error
+
+    with pytest.raises(type(error)) as caught:
+        write_video(tmp_path / "new" / "folder" / "a.mp4", failing(), 25, np.zeros(100000, np.float32), SAMPLE_RATE)
+    assert caught.value is error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_keeps_the_video_that_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"before")
+    frames = [*_frames(5), np.zeros((10, 10, 3), np.uint8)]
+    with pytest.raises(ValueError, match="frame 5"):
+        write_video(path, frames, 25)
+    assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+    write_video(path, _frames(5), 25)
+    assert path.stat().st_size > 500
+
+
+def test_bad_input_is_one_clear_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.mp4").mkdir()
+    sound = np.zeros(100, np.float32)
+    calls: list[tuple[Callable[[], object], str]] = [
+        (lambda: write_video(tmp_path / "a.avi", _frames(2), 25), "must end in .mp4"),
+        (lambda: write_video(tmp_path / "file" / "a.mp4", _frames(2), 25), "cannot make the folder"),
+        (lambda: write_video(tmp_path / "folder.mp4", _frames(2), 25), "is a folder"),
+        (lambda: write_video(tmp_path / "a.mp4", iter(()), 25), "no frames"),
+        (lambda: write_video(tmp_path / "a.mp4", _frames(2), 0), "frame_rate"),
+        (lambda: write_video(tmp_path / "a.mp4", _frames(2), 25, sound), "sample_rate"),
+        (lambda: write_video(tmp_path / "a.mp4", _frames(2), 25, sound * np.nan, 16000), "NaN"),
+        (lambda: write_video(tmp_path / "a.mp4", _frames(2), 25, sound[None], 16000), "mono"),
+    ]
+    for call, message in calls:
+        with pytest.raises(FaceDiffError, match=message):
+            call()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["file", "folder.mp4"]
+
+
+def test_a_folder_that_refuses_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(av, "open", refuse)
+    with pytest.raises(FaceDiffError, match="Permission denied"):
+        write_video(tmp_path / "a.mp4", _frames(2), 25)

@@ -1,0 +1,134 @@
+"""How many pictures a second: facediff's renderer, and matplotlib's painter where it is installed.
+
+Run ``python tools/benchmarks/rendering.py``; a few seconds. The meshes are dented spheres with about as many
+vertices as FLAME (5 023) and BIWI (23 370). OpenCV is held to one thread.
+"""
+
+import importlib
+import importlib.util
+import math
+import os
+import platform
+import time
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.render import Renderer
+
+SIZES = (5023, 23370)
+FRAMES = 12
+
+Array = npt.NDArray[np.float64]
+Faces = npt.NDArray[np.int64]
+
+
+def head(n_vertices: int) -> tuple[Array, Faces]:
+    """A head-sized egg (V, 3) of about `n_vertices`, open at its neck, with faces (F, 3)."""
+    rows = round(math.sqrt(n_vertices / 2))
+    columns = round(n_vertices / rows)
+    polar, around = np.meshgrid(
+        np.linspace(0.01, 0.85 * np.pi, rows),
+        np.linspace(0, 2 * np.pi, columns, endpoint=False),
+        indexing="ij",
+    )
+    unit = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], axis=-1)
+    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij"))
+    a, b = i * columns + j, i * columns + (j + 1) % columns
+    faces = np.concatenate([np.stack([a, a + columns, b], 1), np.stack([b, a + columns, b + columns], 1)])
+    return unit.reshape(-1, 3) * [0.75, 1.1, 0.9], faces
+
+
+def motion(vertices: Array) -> Array:
+    """The mesh with a mouth-like dent that opens: (FRAMES, V, 3)."""
+    x, y, z = vertices.T
+    dent = np.exp(-((x / 0.25) ** 2) - ((y + 0.4) / 0.12) ** 2) * (z > 0)
+    opening = np.sin(np.linspace(0, np.pi, FRAMES))
+    return np.asarray(vertices - opening[:, None, None] * 0.2 * dent[:, None] * [0, 0, 1])
+
+
+def frames_per_second(draw: Callable[[Array], object], frames: Array) -> float:
+    """Median speed over the frames, after one to warm up."""
+    draw(frames[0])
+    seconds = []
+    for frame in frames:
+        start = time.perf_counter()
+        draw(frame)
+        seconds.append(time.perf_counter() - start)
+    return 1 / float(np.median(seconds))
+
+
+def matplotlib_painter(faces: Faces, pixels: int) -> Callable[[Array], object]:
+    """The usual way without a rasteriser: flat polygons, painted from back to front."""
+    # By name: matplotlib is not among the packages that the project's type checker sees.
+    agg, collections, figures = (
+        importlib.import_module(f"matplotlib.{name}") for name in ("backends.backend_agg", "collections", "figure")
+    )
+    figure = figures.Figure(figsize=(pixels / 100, pixels / 100), dpi=100)
+    canvas = agg.FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(-1.2, 1.2), ylim=(-1.2, 1.2))
+    axes.set_axis_off()
+    polygons = collections.PolyCollection([])
+    axes.add_collection(polygons)
+
+    def draw(vertices: Array) -> object:
+        corners = vertices[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        front = np.flatnonzero(normals[:, 2] > 0)
+        order = front[np.argsort(corners[front, :, 2].mean(axis=1))]
+        shade = np.clip(normals[order] @ [-0.4, 0.45, 0.8], 0.1, 1)
+        polygons.set_verts(corners[order, :, :2])
+        polygons.set_facecolor(shade[:, None] * [0.9, 0.75, 0.66])
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())
+
+    return draw
+
+
+def machine() -> str:
+    """Processor, cores and Python, in words."""
+    name = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            name = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), name)
+    except OSError:
+        pass  # not Linux: the processor's family is enough
+    return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def main() -> None:
+    """Print one line per mesh and way of drawing."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    compare = importlib.util.find_spec("matplotlib") is not None
+    print(f"machine: {machine()}; OpenCV {cv2.__version__}, one thread; 512 x 512, median of {FRAMES} frames")
+    if not compare:
+        print("matplotlib is not installed: no comparison")
+    print(f"{'vertices':>9}{'faces':>9}  {'drawn by':<34}{'frames/s':>9}{'ratio':>7}")
+    for size in SIZES:
+        vertices, faces = head(size)
+        frames = motion(vertices)
+        colours = np.clip(np.abs(frames[-1]), 0, 1)
+        smooth = Renderer(faces, template=vertices)
+        coarse = Renderer(faces, template=vertices, supersample=1)
+        tinted = Renderer(faces, template=vertices, colours=colours)
+        ways: dict[str, Callable[[Array], object]] = {
+            "facediff, 2 x 2 samples": smooth.render,
+            "facediff, 2 x 2, vertex colours": tinted.render,
+            "facediff, 1 sample": coarse.render,
+        }
+        if compare:
+            ways = {"matplotlib, flat polygons": matplotlib_painter(faces, 512), **ways}
+        base: float | None = None
+        for name, draw in ways.items():
+            speed = frames_per_second(draw, frames)
+            base = speed if base is None and compare else base
+            ratio = f"{speed / base:.1f}" if base else "-"
+            print(f"{len(vertices):>9}{len(faces):>9}  {name:<34}{speed:>9.1f}{ratio:>7}")
+
+
+if __name__ == "__main__":
+    main()
