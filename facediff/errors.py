@@ -20,6 +20,5 @@ class MissingExtraError(FaceDiffError):
 
     def __init__(self, package: str, extra: str, feature: str) -> None:
         super().__init__(
-            f'{feature} needs the package "{package}", which is not installed: '
-            f'run  pip install "facediff[{extra}]"'
+            f'{feature} needs the package "{package}", which is not installed: run  pip install "facediff[{extra}]"'
         )

@@ -21,6 +21,7 @@ def atomic(path: Path) -> Iterator[Path]:
     """
     temporary = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     check_writable(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -32,7 +33,7 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def check_writable(path: Path) -> None:
-    """Make sure, before any work is done, that a file can be written; leaves nothing behind but its folder.
+    """Make sure, before any work is done, that a file can be written; leaves nothing behind.
 
     Raises:
         FaceDiffError: if the folder cannot be made or written, or if the path is a folder.
@@ -46,7 +47,10 @@ def check_writable(path: Path) -> None:
         probe.touch()
         probe.unlink()
     except OSError as error:
+        raise FaceDiffError(
+            f"{path}: cannot be written ({error.strerror}); choose a folder you may write to"
+        ) from error
+    finally:
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()
-        raise FaceDiffError(f"{path}: cannot be written ({error.strerror}); choose a folder you may write to") from error

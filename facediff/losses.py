@@ -41,9 +41,7 @@ def acceleration_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
     return huber(prediction.diff(n=2, dim=1), truth.diff(n=2, dim=1), all_three)
 
 
-def masked_std(
-    values: Float[Tensor, "batch frames vertices"], mask: Mask
-) -> Float[Tensor, "batch vertices"]:
+def masked_std(values: Float[Tensor, "batch frames vertices"], mask: Mask) -> Float[Tensor, "batch vertices"]:
     """Population standard deviation over each clip's valid frames; its gradient is 0 where it is 0."""
     weight = mask[..., None].to(values.dtype)
     count = weight.sum(1).clamp_min(1)
@@ -53,9 +51,7 @@ def masked_std(
     return torch.where(positive, variance.where(positive, torch.ones_like(variance)).sqrt(), 0.0)
 
 
-def face_dynamics_loss(
-    prediction: Motion, truth: Motion, mask: Mask, region: Int[Tensor, " upper_face"]
-) -> Scalar:
+def face_dynamics_loss(prediction: Motion, truth: Motion, mask: Mask, region: Int[Tensor, " upper_face"]) -> Scalar:
     """L_face: mean over upper-face vertices of |σ − σ̂| (eq. 19).
 
     σ is the standard deviation over time of the length of a vertex's displacement.
@@ -66,7 +62,5 @@ def face_dynamics_loss(
         mask: valid frames.
         region: indices of the upper-face vertices R.
     """
-    deviation = [
-        masked_std(torch.linalg.vector_norm(m[:, :, region], dim=-1), mask) for m in (truth, prediction)
-    ]
+    deviation = [masked_std(torch.linalg.vector_norm(m[:, :, region], dim=-1), mask) for m in (truth, prediction)]
     return (deviation[0] - deviation[1]).abs().mean()

@@ -113,9 +113,7 @@ class Kind:
         """Make the empty subclass whose import path ends in the registered name."""
 
         def body(namespace: dict[str, Any]) -> None:
-            namespace.update(
-                __module__=__name__, __qualname__=f"{self.kind}.{name}", __doc__=implementation.__doc__
-            )
+            namespace.update(__module__=__name__, __qualname__=f"{self.kind}.{name}", __doc__=implementation.__doc__)
 
         return types.new_class(name, (implementation,), exec_body=body)
 
@@ -177,9 +175,7 @@ class Kind:
 
 
 audio_encoder = Kind("audio_encoder", "facediff.components.audio_encoder", "speech to one feature per frame")
-identity_encoder = Kind(
-    "identity_encoder", "facediff.components.identity_encoder", "who the face is, from a label"
-)
+identity_encoder = Kind("identity_encoder", "facediff.components.identity_encoder", "who the face is, from a label")
 style_encoder = Kind(
     "style_encoder", "facediff.components.style_encoder", "how the person moves, from a reference motion"
 )

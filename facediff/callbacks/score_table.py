@@ -52,7 +52,9 @@ def format_table(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool) ->
     lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}"]
     for region in rows[0]["regions"].values():
         lines.append(f"region {region['name']}: {region['count']} vertices, hash {region['hash']}")
-    lines.append(f"{'split':<8} {'who':<24}" + "".join(f"{name.upper():>13}" for name in names) + f"{'frames':>9}{'clips':>7}")
+    lines.append(
+        f"{'split':<8} {'who':<24}" + "".join(f"{name.upper():>13}" for name in names) + f"{'frames':>9}{'clips':>7}"
+    )
     for row in rows:
         scores = "".join(f"{row[name]:>13.4e}" for name in names)
         lines.append(

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from facediff.errors import FaceDiffError
 
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from facediff.data import Assets, Reference
-    from facediff.systems import SpeechAnimator
+
+T = TypeVar("T")
 
 MIN_SECONDS = 0.2
 SILENCE = 1e-4
@@ -62,7 +63,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
     from facediff.systems import load_system
 
     system = load_system(args.checkpoint, map_location=device(args.device))
-    choose_sampler(system, args.sampler, args.steps)
+    if args.sampler is not None or args.steps is not None:
+        system.choose_sampler(args.sampler, args.steps)
     identity = args.identity or system.identities[0]
     style = read_style(args.style, identity, system.assets, args.checkpoint) if args.style else None
 
@@ -118,19 +120,6 @@ def device(name: str) -> str:
     return name
 
 
-def choose_sampler(system: SpeechAnimator, name: str | None, steps: int | None) -> None:
-    """Replace the system's sampler where one was asked for; ``--steps`` alone keeps the kind of sampler."""
-    from facediff import registry
-    from facediff.systems import DualPathDiffusion
-
-    if name is None and steps is None:
-        return
-    if not isinstance(system, DualPathDiffusion):
-        raise FaceDiffError(f"--sampler, --steps: {type(system).__name__} does not sample; leave them away")
-    chosen = registry.sampler.get(name) if name is not None else type(system.sampler)
-    system.use_sampler(partial(chosen, steps=steps) if steps is not None else chosen)
-
-
 def read_style(style: str, identity: str, assets: Assets, checkpoint: Path) -> Reference:
     """A style reference from a file, from the checkpoint, or from the corpus that the checkpoint was trained on.
 
@@ -153,7 +142,7 @@ def corpus_clip(name: str, checkpoint: Path) -> Path:
     path = Path(root) / "vertices_npy" / f"{name}.npy" if root else None
     if path is None or not path.is_file():
         where = f"in the checkpoint nor at {path}" if path else "in the checkpoint, and its corpus is not known"
-        raise FaceDiffError(f'--style {name}: no clip of that name {where}; give a .npy file or another clip')
+        raise FaceDiffError(f"--style {name}: no clip of that name {where}; give a .npy file or another clip")
     return path
 
 
@@ -182,11 +171,11 @@ def read_reference(path: Path, assets: Assets, subject: str) -> Reference:
     return Reference(path.stem, torch.from_numpy(motion) - assets.template(subject))
 
 
-def bar(steps: Iterable[int], *, description: str) -> Iterable[int]:
-    """A progress bar."""
+def bar(items: Iterable[T], *, description: str, total: int | None = None) -> Iterable[T]:
+    """The items, with a progress bar."""
     from tqdm import tqdm
 
-    return tqdm(steps, desc=description, leave=False)
+    return tqdm(items, desc=description, total=total, leave=False)
 
 
 def write(
@@ -224,15 +213,14 @@ def write_animation(
     from facediff.render import Renderer, side_by_side, write_video
 
     if assets.faces is None:
-        raise FaceDiffError(f"{path}: the checkpoint's corpus has no mesh file, so there are no faces to draw; write .npy")
+        raise FaceDiffError(
+            f"{path}: the checkpoint's corpus has no mesh file, so there are no faces to draw; write .npy"
+        )
     options: dict[str, Any] = {} if assets.colours is None else {"colours": assets.colours.numpy()}
     template = next(iter(assets.templates.values())).numpy()
     renderer = Renderer(assets.faces.numpy(), template=template, view=view, size=size, **options)
     footer = f"{assets.corpus}: synthetic corpus" if assets.synthetic else assets.corpus
     frames = side_by_side(renderer, motions, labels, footer=footer)
-    if not quiet:
-        from tqdm import tqdm
-
-        frames = tqdm(frames, desc=f"drawing {path.name}", total=len(motions[0]), leave=False)
+    drawn = frames if quiet else bar(frames, description=f"drawing {path.name}", total=len(motions[0]))
     sound = fit_length(speech, samples_for(len(motions[0]), assets.frame_rate))
-    write_video(path, frames, assets.frame_rate, sound, SAMPLE_RATE)
+    write_video(path, drawn, assets.frame_rate, sound, SAMPLE_RATE)

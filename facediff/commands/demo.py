@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,6 +33,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     args = parser().parse_args(list(arguments))
     from facediff.commands.animate import check_output
     from facediff.commands.lightning import run_cli
+    from facediff.files import atomic
 
     check_output(args.output / "truth_and_prediction.mp4")
     started = time.monotonic()
@@ -42,12 +42,13 @@ def run(name: str, arguments: Sequence[str]) -> int:
     print(f"facediff demo: training on the built-in synthetic corpus ({CONFIG})", flush=True)
     logger = [f"--trainer.logger.save_dir={args.output}", "--trainer.logger.name=training"]
     fitted = run_cli("fit", ["--config", CONFIG, *logger, *data, *epochs])
-    best = Path(fitted.trainer.checkpoint_callback.best_model_path)  # type: ignore[union-attr]
     checkpoint = args.output / "puppet.ckpt"
-    shutil.copyfile(best, checkpoint)
+    with atomic(checkpoint) as temporary:
+        fitted.trainer.save_checkpoint(temporary)
     print(f"facediff demo: trained in {time.monotonic() - started:.0f} s; now the test", flush=True)
-    tested = run_cli("test", ["--ckpt_path", str(checkpoint), "--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={args.output}"])
-    videos = write_videos(args.output, tested.model, tested.datamodule)  # type: ignore[arg-type]
+    where = ["--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={args.output}"]
+    tested = run_cli("test", ["--ckpt_path", str(checkpoint), *where])
+    videos = write_videos(args.output, tested.model, tested.datamodule)
     print(f"\nfacediff demo: done in {time.monotonic() - started:.0f} s. Look at:")
     for path in (*videos, args.output / "test_scores.csv", checkpoint):
         print(f"  {path}")

@@ -17,9 +17,9 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from facediff import registry
 from facediff.callbacks import PredictionWriter, ScoreTable
-from facediff.shipped import config_dir
 from facediff.data import SpeechMotionDataModule
 from facediff.errors import FaceDiffError
+from facediff.shipped import config_dir
 from facediff.systems import SpeechAnimator
 from facediff.systems.checkpoint import read_checkpoint
 
@@ -32,7 +32,7 @@ class Parser(LightningArgumentParser):
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Report a usage error; exits with status 2."""
-        super().error(explain(message), ex)  # type: ignore[misc]
+        super().error(explain(message), ex)
 
 
 def explain(message: str) -> str:
@@ -40,24 +40,26 @@ def explain(message: str) -> str:
 
     jsonargparse reports an unknown name as an import path that it could not make sense of.
     """
-    named = re.findall(r'Parser key "(?:[\w.]*\.)?(\w+)":(?:(?!Parser key).)*?dot import path string: (\S+)', message, re.S)
-    for kind, name in named:
+    pattern = r'Parser key "(?:[\w.]*\.)?(\w+)":(?:(?!Parser key).)*?dot import path string: (\S+)'
+    for kind, name in re.findall(pattern, message, re.DOTALL):
         if kind in registry.KINDS:
             return f"{registry.KINDS[kind].unknown(name)}\n\n{message}"
-    for kind, name in re.findall(r"[Pp]arser key \"(model|data)\".*?dot import path string: (\S+)", message, re.S):
-        known = [cls.__name__ for cls in subclasses(SpeechAnimator if kind == "model" else SpeechMotionDataModule)]
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f'did you mean "{near[0]}"? ' if near else ""
-        return f'there is no {kind} "{name}": {hint}known are {", ".join(known)}\n\n{message}'
+        if kind in ("model", "data"):
+            known = subclasses(SpeechAnimator if kind == "model" else SpeechMotionDataModule)
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f'did you mean "{near[0]}"? ' if near else ""
+            return f'there is no {kind} "{name}": {hint}known are {", ".join(known)}\n\n{message}'
     return message
 
 
-def subclasses(base: type) -> list[type]:
-    """All concrete subclasses that are imported."""
-    found = []
+def subclasses(base: type) -> list[str]:
+    """Names of all concrete subclasses that are imported."""
+    found: list[str] = []
+    cls: type
     for cls in base.__subclasses__():
-        found += [cls, *subclasses(cls)]
-    return [cls for cls in found if not getattr(cls, "__abstractmethods__", None)]
+        found += [] if getattr(cls, "__abstractmethods__", None) else [cls.__name__]
+        found += subclasses(cls)
+    return found
 
 
 class FaceDiffCLI(LightningCLI):

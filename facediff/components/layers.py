@@ -61,9 +61,7 @@ class RotaryEmbedding(nn.Module):
         exponent = torch.arange(0, head_dim, 2, dtype=torch.float32) / head_dim
         self.register_buffer("frequencies", base**-exponent, persistent=False)
 
-    def forward(
-        self, x: Float[Tensor, "batch heads frames head_dim"]
-    ) -> Float[Tensor, "batch heads frames head_dim"]:
+    def forward(self, x: Float[Tensor, "batch heads frames head_dim"]) -> Float[Tensor, "batch heads frames head_dim"]:
         """Rotate channel pair (i, i + head_dim/2) of frame t by t·frequency_i."""
         angle = torch.arange(x.shape[-2], device=x.device, dtype=torch.float32)[:, None] * self.frequencies
         cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
@@ -112,13 +110,11 @@ class Attention(nn.Module):
         return self.out(mixed.transpose(1, 2).flatten(2))
 
     def _split(self, x: Tensor) -> Tensor:
-        return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+        return x.view(*x.shape[:-1], self.num_heads, -1).transpose(1, 2)
 
 
 class FeedForward(nn.Sequential):
     """Two linear maps with a GELU between, ``dim`` to ``dim``."""
 
     def __init__(self, dim: int, hidden_dim: int, dropout: float = 0.0) -> None:
-        super().__init__(
-            nn.Linear(dim, hidden_dim), nn.GELU(), nn.Dropout(dropout), nn.Linear(hidden_dim, dim)
-        )
+        super().__init__(nn.Linear(dim, hidden_dim), nn.GELU(), nn.Dropout(dropout), nn.Linear(hidden_dim, dim))

@@ -146,7 +146,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         total, count = 0.0, 0
         for clip in self.clips("train"):
             frames = self.corpus.frames(clip)
-            for index in torch.linspace(0, frames - 1, min(frames, SCALE_FRAMES)).long().unique().tolist():
+            for index in torch.linspace(0, frames - 1, min(frames, SCALE_FRAMES)).long().tolist():
                 motion = self.corpus.read_motion(clip, index, index + 1)
                 total += float(motion.double().square().sum())
                 count += motion.numel()
@@ -197,5 +197,4 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Move every tensor of the batch."""
-        moved = {k: v.to(device, non_blocking=True) if isinstance(v, torch.Tensor) else v for k, v in vars(batch).items()}
-        return Batch(**moved)
+        return batch.to(device)

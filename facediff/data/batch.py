@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -94,6 +95,15 @@ class Batch:
     def __len__(self) -> int:
         """Number of clips."""
         return len(self.names)
+
+    def to(self, device: torch.device | str) -> Batch:
+        """The same batch on another device."""
+        moved: dict[str, Any] = {
+            field.name: value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
+            for field in fields(self)
+            for value in (getattr(self, field.name),)
+        }
+        return Batch(**moved)
 
     def pin_memory(self) -> Batch:
         """The same batch in page-locked memory; called by PyTorch's loaders."""

@@ -67,9 +67,7 @@ class Corpus:
         attributes = self._attributes()
         names = sorted(path.stem for path in (self.root / "wav").glob("*.wav") if self.motion_path(path.stem).is_file())
         if not names:
-            raise FaceDiffError(
-                f"{self.root}: no clip found; expected wav/<clip>.wav beside vertices_npy/<clip>.npy"
-            )
+            raise FaceDiffError(f"{self.root}: no clip found; expected wav/<clip>.wav beside vertices_npy/<clip>.npy")
         clips = {}
         for name in names:
             subject, _, sentence = name.rpartition("_")

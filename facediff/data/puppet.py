@@ -15,7 +15,7 @@ from facediff.data.dataset import ReferenceChoice
 def cache_root(seed: int) -> Path:
     """Where the corpus of a seed is kept: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
     cache = os.environ.get("FACEDIFF_CACHE") or Path.home() / ".cache" / "facediff"
-    return Path(cache) / f"puppet-v{puppet.FORMAT_VERSION}-seed{seed}"
+    return Path(cache) / f"puppet-{puppet.GENERATOR}-seed{seed}"
 
 
 class Puppet(SpeechMotionDataModule):

@@ -48,10 +48,10 @@ class NoiseProcess:
 
     def add_noise(
         self,
-        clean: Float[Tensor, "batch *rest"],
-        noise: Float[Tensor, "batch *rest"],
+        clean: Float[Tensor, "batch ..."],
+        noise: Float[Tensor, "batch ..."],
         step: Int[Tensor, " batch"],
-    ) -> Float[Tensor, "batch *rest"]:
+    ) -> Float[Tensor, "batch ..."]:
         """Mⁿ = √ᾱ_n M⁰ + √(1 − ᾱ_n) ε, the closed form of n applications of eq. 1."""
         return self._scheduler.add_noise(clean, noise, step)
 

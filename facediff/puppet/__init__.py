@@ -4,7 +4,7 @@ It is synthetic, needs no licence and no download, and lies on disk in the layou
 copies. See `generate`.
 """
 
-from facediff.puppet.corpus import generate, is_complete
+from facediff.puppet.corpus import GENERATOR, generate, is_complete
 from facediff.puppet.face import N_VERTICES
 from facediff.puppet.manner import FRAME_RATE
 from facediff.puppet.plan import (
@@ -23,6 +23,7 @@ UNIT = "m"
 
 __all__ = [
     "FRAME_RATE",
+    "GENERATOR",
     "MOODS",
     "N_VERTICES",
     "REFERENCE_SENTENCES",

@@ -282,11 +282,22 @@ class SpeechAnimator(LightningModule, ABC):
             sentence="",
             reference_name=style.clip,
         )
-        batch = collate([sample])
-        batch = Batch(**{k: v.to(self.device) if isinstance(v, Tensor) else v for k, v in vars(batch).items()})
+        batch = collate([sample]).to(self.device)
         motion = self.generate(batch, generator=self._generator(seed), progress=progress)
         identity = subject if sample.identity >= 0 else "unknown"
         return Prediction(sample.name, identity, style.clip, (motion + batch.template[:, None])[0].cpu())
+
+    def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
+        """Sample in another way from now on; a system that does not sample has no choice.
+
+        Args:
+            name: the sampler's registered name; the present one if None.
+            steps: its denoising steps; its own default if None.
+
+        Raises:
+            FaceDiffError: if the system does not sample, or there is no such sampler.
+        """
+        raise FaceDiffError(f"{type(self).__name__} does not sample: leave --sampler and --steps away")
 
     def default_style(self, subject: str) -> Reference:
         """The stored reference of a subject.

@@ -70,10 +70,10 @@ def system_class(path: str) -> type[SpeechAnimator]:
     """
     from facediff.systems.base import SpeechAnimator
 
-    waiting: list[type[SpeechAnimator]] = [SpeechAnimator]
+    waiting = SpeechAnimator.__subclasses__()
     while waiting:
         candidate = waiting.pop()
         if path == f"{candidate.__module__}.{candidate.__qualname__}":
             return candidate
         waiting += candidate.__subclasses__()
-    raise FaceDiffError(f'the checkpoint was made by the system "{path}", which is not imported; import its package first')
+    raise FaceDiffError(f'the checkpoint was made by the system "{path}", which is not imported; import it first')

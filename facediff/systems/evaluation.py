@@ -51,7 +51,7 @@ class Evaluation:
         """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics."""
         found: dict[str, Tensor] = {}
         for row in self.rows(split):
-            for name in self.metrics[split]["model"]:
+            for name in map(str, self.metrics[split]["model"]):
                 prefix = split if row["method"] == "model" else f"{split}/{row['method']}"
                 found[f"{prefix}/{name}"] = torch.tensor(row[name])
         for metrics in self.metrics[split].values():

@@ -37,7 +37,9 @@ def write_tiny(root: Path, *, sentences: int = 7, seed: int = 0) -> Path:
             motion = np.zeros((frames, VERTICES, 3))
             motion[:, :12, 1] = -0.01 * (1 + i) * loud[:, None]
             motion[:, 12:, 2] = 0.002 * np.cos(7 * time)[:, None]
-            np.save(root / "vertices_npy" / f"{clip}.npy", (templates[subject] + motion).reshape(frames, -1).astype("f4"))
+            np.save(
+                root / "vertices_npy" / f"{clip}.npy", (templates[subject] + motion).reshape(frames, -1).astype("f4")
+            )
             samples = np.repeat(loud, 640) * np.sin(2 * np.pi * 300 * np.arange(frames * 640) / 16000)
             soundfile.write(root / "wav" / f"{clip}.wav", 0.5 * samples, 16000, subtype="PCM_16")
             rows.append(f"{clip},{subject},e{sentence:02d},{'calm' if sentence % 2 else 'lively'}")
@@ -63,7 +65,9 @@ class Tiny(SpeechMotionDataModule):
     mesh_file: ClassVar[str] = "tiny.ply"
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
 
-    def __init__(self, *, root: str, batch_size: int = 4, window: int | None = None, reference: str = "same_subject") -> None:
+    def __init__(
+        self, *, root: str, batch_size: int = 4, window: int | None = None, reference: str = "same_subject"
+    ) -> None:
         super().__init__(root=root, batch_size=batch_size, window=window, reference=reference)  # type: ignore[arg-type]
         self.save_hyperparameters()
 

@@ -90,7 +90,7 @@ class HubertEncoder(AudioEncoder):
         """Encode; see :class:`AudioEncoder`."""
         audio = standardise(audio, audio_lengths)
         parts: dict[int, Tensor] = {}
-        for length in audio_lengths.unique().tolist():
+        for length in sorted(set(audio_lengths.tolist())):
             rows = (audio_lengths == length).nonzero().flatten()
             shortage = max(0, 400 - length - 2 * EDGE)
             wave = nn.functional.pad(audio[rows, :length], (EDGE, EDGE + shortage))
@@ -122,8 +122,8 @@ def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
         return HubertModel.from_pretrained(os.path.expanduser(source), use_safetensors=None)
     except (OSError, ValueError) as error:
         raise FaceDiffError(
-            f'audio_encoder.source: cannot load HuBERT from "{source}" ({str(error).splitlines()[0]}); give a directory '
-            f"that holds config.json and model.safetensors, or go online once to fetch it"
+            f'audio_encoder.source: cannot load HuBERT from "{source}" ({str(error).splitlines()[0]}); '
+            f"give a directory that holds config.json and model.safetensors, or go online once to fetch it"
         ) from error
     finally:
         if bar:

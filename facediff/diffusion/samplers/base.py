@@ -66,9 +66,7 @@ class Sampler(ABC):
         noisy = start
         for step in progress(steps) if progress is not None else steps:
             clean = denoise(noisy, step)
-            noisy = scheduler.step(
-                clean, step, noisy, generator=generator, return_dict=False, **self.step_options()
-            )[0]
+            noisy = scheduler.step(clean, step, noisy, generator=generator, return_dict=False, **self.step_options())[0]
         return noisy
 
 

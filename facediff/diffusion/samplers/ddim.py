@@ -27,9 +27,7 @@ class DdimSampler(Sampler):
         """Trailing spacing, so that the first step sees pure noise as in training."""
         from diffusers import DDIMScheduler
 
-        scheduler = DDIMScheduler(
-            **self.process.scheduler_config(), clip_sample=False, timestep_spacing="trailing"
-        )
+        scheduler = DDIMScheduler(**self.process.scheduler_config(), clip_sample=False, timestep_spacing="trailing")
         scheduler.set_timesteps(self.steps)
         return scheduler
 

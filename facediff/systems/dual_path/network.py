@@ -76,7 +76,7 @@ class StyleTokens(nn.Module):
         """Split F_s and project each part."""
         if self.null is not None:
             return self.null.expand(len(style), -1, -1)
-        parts = style.split(self.token_dims, dim=-1)
+        parts = torch.split(style, list(self.token_dims), dim=-1)
         return torch.stack([p(part) for p, part in zip(self.projections, parts, strict=True)], dim=1)
 
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from facediff import losses
+from facediff import losses, registry
 from facediff.components.audio_encoder import AudioEncoderFactory
 from facediff.components.audio_encoder.mel import MelEncoder
 from facediff.components.decoder import DecoderFactory
@@ -139,9 +139,10 @@ class DualPathDiffusion(SpeechAnimator):
             raise FaceDiffError("the model has never been trained: give a checkpoint (--ckpt_path, --checkpoint)")
         return self.assets.motion_scale
 
-    def use_sampler(self, sampler: SamplerFactory) -> None:
-        """Sample with another sampler from now on; checkpoints keep the one that the system was made with."""
-        self.sampler = sampler(process=self.process)
+    def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
+        """Sample in another way from now on; checkpoints keep the sampler that the system was made with."""
+        chosen = registry.sampler.get(name) if name is not None else type(self.sampler)
+        self.sampler = chosen(process=self.process, **({} if steps is None else {"steps": steps}))
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """One draw of step and noise per clip (algorithm 1), then the four losses (eq. 15 to 19)."""
@@ -149,8 +150,8 @@ class DualPathDiffusion(SpeechAnimator):
         noise = torch.randn(clean.shape, device=clean.device, generator=generator)
         step = torch.randint(self.process.steps, (len(batch),), device=clean.device, generator=generator)
         noisy = self.process.add_noise(clean, noise, step)
-        predicted = self.network(noisy, step, self._conditions(batch)).unflatten(-1, (-1, 3))
-        truth, mask = clean.unflatten(-1, (-1, 3)), batch.mask
+        predicted = self.network(noisy, step, self._conditions(batch)).view(batch.motion.shape)
+        truth, mask = clean.view(batch.motion.shape), batch.mask
         upper = self.assets.regions["upper_face"].to(clean.device)
         terms = {
             "reconstruction": losses.reconstruction_loss(predicted, truth, mask),
@@ -188,4 +189,4 @@ class DualPathDiffusion(SpeechAnimator):
             return self.network(noisy, steps, conditions)
 
         motion = self.sampler.run(denoise, start, generator=generator, progress=progress) / self.scale
-        return motion.unflatten(-1, (-1, 3))
+        return motion.view(batch.motion.shape)
