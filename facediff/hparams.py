@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,8 @@ def plain(value: Any) -> Any:  # noqa: ANN401
     Raises:
         TypeError: if the value has no plain description; the message says which forms have one.
     """
+    if isinstance(value, Enum):  # before the numbers and strings, which members of some enumerations are too
+        return plain(value.value)
     if value is None or isinstance(value, bool | int | float | str):
         # Subclasses such as numpy.float64 would not load again with weights_only=True.
         return value if value is None or type(value) in (bool, int, float, str) else _exact(value)
@@ -27,18 +29,16 @@ def plain(value: Any) -> Any:  # noqa: ANN401
         return {"class_path": alias_path(value), "init_args": {}}
     if isinstance(value, partial):
         return {"class_path": alias_path(component_class(value)), "init_args": plain(value.keywords)}
-    if isinstance(value, Enum):
-        return plain(value.value)
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
+    if isinstance(value, Sequence | Set) and not isinstance(value, bytes | bytearray | memoryview):
         return [plain(item) for item in value]
     if hasattr(value, "items"):
         return {str(key): plain(item) for key, item in value.items()}
-    if hasattr(value, "item"):
-        return plain(value.item())
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
     raise TypeError(
         f"a {type(value).__name__} cannot be kept in a checkpoint; give a component as its class or as "
         f"functools.partial(class, option=value), and everything else as numbers, strings, lists and dicts"

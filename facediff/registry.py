@@ -17,6 +17,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+import keyword
 import pkgutil
 import types
 import warnings
@@ -96,7 +97,8 @@ class Kind:
 
     def _add(self, name: str, implementation: type) -> None:
         """Register ``implementation`` under ``name``; see :meth:`register`."""
-        if not name.isidentifier() or name != name.lower() or name.startswith("_") or name in dir(type(self)):
+        malformed = not name.isidentifier() or keyword.iskeyword(name) or name != name.lower() or name.startswith("_")
+        if malformed or name in dir(self):
             raise RegistrationError(
                 f'{self.kind} name "{name}" cannot be registered: use a lower snake case identifier that is none '
                 f"of the registry's own words"

@@ -129,7 +129,10 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     if not os.environ.get("WANDB_API_KEY") and not (Path.home() / ".netrc").exists():
         # Without a key wandb would ask a question and wait for an answer.
         os.environ.setdefault("WANDB_MODE", "offline")
-    warnings.filterwarnings("ignore", "The '.*dataloader' does not have many workers")
+    # Reading is cheap (memory-mapped motion), so worker processes would only add their start-up time.
+    warnings.filterwarnings("ignore", ".*does not have many workers")
+    # Lightning 2.6.6 calls a spelling that torch 2.13 deprecates.
+    warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
     words = resolve_configs(from_checkpoint(name, list(arguments)))
     if name == "test":
         words = ["--verbose=false", *words]  # ScoreTable prints the scores; Lightning's table repeats them per loader

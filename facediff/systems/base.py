@@ -172,7 +172,8 @@ class SpeechAnimator(LightningModule, ABC):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW on everything trainable, with the learning-rate schedule per optimiser step."""
         parameters = [p for p in self.parameters() if p.requires_grad]
-        optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay)
+        # fused: one pass over all parameters instead of one operation after another for each.
+        optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
         if self.lr_schedule == "constant" and not self.warmup_steps:
             return optimizer
         total = int(self.trainer.estimated_stepping_batches)

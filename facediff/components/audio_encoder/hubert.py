@@ -76,6 +76,8 @@ class HubertEncoder(AudioEncoder):
                 frozen.append(encoder.layer_norm)
         for module in frozen:
             module.requires_grad_(False)
+        # Else transformers marks what enters the convolutions as differentiable and training goes back through them.
+        self.hubert.feature_extractor._freeze_parameters()
         # The embedding that SpecAugment writes over masked steps is of no use without SpecAugment.
         mask = getattr(self.hubert, "masked_spec_embed", None)
         if mask is not None and not self.hubert.config.apply_spec_augment:
@@ -119,12 +121,23 @@ def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
     bar = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     try:
-        return HubertModel.from_pretrained(os.path.expanduser(source), use_safetensors=None)
-    except (OSError, ValueError) as error:
+        model, info = HubertModel.from_pretrained(
+            os.path.expanduser(source), use_safetensors=None, output_loading_info=True
+        )
+    except Exception as error:  # a broken file makes safetensors, pickle and transformers raise anything
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise FaceDiffError(
-            f'audio_encoder.source: cannot load HuBERT from "{source}" ({str(error).splitlines()[0]}); '
-            f"give a directory that holds config.json and model.safetensors, or go online once to fetch it"
+            f'audio_encoder.source: cannot load HuBERT from "{source}" ({reason}); give a directory '
+            f"that holds config.json and model.safetensors, or go online once to fetch it"
         ) from error
     finally:
         if bar:
             logging.enable_progress_bar()
+    # The mask embedding is absent from checkpoints that were fine-tuned without SpecAugment; it has no other use.
+    missing = sorted(set(info["missing_keys"]) - {"masked_spec_embed"})
+    if missing:
+        raise FaceDiffError(
+            f'audio_encoder.source: "{source}" holds no complete HuBERT ({len(missing)} weights are missing, '
+            f"the first is {missing[0]}); its config.json and model.safetensors must belong together"
+        )
+    return model

@@ -6,6 +6,7 @@ from typing import Any
 
 from facediff.diffusion.process import NoiseProcess
 from facediff.diffusion.samplers.base import Sampler
+from facediff.errors import FaceDiffError
 from facediff.registry import sampler
 
 
@@ -17,10 +18,15 @@ class DpmSolverSampler(Sampler):
         process: the noise process; given by the system.
         steps: denoising steps.
         order: order of the solver, 1 to 3.
+
+    Raises:
+        FaceDiffError: if the number of steps or the order is impossible.
     """
 
     def __init__(self, *, process: NoiseProcess, steps: int = 10, order: int = 2) -> None:
         super().__init__(process, steps)
+        if order not in (1, 2, 3):
+            raise FaceDiffError(f"sampler.order: {order} is impossible; choose 1, 2 or 3")
         self.order = order
 
     def make_scheduler(self) -> Any:  # noqa: ANN401

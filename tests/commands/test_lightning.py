@@ -1,0 +1,169 @@
+"""fit, validate, test and predict from the command line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from facediff.cli import main
+from facediff.systems import load_system
+from tests.commands.conftest import SMALL
+
+Fit = Callable[..., int]
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def test_a_decoder_is_swapped_by_name(fitted: Path, checkpoint: Path) -> None:
+    config = yaml.safe_load((fitted / "config.yaml").read_text())
+    decoder = config["model"]["init_args"]["decoder"]
+    assert decoder["class_path"] == "facediff.registry.decoder.gru"
+    assert decoder["init_args"]["num_layers"] == 1
+    assert type(load_system(checkpoint).network.decoder).__name__ == "gru"
+    assert (fitted / "metrics.csv").is_file()
+
+
+def test_a_checkpoint_of_the_command_line_is_plain_data(checkpoint: Path) -> None:
+    loaded = torch.load(checkpoint, weights_only=True)
+    assert loaded["hyper_parameters"]["identities"] == ["A", "B"]
+    assert "current_model_state" in loaded
+
+
+def test_a_saved_config_runs_again(fitted: Path, fit: Fit, tmp_path: Path) -> None:
+    status = fit(f"--trainer.logger.save_dir={tmp_path}", config=str(fitted / "config.yaml"))
+    assert status == 0
+    again = yaml.safe_load((tmp_path / "puppet" / "version_0" / "config.yaml").read_text())
+    first = yaml.safe_load((fitted / "config.yaml").read_text())
+    assert again["model"] == first["model"]
+    assert again["data"] == first["data"]
+
+
+def test_test_takes_everything_from_the_checkpoint(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false"]) == 0
+    assert "protocol paper" in capsys.readouterr().out
+    assert len(list(tmp_path.glob("runs/test/version_0/test_scores.csv"))) == 1
+
+
+def test_predict_writes_files(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["predict", f"--ckpt_path={checkpoint}", "--trainer.enable_progress_bar=false", "--model.sampler.steps=1"]
+    assert main(words) == 0
+    files = sorted(tmp_path.glob("runs/predict/version_0/predictions/*.npy"))
+    assert [f.name for f in files] == [f"{s}_e0{n}_condition_{s}.npy" for s in "AB" for n in (6, 7)]
+    assert np.load(files[0]).shape[1] == 72
+
+
+def test_flags_that_would_change_a_checkpoints_model_are_refused(
+    checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["test", "--ckpt_path", str(checkpoint), "--model.dim=32"]) == 2
+    assert "decides the model" in capsys.readouterr().err
+
+
+def test_training_resumes(fit: Fit, checkpoint: Path, tmp_path: Path) -> None:
+    words = [f"--trainer.logger.save_dir={tmp_path}", "--model.decoder=gru", "--model.decoder.num_layers=1"]
+    assert fit(*words, f"--ckpt_path={checkpoint}", "--trainer.max_epochs=2") == 0
+    resumed = torch.load(tmp_path / "puppet/version_0/checkpoints/last.ckpt", weights_only=True)
+    assert resumed["epoch"] == 1
+    assert resumed["global_step"] == 2 * torch.load(checkpoint, weights_only=True)["global_step"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--model.decoder=grru"], 'there is no decoder "grru": did you mean "gru"? known are gru'),
+        (["--model.fusion=cross"], 'there is no fusion "cross"'),
+        (["--model.audio_encoder=hubret"], 'did you mean "hubert"?'),
+        (["--model=DualPathDifusion"], 'did you mean "DualPathDiffusion"?'),
+        (["--data=Pupet"], 'did you mean "Puppet"?'),
+    ],
+)
+def test_a_wrong_name_lists_the_right_ones(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", "--config", "configs/experiment/puppet.yaml", *words])
+    assert stop.value.code == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_help_of_a_component(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", "--config", "configs/experiment/puppet.yaml", "--model.decoder.help=gru"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert "num_layers" in text
+    assert "style_dim" not in text
+
+
+def print_config(*words: str, capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", *words, "--print_config"])
+    assert stop.value.code == 0
+    return yaml.safe_load(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("config", sorted(path.name for path in (CONFIGS / "experiment").glob("*.yaml")))
+def test_every_shipped_experiment_is_parsed(config: str, capsys: pytest.CaptureFixture[str]) -> None:
+    printed = print_config("--config", f"configs/experiment/{config}", capsys=capsys)
+    assert printed["model"]["init_args"]["dim"]  # type: ignore[index]
+
+
+def test_configs_are_short() -> None:
+    assert all(len(path.read_text().splitlines()) <= 30 for path in CONFIGS.rglob("*.yaml"))
+
+
+def test_sub_configs_and_interpolation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "decoder.yaml").write_text("class_path: gru\ninit_args: {num_layers: 3}\n")
+    (tmp_path / "mine.yaml").write_text(
+        "model:\n  class_path: DualPathDiffusion\n  init_args:\n    dim: 64\n    decoder: decoder.yaml\n"
+        "    warmup_steps: ${trainer.max_epochs}\ndata: Puppet\ntrainer: {max_epochs: 7}\n"
+    )
+    model = print_config("--config", str(tmp_path / "mine.yaml"), capsys=capsys)["model"]["init_args"]  # type: ignore[index]
+    assert model["decoder"]["init_args"]["num_layers"] == 3
+    # A flag must reach what is interpolated from it.
+    words = ["--config", str(tmp_path / "mine.yaml"), "--trainer.max_epochs=9"]
+    done = subprocess.run(
+        [sys.executable, "-m", "facediff", "fit", *words, "--print_config"], capture_output=True, text=True, check=True
+    )
+    assert "warmup_steps: ${trainer.max_epochs}" in done.stdout or "warmup_steps: 9" in done.stdout
+    assert "max_epochs: 9" in done.stdout
+
+
+def test_wandb_offline_asks_nothing(fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("wandb")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    logger = ["--config", "configs/logger/wandb.yaml"]
+    assert fit(*logger) == 0
+    assert len(list(tmp_path.glob("runs/wandb/offline-run-*/*.wandb"))) == 1
+    assert (tmp_path / "runs/wandb/version_0/checkpoints/best.ckpt").exists()
+
+
+def test_two_processes_train_together(tiny_root: Path, tmp_path: Path) -> None:
+    words = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--data.batch_size=2", *SMALL]
+    ddp = ["--trainer.accelerator=cpu", "--trainer.devices=2", "--trainer.strategy=ddp"]
+    out = [f"--trainer.logger.save_dir={tmp_path}"]
+    done = subprocess.run(
+        [sys.executable, "-m", "facediff", "fit", "--config", "configs/experiment/puppet.yaml", *words, *ddp, *out],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "world_size: 2" in done.stdout + done.stderr or "MEMBER: 2/2" in done.stdout + done.stderr
+    run = tmp_path / "puppet" / "version_0" / "checkpoints"
+    # Eight training clips, two clips a batch, two processes: two steps.
+    assert torch.load(run / "last.ckpt", weights_only=True)["global_step"] == 2
+    load_system(run / "best.ckpt")

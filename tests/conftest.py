@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import os
+
+# The shapes in the signatures of the mathematics are checked in tests only; the hook must come before the imports.
+from jaxtyping import install_import_hook
+
+install_import_hook(["facediff.components", "facediff.losses", "facediff.diffusion"], "beartype.beartype")
+
+os.environ["HF_HUB_OFFLINE"] = "1"
+os.environ["WANDB_MODE"] = "offline"
+os.environ["WANDB_SILENT"] = "true"
+
+from collections.abc import Callable
+from pathlib import Path
+
+import lightning.pytorch as pl
+import pytest
+import torch
+
+from facediff import registry
+from facediff.systems import DualPathDiffusion
+from tests.fakes.tiny import SEEN, VERTICES, Tiny, write_tiny
+
+# Tiny tensors are faster on one thread, and much faster where something else keeps the other cores busy.
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def tiny_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("corpus") / "tiny")
+
+
+@pytest.fixture
+def tiny(tiny_root: Path) -> Tiny:
+    return Tiny(root=str(tiny_root))
+
+
+@pytest.fixture
+def make_system() -> Callable[..., DualPathDiffusion]:
+    """A system small enough to train in a test; keyword arguments override."""
+
+    def make(**options: object) -> DualPathDiffusion:
+        from functools import partial
+
+        torch.manual_seed(0)
+        defaults: dict[str, object] = {
+            "n_vertices": VERTICES,
+            "identities": SEEN,
+            "frame_rate": 25.0,
+            "dim": 16,
+            "diffusion_steps": 40,
+            "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1),
+            "style_encoder": partial(registry.style_encoder.tcn_gru_transformer, num_layers=1),
+            "decoder": partial(registry.decoder.style_transformer, num_layers=1),
+            "sampler": partial(registry.sampler.ddim, steps=3),
+        }
+        return DualPathDiffusion(**{**defaults, **options})
+
+    return make
+
+
+@pytest.fixture
+def make_trainer(tmp_path: Path) -> Callable[..., pl.Trainer]:
+    def make(**options: object) -> pl.Trainer:
+        defaults: dict[str, object] = {
+            "accelerator": "cpu",
+            "devices": 1,
+            "max_epochs": 1,
+            "logger": False,
+            "enable_progress_bar": False,
+            "enable_model_summary": False,
+            "enable_checkpointing": False,
+            "num_sanity_val_steps": 0,
+            "default_root_dir": tmp_path,
+            "log_every_n_steps": 1,
+        }
+        return pl.Trainer(**{**defaults, **options})
+
+    return make

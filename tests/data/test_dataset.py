@@ -1,0 +1,164 @@
+"""Reading a corpus: offsets, alignment of speech and motion, references, windows, batches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from facediff.data import collate
+from facediff.data.dataset import MotionDataset
+from facediff.errors import FaceDiffError
+from tests.fakes.tiny import Tiny, write_tiny
+
+
+def test_motion_is_offsets_from_the_subjects_template(tiny: Tiny) -> None:
+    sample = tiny.dataset("val")[0]
+    stored = np.load(tiny.root / "vertices_npy" / f"{sample.name}.npy").reshape(-1, 24, 3)
+    torch.testing.assert_close(sample.motion + sample.template, torch.from_numpy(stored))
+    assert sample.identity == ["A", "B"].index(sample.subject)
+
+
+def test_audio_spans_exactly_the_motion(tiny: Tiny) -> None:
+    for split in ("train", "val", "test_a", "test_b"):
+        for sample in tiny.dataset(split):
+            assert len(sample.audio) == len(sample.motion) * 640
+
+
+def test_a_window_cuts_speech_and_motion_together(tiny_root: Path) -> None:
+    data = Tiny(root=str(tiny_root), window=5)
+    dataset = data.dataset("train")
+    starts = set()
+    for _ in range(20):
+        sample = dataset[0]
+        whole = data.corpus.read_motion(dataset.clips[0])
+        matches = [i for i in range(len(whole) - 4) if torch.equal(whole[i : i + 5], sample.motion)]
+        assert len(matches) == 1
+        audio, _ = soundfile.read(tiny_root / "wav" / f"{sample.name}.wav", dtype="float32")
+        assert np.array_equal(sample.audio.numpy(), audio[matches[0] * 640 : (matches[0] + 5) * 640])
+        starts.add(matches[0])
+    assert len(starts) > 1
+
+
+@pytest.mark.parametrize("split", ["train", "val", "test_a", "test_b"])
+def test_the_reference_is_never_the_clip_it_predicts_nor_an_evaluated_one(tiny: Tiny, split: str) -> None:
+    dataset = tiny.dataset(split)
+    evaluated = {clip.name for s in ("val", "test_a", "test_b") for clip in tiny.clips(s)}
+    for _ in range(5):
+        for sample in dataset:
+            assert sample.reference_name != sample.name
+            assert sample.reference_name not in evaluated
+            assert sample.reference_name.startswith(f"{sample.subject}_")
+
+
+def test_the_reference_shares_the_targets_mood(tiny: Tiny) -> None:
+    clips = tiny.corpus.clips
+    for split in ("train", "test_a", "test_b"):
+        for sample in tiny.dataset(split):
+            assert clips[sample.reference_name].attributes["mood"] == clips[sample.name].attributes["mood"]
+
+
+def test_self_reference_is_for_training_only(tiny_root: Path) -> None:
+    data = Tiny(root=str(tiny_root), reference="self")
+    assert all(sample.reference_name == sample.name for sample in data.dataset("train"))
+    assert all(sample.reference_name != sample.name for sample in data.dataset("val"))
+
+
+def test_evaluation_samples_do_not_change(tiny: Tiny) -> None:
+    for first, second in zip(tiny.dataset("test_a"), tiny.dataset("test_a"), strict=True):
+        assert first.reference_name == second.reference_name
+        assert torch.equal(first.motion, second.motion)
+
+
+def test_decoys_say_something_else_and_are_as_long(tiny: Tiny) -> None:
+    dataset = tiny.dataset("test_a")
+    for sample in dataset:
+        assert sample.decoy_audio is not None
+        assert len(sample.decoy_audio) == len(sample.audio)
+        assert not torch.equal(sample.decoy_audio, sample.audio)
+
+
+def test_unknown_people_have_identity_minus_one(tiny: Tiny) -> None:
+    assert {sample.identity for sample in tiny.dataset("test_b")} == {-1}
+
+
+def test_a_batch_pads_with_zeros_and_says_what_is_valid(tiny: Tiny) -> None:
+    samples = [tiny.dataset("train")[i] for i in (0, 5)]
+    batch = collate(samples)
+    assert batch.mask.sum(1).tolist() == [len(s.motion) for s in samples]
+    assert batch.reference_mask.sum(1).tolist() == [len(s.reference) for s in samples]
+    for i, sample in enumerate(samples):
+        assert torch.equal(batch.motion[i, : len(sample.motion)], sample.motion)
+        assert not batch.motion[i, len(sample.motion) :].any()
+        assert not batch.audio[i, len(sample.audio) :].any()
+
+
+def test_the_motion_scale_gives_unit_variance(tiny: Tiny) -> None:
+    # The miniature's clips are shorter than the number of frames that the scale is measured on, or little longer.
+    motion = np.concatenate(
+        [
+            s.motion.double().numpy().ravel()
+            for s in MotionDataset(
+                tiny.corpus, tiny.clips("train"), tiny.identities, tiny.reference_policy(), training=False
+            )
+        ]
+    )
+    assert tiny.motion_scale() * np.sqrt((motion**2).mean()) == pytest.approx(1.0, rel=0.05)
+
+
+def test_assets_survive_a_round_trip_through_a_safe_file(tiny: Tiny, tmp_path: Path) -> None:
+    from facediff.data import Assets
+
+    assets = tiny.assets().with_motion_scale(3.0)
+    torch.save(assets.state(), tmp_path / "assets.pt")
+    loaded = Assets.from_state(torch.load(tmp_path / "assets.pt", weights_only=True))
+    assert loaded.identities == ["A", "B"]
+    assert loaded.motion_scale == 3.0
+    assert loaded.references["C"].clip == assets.references["C"].clip
+    assert torch.equal(loaded.templates["B"], assets.templates["B"])
+    assert loaded.regions["lips"].tolist() == list(range(12))
+    assert loaded.faces is not None
+    assert loaded.faces.shape == (15, 3)
+
+
+@pytest.fixture
+def broken(tmp_path: Path) -> Path:
+    return write_tiny(tmp_path / "broken")
+
+
+def test_an_empty_folder(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match=r"no clip found; expected wav/<clip>\.wav"):
+        Tiny(root=str(tmp_path)).clips("train")
+
+
+def test_a_missing_folder(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="nowhere: no such folder"):
+        Tiny(root=str(tmp_path / "nowhere")).clips("train")
+
+
+def test_nan_names_the_file_and_the_frame(broken: Path) -> None:
+    path = broken / "vertices_npy" / "A_e01.npy"
+    array = np.load(path)
+    array[3, 5] = np.nan
+    np.save(path, array)
+    with pytest.raises(FaceDiffError, match=r"A_e01\.npy: frame 3 holds NaN"):
+        Tiny(root=str(broken)).dataset("train")[0]
+
+
+def test_wrong_vertex_count_and_truncated_file(broken: Path) -> None:
+    path = broken / "vertices_npy" / "A_e01.npy"
+    np.save(path, np.zeros((4, 30), np.float32))
+    with pytest.raises(FaceDiffError, match=r"A_e01\.npy: has shape \(4, 30\), expected \(frames, 72\)"):
+        Tiny(root=str(broken)).dataset("train")[0]
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(FaceDiffError, match=r"A_e01\.npy: not a readable NumPy array"):
+        Tiny(root=str(broken)).dataset("train")[0]
+
+
+def test_a_region_index_out_of_range_names_the_file(broken: Path) -> None:
+    (broken / "regions" / "lve.txt").write_text("1, 2, 24")
+    with pytest.raises(FaceDiffError, match=r"lve\.txt.*24"):
+        Tiny(root=str(broken)).assets()

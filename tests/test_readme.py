@@ -1,0 +1,53 @@
+"""What the README promises: its files exist, its commands parse, its Python runs."""
+
+from __future__ import annotations
+
+import doctest
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from facediff.cli import COMMANDS, main
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+BLOCKS = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+FITS = [shlex.split(line, comments=True) for block in BLOCKS for line in block.splitlines() if "facediff fit" in line]
+
+
+def test_the_two_commands_are_there() -> None:
+    assert 'pip install -c tools/constraints.txt -e ".[all]" && facediff demo' in README
+    assert 'pip install -c tools/constraints.txt -e ".[all,test]" && pytest' in README
+
+
+def test_every_command_exists() -> None:
+    words = [w for block in BLOCKS for w in re.findall(r"^(?:.*&& )?facediff (\w+)", block, re.MULTILINE)]
+    assert len(words) >= 6
+    assert set(words) <= COMMANDS.keys()
+
+
+@pytest.mark.parametrize("words", FITS, ids=lambda words: words[-1])
+def test_fit_commands_parse(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*words[1:], "--print_config"])
+    assert stop.value.code == 0
+    assert "class_path: facediff.systems.DualPathDiffusion" in capsys.readouterr().out
+
+
+def test_links_lead_somewhere() -> None:
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    missing = [
+        f"{page.name}: {target}"
+        for page in pages
+        for target in re.findall(r"\]\(([^)#:]+)[^)]*\)", page.read_text())
+        if not (page.parent / target).exists()
+    ]
+    assert missing == []
+
+
+def test_the_python_of_the_readme_runs() -> None:
+    failed, attempted = doctest.testfile(str(ROOT / "README.md"), module_relative=False)
+    assert attempted >= 4
+    assert failed == 0
