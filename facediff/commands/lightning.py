@@ -26,6 +26,17 @@ from facediff.systems.checkpoint import read_checkpoint
 LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a system that the data module knows."""
 
+IDLE_WARNINGS = (
+    # Reading is cheap (memory-mapped motion), so worker processes would only add their start-up time.
+    ".*does not have many workers",
+    # Lightning 2.6.6 calls a spelling that torch 2.13 deprecates.
+    ".*isinstance.treespec, LeafSpec.*",
+)
+"""Warnings of Lightning's that nobody needs to act on."""
+
+CALLBACKS_WARNING = ".*callbacks used to create the checkpoint need to be provided"
+"""True of training that goes on; scoring a checkpoint needs none of its callbacks."""
+
 
 class Parser(LightningArgumentParser):
     """Adds to an error about a name the names that exist."""
@@ -125,35 +136,38 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     for kind in registry.KINDS.values():
         kind.load()
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
-    os.environ.setdefault("WANDB_SILENT", "true")
-    if not os.environ.get("WANDB_API_KEY") and not (Path.home() / ".netrc").exists():
-        # Without a key wandb would ask a question and wait for an answer.
-        os.environ.setdefault("WANDB_MODE", "offline")
-    # Reading is cheap (memory-mapped motion), so worker processes would only add their start-up time.
-    warnings.filterwarnings("ignore", ".*does not have many workers")
-    # Lightning 2.6.6 calls a spelling that torch 2.13 deprecates.
-    warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
+    keep_wandb_quiet()
     words = resolve_configs(from_checkpoint(name, list(arguments)))
     if name == "test":
         words = ["--verbose=false", *words]  # ScoreTable prints the scores; Lightning's table repeats them per loader
     callbacks = [ScoreTable()] + ([PredictionWriter()] if name == "predict" else [])
     logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
-    argv, sys.argv = sys.argv, sys.argv[:1]
+    # Lightning starts the other processes of a distributed run with the words of this one.
+    argv, sys.argv = sys.argv, [sys.argv[0], name, *words]
     try:
-        return FaceDiffCLI(
-            SpeechAnimator,
-            SpeechMotionDataModule,
-            subclass_mode_model=True,
-            subclass_mode_data=True,
-            auto_configure_optimizers=False,
-            trainer_defaults={"callbacks": callbacks, "logger": logger},
-            parser_class=Parser,
-            parser_kwargs={"parser_mode": "omegaconf+"},
-            save_config_kwargs={"overwrite": True},
-            args=[name, *words],
-        )
+        with warnings.catch_warnings():
+            for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, CALLBACKS_WARNING):
+                warnings.filterwarnings("ignore", message)
+            return FaceDiffCLI(
+                SpeechAnimator,
+                SpeechMotionDataModule,
+                subclass_mode_model=True,
+                subclass_mode_data=True,
+                auto_configure_optimizers=False,
+                trainer_defaults={"callbacks": callbacks, "logger": logger},
+                parser_class=Parser,
+                parser_kwargs={"parser_mode": "omegaconf+"},
+                save_config_kwargs={"overwrite": True},
+            )
     finally:
         sys.argv = argv
+
+
+def keep_wandb_quiet() -> None:
+    """Without a key wandb would ask a question and wait for an answer: log offline then."""
+    os.environ.setdefault("WANDB_SILENT", "true")
+    if not os.environ.get("WANDB_API_KEY") and not (Path.home() / ".netrc").exists():
+        os.environ.setdefault("WANDB_MODE", "offline")
 
 
 def resolve_configs(arguments: list[str]) -> list[str]:

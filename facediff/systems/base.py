@@ -23,9 +23,9 @@ from facediff.systems.evaluation import Evaluation
 Progress = Callable[[Iterable[int]], Iterable[int]]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Prediction:
-    """Predicted motion of one clip.
+    """Predicted motion of one clip; not frozen, since Lightning moves predictions between devices in place.
 
     Attributes:
         name: the clip.
@@ -70,8 +70,9 @@ class SpeechAnimator(LightningModule, ABC):
         self.n_vertices = n_vertices
         self.identities = list(identities)
         self.frame_rate = frame_rate
-        self.learning_rate = learning_rate
-        self.weight_decay = weight_decay
+        # Optimisers keep these in checkpoints, where a NumPy scalar would make loading unsafe.
+        self.learning_rate = float(learning_rate)
+        self.weight_decay = float(weight_decay)
         self.lr_schedule = lr_schedule
         self.warmup_steps = warmup_steps
         self._assets: Assets | None = None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle  # noqa: S403 - only its exception class
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,10 +25,11 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise FaceDiffError(f"{path}: no such checkpoint; expected a .ckpt file that `facediff fit` has written")
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, zipfile.BadZipFile, OSError) as error:
+    except Exception as error:
+        # Whatever a damaged or hostile file makes the reader raise, the reason is the file.
         raise FaceDiffError(
-            f"{path}: not a checkpoint that can be loaded safely ({str(error).splitlines()[0]}); expected a .ckpt file "
-            f"that `facediff fit` has written"
+            f"{path}: not a checkpoint that can be loaded safely (damaged, or more than tensors and plain values); "
+            f"expected a .ckpt file that `facediff fit` has written"
         ) from error
     if not isinstance(checkpoint, dict) or ASSETS_KEY not in checkpoint:
         raise FaceDiffError(

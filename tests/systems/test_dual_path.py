@@ -164,7 +164,7 @@ def test_animate_is_seeded_and_knows_unseen_people(system: DualPathDiffusion) ->
 
 
 def test_sizes_that_do_not_fit_are_named(make_system: Make, tiny: Tiny) -> None:
-    with pytest.raises(FaceDiffError, match="vertices are {30} in the model and {24} in the corpus"):
+    with pytest.raises(FaceDiffError, match=r"vertices are \{30\} in the model and \{24\} in the corpus"):
         make_system(n_vertices=30).adopt(tiny.assets())
     with pytest.raises(FaceDiffError, match="identities"):
         make_system(identities=["B", "A"]).adopt(tiny.assets())

@@ -32,7 +32,8 @@ def trained(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         identities=["A", "B"],
         frame_rate=25.0,
         dim=16,
-        diffusion_steps=np.int64(20),  # type: ignore[arg-type] # NumPy scalars must not reach the checkpoint
+        diffusion_steps=20,
+        learning_rate=np.float64(1e-3),  # NumPy scalars must not reach the checkpoint
         decoder=partial(registry.decoder.get("gru"), num_layers=1),
         sampler=partial(registry.sampler.get("ddim"), steps=2),
     )

@@ -1,0 +1,214 @@
+"""Names become importable classes; wrong names, clashes and broken plug-ins are told plainly."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import pickle
+import subprocess
+import sys
+import tomllib
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from jsonargparse import ArgumentParser
+
+from facediff import registry
+from facediff.components.decoder import Decoder
+from facediff.components.decoder.gru import GruDecoder
+from facediff.errors import FaceDiffError
+from facediff.registry import Kind, RegistrationError, UnknownComponentError, alias_path
+
+ROOT = Path(__file__).parents[1]
+PLUGIN = Path(__file__).parent / "fakes" / "plugin"
+
+
+@pytest.fixture
+def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Kind:
+    """A kind of its own, whose package is empty, so that tests leave the real ones alone."""
+    (tmp_path / "empty_shelf").mkdir()
+    (tmp_path / "empty_shelf" / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    return Kind("gadget", "empty_shelf", "things for tests")
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Put a distribution with one gadget on the path, as an unpacked wheel would be."""
+
+    def put(distribution: str, name: str, target: str, source: str) -> None:
+        site = tmp_path / f"site_{distribution}"
+        info = site / f"{distribution}-1.0.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[facediff.gadget]\n{name} = {target}\n")
+        (site / f"{target.partition(':')[0]}.py").write_text(source)
+        monkeypatch.syspath_prepend(site)
+
+    return put
+
+
+@pytest.mark.parametrize("kind", registry.KINDS)
+def test_every_name_is_an_importable_picklable_class(kind: str) -> None:
+    assert registry.KINDS[kind].names()
+    for entry in registry.KINDS[kind]:
+        alias = getattr(getattr(registry, kind), entry.name)
+        assert f"{alias.__module__}.{alias.__qualname__}" == f"facediff.registry.{kind}.{entry.name}"
+        assert issubclass(alias, entry.implementation)
+        assert pickle.loads(pickle.dumps(alias)) is alias  # noqa: S301
+        assert alias_path(alias) == alias_path(entry.implementation) == f"facediff.registry.{kind}.{entry.name}"
+        assert entry.summary, f"{entry.owner} has no docstring"
+
+
+def test_an_instance_survives_pickling() -> None:
+    made = registry.decoder.gru(dim=4, style_dim=4, num_layers=1)
+    again = pickle.loads(pickle.dumps(made))  # noqa: S301
+    assert type(again) is registry.decoder.gru
+    assert all(torch.equal(a, b) for a, b in zip(made.parameters(), again.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("word", ["gru", "facediff.registry.decoder.gru"])
+def test_jsonargparse_resolves_the_word(word: str) -> None:
+    registry.decoder.load()
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_subclass_arguments(Decoder, "decoder")
+    parsed = parser.parse_args(
+        [f"--decoder={word}", "--decoder.dim=4", "--decoder.style_dim=4", "--decoder.num_layers=1"]
+    )
+    assert parsed.decoder.class_path == "facediff.registry.decoder.gru"
+    assert parsed.decoder.init_args.num_layers == 1
+
+
+def test_other_classes_keep_their_own_path() -> None:
+    assert alias_path(torch.nn.Linear) == "torch.nn.modules.linear.Linear"
+
+
+def test_unknown_names_list_the_nearest_and_all() -> None:
+    with pytest.raises(UnknownComponentError) as caught:
+        registry.decoder.get("grru")
+    assert 'no decoder "grru"' in str(caught.value)
+    assert 'did you mean "gru"?' in str(caught.value)
+    assert all(name in str(caught.value) for name in registry.decoder.names())
+    assert isinstance(caught.value, FaceDiffError)
+    assert "did you mean" not in registry.decoder.unknown("xyzzy")
+    assert not hasattr(registry.decoder, "grru")
+
+
+@pytest.mark.parametrize(
+    "name", ["Gru", "two words", "a-b", "1st", "", "_hidden", "class", "register", "names", "kind", "title"]
+)
+def test_malformed_and_reserved_names_are_refused(shelf: Kind, name: str) -> None:
+    with pytest.raises(RegistrationError, match="cannot be registered"):
+        shelf.register(name)(GruDecoder)
+    assert name not in shelf.names()
+
+
+def test_a_clash_names_both_owners(shelf: Kind) -> None:
+    shelf.register("thing")(GruDecoder)
+    shelf.register("thing")(GruDecoder)  # the same class again, as when a module is reloaded
+    with pytest.raises(RegistrationError) as caught:
+        shelf.register("thing")(Decoder)
+    for owner in (GruDecoder, Decoder):
+        assert f"{owner.__module__}.{owner.__qualname__}" in str(caught.value)
+    assert shelf.entries()[0].implementation is GruDecoder
+
+
+def test_register_hands_the_class_back_untouched(shelf: Kind) -> None:
+    assert shelf.register("thing")(GruDecoder) is GruDecoder
+    assert GruDecoder.__module__ == "facediff.components.decoder.gru"
+
+
+def test_a_plug_in_is_found(shelf: Kind, install: Callable[..., None]) -> None:
+    install("good-gadgets", "spinner", "good_gadgets:Spinner", 'class Spinner:\n    """Spins."""\n')
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert shelf.names() == ["spinner"]
+    assert shelf.entries()[0].summary == "Spins."
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "reason"),
+    [
+        ("spinner", "import no_such_module_anywhere\n", "no_such_module_anywhere"),
+        ("spinner", "raise SystemError('on fire')\n", "on fire"),
+        ("spinner", "", "has no attribute 'Spinner'"),
+        ("spinner", "Spinner = 3\n", "Error"),
+        ("Spinner-3", "class Spinner: ...\n", "lower snake case"),
+        ("taken", "class Spinner: ...\n", "facediff.components.decoder.gru.GruDecoder"),
+    ],
+)
+def test_a_broken_plug_in_is_a_warning_that_names_it(
+    shelf: Kind, install: Callable[..., None], name: str, source: str, reason: str, request: pytest.FixtureRequest
+) -> None:
+    shelf.register("taken")(GruDecoder)
+    module = f"broken_gadgets_{request.node.callspec.indices['name']}"
+    install("broken-gadgets", name, f"{module}:Spinner", source)
+    with pytest.warns(UserWarning, match=rf'"{name}" of the installed package "broken-gadgets"') as caught:
+        assert shelf.names() == ["taken"]
+    assert reason in str(caught[0].message)
+    assert shelf.get("taken").__bases__ == (GruDecoder,)
+
+
+@pytest.fixture(scope="module")
+def plugin_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The plug-in of ``fakes/plugin`` as a wheel, installed by pip where there is pip; needs no network."""
+    folder = tmp_path_factory.mktemp("plugin")
+    project = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]
+    stem = f"{project['name'].replace('-', '_')}-{project['version']}"
+    points = "".join(
+        f"[{group}]\n" + "".join(f"{name} = {target}\n" for name, target in rows.items())
+        for group, rows in project["entry-points"].items()
+    )
+    files = {
+        "facediff_moving_average.py": (PLUGIN / "facediff_moving_average.py").read_text(),
+        f"{stem}.dist-info/METADATA": "Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n".format(**project),
+        f"{stem}.dist-info/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        f"{stem}.dist-info/entry_points.txt": points,
+    }
+    files[f"{stem}.dist-info/RECORD"] = "".join(f"{path},,\n" for path in [*files, f"{stem}.dist-info/RECORD"])
+    wheel, site = folder / f"{stem}-py3-none-any.whl", folder / "site"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for path, text in files.items():
+            archive.writestr(path, text)
+    if importlib.util.find_spec("pip") is None:
+        zipfile.ZipFile(wheel).extractall(site)  # noqa: S202 - our own archive; this is what installing a wheel does
+    else:
+        options = ["--no-deps", "--no-index", "--quiet", "--disable-pip-version-check", "--target", str(site)]
+        subprocess.run([sys.executable, "-m", "pip", "install", *options, str(wheel)], check=True, timeout=120)
+    return site
+
+
+def facediff(site: Path, *words: str) -> str:
+    path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
+    run = subprocess.run(
+        [sys.executable, "-m", "facediff", *words],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
+def test_an_installed_package_is_listed(plugin_site: Path) -> None:
+    rows = json.loads(facediff(plugin_site, "components", "--json"))
+    ours = {(row["kind"], row["name"]) for row in rows}
+    assert ("decoder", "moving_average") in ours
+    assert {(kind, name) for kind in registry.KINDS for name in registry.KINDS[kind].names()} <= ours
+    [row] = [row for row in rows if row["name"] == "moving_average"]
+    assert row["class"] == "facediff_moving_average.MovingAverageDecoder"
+    assert row["summary"] == "Averages each frame with its neighbours and adds the mean style token."
+
+
+def test_an_installed_package_is_chosen_on_the_command_line(plugin_site: Path) -> None:
+    flags = ["--model.decoder=moving_average", "--model.decoder.reach=2"]
+    printed = facediff(plugin_site, "fit", "--config", "configs/experiment/puppet.yaml", *flags, "--print_config")
+    assert "class_path: facediff.registry.decoder.moving_average" in printed
+    assert "reach: 2" in printed
