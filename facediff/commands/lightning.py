@@ -31,6 +31,8 @@ IDLE_WARNINGS = (
     ".*does not have many workers",
     # Lightning 2.6.6 calls a spelling that torch 2.13 deprecates.
     ".*isinstance.treespec, LeafSpec.*",
+    # The throughput monitor is there for clips a second.
+    ".*define a `flops_per_batch` attribute",
 )
 """Warnings of Lightning's that nobody needs to act on."""
 

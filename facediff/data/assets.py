@@ -10,6 +10,9 @@ from torch import Tensor
 
 from facediff.errors import FaceDiffError
 
+ASSETS_KEY = "facediff_assets"
+"""Where a checkpoint keeps :meth:`Assets.state`."""
+
 
 @dataclass(frozen=True)
 class Reference:

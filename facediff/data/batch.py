@@ -114,6 +114,11 @@ class Batch:
         return self
 
 
+def clips_in(batch: Batch) -> int:
+    """Number of clips of a batch, for Lightning's throughput monitor."""
+    return len(batch)
+
+
 def collate(samples: Sequence[Sample]) -> Batch:
     """Pad samples to a batch."""
     decoys = [s.decoy_audio for s in samples if s.decoy_audio is not None]

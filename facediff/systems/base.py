@@ -14,10 +14,10 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, SpeechMotionDataModule, collate
+from facediff.data.assets import ASSETS_KEY
 from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
 from facediff.hparams import plain
-from facediff.systems.checkpoint import ASSETS_KEY
 from facediff.systems.evaluation import Evaluation
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
@@ -173,8 +173,10 @@ class SpeechAnimator(LightningModule, ABC):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW on everything trainable, with the learning-rate schedule per optimiser step."""
         parameters = [p for p in self.parameters() if p.requires_grad]
-        # fused: one pass over all parameters instead of one operation after another for each.
-        optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        # Fused: one pass over all parameters instead of one operation after another for each. Lightning cannot clip
+        # the gradients of a fused optimiser in mixed precision.
+        fused = not str(self.trainer.precision).endswith("mixed")
+        optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=fused)
         if self.lr_schedule == "constant" and not self.warmup_steps:
             return optimizer
         total = int(self.trainer.estimated_stepping_batches)

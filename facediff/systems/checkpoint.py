@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from facediff.data.assets import ASSETS_KEY
 from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
     from facediff.systems.base import SpeechAnimator
-
-ASSETS_KEY = "facediff_assets"
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

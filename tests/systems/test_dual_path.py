@@ -163,6 +163,14 @@ def test_animate_is_seeded_and_knows_unseen_people(system: DualPathDiffusion) ->
         system.animate(speech, subject="Z")
 
 
+def test_other_steps_keep_the_samplers_other_options(make_system: Make) -> None:
+    system = make_system(sampler=partial(registry.sampler.ddim, steps=3, eta=0.7))
+    system.choose_sampler(steps=9)
+    assert (system.sampler.steps, system.sampler.eta) == (9, 0.7)
+    system.choose_sampler("dpm_solver")
+    assert (type(system.sampler).__name__, system.sampler.steps) == ("dpm_solver", 10)
+
+
 def test_sizes_that_do_not_fit_are_named(make_system: Make, tiny: Tiny) -> None:
     with pytest.raises(FaceDiffError, match=r"vertices are \{30\} in the model and \{24\} in the corpus"):
         make_system(n_vertices=30).adopt(tiny.assets())

@@ -131,6 +131,18 @@ def test_validation_is_the_same_twice(make_system: Make, tiny: Tiny, make_traine
     assert {"val/loss", "val/mve", "val/lve", "val/fdd", "val/reconstruction"} <= scores[0].keys()
 
 
+def test_mixed_precision_trains_with_clipped_gradients(
+    make_system: Make, tiny: Tiny, make_trainer: MakeTrainer
+) -> None:
+    system = make_system()
+    before = system.network.unembed.weight.detach().clone()
+    make_trainer(precision="bf16-mixed", gradient_clip_val=1.0).fit(system, datamodule=tiny)
+    after = system.network.unembed.weight
+    assert after.dtype == torch.float32
+    assert torch.isfinite(after).all()
+    assert not torch.equal(before, after)
+
+
 @pytest.mark.parametrize("schedule", ["constant", "cosine"])
 def test_the_learning_rate_warms_up_and_ends_as_asked(make_system: Make, schedule: str) -> None:
     system = make_system(lr_schedule=schedule, warmup_steps=10)

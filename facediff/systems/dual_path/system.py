@@ -142,7 +142,10 @@ class DualPathDiffusion(SpeechAnimator):
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """Sample in another way from now on; checkpoints keep the sampler that the system was made with."""
         chosen = registry.sampler.get(name) if name is not None else type(self.sampler)
-        self.sampler = chosen(process=self.process, **({} if steps is None else {"steps": steps}))
+        options = dict(self.hparams["sampler"]["init_args"]) if name is None else {}
+        if steps is not None:
+            options["steps"] = steps
+        self.sampler = chosen(process=self.process, **options)
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """One draw of step and noise per clip (algorithm 1), then the four losses (eq. 15 to 19)."""

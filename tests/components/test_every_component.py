@@ -1,0 +1,96 @@
+"""What holds for every registered component of every kind."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+from torch import Tensor, nn
+
+Make = Callable[..., nn.Module]
+Call = Callable[..., tuple[Tensor, ...]]
+DIM = 16
+LENGTHS = (9, 21, 1, 40)
+ALL = (0, 1, 2, 3)
+
+
+@pytest.mark.parametrize("rows", [ALL, (2,), (1, 0)], ids=str)
+def test_shape(kind: str, name: str, rows: tuple[int, ...], make: Make, call: Call) -> None:
+    module = make(kind, name).eval()
+    out = module(*call(kind, rows))
+    assert out.dtype == torch.float32
+    assert torch.isfinite(out).all()
+    if kind in ("identity_encoder", "style_encoder"):
+        assert out.shape == (len(rows), sum(module.token_dims))
+    else:
+        assert out.shape == (len(rows), max(LENGTHS[i] for i in rows), DIM)
+
+
+def test_padding_changes_nothing(kind: str, name: str, make: Make, call: Call) -> None:
+    module = make(kind, name).eval()
+    together = module(*call(kind, ALL, extra=6, garbage=100.0))
+    for i in ALL:
+        alone = module(*call(kind, (i,)))[0]
+        row = together[i] if kind in ("identity_encoder", "style_encoder") else together[i, : LENGTHS[i]]
+        torch.testing.assert_close(row, alone, rtol=0, atol=1e-5)
+        if kind == "audio_encoder":
+            assert not together[i, LENGTHS[i] :].any()
+
+
+def test_gradient_reaches_every_parameter(
+    kind: str, name: str, make: Make, call: Call, without_dropout: Callable[[nn.Module], nn.Module]
+) -> None:
+    module = without_dropout(make(kind, name))
+    out = module(*call(kind, ALL))
+    if not list(module.parameters()):
+        assert not out.requires_grad
+        return
+    (out - torch.randn_like(out)).square().sum().backward()
+    idle = [
+        name
+        for name, parameter in module.named_parameters()
+        if parameter.requires_grad and (parameter.grad is None or not parameter.grad.any())
+    ]
+    # A bias on the keys adds the same to every score of a query, which the softmax takes away again.
+    assert [name for name in idle if not name.endswith("k_proj.bias")] == []
+    assert all(torch.isfinite(p.grad).all() for p in module.parameters() if p.grad is not None)
+
+
+def test_evaluation_is_deterministic(kind: str, name: str, make: Make, call: Call) -> None:
+    module = make(kind, name).eval()
+    torch.manual_seed(1)
+    first = module(*call(kind, ALL))
+    torch.manual_seed(2)
+    assert torch.equal(module(*call(kind, ALL)), first)
+
+
+def test_state_dict_round_trip(kind: str, name: str, make: Make, call: Call) -> None:
+    one, other = make(kind, name, seed=0).eval(), make(kind, name, seed=1).eval()
+    inputs = call(kind, ALL)
+    expected = one(*inputs)
+    assert torch.equal(other(*inputs), expected) == (not list(one.parameters()))
+    file = io.BytesIO()
+    torch.save(one.state_dict(), file)
+    file.seek(0)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    assert torch.equal(other(*inputs), expected)
+
+
+def test_the_modules_inputs_are_left_alone(kind: str, name: str, make: Make, call: Call) -> None:
+    inputs = call(kind, ALL, extra=2)
+    before = [tensor.clone() for tensor in inputs]
+    make(kind, name).eval()(*inputs)
+    assert all(torch.equal(a, b) for a, b in zip(inputs, before, strict=True))
+
+
+def test_declared_shapes_are_enforced(kind: str, name: str, make: Make, call: Call) -> None:
+    """The import hook of the tests checks the annotations; a component without any would let this pass."""
+    inputs = call(kind, ALL)
+    module = make(kind, name).eval()
+    if type(module).__mro__[1].__module__.split(".")[0] != "facediff":
+        pytest.skip("the hook covers facediff's own components only")
+    with pytest.raises(TypeCheckError):
+        module(*(tensor[..., None] for tensor in inputs))

@@ -1,0 +1,63 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SCRIPT = Path(__file__).parents[2] / "tools" / "benchmarks" / "sampling.py"
+TOY = "--vertices 30 --seconds 1 --dim 32 --layers 2 --threads 1 --repeats 2 --full 3 --tiny-encoder"
+
+Output = tuple[str, dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def output(tmp_path_factory: pytest.TempPathFactory) -> Output:
+    """What a toy run prints, and its unrounded numbers."""
+    numbers = tmp_path_factory.mktemp("sampling") / "numbers.json"
+    command = [sys.executable, SCRIPT, *TOY.split(), "--json", numbers]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, json.loads(numbers.read_text())
+
+
+def test_every_total_is_the_sum_of_its_parts(output: Output) -> None:
+    _, numbers = output
+    assert numbers["seconds"] == 1.0
+    assert len(numbers["rows"]) == 6
+    for row in numbers["rows"]:
+        parts = row["audio_encoder"] + row["conditions"] + row["steps"] * row["per_step"] + row["rest"]
+        assert row["total"] == pytest.approx(parts)
+        assert row["real_time_factor"] == pytest.approx(row["total"] / numbers["seconds"])
+
+
+def test_a_step_is_the_sum_of_its_parts(output: Output) -> None:
+    _, numbers = output
+    costs = numbers["costs"]
+    for row in numbers["rows"]:
+        parts = costs["embed"] + costs["core"] + costs["unembed"] + costs["update"][row["sampler"]]
+        assert row["per_step"] == pytest.approx(parts)
+        assert row["all_steps"] == pytest.approx(row["steps"] * parts)
+
+
+def test_the_printed_table_holds_the_same_numbers(output: Output) -> None:
+    text, numbers = output
+    lines = text.split("a clip, in seconds", 1)[1].splitlines()[2:8]
+    for line, row in zip(lines, numbers["rows"], strict=True):
+        name, steps, *cells = line.split()
+        assert (name, int(steps)) == (row["sampler"], row["steps"])
+        audio, conditions, all_steps, rest, total, factor = map(float, cells)
+        assert total == pytest.approx(audio + conditions + all_steps + rest, abs=3e-4)
+        assert total == pytest.approx(row["total"], abs=1e-4)
+        assert factor == pytest.approx(row["real_time_factor"], abs=1e-4)
+
+
+def test_machine_memory_and_the_full_run_are_named(output: Output) -> None:
+    text, numbers = output
+    assert "machine: " in text
+    assert "device cpu" in text
+    assert "EXTRAPOLATED" in text
+    assert "peak memory: " in text
+    assert "ddim 3 in full: measured" in text
+    assert numbers["full"]["measured"] > 0
