@@ -38,9 +38,18 @@ class PredictionWriter(BasePredictionWriter):
         dataloader_idx: int,
     ) -> None:
         """Write a batch's clips, each file whole or not at all."""
-        folder = Path(self.output_dir or Path(trainer.log_dir or trainer.default_root_dir) / "predictions")
+        folder = self.folder(trainer)
         clips: list[Prediction] = prediction
         for clip in clips:
             path = folder / f"{clip.name}_condition_{clip.identity}.npy"
             with atomic(path) as temporary:
                 np.save(temporary, clip.vertices.flatten(1).numpy())
+
+    def folder(self, trainer: Trainer) -> Path:
+        """Where the files go."""
+        return Path(self.output_dir or Path(trainer.log_dir or trainer.default_root_dir) / "predictions")
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say where the files are."""
+        if trainer.is_global_zero:
+            print(f"written: {self.folder(trainer)}")

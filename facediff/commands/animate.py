@@ -20,6 +20,8 @@ T = TypeVar("T")
 
 MIN_SECONDS = 0.2
 SILENCE = 1e-4
+STRANGER = 4.0
+"""A reference whose offsets are this many times larger than any stored one is not of the face it is taken for."""
 SUFFIXES = (".mp4", ".npy")
 
 
@@ -136,9 +138,10 @@ def read_style(style: str, identity: str, assets: Assets, checkpoint: Path) -> R
 
 def corpus_clip(name: str, checkpoint: Path) -> Path:
     """Where a clip of the training corpus lies, if the corpus is on this machine."""
+    from facediff.data.assets import DATA_SOURCE_KEY
     from facediff.systems.checkpoint import read_checkpoint
 
-    root = read_checkpoint(checkpoint).get("datamodule_hyper_parameters", {}).get("root")
+    root = read_checkpoint(checkpoint).get(DATA_SOURCE_KEY, {}).get("root")
     path = Path(root) / "vertices_npy" / f"{name}.npy" if root else None
     if path is None or not path.is_file():
         where = f"in the checkpoint nor at {path}" if path else "in the checkpoint, and its corpus is not known"
@@ -168,7 +171,16 @@ def read_reference(path: Path, assets: Assets, subject: str) -> Reference:
     motion = np.array(array, np.float32).reshape(len(array), vertices, 3)
     if not np.isfinite(motion).all():
         raise FaceDiffError(f"--style {path}: holds NaN or infinity")
-    return Reference(path.stem, torch.from_numpy(motion) - assets.template(subject))
+    offsets = torch.from_numpy(motion) - assets.template(subject)
+    known = [float(reference.motion.float().square().mean().sqrt()) for reference in assets.references.values()]
+    size = float(offsets.square().mean().sqrt())
+    if known and size > STRANGER * max(known):
+        raise FaceDiffError(
+            f"--style {path}: lies {size / max(known):.0f} times as far from the face of {subject} as any motion of "
+            f"the corpus, so it is another person's; name the file <subject>_<clip>.npy, with a subject that the "
+            f"checkpoint knows ({', '.join(sorted(assets.templates))})"
+        )
+    return Reference(path.stem, offsets)
 
 
 def bar(items: Iterable[T], *, description: str, total: int | None = None) -> Iterable[T]:

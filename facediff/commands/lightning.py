@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,6 +18,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from facediff import registry
 from facediff.callbacks import PredictionWriter, ScoreTable
 from facediff.data import SpeechMotionDataModule
+from facediff.data.assets import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
 from facediff.shipped import config_dir
 from facediff.systems import SpeechAnimator
@@ -25,6 +26,11 @@ from facediff.systems.checkpoint import read_checkpoint
 
 LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a system that the data module knows."""
+
+TIP = (
+    "tip: `facediff components` lists what can be chosen by name, `facediff fit --help` the options, and "
+    "`facediff fit --config C --model.decoder.help=NAME` the options of a component"
+)
 
 IDLE_WARNINGS = (
     # Reading is cheap (memory-mapped motion), so worker processes would only add their start-up time.
@@ -44,8 +50,11 @@ class Parser(LightningArgumentParser):
     """Adds to an error about a name the names that exist."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        """Report a usage error; exits with status 2."""
-        super().error(explain(message), ex)
+        """Report a usage error without the hundred lines of usage that would hide it; exits with status 2."""
+        if not self.exit_on_error:
+            super().error(message, ex)
+        print(f"facediff: error: {explain(message)}\n{TIP}", file=sys.stderr)
+        raise SystemExit(2)
 
 
 def explain(message: str) -> str:
@@ -93,6 +102,15 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
     Flags that would change the model are refused: the weights fit the model that they were trained in only.
     """
     path = option(arguments, "--ckpt_path")
+    if (
+        path is None
+        and name != "fit"
+        and not any(re.match(r"-c$|-h$|--(config|model|data|help)\b", w) for w in arguments)
+    ):
+        raise FaceDiffError(
+            f"`facediff {name}` needs --ckpt_path CHECKPOINT, which says everything else, or a --config for an "
+            f"untrained system"
+        )
     if path in (None, "best", "last", "hpc", "registry"):
         return arguments
     checkpoint = read_checkpoint(Path(str(path)))
@@ -104,9 +122,11 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
             f"{given[0]}: the checkpoint {path} decides the model, and its weights fit no other; leave the flag away "
             f"(only --model.sampler… may change)"
         )
+    source = checkpoint.get(DATA_SOURCE_KEY, {})
     config = {
+        "seed_everything": 0,
         "model": described(checkpoint["hyper_parameters"], drop=LINKS),
-        "data": described(checkpoint["datamodule_hyper_parameters"], fallback=checkpoint["facediff_data"]),
+        "data": described(checkpoint["datamodule_hyper_parameters"], fallback=source.get("class_path", "")),
     }
     return ["--config", yaml.safe_dump(config, sort_keys=False), *arguments]
 
@@ -161,8 +181,21 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
                 parser_kwargs={"parser_mode": "omegaconf+"},
                 save_config_kwargs={"overwrite": True},
             )
+    except Exception as error:
+        # jsonargparse wraps what a constructor raises; our own sentence is the useful one.
+        ours = next((cause for cause in causes(error) if isinstance(cause, FaceDiffError)), None)
+        if ours is None or ours is error:
+            raise
+        raise ours from error
     finally:
         sys.argv = argv
+
+
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception and what it came from, outermost first."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def keep_wandb_quiet() -> None:

@@ -13,6 +13,9 @@ from facediff.errors import FaceDiffError
 ASSETS_KEY = "facediff_assets"
 """Where a checkpoint keeps :meth:`Assets.state`."""
 
+DATA_SOURCE_KEY = "facediff_data"
+"""Where a checkpoint keeps which data module it was trained on (``class_path``) and where the corpus was (``root``)."""
+
 
 @dataclass(frozen=True)
 class Reference:

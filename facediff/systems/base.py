@@ -14,7 +14,7 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, SpeechMotionDataModule, collate
-from facediff.data.assets import ASSETS_KEY
+from facediff.data.assets import ASSETS_KEY, DATA_SOURCE_KEY
 from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
 from facediff.hparams import plain
@@ -76,7 +76,7 @@ class SpeechAnimator(LightningModule, ABC):
         self.lr_schedule = lr_schedule
         self.warmup_steps = warmup_steps
         self._assets: Assets | None = None
-        self._datamodule_class = ""
+        self._data_source: dict[str, str] = {}
         self.evaluation = Evaluation(protocol)
 
     @abstractmethod
@@ -149,7 +149,10 @@ class SpeechAnimator(LightningModule, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, SpeechMotionDataModule):
             raise FaceDiffError("facediff's systems train and test on a SpeechMotionDataModule; pass datamodule=…")
-        self._datamodule_class = f"{type(data).__module__}.{type(data).__qualname__}"
+        self._data_source = {
+            "class_path": f"{type(data).__module__}.{type(data).__qualname__}",
+            "root": str(data.root.resolve()),
+        }
         scale = self._assets.motion_scale if self._assets is not None else None
         if scale is None and stage == "fit":
             scale = data.motion_scale()
@@ -160,13 +163,13 @@ class SpeechAnimator(LightningModule, ABC):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the assets, so that the checkpoint animates without the corpus."""
         checkpoint[ASSETS_KEY] = self.assets.state()
-        checkpoint["facediff_data"] = self._datamodule_class
+        checkpoint[DATA_SOURCE_KEY] = self._data_source
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the assets from the checkpoint."""
         if ASSETS_KEY in checkpoint:
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
-            self._datamodule_class = checkpoint.get("facediff_data", "")
+            self._data_source = checkpoint.get(DATA_SOURCE_KEY, {})
 
     # -- optimisation
 
@@ -208,7 +211,8 @@ class SpeechAnimator(LightningModule, ABC):
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics as ``val/mve`` …."""
-        self.log_dict(self.evaluation.scalars("val"), prog_bar=True)
+        # The metrics have been summed over the processes already; averaging equal values changes nothing.
+        self.log_dict(self.evaluation.scalars("val"), prog_bar=False, sync_dist=True)
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Score sampled motion, a still face, and the model's motion for another sentence's speech."""
@@ -223,7 +227,7 @@ class SpeechAnimator(LightningModule, ABC):
     def on_test_epoch_end(self) -> None:
         """Log ``<split>/lve`` and so on; the table is printed by the callback ``ScoreTable``."""
         for split in self.evaluation.splits:
-            self.log_dict(self.evaluation.scalars(split))
+            self.log_dict(self.evaluation.scalars(split), sync_dist=True)
 
     def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> list[Prediction]:
         """Absolute vertices of every clip of the batch."""

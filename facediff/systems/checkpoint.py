@@ -52,7 +52,10 @@ def load_system(path: Path | str, map_location: str = "cpu") -> SpeechAnimator:
     name = str(checkpoint["hyper_parameters"].get("_class_path"))
     try:
         system = system_class(name).load_from_checkpoint(path, map_location=map_location, weights_only=True)
-    except (ValueError, RuntimeError, KeyError, TypeError, SystemExit) as error:
+    except FaceDiffError:
+        raise
+    except (Exception, SystemExit) as error:
+        # Lightning, jsonargparse and the components each have their own exceptions for what cannot be rebuilt.
         reason = next(iter(str(error).strip().splitlines()), repr(error))
         raise FaceDiffError(
             f"{path}: cannot be rebuilt as {name} ({reason}); install the packages its components come from"

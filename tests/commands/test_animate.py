@@ -102,6 +102,7 @@ def bad_reference(folder: Path) -> Path:
         (["--style", "other.npy"], "has shape (9, 31, 3); the checkpoint's faces have 24 vertices"),
         (["--style", "A_e99"], "no clip of that name"),
         (["--style", "none.npy"], "no such file"),
+        (["--style", "far.npy"], "so it is another person's"),
         (["--sampler", "dim"], 'there is no sampler "dim": did you mean "ddim"?'),
         (["--steps", "0"], "sampler.steps: 0 is impossible"),
         (["--device", "cuda:7"], "not usable on this machine"),
@@ -121,6 +122,7 @@ def test_bad_options(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     bad_reference(tmp_path)
+    np.save(tmp_path / "far.npy", np.full((9, 24, 3), 0.5, np.float32))
     (tmp_path / "text.ckpt").write_text("no checkpoint")
     before = sorted(tmp_path.rglob("*"))
     assert animate(speech, "--checkpoint", checkpoint, "-o", "x.npy", *words) == 2

@@ -96,6 +96,26 @@ def test_a_wrong_name_lists_the_right_ones(words: list[str], sentence: str, caps
     assert sentence in capsys.readouterr().err
 
 
+def test_an_error_is_short_and_says_where_to_look(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit", "--config", "configs/experiment/puppet.yaml", "--model.decoder.num_layer=2"])
+    message = capsys.readouterr().err
+    assert "num_layer" in message
+    assert "--model.decoder.help=NAME" in message
+    assert len(message.splitlines()) < 15
+
+
+def test_scoring_without_a_checkpoint_says_what_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["test"]) == 2
+    assert "needs --ckpt_path" in capsys.readouterr().err
+
+
+def test_a_missing_hubert_is_one_sentence(fit: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = [f"--model.audio_encoder.source={tmp_path}/none", f"--trainer.logger.save_dir={tmp_path}"]
+    assert fit("--model.audio_encoder=hubert", *missing) == 2
+    assert f"no directory {tmp_path}/none" in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_help_of_a_component(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["fit", "--config", "configs/experiment/puppet.yaml", "--model.decoder.help=gru"])
@@ -146,7 +166,7 @@ def test_wandb_offline_asks_nothing(fit: Fit, tmp_path: Path, monkeypatch: pytes
     logger = ["--config", "configs/logger/wandb.yaml"]
     assert fit(*logger) == 0
     assert len(list(tmp_path.glob("runs/wandb/offline-run-*/*.wandb"))) == 1
-    assert (tmp_path / "runs/wandb/version_0/checkpoints/best.ckpt").exists()
+    assert (tmp_path / "runs/experiment/version_0/checkpoints/best.ckpt").exists()
 
 
 def test_two_processes_train_together(tiny_root: Path, tmp_path: Path) -> None:
