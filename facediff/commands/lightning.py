@@ -9,23 +9,17 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
-import yaml
 from jsonargparse import set_parsing_settings
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from facediff import registry
 from facediff.callbacks import PredictionWriter, ScoreTable
+from facediff.commands.words import LINKS, rewrite
 from facediff.data import SpeechMotionDataModule
-from facediff.data.assets import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
-from facediff.shipped import config_dir
 from facediff.systems import SpeechAnimator
-from facediff.systems.checkpoint import read_checkpoint
-
-LINKS = ("n_vertices", "identities", "frame_rate")
-"""Constructor arguments of a system that the data module knows."""
 
 TIP = (
     "tip: `facediff components` lists what can be chosen by name, `facediff fit --help` the options, and "
@@ -47,7 +41,7 @@ CALLBACKS_WARNING = ".*callbacks used to create the checkpoint need to be provid
 
 
 class Parser(LightningArgumentParser):
-    """Adds to an error about a name the names that exist."""
+    """Reports errors in a few lines, with the names that exist where a name is wrong."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Report a usage error without the hundred lines of usage that would hide it; exits with status 2."""
@@ -88,63 +82,12 @@ class FaceDiffCLI(LightningCLI):
     """LightningCLI whose system takes its sizes from the data module."""
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Link sizes, and let ``test`` print our table alone."""
+        """Let the system take its sizes from the data module."""
         for name in LINKS:
             parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
 
     def _parse_ckpt_path(self) -> None:
-        """Upstream merges a checkpoint's hyper-parameters over the flags; :func:`run` does it under the flags."""
-
-
-def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
-    """Put a checkpoint's system and data module before the other arguments of validate, test and predict.
-
-    Flags that would change the model are refused: the weights fit the model that they were trained in only.
-    """
-    path = option(arguments, "--ckpt_path")
-    if (
-        path is None
-        and name != "fit"
-        and not any(re.match(r"-c$|-h$|--(config|model|data|help)\b", w) for w in arguments)
-    ):
-        raise FaceDiffError(
-            f"`facediff {name}` needs --ckpt_path CHECKPOINT, which says everything else, or a --config for an "
-            f"untrained system"
-        )
-    if path in (None, "best", "last", "hpc", "registry"):
-        return arguments
-    checkpoint = read_checkpoint(Path(str(path)))
-    if name == "fit":
-        return arguments
-    given = [word for word in arguments if re.match(r"--model(?!\.init_args\.sampler|\.sampler)\b", word)]
-    if given:
-        raise FaceDiffError(
-            f"{given[0]}: the checkpoint {path} decides the model, and its weights fit no other; leave the flag away "
-            f"(only --model.sampler… may change)"
-        )
-    source = checkpoint.get(DATA_SOURCE_KEY, {})
-    config = {
-        "seed_everything": 0,
-        "model": described(checkpoint["hyper_parameters"], drop=LINKS),
-        "data": described(checkpoint["datamodule_hyper_parameters"], fallback=source.get("class_path", "")),
-    }
-    return ["--config", yaml.safe_dump(config, sort_keys=False), *arguments]
-
-
-def described(hparams: dict[str, Any], *, drop: Sequence[str] = (), fallback: str = "") -> dict[str, Any]:
-    """Hyper-parameters in the form of a config file."""
-    arguments = {k: v for k, v in hparams.items() if not k.startswith("_") and k not in drop}
-    return {"class_path": hparams.get("_class_path", fallback), "init_args": arguments}
-
-
-def option(arguments: Sequence[str], flag: str) -> str | None:
-    """Value of a flag written ``--flag value`` or ``--flag=value``."""
-    for i, word in enumerate(arguments):
-        if word == flag and i + 1 < len(arguments):
-            return arguments[i + 1]
-        if word.startswith(f"{flag}="):
-            return word.partition("=")[2]
-    return None
+        """Upstream merges a checkpoint's hyper-parameters over the flags; the module ``words`` does it under them."""
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
@@ -159,7 +102,7 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
         kind.load()
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     keep_wandb_quiet()
-    words = resolve_configs(from_checkpoint(name, list(arguments)))
+    words = rewrite(name, list(arguments))
     if name == "test":
         words = ["--verbose=false", *words]  # ScoreTable prints the scores; Lightning's table repeats them per loader
     callbacks = [ScoreTable()] + ([PredictionWriter()] if name == "predict" else [])
@@ -203,19 +146,3 @@ def keep_wandb_quiet() -> None:
     os.environ.setdefault("WANDB_SILENT", "true")
     if not os.environ.get("WANDB_API_KEY") and not (Path.home() / ".netrc").exists():
         os.environ.setdefault("WANDB_MODE", "offline")
-
-
-def resolve_configs(arguments: list[str]) -> list[str]:
-    """Let ``--config configs/…`` find the shipped configs from any folder."""
-    for i, word in enumerate(arguments):
-        value = arguments[i + 1] if word in ("-c", "--config") and i + 1 < len(arguments) else None
-        value = word.partition("=")[2] if word.startswith("--config=") else value
-        if value and value.startswith("configs/") and not Path(value).exists():
-            shipped = config_dir() / value.removeprefix("configs/")
-            if not shipped.is_file():
-                raise FaceDiffError(f"--config {value}: no such file, neither here nor among the shipped configs")
-            if word.startswith("--config="):
-                arguments[i] = f"--config={shipped}"
-            else:
-                arguments[i + 1] = str(shipped)
-    return arguments

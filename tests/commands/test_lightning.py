@@ -132,6 +132,18 @@ def print_config(*words: str, capsys: pytest.CaptureFixture[str]) -> dict[str, o
     return yaml.safe_load(capsys.readouterr().out)
 
 
+@pytest.mark.parametrize(
+    "words", [["--model.sampler=ddpm", "--model.decoder=gru"], ["--model.sampler", "ddpm", "--model.decoder", "gru"]]
+)
+def test_a_component_chosen_by_name_starts_from_its_own_defaults(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--config", "configs/experiment/puppet.yaml", *words, "--model.decoder.dropout=0.3"]
+    model = print_config(*words, capsys=capsys)["model"]["init_args"]  # type: ignore[index]
+    assert model["sampler"]["init_args"] == {"steps": None}
+    assert model["decoder"]["init_args"] == {"num_layers": 2, "bidirectional": True, "dropout": 0.3}
+
+
 @pytest.mark.parametrize("config", sorted(path.name for path in (CONFIGS / "experiment").glob("*.yaml")))
 def test_every_shipped_experiment_is_parsed(config: str, capsys: pytest.CaptureFixture[str]) -> None:
     printed = print_config("--config", f"configs/experiment/{config}", capsys=capsys)
