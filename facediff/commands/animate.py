@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
+    from torch import Tensor
 
     from facediff.data import Assets, Reference
 
@@ -20,8 +21,8 @@ T = TypeVar("T")
 
 MIN_SECONDS = 0.2
 SILENCE = 1e-4
-STRANGER = 4.0
-"""A reference whose offsets are this many times larger than any stored one is not of the face it is taken for."""
+STRANGER = 0.25
+"""How far the stillest vertices may lie from the face, as a share of how far all vertices move in a stored reference."""
 SUFFIXES = (".mp4", ".npy")
 
 
@@ -172,15 +173,30 @@ def read_reference(path: Path, assets: Assets, subject: str) -> Reference:
     if not np.isfinite(motion).all():
         raise FaceDiffError(f"--style {path}: holds NaN or infinity")
     offsets = torch.from_numpy(motion) - assets.template(subject)
-    known = [float(reference.motion.float().square().mean().sqrt()) for reference in assets.references.values()]
-    size = float(offsets.square().mean().sqrt())
-    if known and size > STRANGER * max(known):
-        raise FaceDiffError(
-            f"--style {path}: lies {size / max(known):.0f} times as far from the face of {subject} as any motion of "
-            f"the corpus, so it is another person's; name the file <subject>_<clip>.npy, with a subject that the "
-            f"checkpoint knows ({', '.join(sorted(assets.templates))})"
-        )
+    refuse_stranger(path, offsets, assets, subject)
     return Reference(path.stem, offsets)
+
+
+def refuse_stranger(path: Path, offsets: Tensor, assets: Assets, subject: str) -> None:
+    """Refuse a motion of another person's face, which would pass for a strange style.
+
+    Told by the quarter of the vertices that move least in the stored references (skull, neck): there the offsets from
+    one's own template are small, and those from another's are not.
+    """
+    import torch
+
+    stored = [reference.motion.float() for reference in assets.references.values()]
+    if not stored:
+        return
+    reach = torch.stack([torch.linalg.vector_norm(motion, dim=-1).amax(0) for motion in stored]).amax(0)
+    still = reach.argsort()[: max(1, len(reach) // 4)]
+    size = float(offsets[:, still].square().mean().sqrt())
+    usual = max(float(motion.square().mean().sqrt()) for motion in stored)
+    if size > STRANGER * usual:
+        raise FaceDiffError(
+            f"--style {path}: is not a motion of {subject}'s face, so it must be another person's; name the file "
+            f"<subject>_<clip>.npy, with a subject that the checkpoint knows ({', '.join(sorted(assets.templates))})"
+        )
 
 
 def bar(items: Iterable[T], *, description: str, total: int | None = None) -> Iterable[T]:
@@ -222,17 +238,34 @@ def write_animation(
 ) -> None:
     """Write motions (T, V, 3) side by side as a video with sound."""
     from facediff.data.audio import SAMPLE_RATE, fit_length, samples_for
-    from facediff.render import Renderer, side_by_side, write_video
+    from facediff.render import write_video
+
+    frames = drawn_frames(path, motions, labels, assets, view=view, size=size)
+    shown = frames if quiet else bar(frames, description=f"drawing {path.name}", total=len(motions[0]))
+    sound = fit_length(speech, samples_for(len(motions[0]), assets.frame_rate))
+    write_video(path, shown, assets.frame_rate, sound, SAMPLE_RATE)
+
+
+def drawn_frames(
+    path: Path,
+    motions: Sequence[npt.NDArray[np.float32]],
+    labels: Sequence[str],
+    assets: Assets,
+    *,
+    view: str = "front",
+    size: int = 512,
+) -> Iterator[npt.NDArray[np.uint8]]:
+    """Pictures of motions (T, V, 3) side by side, one a frame.
+
+    Raises:
+        FaceDiffError: naming ``path``, if the corpus had no mesh to draw.
+    """
+    from facediff.render import Renderer, side_by_side
 
     if assets.faces is None:
-        raise FaceDiffError(
-            f"{path}: the checkpoint's corpus has no mesh file, so there are no faces to draw; write .npy"
-        )
-    options: dict[str, Any] = {} if assets.colours is None else {"colours": assets.colours.numpy()}
+        raise FaceDiffError(f"{path}: the checkpoint holds no faces to draw, since its corpus has no mesh; write .npy")
+    colours = None if assets.colours is None else assets.colours.numpy()
     template = next(iter(assets.templates.values())).numpy()
-    renderer = Renderer(assets.faces.numpy(), template=template, view=view, size=size, **options)
+    renderer = Renderer(assets.faces.numpy(), template=template, view=view, size=size, colours=colours)
     footer = f"{assets.corpus}: synthetic corpus" if assets.synthetic else assets.corpus
-    frames = side_by_side(renderer, motions, labels, footer=footer)
-    drawn = frames if quiet else bar(frames, description=f"drawing {path.name}", total=len(motions[0]))
-    sound = fit_length(speech, samples_for(len(motions[0]), assets.frame_rate))
-    write_video(path, drawn, assets.frame_rate, sound, SAMPLE_RATE)
+    return side_by_side(renderer, motions, labels, footer=footer)

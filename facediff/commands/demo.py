@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from facediff.systems import SpeechAnimator
 
 CONFIG = "configs/experiment/puppet.yaml"
+SHEET = 12
+"""Frames on a contact sheet."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -57,11 +59,15 @@ def run(name: str, arguments: Sequence[str]) -> int:
 
 
 def write_videos(folder: Path, system: SpeechAnimator, data: SpeechMotionDataModule) -> list[Path]:
-    """Truth beside prediction, with sound: the first test clip of a seen speaker and of an unseen one."""
+    """Truth beside prediction of the first test clip of a seen speaker and of an unseen one.
+
+    A video with sound, and a sheet of frames.
+    """
     import torch
 
-    from facediff.commands.animate import write_animation
+    from facediff.commands.animate import drawn_frames, write_animation
     from facediff.data import collate
+    from facediff.render import contact_sheet, save_image
 
     written = []
     for split in data.test_splits:
@@ -72,5 +78,9 @@ def write_videos(folder: Path, system: SpeechAnimator, data: SpeechMotionDataMod
         panels = [(moved + sample.template).numpy() for moved in (sample.motion, motion)]
         path = folder / f"truth_and_prediction_{split}.mp4"
         write_animation(path, panels, ["truth", "facediff"], sample.audio.numpy(), system.assets)
-        written.append(path)
+        picks = [round(i * (len(motion) - 1) / (SHEET + 1)) for i in range(1, SHEET + 1)]
+        frames = drawn_frames(path, [panel[picks] for panel in panels], ["truth", "facediff"], system.assets, size=224)
+        times = [f"{pick / system.frame_rate:.2f} s" for pick in picks]
+        save_image(path.with_suffix(".png"), contact_sheet(list(frames), 4, labels=times))
+        written += [path, path.with_suffix(".png")]
     return written

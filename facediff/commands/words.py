@@ -97,7 +97,10 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
     config = {
         "seed_everything": 0,
         "model": described(checkpoint["hyper_parameters"], drop=LINKS),
-        "data": described(checkpoint["datamodule_hyper_parameters"], fallback=source.get("class_path", "")),
+        "data": described(
+            checkpoint.get("datamodule_hyper_parameters") or {"root": source.get("root")},
+            fallback=source.get("class_path", ""),
+        ),
     }
     return ["--config", yaml.safe_dump(config, sort_keys=False), *arguments]
 

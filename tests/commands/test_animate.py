@@ -102,7 +102,7 @@ def bad_reference(folder: Path) -> Path:
         (["--style", "other.npy"], "has shape (9, 31, 3); the checkpoint's faces have 24 vertices"),
         (["--style", "A_e99"], "no clip of that name"),
         (["--style", "none.npy"], "no such file"),
-        (["--style", "far.npy"], "so it is another person's"),
+        (["--style", "far.npy"], "so it must be another person's"),
         (["--sampler", "dim"], 'there is no sampler "dim": did you mean "ddim"?'),
         (["--steps", "0"], "sampler.steps: 0 is impossible"),
         (["--device", "cuda:7"], "not usable on this machine"),
