@@ -20,13 +20,14 @@ def atomic(path: Path) -> Iterator[Path]:
         FaceDiffError: if the folder cannot be made or written.
     """
     temporary = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
-    check_writable(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        raise FaceDiffError(f"{path}: could not be written ({error.strerror or error})") from error
+        raise FaceDiffError(
+            f"{path}: cannot be written ({error.strerror or error}); choose a folder that you may write to"
+        ) from error
     finally:
         with suppress(FileNotFoundError):
             temporary.unlink()

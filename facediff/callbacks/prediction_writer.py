@@ -26,6 +26,12 @@ class PredictionWriter(BasePredictionWriter):
     def __init__(self, output_dir: str | None = None) -> None:
         super().__init__(write_interval="batch")
         self.output_dir = output_dir
+        self.folder = Path()
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Settle the folder on every process at once: where the run's folder is, is broadcast."""
+        run = trainer.log_dir or trainer.default_root_dir
+        self.folder = Path(self.output_dir or Path(run) / "predictions")
 
     def write_on_batch_end(
         self,
@@ -38,18 +44,13 @@ class PredictionWriter(BasePredictionWriter):
         dataloader_idx: int,
     ) -> None:
         """Write a batch's clips, each file whole or not at all."""
-        folder = self.folder(trainer)
         clips: list[Prediction] = prediction
         for clip in clips:
-            path = folder / f"{clip.name}_condition_{clip.identity}.npy"
+            path = self.folder / f"{clip.name}_condition_{clip.identity}.npy"
             with atomic(path) as temporary:
                 np.save(temporary, clip.vertices.flatten(1).numpy())
-
-    def folder(self, trainer: Trainer) -> Path:
-        """Where the files go."""
-        return Path(self.output_dir or Path(trainer.log_dir or trainer.default_root_dir) / "predictions")
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say where the files are."""
         if trainer.is_global_zero:
-            print(f"written: {self.folder(trainer)}")
+            print(f"written: {self.folder}")

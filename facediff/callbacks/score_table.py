@@ -33,13 +33,14 @@ class ScoreTable(Callback):
             return
         evaluation = pl_module.evaluation
         rows = [row for split in evaluation.splits for row in evaluation.rows(split)]
+        folder = trainer.log_dir  # asked for on every process: the answer is broadcast
         if not trainer.is_global_zero:
             return
         assets = pl_module.assets
         print(format_table(rows, assets.corpus, synthetic=assets.synthetic))
         print(evaluation.protocol.describe())
-        if self.file and trainer.log_dir:
-            path = Path(trainer.log_dir) / self.file
+        if self.file and folder:
+            path = Path(folder) / self.file
             write_csv(path, rows)
             print(f"written: {path}")
         sys.stdout.flush()

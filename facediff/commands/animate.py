@@ -22,7 +22,7 @@ T = TypeVar("T")
 MIN_SECONDS = 0.2
 SILENCE = 1e-4
 STRANGER = 0.25
-"""How far the stillest vertices may lie from the face, as a share of how far all vertices move in a stored reference."""
+"""How far the stillest vertices may lie from the face, as a share of how far all vertices of a reference do."""
 SUFFIXES = (".mp4", ".npy")
 
 
@@ -65,7 +65,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
 
     from facediff.systems import load_system
 
-    system = load_system(args.checkpoint, map_location=device(args.device))
+    system = load_system(args.checkpoint, device=device(args.device))
     if args.sampler is not None or args.steps is not None:
         system.choose_sampler(args.sampler, args.steps)
     identity = args.identity or system.identities[0]

@@ -74,7 +74,7 @@ def write_videos(folder: Path, system: SpeechAnimator, data: SpeechMotionDataMod
         sample = data.dataset(split)[0]
         batch = collate([sample])
         with torch.inference_mode():
-            motion = system.eval().generate(batch, generator=torch.Generator().manual_seed(0))[0]
+            motion = system.eval().generate(batch)[0]
         panels = [(moved + sample.template).numpy() for moved in (sample.motion, motion)]
         path = folder / f"truth_and_prediction_{split}.mp4"
         write_animation(path, panels, ["truth", "facediff"], sample.audio.numpy(), system.assets)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import netrc
 import os
 import re
 import sys
@@ -10,6 +11,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
+from urllib.parse import urlparse
 
 from jsonargparse import set_parsing_settings
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -36,8 +38,8 @@ IDLE_WARNINGS = (
 )
 """Warnings of Lightning's that nobody needs to act on."""
 
-CALLBACKS_WARNING = ".*callbacks used to create the checkpoint need to be provided"
-"""True of training that goes on; scoring a checkpoint needs none of its callbacks."""
+RESUME_WARNINGS = (".*callbacks used to create the checkpoint need to be provided", "The dirpath has changed from")
+"""They matter to training that goes on; scoring a checkpoint needs none of its callbacks."""
 
 
 class Parser(LightningArgumentParser):
@@ -105,13 +107,15 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     words = rewrite(name, list(arguments))
     if name == "test":
         words = ["--verbose=false", *words]  # ScoreTable prints the scores; Lightning's table repeats them per loader
+    if name == "predict":
+        words = ["--return_predictions=false", *words]  # they are on disk, and a corpus of them fills the memory
     callbacks = [ScoreTable()] + ([PredictionWriter()] if name == "predict" else [])
     logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
     # Lightning starts the other processes of a distributed run with the words of this one.
     argv, sys.argv = sys.argv, [sys.argv[0], name, *words]
     try:
         with warnings.catch_warnings():
-            for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, CALLBACKS_WARNING):
+            for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, *RESUME_WARNINGS):
                 warnings.filterwarnings("ignore", message)
             return FaceDiffCLI(
                 SpeechAnimator,
@@ -144,5 +148,15 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
 def keep_wandb_quiet() -> None:
     """Without a key wandb would ask a question and wait for an answer: log offline then."""
     os.environ.setdefault("WANDB_SILENT", "true")
-    if not os.environ.get("WANDB_API_KEY") and not (Path.home() / ".netrc").exists():
+    if not os.environ.get("WANDB_API_KEY") and not has_wandb_login():
         os.environ.setdefault("WANDB_MODE", "offline")
+
+
+def has_wandb_login() -> bool:
+    """Whether `wandb login` has left a key in the netrc file, which others use too."""
+    path = Path(os.environ.get("NETRC") or Path.home() / ".netrc")
+    host = urlparse(os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai")).hostname or ""
+    try:
+        return netrc.netrc(path).authenticators(host) is not None
+    except (OSError, netrc.NetrcParseError):
+        return False

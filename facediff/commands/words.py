@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import yaml
 
 from facediff import registry
+from facediff.data import SpeechMotionDataModule
 from facediff.data.assets import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
 from facediff.hparams import plain
@@ -79,8 +81,8 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
         and not any(re.match(r"-c$|-h$|--(config|model|data|help)\b", w) for w in arguments)
     ):
         raise FaceDiffError(
-            f"`facediff {name}` needs --ckpt_path CHECKPOINT, which says everything else, or a --config for an "
-            f"untrained system"
+            f"`facediff {name}` needs --ckpt_path CHECKPOINT, a file that `facediff fit` has "
+            f"written; it says everything else"
         )
     if path in (None, "best", "last", "hpc", "registry"):
         return arguments
@@ -93,22 +95,35 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
             f"{given[0]}: the checkpoint {path} decides the model, and its weights fit no other; leave the flag away "
             f"(only --model.sampler… may change)"
         )
-    source = checkpoint.get(DATA_SOURCE_KEY, {})
-    config = {
-        "seed_everything": 0,
-        "model": described(checkpoint["hyper_parameters"], drop=LINKS),
-        "data": described(
-            checkpoint.get("datamodule_hyper_parameters") or {"root": source.get("root")},
-            fallback=source.get("class_path", ""),
-        ),
-    }
+    config = {"seed_everything": 0, "model": described(checkpoint["hyper_parameters"], drop=LINKS)}
+    if option(arguments, "--data") is None:
+        config["data"] = data_of(Path(str(path)), checkpoint)
     return ["--config", yaml.safe_dump(config, sort_keys=False), *arguments]
 
 
-def described(hparams: dict[str, Any], *, drop: Sequence[str] = (), fallback: str = "") -> dict[str, Any]:
+def data_of(path: Path, checkpoint: dict[str, Any]) -> dict[str, Any]:
+    """The data module that a checkpoint was trained on, as a config.
+
+    Raises:
+        FaceDiffError: if it is not imported; an import path from a file is not followed.
+    """
+    source = checkpoint.get(DATA_SOURCE_KEY, {})
+    named = str(source.get("class_path"))
+    module, _, name = named.rpartition(".")
+    found = getattr(sys.modules.get(module), name, None)
+    if not (isinstance(found, type) and issubclass(found, SpeechMotionDataModule)):
+        raise FaceDiffError(
+            f"{path}: was trained on the data module {named}, which facediff does not know by itself; "
+            f"if you trust it, add --data={named}"
+        )
+    hparams = checkpoint.get("datamodule_hyper_parameters") or {"root": source.get("root")}
+    return {"class_path": named, "init_args": described(hparams)["init_args"]}
+
+
+def described(hparams: dict[str, Any], *, drop: Sequence[str] = ()) -> dict[str, Any]:
     """Hyper-parameters in the form of a config file."""
     arguments = {k: v for k, v in hparams.items() if not k.startswith("_") and k not in drop}
-    return {"class_path": hparams.get("_class_path", fallback), "init_args": arguments}
+    return {"class_path": hparams.get("_class_path"), "init_args": arguments}
 
 
 def option(arguments: Sequence[str], flag: str) -> str | None:

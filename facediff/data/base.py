@@ -15,6 +15,7 @@ from facediff.data.batch import Batch, Sample, collate
 from facediff.data.corpus import Clip, Corpus
 from facediff.data.dataset import MotionDataset, ReferenceChoice, ReferencePolicy
 from facediff.errors import FaceDiffError
+from facediff.hparams import plain
 
 SCALE_FRAMES = 16
 """Frames of each training clip, evenly spread, from which the motion scale is measured."""
@@ -67,6 +68,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self._corpus: Corpus | None = None
         self._assets: Assets | None = None
 
+    def remember(self, arguments: dict[str, Any]) -> None:
+        """Keep constructor arguments as plain data, so that checkpoints load with ``weights_only=True``."""
+        self.save_hyperparameters(plain(arguments))
+
     @abstractmethod
     def split_of(self, clip: Clip) -> str | None:
         """The split a clip belongs to (``train``, ``val``, ``test_a``, ``test_b``), or None for none of them.
@@ -98,8 +103,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 candidates.setdefault(clip.subject, []).append(clip)
         return ReferencePolicy(candidates, self.reference_attributes, self.reference, self.reference_frames)
 
-    def dataset(self, split: str) -> MotionDataset:
-        """The samples of a split.
+    def dataset(self, split: str, *, training: bool = False) -> MotionDataset:
+        """The samples of a split: whole clips with fixed references, or (``training``) random windows and references.
 
         Raises:
             FaceDiffError: if the split has no clip.
@@ -107,7 +112,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         clips = self.clips(split)
         if not clips:
             raise FaceDiffError(f"{self.root}: no clip of split {split}; check which files are there")
-        training = split == "train"
         return MotionDataset(
             self.corpus,
             clips,
@@ -169,7 +173,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def train_dataloader(self) -> DataLoader[Sample]:
         """Shuffled training batches."""
-        return self._loader("train", shuffle=True)
+        return self._loader("train", training=True)
 
     def val_dataloader(self) -> DataLoader[Sample]:
         """Validation batches in order."""
@@ -183,12 +187,12 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """The clips of ``predict_split`` in order."""
         return self._loader(self.predict_split)
 
-    def _loader(self, split: str, *, shuffle: bool = False) -> DataLoader[Sample]:
+    def _loader(self, split: str, *, training: bool = False) -> DataLoader[Sample]:
         options: dict[str, Any] = {"persistent_workers": True} if self.num_workers else {}
         return DataLoader(
-            self.dataset(split),
+            self.dataset(split, training=training),
             batch_size=self.batch_size,
-            shuffle=shuffle,
+            shuffle=training,
             num_workers=self.num_workers,
             collate_fn=collate,
             pin_memory=torch.cuda.is_available(),

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from facediff.data.audio import samples_for
 from facediff.data.batch import UNKNOWN_IDENTITY, Sample
 from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
@@ -135,5 +136,5 @@ class MotionDataset(Dataset[Sample]):
         if not others:
             return None
         audio = self.corpus.read_audio(others[0], 0, self.corpus.frames(others[0]))
-        length = len(self.corpus.read_audio(own, 0, frames))
+        length = samples_for(frames, self.corpus.frame_rate)
         return audio.repeat(-(-length // len(audio)))[:length]

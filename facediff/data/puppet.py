@@ -57,6 +57,7 @@ class Puppet(SpeechMotionDataModule):
         reference_frames: int = 100,
         predict_split: Literal["train", "val", "test_a", "test_b"] = "test_a",
     ) -> None:
+        arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         super().__init__(
             root=str(cache_root(seed)) if root is None else root,
             batch_size=batch_size,
@@ -67,7 +68,7 @@ class Puppet(SpeechMotionDataModule):
             predict_split=predict_split,
         )
         self.seed = seed
-        self.save_hyperparameters()
+        self.remember(arguments)
 
     def prepare_data(self) -> None:
         """Make the corpus if it is not there; called on one process only."""

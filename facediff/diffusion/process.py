@@ -55,6 +55,8 @@ class NoiseProcess:
         """Mⁿ = √ᾱ_n M⁰ + √(1 − ᾱ_n) ε, the closed form of n applications of eq. 1."""
         return self._scheduler.add_noise(clean, noise, step)
 
-    def draw_steps(self, batch: int, device: torch.device) -> Int[Tensor, " batch"]:
+    def draw_steps(
+        self, batch: int, device: torch.device, generator: torch.Generator | None = None
+    ) -> Int[Tensor, " batch"]:
         """Uniform random step numbers (algorithm 1, line 3)."""
-        return torch.randint(0, self.steps, (batch,), device=device)
+        return torch.randint(0, self.steps, (batch,), device=device, generator=generator)

@@ -17,7 +17,7 @@ from facediff.errors import FaceDiffError
 from facediff.puppet.coarticulation import segments_of
 from facediff.puppet.curves import Array
 from facediff.puppet.face import build_face
-from facediff.puppet.files import folder_as_a_whole, matches_manifest, write_manifest, write_ply
+from facediff.puppet.files import folder_as_a_whole, matches_manifest, read_manifest, write_manifest, write_ply
 from facediff.puppet.manner import FRAME_RATE, perform
 from facediff.puppet.plan import SEEN_SUBJECTS, UNSEEN_SUBJECTS, Clip, clips
 from facediff.puppet.prosody import analyse
@@ -29,6 +29,7 @@ from facediff.puppet.visemes import visemes_of
 
 FORMAT = 1
 GENERATOR = "1.0"
+_CORPUS = "facediff-puppet"
 _SAMPLES_PER_FRAME = SAMPLE_RATE // FRAME_RATE
 _QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
 _PEAK = 0.6
@@ -135,7 +136,7 @@ def regions() -> dict[str, NDArray[np.int64]]:
 
 def _facts(seed: int, count: int) -> dict[str, int | str]:
     return {
-        "corpus": "facediff-puppet",
+        "corpus": _CORPUS,
         "format": FORMAT,
         "generator": GENERATOR,
         "seed": seed,
@@ -160,7 +161,7 @@ def _refuse_foreign(root: Path) -> None:
         return
     if not root.is_dir():
         raise FaceDiffError(f"{root} is a file, but the built-in corpus needs a folder there: choose another place")
-    if any(root.iterdir()) and not (root / "manifest.json").is_file():
+    if any(root.iterdir()) and read_manifest(root).get("corpus") != _CORPUS:
         raise FaceDiffError(
             f"{root} is not empty and holds no manifest of the built-in corpus: remove it or choose another folder"
         )

@@ -110,6 +110,15 @@ def write_manifest(folder: Path, facts: dict[str, Any]) -> None:
     (folder / "manifest.json").write_text(text + "\n", encoding="utf-8")
 
 
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """A folder's manifest; empty if there is none that can be read."""
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return manifest if isinstance(manifest, dict) else {}
+
+
 def matches_manifest(folder: Path, facts: dict[str, Any]) -> bool:
     """Say whether a folder has a manifest with these facts and all its files in their sizes.
 
@@ -120,8 +129,8 @@ def matches_manifest(folder: Path, facts: dict[str, Any]) -> bool:
     Returns:
         False as well if the manifest is missing or cannot be read.
     """
+    manifest = read_manifest(folder)
     try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
         if any(manifest.get(key) != value for key, value in facts.items()):
             return False
         return all((folder / name).stat().st_size == file["bytes"] for name, file in manifest["files"].items())

@@ -90,13 +90,13 @@ class SpeechAnimator(LightningModule, ABC):
 
     @abstractmethod
     def generate(
-        self, batch: Batch, *, generator: torch.Generator | None = None, progress: Progress | None = None
+        self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Motion for the batch's speech, identity and reference; its true motion is not looked at.
 
         Args:
             batch: clips; ``motion`` gives the number of frames only.
-            generator: source of the noise.
+            seed: seed of the noise; a clip's noise depends on it and on the clip's name, not on the clips beside it.
             progress: wraps the iteration over steps, e.g. in a progress bar.
         """
 
@@ -158,7 +158,9 @@ class SpeechAnimator(LightningModule, ABC):
             scale = data.motion_scale()
         self.adopt(data.assets().with_motion_scale(scale))
         if stage != "predict":
-            self.evaluation.prepare(self.assets, ["val"] if stage in ("fit", "validate") else data.test_splits)
+            self.evaluation.prepare(
+                self.assets, ["val"] if stage in ("fit", "validate") else data.test_splits, self.device
+            )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the assets, so that the checkpoint animates without the corpus."""
@@ -204,10 +206,10 @@ class SpeechAnimator(LightningModule, ABC):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss with fixed draws and the protocol's metrics of sampled motion, so that epochs compare."""
-        losses = self.losses(batch, self._generator(batch_idx))
+        losses = self.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=len(batch), sync_dist=True)
-        self.evaluation.update("val", "model", self.generate(batch, generator=self._generator(batch_idx)), batch)
+        self.evaluation.update("val", "model", self.generate(batch, seed=0), batch)
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics as ``val/mve`` …."""
@@ -217,11 +219,11 @@ class SpeechAnimator(LightningModule, ABC):
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Score sampled motion, a still face, and the model's motion for another sentence's speech."""
         split = self.evaluation.splits[dataloader_idx]
-        self.evaluation.update(split, "model", self.generate(batch, generator=self._generator(batch_idx)), batch)
+        self.evaluation.update(split, "model", self.generate(batch, seed=0), batch)
         self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
         if batch.decoy_audio is not None:
             decoy = replace(batch, audio=batch.decoy_audio)
-            shuffled = self.generate(decoy, generator=self._generator(batch_idx))
+            shuffled = self.generate(decoy, seed=0)
             self.evaluation.update(split, "shuffled", shuffled, batch)
 
     def on_test_epoch_end(self) -> None:
@@ -231,16 +233,13 @@ class SpeechAnimator(LightningModule, ABC):
 
     def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> list[Prediction]:
         """Absolute vertices of every clip of the batch."""
-        motion = self.generate(batch, generator=self._generator(batch_idx))
+        motion = self.generate(batch, seed=0)
         vertices = motion + batch.template[:, None]
         names = [self.identities[i] if i >= 0 else "unknown" for i in batch.identity.tolist()]
         return [
             Prediction(name, names[i], batch.reference_names[i], vertices[i, : int(batch.frame_lengths[i])].cpu())
             for i, name in enumerate(batch.names)
         ]
-
-    def _generator(self, seed: int) -> torch.Generator:
-        return torch.Generator(self.device).manual_seed(seed)
 
     # -- animation
 
@@ -291,7 +290,7 @@ class SpeechAnimator(LightningModule, ABC):
             reference_name=style.clip,
         )
         batch = collate([sample]).to(self.device)
-        motion = self.generate(batch, generator=self._generator(seed), progress=progress)
+        motion = self.generate(batch, seed=seed, progress=progress)
         identity = subject if sample.identity >= 0 else "unknown"
         return Prediction(sample.name, identity, style.clip, (motion + batch.template[:, None])[0].cpu())
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import nn
 
 from facediff.data.assets import ASSETS_KEY
+from facediff.diffusion.samplers import Sampler
 from facediff.errors import FaceDiffError
+from facediff.registry import KINDS
 
 if TYPE_CHECKING:
     from facediff.systems.base import SpeechAnimator
@@ -35,15 +39,56 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             f"{path}: a checkpoint, but not of facediff: it lacks the templates and sizes that animation needs; "
             f"expected a .ckpt file that `facediff fit` has written"
         )
+    check_class_paths(path, checkpoint.get("hyper_parameters", {}))
     return checkpoint
 
 
-def load_system(path: Path | str, map_location: str = "cpu") -> SpeechAnimator:
+def check_class_paths(path: Path, hparams: dict[str, Any]) -> None:
+    """Refuse hyper-parameters that name anything but components.
+
+    Whatever class path stands in a checkpoint would be imported and called when the system is rebuilt.
+
+    Raises:
+        FaceDiffError: if a class path is neither a registered component's nor that of an imported module class, or
+            stands where no component belongs.
+    """
+    for key, value in hparams.items():
+        if key in KINDS and isinstance(value, dict):
+            named = str(value.get("class_path"))
+            if not is_component(key, named):
+                raise FaceDiffError(
+                    f'{path}: its {key} is "{named}", which is no known component; it was not loaded. If you trust the '
+                    f"file, install or import the package that the component comes from"
+                )
+            value = value.get("init_args", {})
+        if names_a_class(value):
+            raise FaceDiffError(
+                f"{path}: its hyper-parameter {key} names a class where none belongs; it was not loaded"
+            )
+
+
+def is_component(kind: str, path: str) -> bool:
+    """Whether an import path is a registered component's, or that of a class of modules that is imported already."""
+    module, _, name = path.rpartition(".")
+    if module == f"facediff.registry.{kind}":
+        return name in KINDS[kind].names()
+    found = getattr(sys.modules.get(module), name, None)
+    return isinstance(found, type) and issubclass(found, nn.Module | Sampler)
+
+
+def names_a_class(value: object) -> bool:
+    """Whether plain data holds a class path at any depth."""
+    if isinstance(value, dict):
+        return "class_path" in value or any(names_a_class(item) for item in value.values())
+    return isinstance(value, list) and any(names_a_class(item) for item in value)
+
+
+def load_system(path: Path | str, device: str = "cpu") -> SpeechAnimator:
     """A trained system, ready to animate.
 
     Args:
         path: a checkpoint of any system.
-        map_location: device to load it to.
+        device: where it shall compute.
 
     Raises:
         FaceDiffError: as :func:`read_checkpoint`, or if the system or one of its components is not installed.
@@ -51,7 +96,8 @@ def load_system(path: Path | str, map_location: str = "cpu") -> SpeechAnimator:
     checkpoint = read_checkpoint(Path(path))
     name = str(checkpoint["hyper_parameters"].get("_class_path"))
     try:
-        system = system_class(name).load_from_checkpoint(path, map_location=map_location, weights_only=True)
+        # Assets stay on the CPU, where pictures and files are made of them.
+        system = system_class(name).load_from_checkpoint(path, map_location="cpu", weights_only=True)
     except FaceDiffError:
         raise
     except (Exception, SystemExit) as error:
@@ -60,7 +106,7 @@ def load_system(path: Path | str, map_location: str = "cpu") -> SpeechAnimator:
         raise FaceDiffError(
             f"{path}: cannot be rebuilt as {name} ({reason}); install the packages its components come from"
         ) from error
-    return system.eval()
+    return system.eval().to(device)
 
 
 def system_class(path: str) -> type[SpeechAnimator]:

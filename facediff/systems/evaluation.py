@@ -29,8 +29,8 @@ class Evaluation:
         self.splits: list[str] = []
         self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}
 
-    def prepare(self, assets: Assets, splits: Sequence[str]) -> None:
-        """Make empty metrics for a corpus's regions."""
+    def prepare(self, assets: Assets, splits: Sequence[str], device: torch.device) -> None:
+        """Make empty metrics for a corpus's regions, on the device where processes reduce them."""
         regions = {
             name: Region.from_indices(f"{assets.corpus}/{name}", indices, n_vertices=assets.n_vertices)
             for name, indices in assets.regions.items()
@@ -38,7 +38,9 @@ class Evaluation:
         self.splits = list(splits)
         methods = METHODS if self.splits != ["val"] else METHODS[:1]
         self.metrics = {
-            split: {method: self.protocol.build(regions["lips"], regions["upper_face"]) for method in methods}
+            split: {
+                method: self.protocol.build(regions["lips"], regions["upper_face"]).to(device) for method in methods
+            }
             for split in self.splits
         }
 
@@ -47,13 +49,13 @@ class Evaluation:
         metrics = self.metrics[split][method].to(motion.device)
         metrics.update(motion, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
 
-    def scalars(self, split: str) -> dict[str, Tensor]:
+    def scalars(self, split: str) -> dict[str, float]:
         """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics."""
-        found: dict[str, Tensor] = {}
+        found: dict[str, float] = {}
         for row in self.rows(split):
             for name in map(str, self.metrics[split]["model"]):
                 prefix = split if row["method"] == "model" else f"{split}/{row['method']}"
-                found[f"{prefix}/{name}"] = torch.tensor(row[name])
+                found[f"{prefix}/{name}"] = row[name]
         for metrics in self.metrics[split].values():
             metrics.reset()
         return found

@@ -30,7 +30,7 @@ def test_audio_spans_exactly_the_motion(tiny: Tiny) -> None:
 
 def test_a_window_cuts_speech_and_motion_together(tiny_root: Path) -> None:
     data = Tiny(root=str(tiny_root), window=5)
-    dataset = data.dataset("train")
+    dataset = data.dataset("train", training=True)
     starts = set()
     for _ in range(20):
         sample = dataset[0]
@@ -45,7 +45,7 @@ def test_a_window_cuts_speech_and_motion_together(tiny_root: Path) -> None:
 
 @pytest.mark.parametrize("split", ["train", "val", "test_a", "test_b"])
 def test_the_reference_is_never_the_clip_it_predicts_nor_an_evaluated_one(tiny: Tiny, split: str) -> None:
-    dataset = tiny.dataset(split)
+    dataset = tiny.dataset(split, training=split == "train")
     evaluated = {clip.name for s in ("val", "test_a", "test_b") for clip in tiny.clips(s)}
     for _ in range(5):
         for sample in dataset:
@@ -63,8 +63,8 @@ def test_the_reference_shares_the_targets_mood(tiny: Tiny) -> None:
 
 def test_self_reference_is_for_training_only(tiny_root: Path) -> None:
     data = Tiny(root=str(tiny_root), reference="self")
-    assert all(sample.reference_name == sample.name for sample in data.dataset("train"))
-    assert all(sample.reference_name != sample.name for sample in data.dataset("val"))
+    assert all(sample.reference_name == sample.name for sample in data.dataset("train", training=True))
+    assert all(sample.reference_name != sample.name for sample in data.dataset("train"))
 
 
 def test_evaluation_samples_do_not_change(tiny: Tiny) -> None:

@@ -174,3 +174,16 @@ def test_dpm_solver_of_first_order_is_ddim() -> None:
         for name, options in (("ddim", {}), ("dpm_solver", {"order": 1}))
     ]
     torch.testing.assert_close(*ends, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", registry.sampler.names())
+@pytest.mark.parametrize("steps", [1, 7, 61, 103, 121, 122, 201, 206, 217, 999, 1000])
+def test_every_number_of_steps_visits_as_many_places_downwards(name: str, steps: int) -> None:
+    # 61, 103, 121 … are numbers for which the library's own spacing has one step too many, the last at -1.
+    places = [
+        int(t) for t in registry.sampler.get(name)(process=NoiseProcess(1000), steps=steps).make_scheduler().timesteps
+    ]
+    assert len(places) == steps
+    assert places[0] == 999
+    assert places[-1] >= 0
+    assert places == sorted(set(places), reverse=True)

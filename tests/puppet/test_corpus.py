@@ -185,3 +185,11 @@ def test_importing_is_cheap() -> None:
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == [str(puppet.N_VERTICES)]
+
+
+def test_somebody_elses_folder_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "manifest.json").write_text('{"name": "my browser extension"}')
+    with pytest.raises(FaceDiffError, match="holds no manifest of the built-in corpus"):
+        generate(tmp_path / "mine", only=["F1_e01"], progress=False)
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["manifest.json"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -11,10 +12,13 @@ import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
+import yaml
 from lightning.pytorch.callbacks import EMAWeightAveraging
 
 from facediff import registry
 from facediff.callbacks import PredictionWriter, ScoreTable
+from facediff.cli import main
+from facediff.data import Puppet, collate
 from facediff.errors import FaceDiffError
 from facediff.systems import DualPathDiffusion, SpeechAnimator, load_system
 from tests.fakes.tiny import Tiny
@@ -137,6 +141,10 @@ def test_mixed_precision_trains_with_clipped_gradients(
     system = make_system()
     before = system.network.unembed.weight.detach().clone()
     make_trainer(precision="bf16-mixed", gradient_clip_val=1.0).fit(system, datamodule=tiny)
+    batch = collate([tiny.dataset("val")[0]])
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        noisy = torch.randn(batch.motion.flatten(2).shape)
+        assert system.network(noisy, torch.tensor([3]), system._conditions(batch)).dtype == torch.float32
     after = system.network.unembed.weight
     assert after.dtype == torch.float32
     assert torch.isfinite(after).all()
@@ -172,6 +180,79 @@ def test_a_checkpoint_of_another_system_class_is_refused(tmp_path: Path, trained
     torch.save(checkpoint, tmp_path / "evil.ckpt")
     with pytest.raises(FaceDiffError, match=r'the system "os\.system", which is not imported'):
         load_system(tmp_path / "evil.ckpt")
+
+
+@pytest.mark.parametrize(
+    "named",
+    ["os.system", "subprocess.Popen", "facediff.registry.decoder.nothing", "facediff.registry.fusion.add", "this"],
+)
+def test_a_checkpoint_that_names_a_program_does_not_run_it(tmp_path: Path, trained: Path, named: str) -> None:
+    checkpoint = torch.load(trained, weights_only=True)
+    harm = {
+        "class_path": named,
+        "init_args": {"command": f"touch {tmp_path}/harm", "args": ["touch", f"{tmp_path}/harm"]},
+    }
+    for place in ("decoder", "dim"):
+        hostile = {**checkpoint, "hyper_parameters": {**checkpoint["hyper_parameters"], place: harm}}
+        torch.save(hostile, tmp_path / "hostile.ckpt")
+        with pytest.raises(FaceDiffError, match="it was not loaded"):
+            load_system(tmp_path / "hostile.ckpt")
+    nested = {"class_path": "facediff.registry.decoder.gru", "init_args": {"num_layers": harm}}
+    checkpoint["hyper_parameters"]["decoder"] = nested
+    torch.save(checkpoint, tmp_path / "hostile.ckpt")
+    assert main(["test", "--ckpt_path", str(tmp_path / "hostile.ckpt")]) == 2
+    assert not (tmp_path / "harm").exists()
+
+
+def test_a_data_module_named_by_a_checkpoint_is_not_imported(tmp_path: Path, trained: Path) -> None:
+    checkpoint = torch.load(trained, weights_only=True)
+    checkpoint["facediff_data"] = {"class_path": "this.Zen", "root": "/"}
+    torch.save(checkpoint, tmp_path / "hostile.ckpt")
+    assert main(["test", "--ckpt_path", str(tmp_path / "hostile.ckpt")]) == 2
+    assert "this" not in sys.modules
+
+
+def test_an_interruption_leaves_the_best_checkpoint_alone(
+    make_system: Make, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
+) -> None:
+    from lightning.pytorch.callbacks import ModelCheckpoint
+
+    shipped = yaml.safe_load((Path(__file__).parents[2] / "configs/trainer/cpu.yaml").read_text())["callbacks"]
+    keepers = [
+        ModelCheckpoint(dirpath=tmp_path, **callback["init_args"])
+        for callback in shipped
+        if callback["class_path"].endswith("ModelCheckpoint")
+    ]
+    seen: list[bytes] = []
+
+    class Interrupted(DualPathDiffusion):
+        def training_step(self, batch: object, batch_idx: int) -> torch.Tensor:
+            if self.current_epoch == 1 and batch_idx == 1:
+                seen.append((tmp_path / "best.ckpt").read_bytes())
+                raise RuntimeError("pulled the plug")
+            return super().training_step(batch, batch_idx)  # type: ignore[arg-type]
+
+    system = make_system()
+    system.__class__ = Interrupted
+    with pytest.raises(RuntimeError, match="pulled the plug"):
+        make_trainer(max_epochs=3, callbacks=keepers, enable_checkpointing=True).fit(system, datamodule=tiny)
+    assert seen == [(tmp_path / "best.ckpt").read_bytes()]
+    assert (tmp_path / "interrupted.ckpt").exists()
+
+
+def test_scores_do_not_depend_on_the_batch_size(trained: Path, tiny_root: Path, make_trainer: MakeTrainer) -> None:
+    system = load_system(trained)
+    scores = [
+        make_trainer().test(system, datamodule=Tiny(root=str(tiny_root), batch_size=size), verbose=False)[0]
+        for size in (1, 4)
+    ]
+    assert scores[0] == pytest.approx(scores[1], rel=1e-4)
+
+
+def test_a_corpus_folder_given_as_a_path_object_is_kept_as_text(tmp_path: Path) -> None:
+    data = Puppet(root=tmp_path)  # type: ignore[arg-type]
+    torch.save(dict(data.hparams), tmp_path / "h.pt")
+    assert torch.load(tmp_path / "h.pt", weights_only=True)["root"] == str(tmp_path)
 
 
 def test_the_corpus_must_fit_the_checkpoint(trained: Path, tiny_root: Path, make_trainer: MakeTrainer) -> None:

@@ -122,7 +122,7 @@ def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
     logging.disable_progress_bar()
     try:
         model, info = HubertModel.from_pretrained(
-            os.path.expanduser(source), use_safetensors=None, output_loading_info=True
+            os.path.expanduser(source), use_safetensors=None, output_loading_info=True, dtype=torch.float32
         )
     except Exception as error:  # a broken file makes safetensors, pickle and transformers raise anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -140,4 +140,5 @@ def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
             f'audio_encoder.source: "{source}" holds no complete HuBERT ({len(missing)} weights are missing, '
             f"the first is {missing[0]}); its config.json and model.safetensors must belong together"
         )
-    return model
+    # from_pretrained leaves evaluation mode on, and Lightning trains modules in the mode that it finds them in.
+    return model.train()

@@ -37,6 +37,11 @@ class Sampler(ABC):
         self.process = process
         self.steps = steps
 
+    def places(self) -> list[int]:
+        """The steps visited, counted from 0: evenly spread, from the process's last (pure noise) downwards."""
+        total = self.process.steps
+        return [round(total * (self.steps - i) / self.steps) - 1 for i in range(self.steps)]
+
     @abstractmethod
     def make_scheduler(self) -> Any:  # noqa: ANN401 - diffusers' schedulers share no typed base class
         """A fresh scheduler of diffusers with its timesteps set."""

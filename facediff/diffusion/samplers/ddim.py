@@ -22,11 +22,10 @@ class DdimScheduler:
 
     Args:
         process: the noise process.
-        steps: denoising steps, spread evenly; the first is the process's last, so that it sees pure noise.
+        places: the steps visited, descending; the first is the process's last, so that it sees pure noise.
     """
 
-    def __init__(self, process: NoiseProcess, steps: int) -> None:
-        places = [round(process.steps * (steps - i) / steps) - 1 for i in range(steps)]
+    def __init__(self, process: NoiseProcess, places: list[int]) -> None:
         signal = [float(process.signal[place]) for place in places]
         self.timesteps = torch.tensor(places)
         self._signal = dict(zip(places, zip(signal, [*signal[1:], 1.0], strict=True), strict=True))
@@ -74,7 +73,7 @@ class DdimSampler(Sampler):
 
     def make_scheduler(self) -> Any:  # noqa: ANN401
         """Even spacing from the process's last step to the clean end."""
-        return DdimScheduler(self.process, self.steps)
+        return DdimScheduler(self.process, self.places())
 
     def step_options(self) -> dict[str, Any]:
         """The noise share."""

@@ -31,7 +31,7 @@ class DdpmSampler(Sampler):
             **self.process.scheduler_config(),
             variance_type="fixed_small",
             clip_sample=False,
-            timestep_spacing="trailing",
         )
-        scheduler.set_timesteps(self.steps)
+        # Given by hand: the library's own spacing has one step too many for some numbers of steps, by rounding.
+        scheduler.set_timesteps(timesteps=self.places())
         return scheduler

@@ -37,8 +37,8 @@ class DpmSolverSampler(Sampler):
             **self.process.scheduler_config(),
             algorithm_type="dpmsolver++",
             solver_order=self.order,
-            timestep_spacing="trailing",
             final_sigmas_type="zero",
         )
-        scheduler.set_timesteps(self.steps)
+        # Given by hand: the library's own spacing has one step too many for some numbers of steps, by rounding.
+        scheduler.set_timesteps(timesteps=self.places())
         return scheduler

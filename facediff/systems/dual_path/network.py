@@ -157,7 +157,10 @@ class DualPathNetwork(nn.Module):
         conditions: Conditions,
     ) -> Float[Tensor, "batch frames coordinates"]:
         """Predict the clean scaled motion M̂⁰ from Mⁿ."""
-        return self.unembed(self.core(self.embed(noisy), step, conditions))
+        hidden = self.core(self.embed(noisy), step, conditions)
+        # In mixed precision the last map stays in float32: differences over time of half-precision motion are noise.
+        with torch.autocast(hidden.device.type, enabled=False):
+            return self.unembed(hidden.float())
 
     def core(
         self, motion: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions

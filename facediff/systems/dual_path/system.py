@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from typing import Literal
 
 import torch
@@ -151,7 +152,7 @@ class DualPathDiffusion(SpeechAnimator):
         """One draw of step and noise per clip (algorithm 1), then the four losses (eq. 15 to 19)."""
         clean = batch.motion.flatten(2) * self.scale
         noise = torch.randn(clean.shape, device=clean.device, generator=generator)
-        step = torch.randint(self.process.steps, (len(batch),), device=clean.device, generator=generator)
+        step = self.process.draw_steps(len(batch), clean.device, generator)
         noisy = self.process.add_noise(clean, noise, step)
         predicted = self.network(noisy, step, self._conditions(batch)).view(batch.motion.shape)
         truth, mask = clean.view(batch.motion.shape), batch.mask
@@ -180,12 +181,15 @@ class DualPathDiffusion(SpeechAnimator):
         )
 
     def generate(
-        self, batch: Batch, *, generator: torch.Generator | None = None, progress: Progress | None = None
+        self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
     ) -> Float[Tensor, "batch frames vertices 3"]:
-        """Algorithm 2 with the system's sampler; conditions are computed once."""
+        """Algorithm 2 with the system's sampler; conditions are computed once.
+
+        Each clip starts from noise of its own. What a stochastic sampler adds on the way is drawn for the whole batch.
+        """
         conditions = self._conditions(batch)
-        shape = batch.motion.flatten(2).shape
-        start = torch.randn(shape, device=batch.motion.device, generator=generator)
+        start = self._noise(batch, seed)
+        generator = torch.Generator(start.device).manual_seed(seed)
 
         def denoise(noisy: Tensor, step: int) -> Tensor:
             steps = torch.full((len(batch),), step, device=noisy.device)
@@ -193,3 +197,12 @@ class DualPathDiffusion(SpeechAnimator):
 
         motion = self.sampler.run(denoise, start, generator=generator, progress=progress) / self.scale
         return motion.view(batch.motion.shape)
+
+    def _noise(self, batch: Batch, seed: int) -> Float[Tensor, "batch frames coordinates"]:
+        """Unit Gaussian noise by seed and clip name, zero on padding."""
+        device = batch.motion.device
+        noise = torch.zeros(batch.motion.flatten(2).shape, device=device)
+        for i, (name, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
+            generator = torch.Generator(device).manual_seed(zlib.crc32(name.encode()) + seed)
+            noise[i, :frames] = torch.randn((frames, noise.shape[2]), device=device, generator=generator)
+        return noise
