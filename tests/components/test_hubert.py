@@ -173,3 +173,10 @@ def test_a_corrupt_directory_is_one_sentence(copy: Path, case: str) -> None:
     with pytest.raises(FaceDiffError, match="audio_encoder.source: .*copy") as caught:
         HubertEncoder(dim=8, source=str(copy))
     assert "\n" not in str(caught.value)
+
+
+def test_it_trains_in_training_mode_and_in_full_precision(hubert_source: Path) -> None:
+    # from_pretrained hands a model over in evaluation mode, and Lightning leaves modes as they are.
+    encoder = HubertEncoder(dim=8, source=str(hubert_source))
+    assert all(module.training for module in encoder.modules())
+    assert {p.dtype for p in encoder.parameters()} == {torch.float32}
