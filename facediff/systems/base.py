@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -19,6 +20,7 @@ from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
 from facediff.hparams import plain
 from facediff.systems.evaluation import Evaluation
+from facediff.systems.schedule import Schedule, lr_factor
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 
@@ -62,7 +64,7 @@ class SpeechAnimator(LightningModule, ABC):
         frame_rate: float,
         learning_rate: float,
         weight_decay: float,
-        lr_schedule: Literal["constant", "cosine"],
+        lr_schedule: Schedule,
         warmup_steps: int,
         protocol: str,
     ) -> None:
@@ -109,8 +111,6 @@ class SpeechAnimator(LightningModule, ABC):
                 **plain(arguments),
             }
         )
-
-    # -- assets and checkpoints
 
     @property
     def assets(self) -> Assets:
@@ -173,26 +173,19 @@ class SpeechAnimator(LightningModule, ABC):
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
             self._data_source = checkpoint.get(DATA_SOURCE_KEY, {})
 
-    # -- optimisation
-
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW on everything trainable, with the learning-rate schedule per optimiser step."""
         parameters = [p for p in self.parameters() if p.requires_grad]
-        # Fused: one pass over all parameters instead of one operation after another for each. Lightning cannot clip
-        # the gradients of a fused optimiser in mixed precision.
+        # Fused: one pass over all parameters instead of several operations for each. Lightning cannot clip the
+        # gradients of a fused optimiser in mixed precision.
         fused = not str(self.trainer.precision).endswith("mixed")
         optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=fused)
         if self.lr_schedule == "constant" and not self.warmup_steps:
             return optimizer
         total = int(self.trainer.estimated_stepping_batches)
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self._lr_factor(step, total))
+        factor = partial(lr_factor, total=total, warmup_steps=self.warmup_steps, schedule=self.lr_schedule)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
-
-    def _lr_factor(self, step: int, total: int) -> float:
-        warm = min(1.0, (step + 1) / max(1, self.warmup_steps))
-        if self.lr_schedule == "constant":
-            return warm
-        return warm * 0.5 * (1.0 + float(torch.cos(torch.tensor(torch.pi * min(1.0, step / max(1, total))))))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted loss; every term is logged as ``train/<term>``."""
@@ -201,8 +194,6 @@ class SpeechAnimator(LightningModule, ABC):
         self.log_dict(logged, batch_size=len(batch), prog_bar=False)
         self.log("loss", losses["loss"].detach(), batch_size=len(batch), prog_bar=True, logger=False)
         return losses["loss"]
-
-    # -- evaluation
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss with fixed draws and the protocol's metrics of sampled motion, so that epochs compare."""
@@ -240,8 +231,6 @@ class SpeechAnimator(LightningModule, ABC):
             Prediction(name, names[i], batch.reference_names[i], vertices[i, : int(batch.frame_lengths[i])].cpu())
             for i, name in enumerate(batch.names)
         ]
-
-    # -- animation
 
     @torch.inference_mode()
     def animate(
