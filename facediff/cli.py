@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import facediff
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, choices
 
 
 @dataclass(frozen=True)
@@ -71,9 +70,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 0
     name, rest = words[0], words[1:]
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f'did you mean "{near[0]}"? ' if near else ""
-        return fail(f'there is no command "{name}": {hint}known are {", ".join(COMMANDS)}')
+        return fail(f'there is no command "{name}": {choices(name, COMMANDS)}')
     try:
         status: int = importlib.import_module(COMMANDS[name].module).run(name, rest)
     except FaceDiffError as error:

@@ -1,5 +1,16 @@
 """The one error that facediff shows to people as a plain sentence instead of a traceback."""
 
+import difflib
+from collections.abc import Iterable
+
+
+def choices(name: str, known: Iterable[str]) -> str:
+    """What follows "there is no …": the nearest of the known names, then all of them."""
+    names = list(known)
+    near = difflib.get_close_matches(name, names, n=1)
+    hint = f'did you mean "{near[0]}"? ' if near else ""
+    return f"{hint}known are {', '.join(names)}"
+
 
 class FaceDiffError(Exception):
     """Something that the user can put right: a file, an argument or an installation.

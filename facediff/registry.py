@@ -14,7 +14,6 @@ This module depends on the standard library only.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import inspect
 import keyword
@@ -26,7 +25,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, choices
 
 T = TypeVar("T", bound=type)
 
@@ -160,10 +159,7 @@ class Kind:
 
     def unknown(self, name: str) -> str:
         """The sentence for a name that does not exist: the nearest one, then all."""
-        known = self.names()
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f'did you mean "{near[0]}"? ' if near else ""
-        return f'there is no {self.kind} "{name}": {hint}known are {", ".join(known)}'
+        return f'there is no {self.kind} "{name}": {choices(name, self.names())}'
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401
         """Make ``facediff.registry.<kind>.<name>`` importable and picklable."""

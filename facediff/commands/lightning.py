@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import netrc
 import os
 import re
@@ -20,7 +19,7 @@ from facediff import registry
 from facediff.callbacks import PredictionWriter, ScoreTable
 from facediff.commands.words import LINKS, rewrite
 from facediff.data import SpeechMotionDataModule
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, choices
 from facediff.systems import SpeechAnimator
 
 TIP = (
@@ -64,9 +63,7 @@ def explain(message: str) -> str:
             return f"{registry.KINDS[kind].unknown(name)}\n\n{message}"
         if kind in ("model", "data"):
             known = subclasses(SpeechAnimator if kind == "model" else SpeechMotionDataModule)
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f'did you mean "{near[0]}"? ' if near else ""
-            return f'there is no {kind} "{name}": {hint}known are {", ".join(known)}\n\n{message}'
+            return f'there is no {kind} "{name}": {choices(name, known)}\n\n{message}'
     return message
 
 

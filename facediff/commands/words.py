@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import json
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from facediff.data.assets import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
 from facediff.hparams import plain
 from facediff.shipped import config_dir
-from facediff.systems.checkpoint import read_checkpoint
+from facediff.systems.checkpoint import is_imported, read_checkpoint
 
 LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a system that the data module knows."""
@@ -109,9 +108,7 @@ def data_of(path: Path, checkpoint: dict[str, Any]) -> dict[str, Any]:
     """
     source = checkpoint.get(DATA_SOURCE_KEY, {})
     named = str(source.get("class_path"))
-    module, _, name = named.rpartition(".")
-    found = getattr(sys.modules.get(module), name, None)
-    if not (isinstance(found, type) and issubclass(found, SpeechMotionDataModule)):
+    if not is_imported(named, SpeechMotionDataModule):
         raise FaceDiffError(
             f"{path}: was trained on the data module {named}, which facediff does not know by itself; "
             f"if you trust it, add --data={named}"

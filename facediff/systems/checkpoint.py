@@ -72,8 +72,14 @@ def is_component(kind: str, path: str) -> bool:
     module, _, name = path.rpartition(".")
     if module == f"facediff.registry.{kind}":
         return name in KINDS[kind].names()
+    return is_imported(path, nn.Module) or is_imported(path, Sampler)
+
+
+def is_imported(path: str, base: type) -> bool:
+    """Whether an import path is that of a subclass of ``base``; a module that is not imported yet stays so."""
+    module, _, name = path.rpartition(".")
     found = getattr(sys.modules.get(module), name, None)
-    return isinstance(found, type) and issubclass(found, nn.Module | Sampler)
+    return isinstance(found, type) and issubclass(found, base)
 
 
 def names_a_class(value: object) -> bool:

@@ -8,6 +8,8 @@ from typing import Protocol
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from facediff.components.layers import frame_mask
+
 SAMPLE_RATE = 16_000
 
 
@@ -48,8 +50,6 @@ def standardise(
     audio: Float[Tensor, "batch samples"], lengths: Int[Tensor, " batch"]
 ) -> Float[Tensor, "batch samples"]:
     """Zero mean and unit variance over each clip's valid samples, zero on padding, as HuBERT's processor does."""
-    from facediff.components.layers import frame_mask
-
     mask = frame_mask(lengths, audio.shape[1])
     count = lengths[:, None].to(audio.dtype)
     mean = (audio * mask).sum(1, keepdim=True) / count

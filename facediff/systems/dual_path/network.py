@@ -14,6 +14,7 @@ from facediff.components.audio_encoder import AudioEncoder
 from facediff.components.decoder import Decoder
 from facediff.components.fusion import Fusion
 from facediff.components.identity_encoder import IdentityEncoder
+from facediff.components.layers import frame_mask
 from facediff.components.style_encoder import StyleEncoder
 
 TokenForm = Literal["levels", "single"]
@@ -146,8 +147,7 @@ class DualPathNetwork(nn.Module):
         style_parts = [self.identity_encoder(identity)]
         if self.embed_reference is not None:
             style_parts.append(self.style_encoder(self.embed_reference(reference), reference_mask))
-        frames = torch.arange(features.shape[1], device=features.device)
-        mask = frames < frame_lengths[:, None]
+        mask = frame_mask(frame_lengths, features.shape[1])
         return Conditions(features, self.style_tokens(torch.cat(style_parts, dim=-1)), mask)
 
     def forward(
