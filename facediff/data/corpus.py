@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from facediff.data.audio import fit_length, read_speech, samples_for
-from facediff.data.pickles import load_pickle
+from facediff.pickles import load_pickle
 from facediff.errors import FaceDiffError
 from facediff.metrics import Region
 from facediff.topology.mesh import Mesh, read_mesh
