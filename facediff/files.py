@@ -10,6 +10,11 @@ from pathlib import Path
 from facediff.errors import FaceDiffError
 
 
+def cache_dir() -> Path:
+    """Where things are kept that can be made anew: ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
+    return Path(os.environ.get("FACEDIFF_CACHE") or Path.home() / ".cache" / "facediff")
+
+
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """A temporary sibling to write to, renamed to ``path`` at the end; removed if anything fails.

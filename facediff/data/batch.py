@@ -33,6 +33,7 @@ class Sample:
         sentence: which sentence is spoken.
         reference_name: the clip that the reference was taken from.
         decoy_audio: speech of another sentence, as long as ``audio``; only for evaluation against shuffled audio.
+        features: what the frozen part of the audio encoder makes of the clip's speech; None where it is not cached.
     """
 
     audio: Float[Tensor, " samples"]
@@ -45,6 +46,7 @@ class Sample:
     sentence: str
     reference_name: str
     decoy_audio: Float[Tensor, " samples"] | None = None
+    features: Float[Tensor, "steps channels"] | None = None
 
 
 @dataclass
@@ -65,6 +67,8 @@ class Batch:
         sentences: which sentences.
         reference_names: the clips that the references were taken from.
         decoy_audio: padded speech of other sentences, with the lengths of ``audio``; evaluation only.
+        features: padded features of the frozen part of the audio encoder; None unless all clips have them.
+        feature_lengths: valid steps of the features.
     """
 
     audio: Float[Tensor, "batch samples"]
@@ -80,6 +84,8 @@ class Batch:
     sentences: list[str]
     reference_names: list[str]
     decoy_audio: Float[Tensor, "batch samples"] | None = None
+    features: Float[Tensor, "batch steps channels"] | None = None
+    feature_lengths: Int[Tensor, " batch"] | None = None
 
     @property
     def mask(self) -> Bool[Tensor, "batch frames"]:
@@ -122,6 +128,8 @@ def clips_in(batch: Batch) -> int:
 def collate(samples: Sequence[Sample]) -> Batch:
     """Pad samples to a batch."""
     decoys = [s.decoy_audio for s in samples if s.decoy_audio is not None]
+    features = [s.features for s in samples if s.features is not None]
+    cached = len(features) == len(samples)
     return Batch(
         audio=pad_sequence([s.audio for s in samples], batch_first=True),
         audio_lengths=torch.tensor([len(s.audio) for s in samples]),
@@ -136,4 +144,6 @@ def collate(samples: Sequence[Sample]) -> Batch:
         sentences=[s.sentence for s in samples],
         reference_names=[s.reference_name for s in samples],
         decoy_audio=pad_sequence(decoys, batch_first=True) if len(decoys) == len(samples) else None,
+        features=pad_sequence(features, batch_first=True) if cached else None,
+        feature_lengths=torch.tensor([len(f) for f in features]) if cached else None,
     )

@@ -1,26 +1,38 @@
 """A corpus on disk in the layout that circulates in the field.
 
 ``wav/<clip>.wav``, ``vertices_npy/<clip>.npy`` with (T, 3V) absolute vertices, ``templates.pkl``, ``regions/*.txt``,
-a mesh file with the faces, and optionally ``clips.csv`` with further columns per clip.
+a mesh file with the faces, and optionally ``clips.csv`` with further columns per clip and ``manifest.json``.
 """
 
 from __future__ import annotations
 
 import csv
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from facediff.data.audio import fit_length, read_speech, samples_for
-from facediff.pickles import load_pickle
+from facediff.data.audio import read_stretch, samples_for
+from facediff.data.regions import find_region
+from facediff.data.store import ArrayStore
 from facediff.errors import FaceDiffError
+from facediff.files import cache_dir
 from facediff.metrics import Region
+from facediff.pickles import load_pickle
 from facediff.topology.mesh import Mesh, read_mesh
+
+MOTION_FOLDERS = ("vertices_npy", "vertex")
+"""Where projects keep absolute vertices; the second is ProbTalk3D's."""
+
+CHUNK = 8
+"""Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
 
 
 @dataclass(frozen=True)
@@ -28,92 +40,143 @@ class Clip:
     """One recording.
 
     Attributes:
-        name: ``<subject>_<sentence>``.
-        subject: everything before the last underscore.
-        sentence: everything after it.
-        attributes: further columns of ``clips.csv``, e.g. the mood.
+        name: the name of its files.
+        subject: who speaks.
+        sentence: what is said; clips of equal sentence say the same words.
+        attributes: further columns of ``clips.csv``, or of the name, e.g. the mood.
+        root: the corpus folder that holds its files.
     """
 
     name: str
     subject: str
     sentence: str
     attributes: dict[str, str] = field(default_factory=dict, hash=False)
+    root: Path = field(default=Path(), repr=False, compare=False)
 
     @property
     def number(self) -> int:
-        """The sentence's number: the last two characters, as every project of the field has it."""
-        return int(self.sentence[-2:])
+        """The sentence's number: the last two characters, as every project of the field has it; −1 if it has none."""
+        return int(self.sentence[-2:]) if self.sentence[-2:].isdecimal() else -1
+
+
+NameParser = Callable[[str], Clip | None]
+"""Tells subject and sentence from a clip's name; None for a file that is no clip of the corpus."""
+
+
+def parse_name(name: str) -> Clip:
+    """``<subject>_<sentence>``, split at the last underscore."""
+    subject, _, sentence = name.rpartition("_")
+    return Clip(name, subject, sentence)
 
 
 class Corpus:
-    """Read access to one corpus folder. Motion is memory-mapped; nothing is kept in memory but the templates.
+    """Read access to a corpus folder. Motion is memory-mapped; nothing is kept in memory but the templates.
 
     Args:
         root: the folder.
         n_vertices: vertices of its meshes.
-        frame_rate: motion frames a second.
+        frame_rate: motion frames a second that are given out.
+        stored_frame_rate: motion frames a second on disk, a whole multiple of ``frame_rate``, of which every second
+            (third …) is taken; what ``manifest.json`` says goes before it.
+        parse: tells subject and sentence from a clip's name.
+        people: folders of further people with the same topology, as ``facediff data import-person`` writes them.
     """
 
-    def __init__(self, root: Path, n_vertices: int, frame_rate: float) -> None:
+    def __init__(
+        self,
+        root: Path,
+        n_vertices: int,
+        frame_rate: float,
+        *,
+        stored_frame_rate: float | None = None,
+        parse: NameParser = parse_name,
+        people: Sequence[Path] = (),
+    ) -> None:
         self.root = root
         self.n_vertices = n_vertices
         self.frame_rate = frame_rate
-        if not root.is_dir():
-            raise FaceDiffError(f"{root}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl")
+        self.parse = parse
+        self.people = list(people)
+        self.store = ArrayStore(cache_dir() / "speech")
+        for folder in (root, *people):
+            if not folder.is_dir():
+                raise FaceDiffError(
+                    f"{folder}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl"
+                )
+        stored = stored_frame_rate or frame_rate
+        self._strides = {folder: self._stride(folder, stored) for folder in (root, *people)}
+
+    def _stride(self, root: Path, default: float) -> int:
+        stored = float(read_manifest(root).get("frame_rate") or default)
+        stride = round(stored / self.frame_rate)
+        if stride < 1 or abs(stride * self.frame_rate - stored) > 1e-6:
+            raise FaceDiffError(
+                f"{root / 'manifest.json'}: frame_rate is {stored:g}, which is no whole multiple of the corpus's "
+                f"{self.frame_rate:g} frames a second; prepare the folder anew with that frame rate"
+            )
+        return stride
 
     @cached_property
     def clips(self) -> dict[str, Clip]:
-        """Every clip that has both speech and motion, by name, sorted."""
-        attributes = self._attributes()
-        names = sorted(path.stem for path in (self.root / "wav").glob("*.wav") if self.motion_path(path.stem).is_file())
-        if not names:
+        """Every clip that has both speech and motion, by name, sorted; people's own clips after the corpus's."""
+        clips = self._clips_of(self.root, self.parse)
+        if not clips:
             raise FaceDiffError(f"{self.root}: no clip found; expected wav/<clip>.wav beside vertices_npy/<clip>.npy")
-        clips = {}
-        for name in names:
-            subject, _, sentence = name.rpartition("_")
-            clips[name] = Clip(name, subject, sentence, attributes.get(name, {}))
+        for person in self.people:
+            more = self._clips_of(person, parse_name)
+            for name in more.keys() & clips.keys():
+                raise FaceDiffError(
+                    f"{person}: its clip {name} is also in {clips[name].root}; give the person a new name"
+                )
+            clips |= more
         return clips
 
-    def _attributes(self) -> dict[str, dict[str, str]]:
-        path = self.root / "clips.csv"
+    def _clips_of(self, root: Path, parse: NameParser) -> dict[str, Clip]:
+        rows = self._attributes(root)
+        clips = {}
+        for name in sorted(
+            path.stem for path in (root / "wav").glob("*.wav") if motion_path(root, path.stem).is_file()
+        ):
+            clip = parse(name)
+            if clip is not None:
+                clips[name] = Clip(name, clip.subject, clip.sentence, {**rows.get(name, {}), **clip.attributes}, root)
+        return clips
+
+    @staticmethod
+    def _attributes(root: Path) -> dict[str, dict[str, str]]:
+        path = root / "clips.csv"
         if not path.is_file():
             return {}
         with path.open(newline="", encoding="utf-8") as stream:
-            return {row.pop("clip"): row for row in csv.DictReader(stream)}
+            rows = list(csv.DictReader(stream))
+        if rows and "clip" not in rows[0]:
+            raise FaceDiffError(f"{path}: has no column clip; expected clip and further columns, one row a clip")
+        return {row.pop("clip"): row for row in rows}
 
     @cached_property
     def templates(self) -> dict[str, Tensor]:
         """Neutral face (V, 3) of every subject, float32."""
-        path = self.root / "templates.pkl"
-        loaded = load_pickle(path)
-        if not isinstance(loaded, dict):
-            raise FaceDiffError(f"{path}: expected a dict from subject to (V, 3) array, got {type(loaded).__name__}")
-        return {str(name): torch.from_numpy(self._vertices(path, name, value)) for name, value in loaded.items()}
+        templates: dict[str, Tensor] = {}
+        for root in (self.root, *self.people):
+            templates |= read_templates(root / "templates.pkl", self.n_vertices)
+        return templates
 
-    def _vertices(self, path: Path, name: str, value: object) -> npt.NDArray[np.float32]:
-        array = np.asarray(value, np.float32)
-        if array.size != self.n_vertices * 3:
+    def template(self, clip: Clip) -> Tensor:
+        """Neutral face (V, 3) of a clip's subject.
+
+        Raises:
+            FaceDiffError: if there is none.
+        """
+        if clip.subject not in self.templates:
             raise FaceDiffError(
-                f"{path}: the template of {name} has shape {array.shape}, expected ({self.n_vertices}, 3)"
+                f"{clip.root / 'templates.pkl'}: no template for {clip.subject}, needed by clip {clip.name}; "
+                f"it has {', '.join(sorted(self.templates))}"
             )
-        return array.reshape(-1, 3)
-
-    def motion_path(self, name: str) -> Path:
-        """Where a clip's vertices lie."""
-        return self.root / "vertices_npy" / f"{name}.npy"
+        return self.templates[clip.subject]
 
     def open_vertices(self, clip: Clip) -> npt.NDArray[np.floating]:
-        """A clip's absolute vertices (T, V, 3), memory-mapped."""
-        path = self.motion_path(clip.name)
-        try:
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, OSError, EOFError) as error:
-            raise FaceDiffError(f"{path}: not a readable NumPy array ({error}); expected (T, 3V) floats") from error
-        if array.ndim not in (2, 3) or array.size != len(array) * self.n_vertices * 3 or not len(array):
-            raise FaceDiffError(
-                f"{path}: has shape {array.shape}, expected (frames, {3 * self.n_vertices}) with at least one frame"
-            )
-        return array.reshape(len(array), self.n_vertices, 3)
+        """A clip's absolute vertices (T, V, 3) at the corpus's frame rate, memory-mapped."""
+        return open_vertices(motion_path(clip.root, clip.name), self.n_vertices)[:: self._strides[clip.root]]
 
     def frames(self, clip: Clip) -> int:
         """Number of motion frames of a clip."""
@@ -121,39 +184,44 @@ class Corpus:
 
     def read_motion(self, clip: Clip, start: int = 0, stop: int | None = None) -> Tensor:
         """Offsets from the template (T, V, 3), float32; only the frames asked for are read."""
-        if clip.subject not in self.templates:
-            raise FaceDiffError(
-                f"{self.root / 'templates.pkl'}: no template for {clip.subject}, needed by clip {clip.name}; "
-                f"it has {', '.join(sorted(self.templates))}"
-            )
-        window = np.array(self.open_vertices(clip)[start:stop], np.float32)
-        if not np.isfinite(window).all():
-            bad = start + int(np.argmax(~np.isfinite(window).all((1, 2))))
-            raise FaceDiffError(f"{self.motion_path(clip.name)}: frame {bad} holds NaN or infinity; remove the clip")
-        return torch.from_numpy(window) - self.templates[clip.subject]
+        template = self.template(clip).numpy()
+        stored = self.open_vertices(clip)[start:stop]
+        motion = np.empty(stored.shape, np.float32)
+        for first in range(0, len(stored), CHUNK):
+            chunk = motion[first : first + CHUNK]
+            np.copyto(chunk, stored[first : first + CHUNK], casting="same_kind")
+            if not np.isfinite(chunk.sum()):
+                bad = start + first + int(np.argmax(~np.isfinite(chunk).all((1, 2))))
+                raise FaceDiffError(
+                    f"{motion_path(clip.root, clip.name)}: frame {bad} holds NaN or infinity; remove the clip"
+                )
+            chunk -= template
+        return torch.from_numpy(motion)
 
     def read_audio(self, clip: Clip, start: int, stop: int) -> Tensor:
         """Speech that spans motion frames ``start`` to ``stop``, 16 kHz, filled with zeros past its end."""
-        audio = read_speech(self.root / "wav" / f"{clip.name}.wav")
         first = samples_for(start, self.frame_rate)
-        return torch.from_numpy(fit_length(audio[first:], samples_for(stop - start, self.frame_rate)))
+        length = samples_for(stop - start, self.frame_rate)
+        return torch.from_numpy(read_stretch(self.audio_path(clip), first, length, self.store))
 
-    def read_mesh(self, file: str) -> Mesh | None:
-        """The corpus's mesh file; None if there is no such file."""
-        path = self.root / file
-        if not path.is_file():
+    def audio_path(self, clip: Clip) -> Path:
+        """Where a clip's speech lies."""
+        return clip.root / "wav" / f"{clip.name}.wav"
+
+    def read_mesh(self, files: Sequence[str]) -> Mesh | None:
+        """The first mesh file that is there, in the folder itself or in ``templates/``; None if there is none."""
+        places = [folder / file for file in files for folder in (self.root, self.root / "templates")]
+        path = next((place for place in places if place.is_file()), None)
+        if path is None:
             return None
         mesh = read_mesh(path)
         if len(mesh.vertices) != self.n_vertices:
             raise FaceDiffError(f"{path}: has {len(mesh.vertices)} vertices, expected {self.n_vertices}")
         return mesh
 
-    def read_region(self, file: str, name: str) -> Region:
-        """A region file: vertex indices separated by "," or ", "."""
-        try:
-            return Region.from_file(self.root / "regions" / file, name=name, n_vertices=self.n_vertices)
-        except ValueError as error:
-            raise FaceDiffError(str(error)) from error
+    def read_region(self, sources: Sequence[str], name: str, help_text: str = "") -> Region:
+        """The first of several region sources that is there; see :func:`facediff.data.regions.find_region`."""
+        return find_region(self.root, sources, name, self.n_vertices, help_text)
 
     def read_pairs(self, file: str) -> Tensor | None:
         """Vertex pairs (P, 2), one ``upper, lower`` a line; None if there is no such file."""
@@ -168,3 +236,69 @@ class Corpus:
         if pairs.numel() == 0 or int(pairs.min()) < 0 or int(pairs.max()) >= self.n_vertices:
             raise FaceDiffError(f"{path}: expected pairs of vertex indices 0 to {self.n_vertices - 1}")
         return pairs
+
+
+def motion_path(root: Path, name: str) -> Path:
+    """Where a clip's vertices lie; the usual place if they are nowhere."""
+    paths = [root / folder / f"{name}.npy" for folder in MOTION_FOLDERS]
+    return next((path for path in paths if path.is_file()), paths[0])
+
+
+def open_vertices(path: Path, n_vertices: int) -> npt.NDArray[np.floating]:
+    """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3), memory-mapped.
+
+    Raises:
+        FaceDiffError: if the file is unreadable or of another shape.
+    """
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise FaceDiffError(f"{path}: not a readable NumPy array ({error}); expected (T, 3V) floats") from error
+    if array.ndim not in (2, 3) or array.size != len(array) * n_vertices * 3 or not len(array):
+        raise FaceDiffError(
+            f"{path}: has shape {array.shape}, expected (frames, {3 * n_vertices}) with at least one frame"
+        )
+    if not np.issubdtype(array.dtype, np.floating):
+        raise FaceDiffError(f"{path}: holds {array.dtype}, expected floating-point vertices")
+    return array.reshape(len(array), n_vertices, 3)
+
+
+def read_templates(path: Path, n_vertices: int) -> dict[str, Tensor]:
+    """``templates.pkl``: subject to neutral face (V, 3), float32.
+
+    Raises:
+        FaceDiffError: if the file is not that.
+    """
+    loaded = load_pickle(path)
+    if not isinstance(loaded, dict):
+        raise FaceDiffError(f"{path}: expected a dict from subject to (V, 3) array, got {type(loaded).__name__}")
+    templates = {}
+    for name, value in loaded.items():
+        try:
+            array = np.asarray(value, np.float32)
+        except (TypeError, ValueError) as error:
+            raise FaceDiffError(f"{path}: the template of {name} is no array of numbers; expected (V, 3)") from error
+        if array.size != n_vertices * 3:
+            raise FaceDiffError(f"{path}: the template of {name} has shape {array.shape}, expected ({n_vertices}, 3)")
+        if not np.isfinite(array).all():
+            raise FaceDiffError(f"{path}: the template of {name} holds NaN or infinity")
+        templates[str(name)] = torch.from_numpy(np.array(array).reshape(-1, 3))
+    return templates
+
+
+def read_manifest(root: Path) -> dict[str, Any]:
+    """``manifest.json`` of a folder; empty if there is none.
+
+    Raises:
+        FaceDiffError: if it is damaged.
+    """
+    path = root / "manifest.json"
+    if not path.is_file():
+        return {}
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FaceDiffError(
+            f"{path}: not readable as JSON ({error}); prepare the folder anew, or remove the file"
+        ) from error
+    return manifest if isinstance(manifest, dict) else {}

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from facediff import puppet
-from facediff.data.base import SpeechMotionDataModule
+from facediff.data.base import SpeechMotionDataModule, Split
 from facediff.data.corpus import Clip
 from facediff.data.dataset import ReferenceChoice
+from facediff.files import cache_dir
 
 
 def cache_root(seed: int) -> Path:
     """Where the corpus of a seed is kept: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
-    cache = os.environ.get("FACEDIFF_CACHE") or Path.home() / ".cache" / "facediff"
-    return Path(cache) / f"puppet-{puppet.GENERATOR}-seed{seed}"
+    return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}"
 
 
 class Puppet(SpeechMotionDataModule):
@@ -27,22 +26,26 @@ class Puppet(SpeechMotionDataModule):
     Args:
         root: the corpus folder; the user's cache folder if None.
         seed: seed of the corpus; another seed makes another corpus.
-        batch_size: clips a batch.
+        batch_size: clips a batch; looked at where no frame budget is given.
+        max_frames_per_batch: frame budget of a batch of clips of like length, counted with their padding.
         num_workers: loader processes.
         window: longest training window in frames; whole clips if None.
         reference: where a training target's style reference comes from: another clip of the same subject and mood,
             or itself.
         reference_frames: longest style reference, in frames.
-        predict_split: the split that ``predict`` runs over.
+        predict_split: the split that ``predict`` runs over; test A if None.
+        people: folders of further people with this face's topology to train on.
+        lips: file that says which vertices are the lips, or ``all``; the corpus's own if None.
+        upper_face: the same for the upper face.
     """
 
     corpus_name: ClassVar[str] = "puppet"
     synthetic: ClassVar[bool] = True
-    unit: ClassVar[str] = puppet.UNIT
+    unit = puppet.UNIT
     frame_rate: ClassVar[float] = float(puppet.FRAME_RATE)
-    n_vertices: ClassVar[int] = puppet.N_VERTICES
-    identities: ClassVar[list[str]] = list(puppet.SEEN_SUBJECTS)
-    mesh_file: ClassVar[str] = "PUPPET.ply"
+    n_vertices = puppet.N_VERTICES
+    identities = list(puppet.SEEN_SUBJECTS)
+    mesh_files: ClassVar[tuple[str, ...]] = ("PUPPET.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
 
     def __init__(
@@ -51,21 +54,20 @@ class Puppet(SpeechMotionDataModule):
         root: str | None = None,
         seed: int = 0,
         batch_size: int = 8,
+        max_frames_per_batch: int | None = None,
         num_workers: int = 0,
         window: int | None = None,
         reference: ReferenceChoice = "same_subject",
         reference_frames: int = 100,
-        predict_split: Literal["train", "val", "test_a", "test_b"] = "test_a",
+        predict_split: Split | None = None,
+        people: list[str] | None = None,
+        lips: str | None = None,
+        upper_face: str | None = None,
     ) -> None:
         arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         super().__init__(
             root=str(cache_root(seed)) if root is None else root,
-            batch_size=batch_size,
-            num_workers=num_workers,
-            window=window,
-            reference=reference,
-            reference_frames=reference_frames,
-            predict_split=predict_split,
+            **{name: value for name, value in arguments.items() if name not in ("root", "seed")},
         )
         self.seed = seed
         self.remember(arguments)

@@ -32,7 +32,11 @@ class Evaluation:
     def prepare(self, assets: Assets, splits: Sequence[str], device: torch.device) -> None:
         """Make empty metrics for a corpus's regions, on the device where processes reduce them."""
         regions = {
-            name: Region.from_indices(f"{assets.corpus}/{name}", indices, n_vertices=assets.n_vertices)
+            name: Region.from_indices(
+                f"{assets.corpus}/{name if len(indices) < assets.n_vertices else 'all vertices'}",
+                indices,
+                n_vertices=assets.n_vertices,
+            )
             for name, indices in assets.regions.items()
         }
         self.splits = list(splits)

@@ -58,18 +58,12 @@ class Tiny(SpeechMotionDataModule):
 
     corpus_name: ClassVar[str] = "tiny"
     synthetic: ClassVar[bool] = True
-    unit: ClassVar[str] = "m"
+    unit = "m"
     frame_rate: ClassVar[float] = float(RATE)
-    n_vertices: ClassVar[int] = VERTICES
-    identities: ClassVar[list[str]] = SEEN
-    mesh_file: ClassVar[str] = "tiny.ply"
+    n_vertices = VERTICES
+    identities = SEEN
+    mesh_files: ClassVar[tuple[str, ...]] = ("tiny.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
-
-    def __init__(
-        self, *, root: str, batch_size: int = 4, window: int | None = None, reference: str = "same_subject"
-    ) -> None:
-        super().__init__(root=root, batch_size=batch_size, window=window, reference=reference)  # type: ignore[arg-type]
-        self.save_hyperparameters()
 
     def split_of(self, clip: Clip) -> str | None:
         seen = clip.subject in SEEN

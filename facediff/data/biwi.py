@@ -1,0 +1,70 @@
+"""BIWI, the B3D(AC)^2 corpus of emotional speech (Fanelli et al. 2010)."""
+
+from __future__ import annotations
+
+import re
+from typing import ClassVar
+
+from facediff.data.base import SpeechMotionDataModule
+from facediff.data.corpus import Clip
+
+SEEN = ("F2", "F3", "F4", "M3", "M4", "M5")
+UNSEEN = ("F1", "F5", "F6", "F7", "F8", "M1", "M2", "M6")
+SENTENCES = {"train": range(1, 33), "val": range(33, 37), "test": range(37, 41)}
+
+
+class Biwi(SpeechMotionDataModule):
+    """BIWI (B3D(AC)^2) in the layout of FaceFormer, CodeTalker, SelfTalk and FaceDiffuser.
+
+    25 frames a second, 23 370 vertices, emotional sentences e01 to e40. F2 F3 F4 M3 M4 M5 are trained on: sentences
+    1–32 train, 33–36 validate, 37–40 test (test A: 24 sequences); the other eight people's 37–40 are test B (32). The
+    other sentences of these eight give style references only.
+    """
+
+    corpus_name: ClassVar[str] = "biwi"
+    unit = "normalised (the square root of a face's surface area is 1, about 185 mm)"
+    frame_rate: ClassVar[float] = 25.0
+    n_vertices = 23370
+    identities = list(SEEN)
+    mesh_files: ClassVar[tuple[str, ...]] = ("BIWI.ply",)
+    region_sources: ClassVar[dict[str, tuple[str, ...]]] = {
+        "lips": ("regions/lve.txt", "regions/lip.txt", "BIWI_lip.pkl"),
+        "upper_face": ("regions/fdd.txt",),
+    }
+    region_help: ClassVar[str] = (
+        "The files lve.txt and fdd.txt are in the CodeTalker repository (github.com/Doubiiu/CodeTalker), in "
+        "BIWI/regions; put them into regions/ of your corpus folder."
+    )
+    licence: ClassVar[str] = "B3D(AC)^2 end-user licence of ETH Zurich: non-commercial research"
+    obtain: ClassVar[str] = (
+        "ETH Zurich gave BIWI (B3D(AC)^2) out on request; since 2024 its page is reported gone and no request is "
+        "known to have succeeded, so only those who have a copy can use it. `facediff data prepare biwi RAW OUT` makes "
+        "the corpus folder from the raw files."
+    )
+
+    @classmethod
+    def parse_name(cls, name: str) -> Clip | None:
+        """``F2_e01``; the neutral sequences (``F2_01``) are no part of what the field trains and tests on."""
+        found = re.fullmatch(r"([FM]\d)_(e\d\d)", name)
+        return Clip(name, found[1], found[2]) if found else None
+
+    @classmethod
+    def expected_clips(cls) -> dict[str, list[str]]:
+        """192 training, 24 validation, 24 test A and 32 test B sequences."""
+
+        def names(people: tuple[str, ...], part: str) -> list[str]:
+            return [f"{person}_e{number:02d}" for person in people for number in SENTENCES[part]]
+
+        return {
+            "train": names(SEEN, "train"),
+            "val": names(SEEN, "val"),
+            "test_a": names(SEEN, "test"),
+            "test_b": names(UNSEEN, "test"),
+        }
+
+    def split_of(self, clip: Clip) -> str | None:
+        """By person and sentence number."""
+        part = next((part for part, numbers in SENTENCES.items() if clip.number in numbers), None)
+        if clip.subject in UNSEEN:
+            return "test_b" if part == "test" else None
+        return "test_a" if part == "test" else part

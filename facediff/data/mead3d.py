@@ -1,0 +1,115 @@
+"""3DMEAD: FLAME reconstructions of the emotional videos of MEAD (Wang et al. 2020, Daněček et al. 2023)."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, ClassVar, Literal
+
+from facediff.data.base import SpeechMotionDataModule, Split
+from facediff.data.corpus import Clip
+from facediff.data.dataset import ReferenceChoice
+
+EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry", "contempt")
+TRAIN = (
+    *(f"M{n:03d}" for n in (3, 5, 7, 9, 11, 12, 13, 19, *range(22, 32))),
+    *(f"W{n:03d}" for n in (9, 11, 14, 15, 16, 18, 19, 21, 23, 24, 25, 26, 28, 29)),
+)
+VALIDATION = ("M032", "M033", "M034", "M035", "W033", "W035", "W036")
+TEST = ("M037", "M039", "M040", "M041", "M042", "W037", "W038", "W040")
+NEUTRAL_SENTENCES = {"train": range(1, 33), "val": range(33, 37), "test_a": range(37, 41)}
+EMOTIONAL_SENTENCES = {"train": range(1, 25), "val": range(25, 28), "test_a": range(28, 31)}
+
+
+class Mead3D(SpeechMotionDataModule):
+    """3DMEAD as vertices, from EMOTE's reconstructions or in ProbTalk3D's layout.
+
+    25 frames a second, FLAME topology (5 023 vertices, metres), 47 people, eight emotions at three intensities; the
+    clip attributes ``emotion`` and ``intensity`` tell them, and style references share the emotion of their target.
+
+    Args:
+        root: the corpus folder.
+        split: ``sentence`` is ProbTalk3D's: the 32 training people, the last sentences of each emotion are for
+            validation and test (test A). ``identity`` is EMOTE's: 32 people train, 7 validate, 8 test (test B).
+        batch_size: clips a batch; looked at where no frame budget is given.
+        max_frames_per_batch: frame budget of a batch of clips of like length, counted with their padding.
+        num_workers: loader processes.
+        window: longest training window in frames; whole clips if None.
+        reference: where a training target's style reference comes from: another clip of the same subject and emotion,
+            or itself.
+        reference_frames: longest style reference, in frames.
+        predict_split: the split that ``predict`` runs over; the first test split if None.
+        people: folders of further people with FLAME's topology to train on.
+        lips: file that says which vertices are the lips, or ``all``; the corpus's usual one if None.
+        upper_face: the same for the upper face.
+    """
+
+    corpus_name: ClassVar[str] = "mead3d"
+    unit = "m"
+    frame_rate: ClassVar[float] = 25.0
+    n_vertices = 5023
+    identities = list(TRAIN)
+    mesh_files: ClassVar[tuple[str, ...]] = ("FLAME.ply", "FLAME_sample.ply", "flame_sample.ply")
+    region_sources: ClassVar[dict[str, tuple[str, ...]]] = {
+        "lips": ("regions/lve.txt", "FLAME_masks.pkl:lips", "regions/FLAME_masks.pkl:lips", "regions/lip.txt"),
+        "upper_face": (
+            "regions/fdd.txt",
+            "FLAME_masks.pkl:forehead+eye_region",
+            "regions/FLAME_masks.pkl:forehead+eye_region",
+        ),
+    }
+    region_help: ClassVar[str] = (
+        "lve.txt and fdd.txt are in datasets/regions of the ProbTalk3D repository "
+        "(github.com/uuembodiedsocialai/ProbTalk3D); put them into regions/ of your corpus folder. Or take "
+        "FLAME_masks.pkl from flame.is.tue.mpg.de."
+    )
+    reference_attributes: ClassVar[tuple[str, ...]] = ("emotion",)
+    licence: ClassVar[str] = "MEAD and FLAME licences: non-commercial research"
+    obtain: ClassVar[str] = (
+        "3DMEAD is MEAD (wywu.github.io/projects/MEAD) with the reconstructions that EMOTE's authors give out (see the "
+        "inferno repository, github.com/radekd91/inferno); `facediff data prepare mead3d RAW OUT --flame MODEL` makes "
+        "the corpus folder from them."
+    )
+
+    def __init__(
+        self,
+        *,
+        root: str,
+        split: Literal["sentence", "identity"] = "sentence",
+        batch_size: int = 1,
+        max_frames_per_batch: int | None = None,
+        num_workers: int = 0,
+        window: int | None = None,
+        reference: ReferenceChoice = "same_subject",
+        reference_frames: int = 100,
+        predict_split: Split | None = None,
+        people: list[str] | None = None,
+        lips: str | None = None,
+        upper_face: str | None = None,
+    ) -> None:
+        arguments: dict[str, Any] = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        super().__init__(**{name: value for name, value in arguments.items() if name != "split"})
+        self.split = split
+        self.remember(arguments)
+
+    @classmethod
+    def parse_name(cls, name: str) -> Clip | None:
+        """``M003_001_0_0``: subject, sequence, emotion, intensity.
+
+        Sequences of one number say the same words within one emotion only.
+        """
+        found = re.fullmatch(r"([MW]\d{3})_(\d{3})_([0-7])_([0-2])", name)
+        if found is None:
+            return None
+        emotion = EMOTIONS[int(found[3])]
+        attributes = {"emotion": emotion, "intensity": str(int(found[4]) + 1)}
+        return Clip(name, found[1], f"{emotion}_{found[2]}", attributes)
+
+    def split_of(self, clip: Clip) -> str | None:
+        """By person (``identity``), or by sentence for the training people (``sentence``)."""
+        if self.split == "identity":
+            groups = {"train": TRAIN, "val": VALIDATION, "test_b": TEST}
+            return next((split for split, people in groups.items() if clip.subject in people), None)
+        if clip.subject not in TRAIN:
+            return None
+        sentences = NEUTRAL_SENTENCES if clip.attributes["emotion"] == "neutral" else EMOTIONAL_SENTENCES
+        return next((split for split, numbers in sentences.items() if clip.number in numbers), None)

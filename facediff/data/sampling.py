@@ -1,0 +1,126 @@
+"""Which clips make a batch, on which process, with which random draws."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch.utils.data import DistributedSampler
+
+BUCKETS = 32
+"""Into how many lengths a frame budget is divided for bucketing."""
+
+
+@dataclass(frozen=True)
+class Pick:
+    """One clip of a batch.
+
+    Attributes:
+        index: which clip.
+        seed: seed of its random draws (window, style reference).
+    """
+
+    index: int
+    seed: int
+
+
+class ClipBatches(DistributedSampler[list[Pick]]):
+    """Batches of clips, the same for a seed and an epoch however many workers read them.
+
+    Either ``batch_size`` clips a batch, or, with ``max_frames``, as many clips of like length as fit into that many
+    frames once they are padded to the longest. The draws of a clip follow from seed, epoch and clip alone.
+
+    It is a ``DistributedSampler`` in the sense that each process iterates over its own share of the same batches, so
+    Lightning leaves it as it is. All processes get equally many batches, for they wait for one another at each. In
+    training that may repeat some batches of an epoch's last step. In evaluation every clip is there once: batches are
+    split, or where all are single clips put together, until their number goes up in the processes.
+
+    Args:
+        lengths: frames of every clip; looked at with ``max_frames`` only.
+        batch_size: clips a batch.
+        max_frames: padded frames a batch; a longer clip is a batch of its own.
+        training: shuffle, and let every process have equally many batches.
+        seed: of order and draws.
+        rank: this process.
+        world_size: number of processes.
+    """
+
+    def __init__(
+        self,
+        lengths: Sequence[int],
+        *,
+        batch_size: int,
+        max_frames: int | None = None,
+        training: bool = False,
+        seed: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        super().__init__(range(len(lengths)), num_replicas=world_size, rank=rank, shuffle=training, seed=seed)
+        self.lengths = list(lengths)
+        self.batch_size = batch_size
+        self.max_frames = max_frames
+        self.training = training
+
+    def __len__(self) -> int:
+        """Number of batches of this process; the same in every epoch."""
+        return len(self._share(self._batches(torch.Generator())))
+
+    def __iter__(self) -> Iterator[list[Pick]]:  # type: ignore[override]
+        """This process's batches of the present epoch."""
+        generator = torch.Generator().manual_seed(self._hash("order"))
+        for batch in self._share(self._batches(generator), generator):
+            yield [Pick(index, self._hash(index) if self.training else 0) for index in batch]
+
+    def _hash(self, what: object) -> int:
+        return zlib.crc32(f"{self.seed}:{self.epoch}:{what}".encode())
+
+    def _batches(self, generator: torch.Generator) -> list[list[int]]:
+        count = len(self.lengths)
+        order = torch.randperm(count, generator=generator).tolist() if self.training else list(range(count))
+        if self.max_frames is None:
+            return [order[i : i + self.batch_size] for i in range(0, count, self.batch_size)]
+        # Rounded up to a bucket, lengths give equally many batches in every epoch, whoever shares a bucket.
+        width = max(1, self.max_frames // BUCKETS)
+        rounded = [-(-length // width) * width for length in self.lengths]
+        batches: list[list[int]] = []
+        for index in sorted(order, key=lambda i: rounded[i]):  # stable: random within a bucket
+            if batches and rounded[index] * (len(batches[-1]) + 1) <= self.max_frames:
+                batches[-1].append(index)
+            else:
+                batches.append([index])
+        return batches
+
+    def _share(self, batches: list[list[int]], generator: torch.Generator | None = None) -> list[list[int]]:
+        """This process's part. In training, batches of one step are neighbours in length, and steps are shuffled."""
+        world = self.num_replicas
+        if not self.training:
+            return evened(batches, world)[self.rank :: world]
+        steps = [batches[i : i + world] for i in range(0, len(batches), world)]
+        if steps and len(steps[-1]) < world:
+            steps[-1] = [*steps[-1], *(batches * world)[: world - len(steps[-1])]]
+        if self.max_frames is not None and generator is not None:
+            steps = [steps[i] for i in torch.randperm(len(steps), generator=generator).tolist()]
+        return [step[self.rank] for step in steps]
+
+
+def evened(batches: list[list[int]], world_size: int) -> list[list[int]]:
+    """The same clips in a number of batches that ``world_size`` divides; clips are repeated only if there are fewer."""
+    batches = list(batches)
+    clips = sum(map(len, batches))
+    if not clips:
+        return batches
+    up = -(-len(batches) // world_size) * world_size
+    if clips >= up:
+        while len(batches) < up:
+            largest = max(batches, key=len)
+            place, half = batches.index(largest), len(largest) // 2
+            batches[place : place + 1] = [largest[:half], largest[half:]]
+    elif up > world_size:
+        while len(batches) > up - world_size:
+            batches[-2:] = [batches[-2] + batches[-1]]
+    else:
+        batches += [batches[i % len(batches)] for i in range(up - len(batches))]
+    return batches

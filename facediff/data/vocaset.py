@@ -1,0 +1,82 @@
+"""VOCASET, the corpus of VOCA (Cudeiro et al. 2019)."""
+
+from __future__ import annotations
+
+import re
+from typing import ClassVar
+
+from facediff.data.base import SpeechMotionDataModule
+from facediff.data.corpus import Clip
+
+TRAIN = (
+    "FaceTalk_170728_03272_TA",
+    "FaceTalk_170904_00128_TA",
+    "FaceTalk_170725_00137_TA",
+    "FaceTalk_170915_00223_TA",
+    "FaceTalk_170811_03274_TA",
+    "FaceTalk_170913_03279_TA",
+    "FaceTalk_170904_03276_TA",
+    "FaceTalk_170912_03278_TA",
+)
+VALIDATION = ("FaceTalk_170811_03275_TA", "FaceTalk_170908_03277_TA")
+TEST = ("FaceTalk_170809_00138_TA", "FaceTalk_170731_00024_TA")
+EVALUATED = range(21, 41)
+
+
+class Vocaset(SpeechMotionDataModule):
+    """VOCASET in the layout of FaceFormer, CodeTalker, SelfTalk and TalkingStyle.
+
+    12 people, 40 sentences, FLAME topology (5 023 vertices, metres). Circulating copies hold 60 frames a second, of
+    which every second is taken, as all projects do; a folder made by ``facediff data prepare vocaset`` says itself how
+    many it holds. Eight people train (all sentences), two validate and two test (sentences 21–40 of each): all of
+    these are strangers to the model, so the test is test B. Some clips do not exist and are left out.
+    """
+
+    corpus_name: ClassVar[str] = "vocaset"
+    unit = "m"
+    frame_rate: ClassVar[float] = 30.0
+    stored_frame_rate: ClassVar[float | None] = 60.0
+    n_vertices = 5023
+    identities = list(TRAIN)
+    mesh_files: ClassVar[tuple[str, ...]] = ("FLAME_sample.ply",)
+    region_sources: ClassVar[dict[str, tuple[str, ...]]] = {
+        "lips": ("regions/lve.txt", "FLAME_masks.pkl:lips", "regions/FLAME_masks.pkl:lips", "regions/lip.txt"),
+        "upper_face": (
+            "regions/fdd.txt",
+            "FLAME_masks.pkl:forehead+eye_region",
+            "regions/FLAME_masks.pkl:forehead+eye_region",
+        ),
+    }
+    region_help: ClassVar[str] = (
+        "FLAME_masks.pkl is had from flame.is.tue.mpg.de (FLAME vertex masks); put it into your corpus folder. Or take "
+        "lve.txt and fdd.txt from data/vocaset/regions of the FaceDiffuser repository "
+        "(github.com/uuembodiedsocialai/FaceDiffuser) into regions/."
+    )
+    licence: ClassVar[str] = "VOCASET licence of the Max Planck Society: non-commercial research"
+    obtain: ClassVar[str] = (
+        "VOCASET is had after registration at voca.is.tue.mpg.de; `facediff data prepare vocaset RAW OUT` makes the "
+        "corpus folder from its files."
+    )
+
+    @classmethod
+    def parse_name(cls, name: str) -> Clip | None:
+        """``FaceTalk_170728_03272_TA_sentence01``."""
+        found = re.fullmatch(r"(FaceTalk_\d+_\d+_TA)_(sentence\d\d)", name)
+        return Clip(name, found[1], found[2]) if found else None
+
+    @classmethod
+    def expected_clips(cls) -> dict[str, list[str]]:
+        """320 training, 40 validation and 40 test clips; a few of them were never recorded."""
+        people = {"train": (TRAIN, range(1, 41)), "val": (VALIDATION, EVALUATED), "test_b": (TEST, EVALUATED)}
+        return {
+            split: [f"{name}_sentence{number:02d}" for name in names for number in numbers]
+            for split, (names, numbers) in people.items()
+        }
+
+    def split_of(self, clip: Clip) -> str | None:
+        """By person, and for validation and test by sentence number."""
+        if clip.subject in TRAIN:
+            return "train"
+        if clip.number not in EVALUATED:
+            return None
+        return "val" if clip.subject in VALIDATION else "test_b" if clip.subject in TEST else None
