@@ -2,5 +2,6 @@
 
 from facediff.callbacks.prediction_writer import PredictionWriter
 from facediff.callbacks.score_table import ScoreTable
+from facediff.callbacks.speech_features import SpeechFeatureCache
 
-__all__ = ["PredictionWriter", "ScoreTable"]
+__all__ = ["PredictionWriter", "ScoreTable", "SpeechFeatureCache"]

@@ -98,6 +98,13 @@ class Batch:
         frames = torch.arange(self.reference.shape[1], device=self.reference.device)
         return frames < self.reference_lengths[:, None]
 
+    @property
+    def cached_features(self) -> tuple[Tensor, Tensor] | None:
+        """Features of the frozen part of the audio encoder with their lengths; None if they are not cached."""
+        if self.features is None or self.feature_lengths is None:
+            return None
+        return self.features, self.feature_lengths
+
     def __len__(self) -> int:
         """Number of clips."""
         return len(self.names)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch.utils.data import DistributedSampler
@@ -58,7 +59,8 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
-        super().__init__(range(len(lengths)), num_replicas=world_size, rank=rank, shuffle=training, seed=seed)
+        clips: Any = range(len(lengths))  # only its length is looked at
+        super().__init__(clips, num_replicas=world_size, rank=rank, shuffle=training, seed=seed)
         self.lengths = list(lengths)
         self.batch_size = batch_size
         self.max_frames = max_frames
@@ -68,7 +70,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         """Number of batches of this process; the same in every epoch."""
         return len(self._share(self._batches(torch.Generator())))
 
-    def __iter__(self) -> Iterator[list[Pick]]:  # type: ignore[override]
+    def __iter__(self) -> Iterator[list[Pick]]:
         """This process's batches of the present epoch."""
         generator = torch.Generator().manual_seed(self._hash("order"))
         for batch in self._share(self._batches(generator), generator):

@@ -14,6 +14,7 @@ from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 
+from facediff.components.audio_encoder import AudioEncoder
 from facediff.data import Assets, Batch, Reference, Sample, SpeechMotionDataModule, collate
 from facediff.data.assets import ASSETS_KEY, DATA_SOURCE_KEY
 from facediff.data.audio import SAMPLE_RATE, samples_for
@@ -101,6 +102,11 @@ class SpeechAnimator(LightningModule, ABC):
             seed: seed of the noise; a clip's noise depends on it and on the clip's name, not on the clips beside it.
             progress: wraps the iteration over steps, e.g. in a progress bar.
         """
+
+    @property
+    @abstractmethod
+    def speech_encoder(self) -> AudioEncoder:
+        """The part that hears: its frozen part may be computed once per clip."""
 
     def remember(self, arguments: dict[str, Any]) -> None:
         """Keep constructor arguments as plain hyper-parameters, in the form that Lightning rebuilds a module from."""
@@ -213,7 +219,7 @@ class SpeechAnimator(LightningModule, ABC):
         self.evaluation.update(split, "model", self.generate(batch, seed=0), batch)
         self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
         if batch.decoy_audio is not None:
-            decoy = replace(batch, audio=batch.decoy_audio)
+            decoy = replace(batch, audio=batch.decoy_audio, features=None)
             shuffled = self.generate(decoy, seed=0)
             self.evaluation.update(split, "shuffled", shuffled, batch)
 

@@ -13,7 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from facediff import registry
+from facediff.components.audio_encoder.base import standardise
 from facediff.components.audio_encoder.hubert import HubertEncoder
+from facediff.components.layers import interpolate_frames
 from facediff.errors import FaceDiffError
 from facediff.hparams import describe
 
@@ -92,7 +94,7 @@ def test_two_steps_for_every_frame(hubert_source: Path, frames: int) -> None:
 def test_clips_of_equal_length_are_encoded_together(hubert_source: Path) -> None:
     encoder = HubertEncoder(dim=8, source=str(hubert_source)).eval()
     sizes: list[tuple[int, ...]] = []
-    encoder.hubert.register_forward_pre_hook(lambda _, args: sizes.append(tuple(args[0].shape)))
+    encoder.hubert.feature_extractor.register_forward_pre_hook(lambda _, args: sizes.append(tuple(args[0].shape)))
     lengths = torch.tensor([3, 5, 3])
     encoder(torch.randn(3, 5 * 640), lengths * 640, lengths)
     assert sorted(sizes) == [(1, 5 * 640 + 80), (2, 3 * 640 + 80)]
@@ -175,8 +177,67 @@ def test_a_corrupt_directory_is_one_sentence(copy: Path, case: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_it_trains_in_training_mode_and_in_full_precision(hubert_source: Path) -> None:
+def test_all_but_the_frozen_part_trains_in_training_mode_and_in_full_precision(hubert_source: Path) -> None:
     # from_pretrained hands a model over in evaluation mode, and Lightning leaves modes as they are.
-    encoder = HubertEncoder(dim=8, source=str(hubert_source))
-    assert all(module.training for module in encoder.modules())
+    encoder = HubertEncoder(dim=8, source=str(hubert_source), frozen_layers=1)
+    layers = encoder.hubert.encoder.layers
+    assert [layer.training for layer in layers] == [False, True, True]
+    assert not encoder.hubert.feature_extractor.training
+    assert encoder.training
     assert {p.dtype for p in encoder.parameters()} == {torch.float32}
+    assert not any(module.training for module in encoder.eval().modules())
+    assert [layer.training for layer in encoder.train().hubert.encoder.layers] == [False, True, True]
+
+
+@pytest.fixture(params=[False, True], ids=["base", "large"])
+def either_source(request: pytest.FixtureRequest, hubert_source: Path, tmp_path: Path) -> Path:
+    """A HuBERT whose Transformer normalises first, as the base model does, or last, as the large ones do."""
+    if not request.param:
+        return hubert_source
+    from transformers import HubertConfig, HubertModel
+
+    config = json.loads((hubert_source / "config.json").read_text())
+    torch.manual_seed(0)
+    large = HubertModel(HubertConfig.from_dict({**config, "do_stable_layer_norm": True, "feat_extract_norm": "layer"}))
+    large.save_pretrained(tmp_path / "large")
+    return tmp_path / "large"
+
+
+@pytest.mark.parametrize("frozen", [0, 1, 2, 3, -1])
+def test_the_two_parts_together_are_the_published_model(either_source: Path, frozen: int) -> None:
+    encoder = HubertEncoder(dim=8, source=str(either_source), frozen_layers=frozen).eval()
+    audio, lengths, frames = clip(9, batch=2)
+    features, steps = encoder.frozen_features(audio, lengths)
+    assert steps.tolist() == [18, 18]
+    hidden = encoder.hubert(torch.nn.functional.pad(standardise(audio, lengths), (40, 40))).last_hidden_state
+    expected = interpolate_frames(encoder.out(hidden), steps, frames)
+    torch.testing.assert_close(encoder(audio, lengths, frames), expected, rtol=0, atol=1e-6)
+    assert torch.equal(encoder(audio, lengths, frames, features, steps), encoder(audio, lengths, frames))
+
+
+def test_features_of_clips_of_several_lengths_do_not_mix(hubert_source: Path) -> None:
+    encoder = HubertEncoder(dim=8, source=str(hubert_source), frozen_layers=1).eval()
+    audio, frames = torch.randn(2, 9 * 640), torch.tensor([9, 4])
+    audio[1, 4 * 640 :] = 0
+    features, steps = encoder.frozen_features(audio, frames * 640)
+    alone, _ = encoder.frozen_features(audio[1:, : 4 * 640], frames[1:] * 640)
+    torch.testing.assert_close(features[1, :8], alone[0], rtol=0, atol=1e-6)
+    whole = encoder(audio, frames * 640, frames)
+    torch.testing.assert_close(encoder(audio, frames * 640, frames, features, steps), whole, rtol=0, atol=0)
+
+
+def test_the_key_changes_with_what_decides_the_frozen_features(hubert_source: Path) -> None:
+    def key(change: Callable[[HubertEncoder], object] = lambda encoder: None, **options: object) -> str | None:
+        torch.manual_seed(0)
+        encoder = HubertEncoder(dim=8, source=str(hubert_source), **options)
+        with torch.no_grad():
+            change(encoder)
+        return encoder.frozen_key()
+
+    first = key()
+    assert first == key() == key(lambda e: e.out.weight.add_(1)) == key(layer_drop=0.5)
+    assert first == key(lambda e: e.hubert.encoder.layers[2].final_layer_norm.weight.add_(1))
+    assert key(lambda e: e.hubert.encoder.layers[1].final_layer_norm.weight.add_(1)) != first
+    assert key(lambda e: e.hubert.feature_projection.projection.bias.add_(1)) != first
+    assert key(frozen_layers=1) != first
+    assert key(spec_augment=True) is None

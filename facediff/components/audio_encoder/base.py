@@ -17,7 +17,25 @@ class AudioEncoder(nn.Module, ABC):
     """Speech to one feature per motion frame.
 
     A clip's feature must not depend on how far it is padded, nor on the clips beside it.
+
+    An encoder whose first part is frozen may let it be computed once per clip and kept on disk: it then overrides
+    :meth:`frozen_key` and :meth:`frozen_features`, and takes their result as ``features`` and ``feature_lengths``,
+    two further arguments of its :meth:`forward` that no other encoder is given.
     """
+
+    def frozen_key(self) -> str | None:
+        """A hash of all that decides :meth:`frozen_features`; None if nothing is frozen, or something is random."""
+        return None
+
+    def frozen_features(
+        self, audio: Float[Tensor, "batch samples"], audio_lengths: Int[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]]:
+        """What the frozen part makes of speech, and each clip's valid steps.
+
+        Raises:
+            NotImplementedError: if the encoder has no frozen part.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no frozen part")
 
     @abstractmethod
     def forward(

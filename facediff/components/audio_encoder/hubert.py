@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +31,8 @@ class HubertEncoder(AudioEncoder):
     """Pretrained HuBERT; lower layers frozen, upper layers and the projection fine-tuned.
 
     Clips are encoded one by one, or together where their lengths are equal: HuBERT normalises over time, so padding
-    would change its features. The 50 steps a second are interpolated to the motion's frames.
+    would change its features. The 50 steps a second are interpolated to the motion's frames. Frozen layers run without
+    dropout, also in training, so that their result can be kept on disk.
 
     Args:
         dim: channels of the result; given by the system.
@@ -59,48 +63,120 @@ class HubertEncoder(AudioEncoder):
         self.hubert = load_hubert(source, config)
         self.hubert.config.apply_spec_augment = spec_augment
         self.hubert.config.layerdrop = layer_drop
-        self._freeze(frozen_layers)
+        self.frozen_layers = len(self.hubert.encoder.layers) if frozen_layers < 0 else frozen_layers
+        self._frozen = self._freeze(self.frozen_layers)
+        self.train()
         self.out = nn.Linear(self.hubert.config.hidden_size, dim)
 
     def checkpoint_init_args(self) -> dict[str, Any]:
         """What a checkpoint stores in place of a look at ``source``: the configuration as plain data."""
         return {"config": self.hubert.config.to_dict()}
 
-    def _freeze(self, frozen_layers: int) -> None:
-        encoder = self.hubert.encoder
-        count = len(encoder.layers) if frozen_layers < 0 else frozen_layers
-        frozen: list[nn.Module] = [self.hubert.feature_extractor, self.hubert.feature_projection]
+    def _freeze(self, count: int) -> list[str]:
+        """Freeze what lies below layer ``count``; the names of the frozen modules."""
+        names = ["feature_extractor", "feature_projection"]
         if count:
-            frozen += [encoder.pos_conv_embed, *encoder.layers[:count]]
-            if not getattr(self.hubert.config, "do_stable_layer_norm", False) or count >= len(encoder.layers):
-                frozen.append(encoder.layer_norm)
-        for module in frozen:
-            module.requires_grad_(False)
+            names += ["encoder.pos_conv_embed", "encoder.dropout", *(f"encoder.layers.{i}" for i in range(count))]
+            if not self._normalises_last or count >= len(self.hubert.encoder.layers):
+                names.append("encoder.layer_norm")
+        for name in names:
+            self.hubert.get_submodule(name).requires_grad_(False)
         # Else transformers marks what enters the convolutions as differentiable and training goes back through them.
         self.hubert.feature_extractor._freeze_parameters()
         # The embedding that SpecAugment writes over masked steps is of no use without SpecAugment.
         mask = getattr(self.hubert, "masked_spec_embed", None)
         if mask is not None and not self.hubert.config.apply_spec_augment:
             mask.requires_grad_(False)
+        return names
+
+    @property
+    def _normalises_last(self) -> bool:
+        """Whether the Transformer's own layer norm comes after its layers (large models) or before them (base)."""
+        return bool(getattr(self.hubert.config, "do_stable_layer_norm", False))
+
+    def train(self, mode: bool = True) -> HubertEncoder:
+        """Training mode for all but the frozen part."""
+        super().train(mode)
+        for name in self._frozen:
+            self.hubert.get_submodule(name).eval()
+        return self
+
+    def frozen_key(self) -> str | None:
+        """A hash of the frozen weights, the configuration and the number of frozen layers."""
+        if self.hubert.config.apply_spec_augment:
+            return None
+        # Where the weights came from, and how they are to be trained, decides nothing.
+        config = {k: v for k, v in self.hubert.config.to_dict().items() if k not in ("_name_or_path", "layerdrop")}
+        digest = hashlib.sha256(json.dumps([self.frozen_layers, EDGE, config], sort_keys=True, default=str).encode())
+        for name in self._frozen:
+            for key, value in sorted(self.hubert.get_submodule(name).state_dict().items()):
+                digest.update(f"{name}.{key}".encode())
+                digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    def frozen_features(
+        self, audio: Float[Tensor, "batch samples"], audio_lengths: Int[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]]:
+        """Hidden states below the first layer that is trained, at 50 steps a second."""
+        return by_length(standardise(audio, audio_lengths), audio_lengths, self._lower)
+
+    def _lower(self, wave: Tensor) -> Tensor:
+        """The frozen part: convolutions, projection and the frozen layers."""
+        hidden = self.hubert.feature_projection(self.hubert.feature_extractor(with_edges(wave)).transpose(1, 2))
+        return self._layers(hidden, 0, self.frozen_layers) if self.frozen_layers else hidden
+
+    def _upper(self, hidden: Tensor) -> Tensor:
+        """The part that is trained."""
+        hidden = self._layers(hidden, self.frozen_layers, len(self.hubert.encoder.layers))
+        return self.hubert.encoder.layer_norm(hidden) if self._normalises_last else hidden
+
+    def _layers(self, hidden: Tensor, first: int, last: int) -> Tensor:
+        """Transformer layers ``first`` to ``last``, with what comes before the first of all."""
+        encoder = self.hubert.encoder
+        if first == 0:
+            hidden = hidden + encoder.pos_conv_embed(hidden)
+            hidden = encoder.dropout(hidden if self._normalises_last else encoder.layer_norm(hidden))
+        for layer in encoder.layers[first:last]:
+            if layer.training and self.hubert.config.layerdrop > 0 and torch.rand(()) < self.hubert.config.layerdrop:
+                continue
+            hidden = layer(hidden)
+        return hidden
 
     def forward(
         self,
         audio: Float[Tensor, "batch samples"],
         audio_lengths: Int[Tensor, " batch"],
         frame_lengths: Int[Tensor, " batch"],
+        features: Float[Tensor, "batch steps channels"] | None = None,
+        feature_lengths: Int[Tensor, " batch"] | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
         """Encode; see :class:`AudioEncoder`."""
-        audio = standardise(audio, audio_lengths)
-        parts: dict[int, Tensor] = {}
-        for length in sorted(set(audio_lengths.tolist())):
-            rows = (audio_lengths == length).nonzero().flatten()
-            shortage = max(0, 400 - length - 2 * EDGE)
-            wave = nn.functional.pad(audio[rows, :length], (EDGE, EDGE + shortage))
-            hidden = self.hubert(wave).last_hidden_state
-            parts.update(zip(rows.tolist(), hidden, strict=True))
-        steps = torch.tensor([parts[i].shape[0] for i in range(len(audio))], device=audio.device)
-        features = nn.utils.rnn.pad_sequence([parts[i] for i in range(len(audio))], batch_first=True)
-        return interpolate_frames(self.out(features), steps, frame_lengths)
+        if self.hubert.config.apply_spec_augment:
+            hidden, steps = by_length(standardise(audio, audio_lengths), audio_lengths, self._whole)
+        else:
+            if features is None or feature_lengths is None:
+                features, feature_lengths = self.frozen_features(audio, audio_lengths)
+            hidden, steps = by_length(features, feature_lengths, self._upper)
+        return interpolate_frames(self.out(hidden), steps, frame_lengths)
+
+    def _whole(self, wave: Tensor) -> Tensor:
+        return self.hubert(with_edges(wave)).last_hidden_state
+
+
+def with_edges(wave: Float[Tensor, "batch samples"]) -> Float[Tensor, "batch padded"]:
+    """Speech with the zeros at either end that make its steps fall where they belong; at least one step long."""
+    return nn.functional.pad(wave, (EDGE, EDGE + max(0, 400 - wave.shape[1] - 2 * EDGE)))
+
+
+def by_length(padded: Tensor, lengths: Tensor, encode: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """Encode clips of equal length together, without their padding; the padded results and their lengths."""
+    parts: dict[int, Tensor] = {}
+    for length in sorted(set(lengths.tolist())):
+        rows = (lengths == length).nonzero().flatten()
+        parts.update(zip(rows.tolist(), encode(padded[rows, :length]), strict=True))
+    ordered = [parts[i] for i in range(len(padded))]
+    steps = torch.tensor([len(part) for part in ordered], device=padded.device)
+    return nn.utils.rnn.pad_sequence(ordered, batch_first=True), steps
 
 
 def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:

@@ -132,6 +132,7 @@ class DualPathNetwork(nn.Module):
         identity: Int[Tensor, " batch"],
         reference: Float[Tensor, "batch reference_frames coordinates"],
         reference_mask: Bool[Tensor, "batch reference_frames"],
+        features: tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]] | None = None,
     ) -> Conditions:
         """Everything that is computed once per clip.
 
@@ -142,13 +143,14 @@ class DualPathNetwork(nn.Module):
             identity: identity indices, −1 for unknown.
             reference: scaled reference motion, flattened to 3V coordinates.
             reference_mask: True on valid reference frames.
+            features: cached result of the audio encoder's frozen part, and its lengths.
         """
-        features = self.audio_encoder(audio, audio_lengths, frame_lengths)
+        encoded = self.audio_encoder(audio, audio_lengths, frame_lengths, *(features or ()))
         style_parts = [self.identity_encoder(identity)]
         if self.embed_reference is not None:
             style_parts.append(self.style_encoder(self.embed_reference(reference), reference_mask))
-        mask = frame_mask(frame_lengths, features.shape[1])
-        return Conditions(features, self.style_tokens(torch.cat(style_parts, dim=-1)), mask)
+        mask = frame_mask(frame_lengths, encoded.shape[1])
+        return Conditions(encoded, self.style_tokens(torch.cat(style_parts, dim=-1)), mask)
 
     def forward(
         self,

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from facediff import losses, registry
-from facediff.components.audio_encoder import AudioEncoderFactory
+from facediff.components.audio_encoder import AudioEncoder, AudioEncoderFactory
 from facediff.components.audio_encoder.mel import MelEncoder
 from facediff.components.decoder import DecoderFactory
 from facediff.components.decoder.style_transformer import StyleTransformer
@@ -128,6 +128,11 @@ class DualPathDiffusion(SpeechAnimator):
         self.remember(arguments)
 
     @property
+    def speech_encoder(self) -> AudioEncoder:
+        """The audio encoder."""
+        return self.network.audio_encoder
+
+    @property
     def scale(self) -> float:
         """Factor from offsets in the corpus's unit to the motion that is noised.
 
@@ -178,6 +183,7 @@ class DualPathDiffusion(SpeechAnimator):
             identity,
             batch.reference.flatten(2) * self.scale,
             batch.reference_mask,
+            batch.cached_features,
         )
 
     def generate(
