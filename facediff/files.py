@@ -34,7 +34,7 @@ def atomic(path: Path) -> Iterator[Path]:
             f"{path}: cannot be written ({error.strerror or error}); choose a folder that you may write to"
         ) from error
     finally:
-        with suppress(FileNotFoundError):
+        with suppress(OSError):  # not there, or below something that is no folder: the error above says it
             temporary.unlink()
 
 

@@ -34,6 +34,8 @@ IDLE_WARNINGS = (
     ".*isinstance.treespec, LeafSpec.*",
     # The throughput monitor is there for clips a second.
     ".*define a `flops_per_batch` attribute",
+    # Frozen layers are in evaluation mode on purpose: no dropout.
+    r"Found \d+ module\(s\) in eval mode at the start of training",
 )
 """Warnings of Lightning's that nobody needs to act on."""
 

@@ -1,5 +1,18 @@
-"""What depends on the mesh alone: faces of a template."""
+"""What depends on the mesh alone: faces of a template, and laying faces onto one another."""
 
+from facediff.topology.alignment import Similarity, align, face_size, robust_align
 from facediff.topology.mesh import Mesh, read_mesh
+from facediff.topology.rigid_motion import RigidMotion, median_face, remove_rigid_motion, stable_vertices
 
-__all__ = ["Mesh", "read_mesh"]
+__all__ = [
+    "Mesh",
+    "RigidMotion",
+    "Similarity",
+    "align",
+    "face_size",
+    "median_face",
+    "read_mesh",
+    "remove_rigid_motion",
+    "robust_align",
+    "stable_vertices",
+]

@@ -35,29 +35,6 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize(("kind", "name"), cases)
 
 
-@pytest.fixture(scope="session")
-def hubert_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A HuBERT of the published shape (seven convolutions, stride 320) in miniature, with random weights."""
-    from transformers import HubertConfig, HubertModel
-    from transformers.utils import logging
-
-    folder = tmp_path_factory.mktemp("hubert")
-    config = HubertConfig(
-        hidden_size=32,
-        num_hidden_layers=3,
-        num_attention_heads=4,
-        intermediate_size=48,
-        conv_dim=(16,) * 7,
-        num_conv_pos_embeddings=8,
-        num_conv_pos_embedding_groups=4,
-    )
-    torch.manual_seed(0)
-    logging.disable_progress_bar()
-    HubertModel(config).save_pretrained(folder)
-    logging.enable_progress_bar()
-    return folder
-
-
 @pytest.fixture
 def make(hubert_source: Path) -> Make:
     """A small component by kind and name, with reproducible weights."""

@@ -12,9 +12,9 @@ import soundfile
 import trimesh
 
 from facediff.data.audio import read_speech
-from facediff.pickles import load_pickle
 from facediff.errors import FaceDiffError
 from facediff.files import atomic, check_writable
+from facediff.pickles import load_pickle
 from facediff.topology import read_mesh
 
 

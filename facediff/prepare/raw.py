@@ -1,0 +1,88 @@
+"""Finding and copying files of a raw folder, which may hold the data set or the folder that an archive unpacked to."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from facediff.errors import FaceDiffError
+from facediff.files import atomic
+
+
+def bases(raw: Path) -> list[Path]:
+    """The raw folder and the folders in it, sorted: places where a data set may begin.
+
+    Raises:
+        FaceDiffError: if there is no such folder or it cannot be read.
+    """
+    if not raw.is_dir():
+        raise FaceDiffError(f"{raw}: no such folder; expected the raw data set as it was distributed")
+    try:
+        return [raw, *sorted(path for path in raw.iterdir() if path.is_dir() and not path.name.startswith("."))]
+    except OSError as error:
+        raise FaceDiffError(f"{raw}: cannot be read ({error.strerror}); check its permissions") from error
+
+
+def find_file(raw: Path, name: str) -> Path | None:
+    """A file of this name in the raw folder or one folder deeper; None if there is none."""
+    return next((path for base in bases(raw) if (path := base / name).is_file()), None)
+
+
+def find_regions(raw: Path, given: Path | None) -> Path | None:
+    """The folder with the lists of vertices: the one given, else ``regions/`` of the raw folder if there is one.
+
+    Raises:
+        FaceDiffError: if the one given is no folder or holds no list.
+    """
+    if given is None:
+        return next((path for base in bases(raw) if (path := base / "regions").is_dir()), None)
+    if not region_files(given):
+        raise FaceDiffError(f"{given}: expected a folder with lists of vertices, e.g. lve.txt and fdd.txt")
+    return given
+
+
+def region_files(folder: Path | None) -> list[Path]:
+    """The lists of vertices in a folder."""
+    return [] if folder is None else sorted(path for path in folder.glob("*.txt") if path.is_file())
+
+
+def copy_files(sources: Sequence[Path], out: Path, folder: str = "") -> list[str]:
+    """Copy files into the output folder (or a folder in it) under their own names; returns their relative paths."""
+    written = []
+    for source in sources:
+        target = out / folder / source.name
+        with atomic(target) as temporary:
+            shutil.copyfile(source, temporary)
+        written.append(target.relative_to(out).as_posix())
+    return written
+
+
+def read_obj(path: Path) -> tuple[list[list[float]], list[list[int]]]:
+    """Vertices and triangles of a Wavefront OBJ, every vertex in the order of the file, used by a face or not.
+
+    Further figures of a vertex (colours) and of a corner (texture, normal) are left out; polygons become fans.
+
+    Raises:
+        FaceDiffError: if the file is missing or damaged.
+    """
+    vertices: list[list[float]] = []
+    faces: list[list[int]] = []
+    try:
+        for line in path.read_text(encoding="latin-1").splitlines():
+            if line.startswith("v "):
+                x, y, z = line.split()[1:4]
+                vertices.append([float(x), float(y), float(z)])
+            elif line.startswith("f "):
+                corners = [int(word.partition("/")[0]) for word in line.split()[1:]]
+                corners = [corner - 1 if corner > 0 else len(vertices) + corner for corner in corners]
+                faces += [[corners[0], second, third] for second, third in zip(corners[1:], corners[2:], strict=False)]
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a mesh") from error
+    except ValueError as error:
+        raise FaceDiffError(f"{path}: not a readable OBJ mesh ({error}); get it anew") from error
+    if not faces or min(map(min, faces)) < 0 or max(map(max, faces)) >= len(vertices):
+        raise FaceDiffError(
+            f"{path}: has {len(vertices)} vertices and {len(faces)} triangles that do not fit; expected a whole mesh"
+        )
+    return vertices, faces

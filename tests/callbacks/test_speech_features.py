@@ -1,0 +1,124 @@
+"""Training from cached features of a frozen encoder is training without them, only quicker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import lightning.pytorch as pl
+import pytest
+import torch
+
+from facediff import registry
+from facediff.callbacks import SpeechFeatureCache
+from facediff.cli import main
+from facediff.errors import FaceDiffError
+from facediff.systems import DualPathDiffusion
+from tests.fakes.tiny import Tiny
+
+MakeSystem = Callable[..., DualPathDiffusion]
+MakeTrainer = Callable[..., pl.Trainer]
+
+
+class Losses(pl.Callback):
+    def __init__(self) -> None:
+        self.found: list[float] = []
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
+    ) -> None:
+        self.found.append(float(outputs["loss"]))  # type: ignore[index]
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.found.append(float(trainer.callback_metrics["val/loss"]))
+
+
+@pytest.fixture
+def losses(
+    make_system: MakeSystem, make_trainer: MakeTrainer, hubert_source: Path, tiny_root: Path
+) -> Callable[..., tuple[list[float], int]]:
+    """Losses of two epochs of training and validation, and how many clips went through the convolutions."""
+
+    def train(*callbacks: pl.Callback, window: int | None = None, frozen: int = 2) -> tuple[list[float], int]:
+        encoder = partial(registry.audio_encoder.hubert, source=str(hubert_source), frozen_layers=frozen)
+        pl.seed_everything(1, workers=True, verbose=False)
+        system = make_system(audio_encoder=encoder)
+        clips: list[int] = []
+        system.network.audio_encoder.hubert.feature_extractor.register_forward_pre_hook(
+            lambda _, args: clips.append(len(args[0]))
+        )
+        spy = Losses()
+        data = Tiny(root=str(tiny_root), window=window, max_frames_per_batch=60)
+        trainer = make_trainer(max_epochs=2, callbacks=[spy, *callbacks])
+        trainer.fit(system, datamodule=data)
+        return spy.found, sum(clips)
+
+    return train
+
+
+@pytest.mark.parametrize("frozen", [0, 2, -1])
+def test_losses_are_the_same_with_and_without(
+    losses: Callable[..., tuple[list[float], int]], tmp_path: Path, frozen: int
+) -> None:
+    without, _ = losses(frozen=frozen)
+    making, encoded = losses(SpeechFeatureCache(str(tmp_path)), frozen=frozen)
+    reading, encoded_again = losses(SpeechFeatureCache(str(tmp_path)), frozen=frozen)
+    assert len(without) >= 8
+    assert making == pytest.approx(without, rel=1e-6)
+    assert reading == making
+    # Eight training clips and two for validation, once each; then never again, though each is used in both epochs.
+    # (Lightning's summary and sampling run no encoder; validation samples from cached features too.)
+    assert (encoded, encoded_again) == (10, 0)
+
+
+def test_windows_take_their_part_of_the_whole_clips_features(
+    losses: Callable[..., tuple[list[float], int]], tmp_path: Path
+) -> None:
+    found, encoded = losses(SpeechFeatureCache(str(tmp_path)), window=7)
+    assert all(map(torch.isfinite, map(torch.tensor, found)))
+    assert encoded == 10
+
+
+def test_a_window_of_features_lies_where_the_window_of_motion_lies(tiny_root: Path) -> None:
+    data = Tiny(root=str(tiny_root), window=5)
+    # Features that count frames in half steps, as an encoder with two steps a frame would give.
+    data.features = lambda clip: torch.arange(2.0 * data.corpus.frames(clip))[:, None]
+    dataset = data.dataset("train", training=True)
+    for _ in range(10):
+        sample = dataset[0]
+        whole = data.corpus.read_motion(dataset.clips[0])
+        (start,) = (i for i in range(len(whole) - 4) if torch.equal(whole[i : i + 5], sample.motion))
+        assert sample.features is not None
+        assert sample.features.flatten().tolist() == list(range(2 * start, 2 * start + 10))
+
+
+def test_a_damaged_cache_file_is_made_anew(losses: Callable[..., tuple[list[float], int]], tmp_path: Path) -> None:
+    first, _ = losses(SpeechFeatureCache(str(tmp_path)))
+    files = sorted(tmp_path.rglob("*.npy"))
+    assert len(files) == 10
+    files[3].write_bytes(files[3].read_bytes()[:90])
+    with pytest.warns(UserWarning, match="a damaged or half-written cache file; it is made anew"):
+        again, encoded = losses(SpeechFeatureCache(str(tmp_path)))
+    assert again == first
+    assert encoded == 1
+
+
+def test_an_encoder_without_a_frozen_part_is_refused(
+    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+) -> None:
+    trainer = make_trainer(callbacks=[SpeechFeatureCache(str(tmp_path))])
+    with pytest.raises(FaceDiffError, match="the audio encoder mel has no frozen part"):
+        trainer.fit(make_system(), datamodule=tiny)
+
+
+def test_from_the_command_line(
+    tiny_root: Path, hubert_source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
+    words = ["--config", "configs/experiment/puppet.yaml", "--config", "configs/callbacks/speech_features.yaml"]
+    words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--model.audio_encoder=hubert"]
+    words += [f"--model.audio_encoder.source={hubert_source}", "--model.dim=16", "--trainer.max_steps=1"]
+    words += ["--trainer.limit_val_batches=0", "--trainer.enable_progress_bar=false", "--trainer.log_every_n_steps=1"]
+    assert main(["fit", *words, f"--trainer.logger.save_dir={tmp_path}"]) == 0
+    assert len(list((tmp_path / "cache" / "speech_features").rglob("*.npy"))) == 10

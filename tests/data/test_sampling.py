@@ -1,0 +1,103 @@
+"""Batches under a frame budget, on several processes, repeatable."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from facediff.data.sampling import ClipBatches, Pick
+
+LENGTHS = st.lists(st.integers(1, 300), min_size=1, max_size=60)
+
+
+def batches(lengths: list[int], epoch: int = 0, **options: object) -> list[list[Pick]]:
+    sampler = ClipBatches(lengths, **{"batch_size": 4, **options})  # type: ignore[arg-type]
+    sampler.set_epoch(epoch)
+    found = list(sampler)
+    assert len(found) == len(sampler)
+    return found
+
+
+def indices(found: list[list[Pick]]) -> list[list[int]]:
+    return [[pick.index for pick in batch] for batch in found]
+
+
+@settings(deadline=None)
+@given(LENGTHS, st.integers(1, 400), st.integers(0, 3), st.booleans())
+def test_a_budget_holds_and_every_clip_is_there_once(
+    lengths: list[int], budget: int, epoch: int, training: bool
+) -> None:
+    found = indices(batches(lengths, epoch, max_frames=budget, training=training))
+    assert sorted(i for batch in found for i in batch) == list(range(len(lengths)))
+    for batch in found:
+        assert len(batch) == 1 or max(lengths[i] for i in batch) * len(batch) <= budget
+
+
+@settings(deadline=None)
+@given(LENGTHS, st.integers(10, 400))
+def test_batches_are_of_like_length(lengths: list[int], budget: int) -> None:
+    """No worse than sorting: neighbouring batches overlap in length by less than a bucket."""
+    found = [[lengths[i] for i in batch] for batch in indices(batches(lengths, max_frames=budget, training=True))]
+    found.sort(key=lambda batch: (min(batch), max(batch)))
+    for shorter, longer in zip(found, found[1:], strict=False):
+        assert min(longer) > max(shorter) - max(1, budget // 32)
+
+
+@settings(deadline=None)
+@given(LENGTHS, st.integers(1, 5), st.one_of(st.none(), st.integers(1, 400)), st.integers(1, 6))
+def test_processes_share_evaluation_without_repeats(
+    lengths: list[int], world: int, budget: int | None, size: int
+) -> None:
+    shares = [
+        indices(batches(lengths, max_frames=budget, batch_size=size, rank=rank, world_size=world))
+        for rank in range(world)
+    ]
+    # They wait for one another at every batch.
+    assert len({len(share) for share in shares}) == 1
+    counts = Counter(i for share in shares for batch in share for i in batch)
+    assert set(counts) == set(range(len(lengths)))
+    if len(lengths) >= world:
+        assert set(counts.values()) == {1}
+
+
+@settings(deadline=None)
+@given(LENGTHS, st.integers(1, 5), st.one_of(st.none(), st.integers(1, 400)), st.integers(0, 3))
+def test_processes_train_on_all_clips_in_equally_many_batches(
+    lengths: list[int], world: int, budget: int | None, epoch: int
+) -> None:
+    shares = [
+        indices(batches(lengths, epoch, max_frames=budget, training=True, rank=rank, world_size=world))
+        for rank in range(world)
+    ]
+    assert len({len(share) for share in shares}) == 1
+    assert {i for share in shares for batch in share for i in batch} == set(range(len(lengths)))
+
+
+@pytest.mark.parametrize("budget", [None, 300])
+def test_order_and_draws_follow_from_seed_and_epoch(budget: int | None) -> None:
+    lengths = [20 + 7 * i % 90 for i in range(40)]
+
+    def made(epoch: int, seed: int = 3, **options: object) -> list[list[Pick]]:
+        return batches(lengths, epoch, max_frames=budget, training=True, seed=seed, **options)
+
+    assert made(1) == made(1)
+    assert made(1) != made(2)
+    assert made(1) != made(1, seed=4)
+    # A clip's draws are its own, whichever process and batch it is in.
+    draws = {pick.index: pick.seed for batch in made(1) for pick in batch}
+    for rank in range(2):
+        assert all(pick.seed == draws[pick.index] for b in made(1, rank=rank, world_size=2) for pick in b)
+    assert len(set(draws.values())) == len(lengths)
+
+
+def test_the_number_of_batches_does_not_change_from_epoch_to_epoch() -> None:
+    lengths = [30 + 13 * i % 170 for i in range(97)]
+    assert len({len(batches(lengths, epoch, max_frames=500, training=True)) for epoch in range(20)}) == 1
+
+
+def test_evaluation_is_in_order() -> None:
+    assert indices(batches([5] * 6, batch_size=4)) == [[0, 1, 2, 3], [4, 5]]
+    assert {pick.seed for batch in batches([5] * 6) for pick in batch} == {0}
