@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from facediff.prepare.job import Plan
     from facediff.prepare.runner import Report
 
-SHOWN = 12
+SHOWN = 20
 """Lines of a list on the screen; the whole list is in the manifest."""
 
 
@@ -22,8 +22,8 @@ def parser() -> argparse.ArgumentParser:
     """Options of the command."""
     made = argparse.ArgumentParser(
         "facediff data prepare",
-        description="Write a corpus folder from a data set as its authors distribute it. A run that was stopped is taken "
-        "up where it was by the same command.",
+        description="Write a corpus folder from a data set as its authors distribute it. A run that was stopped is "
+        "taken up where it was by the same command.",
     )
     corpora = made.add_subparsers(dest="corpus", required=True, metavar="corpus")
     _add_biwi(corpora)
@@ -117,15 +117,28 @@ def describe(report: Report) -> list[str]:
     ]
     for title, entries in (("missing", report.missing), ("failed", report.failed)):
         if entries:
-            lines.append(f"{title}: {len(entries)}")
-            lines += [f"  {key}: {text}" for key, text in list(entries.items())[:SHOWN]]
-            if len(entries) > SHOWN:
-                lines.append(f"  … and {len(entries) - SHOWN} more, see {report.out / 'manifest.json'}")
+            listed = grouped(entries)
+            lines += [f"{title}: {len(entries)}", *(f"  {line}" for line in listed[:SHOWN])]
+            if len(listed) > SHOWN:
+                lines.append(f"  … and more, see {report.out / 'manifest.json'}")
     lines += [f"note: {note}" for note in report.notes[:SHOWN]]
     if len(report.notes) > SHOWN:
         lines.append(f"note: … and {len(report.notes) - SHOWN} more, see {report.out / 'manifest.json'}")
     lines.append(f"Next: facediff data check {report.out}")
     return lines
+
+
+def grouped(entries: dict[str, str]) -> list[str]:
+    """A line for each entry, but one line for clips of a subject whose texts differ in the clip's name only."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for key, text in entries.items():
+        subject, _, sentence = key.rpartition("_")
+        common = text.replace(key, "").replace(sentence, "") if subject else text
+        groups.setdefault((subject or key, common), []).append(key)
+    return [
+        f"{keys[0]}{f' … {keys[-1]} ({len(keys)} in all)' if len(keys) > 1 else ''}: {entries[keys[0]]}"
+        for keys in groups.values()
+    ]
 
 
 def _keep_apart(raw: Path, out: Path) -> None:

@@ -132,25 +132,30 @@ def clips_in(batch: Batch) -> int:
     return len(batch)
 
 
+def pad(tensors: Sequence[Tensor]) -> Tensor:
+    """Stack tensors, padded with zeros to the longest; one alone is not copied, for motion is large."""
+    return tensors[0][None] if len(tensors) == 1 else pad_sequence(list(tensors), batch_first=True)
+
+
 def collate(samples: Sequence[Sample]) -> Batch:
     """Pad samples to a batch."""
     decoys = [s.decoy_audio for s in samples if s.decoy_audio is not None]
     features = [s.features for s in samples if s.features is not None]
     cached = len(features) == len(samples)
     return Batch(
-        audio=pad_sequence([s.audio for s in samples], batch_first=True),
+        audio=pad([s.audio for s in samples]),
         audio_lengths=torch.tensor([len(s.audio) for s in samples]),
-        motion=pad_sequence([s.motion for s in samples], batch_first=True),
+        motion=pad([s.motion for s in samples]),
         frame_lengths=torch.tensor([len(s.motion) for s in samples]),
         template=torch.stack([s.template for s in samples]),
         identity=torch.tensor([s.identity for s in samples]),
-        reference=pad_sequence([s.reference for s in samples], batch_first=True),
+        reference=pad([s.reference for s in samples]),
         reference_lengths=torch.tensor([len(s.reference) for s in samples]),
         names=[s.name for s in samples],
         subjects=[s.subject for s in samples],
         sentences=[s.sentence for s in samples],
         reference_names=[s.reference_name for s in samples],
-        decoy_audio=pad_sequence(decoys, batch_first=True) if len(decoys) == len(samples) else None,
-        features=pad_sequence(features, batch_first=True) if cached else None,
+        decoy_audio=pad(decoys) if len(decoys) == len(samples) else None,
+        features=pad(features) if cached else None,
         feature_lengths=torch.tensor([len(f) for f in features]) if cached else None,
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
 from facediff.errors import FaceDiffError
 from facediff.person.meshes import MESHES, Faces, differing_faces, read_frame_mesh
 from facediff.pickles import load_pickle
@@ -60,15 +61,15 @@ def read_auxiliary(root: Path, *, name: str, frame_rate: float | None) -> Auxili
     Raises:
         FaceDiffError: if the folder is no corpus, knows the name already, or its frame rate is unknown or contradicted.
     """
-    from facediff.data.corpus import MOTION_FOLDERS, read_manifest
-
     if not root.is_dir():
         raise FaceDiffError(f"--corpus {root}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl")
     templates = _templates(root / "templates.pkl")
     stems = {path.stem for folder in MOTION_FOLDERS for path in (root / folder).glob("*.npy")}
     subjects = {*templates, *(stem.rpartition("_")[0] for stem in stems)}
     if name.casefold() in {subject.casefold() for subject in subjects}:
-        raise FaceDiffError(f"--name {name}: {root} has a person of that name already; no clip of the new person may be in it")
+        raise FaceDiffError(
+            f"--name {name}: {root} has a person of that name already; no clip of the new person may be in it"
+        )
     manifest = read_manifest(root)
     unit = manifest.get("unit")
     mean = np.mean(list(templates.values()), axis=0)
@@ -93,8 +94,6 @@ def _frame_rate(root: Path, told: object, given: float | None) -> float:
 
 
 def _templates(path: Path) -> dict[str, Array]:
-    from facediff.data.corpus import read_templates
-
     loaded = load_pickle(path)
     first = next(iter(loaded.values()), None) if isinstance(loaded, dict) else None
     size = np.size(first) if isinstance(first, np.ndarray) else 0
@@ -141,8 +140,8 @@ def lay_onto_corpus(path: Path, face: Array, corpus: Auxiliary) -> tuple[Similar
     residual = relative_residual(map_.apply(face), corpus.mean)
     if not residual < RESIDUAL_LIMIT:
         raise FaceDiffError(
-            f"{path}: its face does not lie on those of {corpus.root} (residual {residual:.2f} of the face's size, "
-            f"expected less than {RESIDUAL_LIMIT}), so its vertices are in another order, mirrored, or of another topology"
+            f"{path}: its face does not lie on those of {corpus.root} (residual {residual:.2f} of its size, expected "
+            f"less than {RESIDUAL_LIMIT}), so the order of its vertices or the topology is another, or it is mirrored"
         )
     return map_, residual
 

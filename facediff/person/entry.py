@@ -14,8 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.audio import fit_length, samples_for
 from facediff.errors import FaceDiffError
 from facediff.files import check_writable
+from facediff.prepare.job import motion_file, speech_file, write_motion, write_speech, write_templates
+from facediff.prepare.manifest import MANIFEST, describe_files, version, write_record
 
 
 @dataclass(frozen=True)
@@ -50,8 +53,10 @@ def check_output(path: Path) -> None:
 
 
 @contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
-    """A temporary sibling folder to fill, renamed to ``path`` at the end; removed if anything fails or is interrupted.
+def whole_folder(path: Path) -> Iterator[tuple[Path, Path]]:
+    """A folder to fill, renamed to ``path`` at the end, and one for scratch files; both vanish if anything fails.
+
+    They lie beside ``path``, and are also removed when the user interrupts.
 
     Raises:
         FaceDiffError: if it cannot be written.
@@ -60,11 +65,12 @@ def whole_folder(path: Path) -> Iterator[Path]:
     made = [folder for folder in path.parents if not folder.exists()]
     done = False
     try:
-        partial.mkdir(parents=True)
-        yield partial
+        for folder in (partial / "entry", partial / "scratch"):
+            folder.mkdir(parents=True)
+        yield partial / "entry", partial / "scratch"
         if path.is_dir():
             path.rmdir()  # it was empty before; if it is not any more, this fails
-        partial.rename(path)
+        (partial / "entry").rename(path)
         done = True
     except OSError as error:
         raise FaceDiffError(
@@ -101,10 +107,6 @@ def write_entry(
         frame_rate: frames a second.
         facts: what else the manifest shall say.
     """
-    from facediff.data.audio import fit_length, samples_for
-    from facediff.prepare.job import motion_file, speech_file, write_motion, write_speech, write_templates
-    from facediff.prepare.manifest import MANIFEST, describe_files, version, write_record
-
     # 16-bit sound ends at full scale: turn down a recording that goes beyond as a whole.
     speech = speech / max(1.0, float(np.abs(speech).max(initial=0.0)))
     for clip in clips:
@@ -120,4 +122,6 @@ def write_entry(
         table.writerows([clip.name, name, clip.name.rpartition("_")[2], clip.split] for clip in clips)
     written = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     files = describe_files(folder, written, 2, lambda: None)
-    write_record(folder / MANIFEST, {"facediff": version(), "corpus": "person", "person": name, **facts, "files": files})
+    write_record(
+        folder / MANIFEST, {"facediff": version(), "corpus": "person", "person": name, **facts, "files": files}
+    )

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.person.meshes import MESHES, Faces, FrameMesh, differing_faces, read_frame_mesh
+from facediff.person.scratch import scratch_array
 
 MAX_GAP = 0.2
 """Longest stretch of missing frames that is filled, in seconds."""
@@ -112,9 +113,7 @@ def read_frames(
                 f"{folder}: {after - before - 1} frames are missing between {files.paths[here].name} and "
                 f"{files.paths[here + 1].name}; at most {MAX_GAP} s can be filled, so cut the video there"
             )
-    frames = np.lib.format.open_memmap(
-        scratch, mode="w+", dtype=np.float32, shape=(files.frames, n_vertices, 3)
-    )  # type: ignore[no-untyped-call]
+    frames = scratch_array(scratch, (files.frames, n_vertices, 3))
     first: FrameMesh | None = None
     for path, place in zip(_bar(files.paths, progress), files.places, strict=True):
         mesh = read_frame_mesh(path, known=first)

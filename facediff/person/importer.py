@@ -5,30 +5,29 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.audio import SAMPLE_RATE, read_speech
 from facediff.errors import FaceDiffError
-from facediff.person.auxiliary import (
-    RESIDUAL_LIMIT,
-    Auxiliary,
-    check_faces,
-    into_coordinates,
-    lay_onto_corpus,
-    read_auxiliary,
-    relative_residual,
-)
+from facediff.person.auxiliary import Auxiliary, check_faces, into_coordinates, lay_onto_corpus, read_auxiliary
 from facediff.person.entry import EntryClip, check_output, whole_folder, write_entry
-from facediff.person.frames import spans
-from facediff.person.motion import Motion, read_motion, read_template
+from facediff.person.motion import Motion, read_motion
+from facediff.person.neutral import Neutral, choose_neutral, read_template
 from facediff.person.report import Report
-from facediff.person.stabilise import Stabilised, find_stable, middle_face, stabilise
-from facediff.topology import Similarity, robust_align
-from facediff.topology.rigid_motion import Indices, chunks
+from facediff.person.scratch import scratch_array
+from facediff.person.speech import cut_points, loudness, splits
+from facediff.person.stabilise import Stabilised, middle_face, read_stable, stabilise
+from facediff.prepare.resample import resample_frames, resampled_length
+from facediff.topology import Similarity, stable_vertices
+from facediff.topology.rigid_motion import chunks
 
-Array = npt.NDArray[np.float64]
+Speech = npt.NDArray[np.float32]
 
 MIN_SECONDS = 2.0
 MIN_CLIP_SECONDS = 1.0
@@ -36,6 +35,46 @@ SILENCE = 1e-4
 MISMATCH = 0.1
 """Sound and motion may differ in length by this share; more is an error."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9-]{0,63}")
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A person's frames on the way into the corpus.
+
+    Attributes:
+        made: frames without head motion, still in the motion's coordinates.
+        neutral: the neutral face.
+        place: from the neutral face's coordinates to the corpus's.
+        measured_scale: scale of the best similarity between the neutral face and the corpus's mean face.
+        residual: what that similarity leaves, as a share of the face's size.
+        faces_compared: whether the triangles could be compared with the corpus's.
+    """
+
+    made: Stabilised
+    neutral: Neutral
+    place: Similarity
+    measured_scale: float
+    residual: float
+    faces_compared: bool
+
+
+@dataclass(frozen=True)
+class Request:
+    """The arguments of :func:`import_person`, which explains them."""
+
+    motion: Path
+    audio: Path
+    name: str
+    corpus: Path
+    output: Path
+    frame_rate: float
+    corpus_frame_rate: float | None
+    template: Path | None
+    stable: str | None
+    flame: Path | None
+    scale: float | None
+    clip_seconds: float
+    progress: bool
 
 
 def import_person(
@@ -57,7 +96,7 @@ def import_person(
     """Turn the reconstruction of one person's video into a corpus entry that fits an existing corpus.
 
     Args:
-        motion: folder of .obj or .ply files, .npy of vertices, or FLAME parameters.
+        motion: folder of .obj or .ply files, .npy of vertices, or FLAME parameters (.hdf5, .npy).
         audio: the video, or its sound.
         name: the person's name, without underscore.
         corpus: folder of the auxiliary corpus.
@@ -65,7 +104,7 @@ def import_person(
         frame_rate: frames a second of the motion.
         corpus_frame_rate: frames a second of the corpus, where its manifest does not say.
         template: neutral face (.obj, .ply, .npy) in the motion's unit; found in the motion if None.
-        stable: file with the vertices that move with the skull only; found in the motion if None.
+        stable: file of the vertices that move with the skull only; found in the motion if None.
         flame: FLAME model file, for FLAME parameters.
         scale: corpus units to a unit of the motion; measured if None.
         clip_seconds: length of the clips, about.
@@ -75,59 +114,205 @@ def import_person(
         what was done.
 
     Raises:
-        FaceDiffError: for anything that is wrong with the files or arguments; nothing is left behind then.
+        FaceDiffError: for anything that is wrong with files or arguments; nothing is left behind then.
     """
     output = output.expanduser().absolute()
-    _check_arguments(name, frame_rate, corpus_frame_rate, scale, clip_seconds)
+    request = Request(
+        motion,
+        audio,
+        name,
+        corpus,
+        output,
+        frame_rate,
+        corpus_frame_rate,
+        template,
+        stable,
+        flame,
+        scale,
+        clip_seconds,
+        progress,
+    )
+    _check_arguments(request)
     check_output(output)
     known = read_auxiliary(corpus, name=name, frame_rate=corpus_frame_rate)
     speech = _read_speech(audio)
-    with whole_folder(output) as folder:
-        scratch = folder / "scratch"
-        scratch.mkdir()
-        read = read_motion(
-            motion,
-            n_vertices=known.n_vertices,
-            frame_rate=frame_rate,
-            scratch=scratch / "read.npy",
-            flame=flame,
-            progress=progress,
+    with whole_folder(output) as (folder, scratch):
+        return _import(request, known, speech, folder, scratch)
+
+
+def _import(request: Request, known: Auxiliary, speech: Speech, folder: Path, scratch: Path) -> Report:
+    read = read_motion(
+        request.motion,
+        n_vertices=known.n_vertices,
+        frame_rate=request.frame_rate,
+        scratch=scratch / "read.npy",
+        flame=request.flame,
+        progress=request.progress,
+    )
+    warnings = _check_lengths(request, len(speech), len(read.frames))
+    fitted = _fit(request, read, known, speech, scratch)
+    frames = _move(fitted.made.frames, fitted.neutral.placing.then(fitted.place))
+    frames = _at_rate(frames, request.frame_rate, known.frame_rate, scratch / "rate.npy")
+    clips = _clips(request, speech, len(frames), known.frame_rate)
+    report = _report(request, read, known, fitted, clips, len(speech), warnings)
+    write_entry(
+        folder,
+        name=request.name,
+        clips=clips,
+        frames=frames,
+        speech=speech,
+        template=fitted.place.apply(fitted.neutral.face),
+        frame_rate=known.frame_rate,
+        facts={
+            "frame_rate": known.frame_rate,
+            "n_vertices": known.n_vertices,
+            "unit": known.unit,
+            "report": report.state(),
+        },
+    )
+    return report
+
+
+def _fit(request: Request, read: Motion, known: Auxiliary, speech: Speech, scratch: Path) -> Fitted:
+    """Take out the head's motion, find the neutral face, and find the way into the corpus's coordinates."""
+    given = None if request.template is None else read_template(request.template, known)
+    told = None if request.stable is None else read_stable(request.stable, known.n_vertices)
+    compared = check_faces(request.motion, read.faces, known)
+    with _naming(request.motion):
+        for _ in chunks(read.frames):
+            pass  # every frame is finite
+        stable = stable_vertices(read.frames) if told is None else told
+        face = middle_face(read, stable)
+        lay_onto_corpus(request.motion, face, known)  # before the long work
+        made = stabilise(read, face, stable, scratch / "stable.npy")
+    neutral = choose_neutral(read, made, given, speech, request.frame_rate)
+    best, residual = lay_onto_corpus(request.template or request.motion, neutral.face, known)
+    place = into_coordinates(neutral.face, known, best.scale, request.scale)
+    return Fitted(made, neutral, place, best.scale, residual, compared)
+
+
+def _check_arguments(request: Request) -> None:
+    if not NAME.fullmatch(request.name):
+        raise FaceDiffError(
+            f"--name {request.name!r}: expected letters, digits and dashes, at most 64, with no dash first"
         )
-        warnings, mismatch = _check_lengths(audio, len(speech), motion, len(read.frames), frame_rate)
-        chosen = _named(motion, lambda: find_stable(read, stable))
-        face = _named(motion, lambda: middle_face(read, chosen))
-        compared = check_faces(motion, read.faces, known)
-        lay_onto_corpus(motion, face, known)  # before the long work
-        made = _named(motion, lambda: stabilise(read, face, chosen, scratch / "stable.npy"))
-        neutral = _neutral(read, made, template, known, speech, frame_rate)
-        fit, residual = lay_onto_corpus(template or motion, neutral.face, known)
-        place = into_coordinates(neutral.face, known, fit.scale, scale)
-        frames = _placed(made, neutral.placing.then(place), scratch / "placed.npy")
-        frames = _at_rate(frames, frame_rate, known.frame_rate, scratch / "rate.npy")
-        clips, count = _cut(name, speech, len(frames), known.frame_rate, clip_seconds)
-        report = Report(
-            name=name,
-            frames=len(read.frames),
-            seconds=len(read.frames) / frame_rate,
-            frame_rate=frame_rate,
-            corpus_frame_rate=known.frame_rate,
-            rotation_max=float(np.degrees(made.turns.max())),
-            rotation_rms=float(np.degrees(_rms(made.turns))),
-            translation_max=place.scale * float(made.shifts.max()),
-            translation_rms=place.scale * _rms(made.shifts),
-            stable_vertices=len(chosen),
-            stable_source="found to move least" if stable is None else f"of {stable}",
-            jitter=place.scale * made.jitter,
-            scale=place.scale,
-            measured_scale=fit.scale,
-            topology_residual=residual,
-            faces_compared=compared,
-            template_source=neutral.source,
-            template_frames=neutral.frames,
-            mismatch=mismatch,
-            clips=len(clips),
-            splits=dict(Counter(clip.split for clip in clips)),
-            frames_written=count,
-            warnings=warnings,
-            notes=read.notes,
+    numbers = {
+        "--frame-rate": request.frame_rate,
+        "--corpus-frame-rate": request.corpus_frame_rate,
+        "--scale": request.scale,
+        "--clip-seconds": request.clip_seconds,
+    }
+    for option, number in numbers.items():
+        if number is not None and not (math.isfinite(number) and number > 0):
+            raise FaceDiffError(f"{option} {number:g}: expected a positive number")
+    if request.clip_seconds < MIN_CLIP_SECONDS:
+        raise FaceDiffError(f"--clip-seconds {request.clip_seconds:g}: expected at least {MIN_CLIP_SECONDS:g}")
+
+
+def _read_speech(path: Path) -> Speech:
+    speech = read_speech(path)
+    if float(np.abs(speech).max()) < SILENCE:
+        raise FaceDiffError(f"{path}: holds only silence; expected the speech of the video")
+    return speech
+
+
+def _check_lengths(request: Request, samples: int, frames: int) -> list[str]:
+    """Warnings about the lengths of sound and motion.
+
+    Raises:
+        FaceDiffError: if they are too short, or differ by more than a tenth.
+    """
+    sound, motion = samples / SAMPLE_RATE, frames / request.frame_rate
+    lengths = (
+        f"the motion lasts {motion:.2f} s ({frames} frames at {request.frame_rate:g}/s) and the sound {sound:.2f} s"
+    )
+    if abs(sound - motion) > MISMATCH * max(sound, motion):
+        raise FaceDiffError(
+            f"{request.motion} and {request.audio}: {lengths}; expected the same stretch of video; check --frame-rate"
         )
+    if min(sound, motion) < MIN_SECONDS:
+        raise FaceDiffError(
+            f"{request.motion}: {lengths}; expected at least {MIN_SECONDS:g} s, and better about a minute"
+        )
+    if abs(sound - motion) > 2 / request.frame_rate + 0.1:
+        return [f"{lengths}; what one has over the other is left out at the end"]
+    return []
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Put a path before the messages of errors that do not name a file."""
+    try:
+        yield
+    except FaceDiffError as error:
+        raise error if str(error).startswith(str(path)) else FaceDiffError(f"{path}: {error}") from error
+
+
+def _move(frames: npt.NDArray[np.floating], way: Similarity) -> npt.NDArray[np.floating]:
+    """Map frames where they are, chunk by chunk."""
+    for part, chunk in chunks(frames):
+        frames[part] = way.apply(chunk)
+    return frames
+
+
+def _at_rate(
+    frames: npt.NDArray[np.floating], rate_in: float, rate_out: float, scratch: Path
+) -> npt.NDArray[np.floating]:
+    if rate_in == rate_out:
+        return frames
+    shape = (resampled_length(len(frames), rate_in, rate_out), *frames.shape[1:])
+    return resample_frames(frames, rate_in, rate_out, out=scratch_array(scratch, shape))
+
+
+def _clips(request: Request, speech: Speech, frames: int, frame_rate: float) -> list[EntryClip]:
+    """Cut what both sound and motion cover."""
+    covered = min(frames, max(1, round(len(speech) / SAMPLE_RATE * frame_rate)))
+    cuts = cut_points(loudness(speech, covered, frame_rate), request.clip_seconds * frame_rate)
+    width = max(2, len(str(len(cuts))))
+    return [
+        EntryClip(f"{request.name}_s{i:0{width}d}", split, *cut)
+        for i, (cut, split) in enumerate(zip(cuts, splits(len(cuts)), strict=True), start=1)
+    ]
+
+
+def _report(
+    request: Request,
+    read: Motion,
+    known: Auxiliary,
+    fitted: Fitted,
+    clips: list[EntryClip],
+    samples: int,
+    warnings: list[str],
+) -> Report:
+    made, scale, seconds = fitted.made, fitted.place.scale, len(read.frames) / request.frame_rate
+    return Report(
+        name=request.name,
+        frames=len(read.frames),
+        seconds=seconds,
+        frame_rate=request.frame_rate,
+        corpus_frame_rate=known.frame_rate,
+        has_head_motion=read.has_head_motion,
+        rotation_max=float(np.degrees(made.turns.max())),
+        rotation_rms=float(np.degrees(_rms(made.turns))),
+        translation_max=scale * float(made.shifts.max()),
+        translation_rms=scale * _rms(made.shifts),
+        stable_vertices=len(made.stable),
+        stable_source="found to move least" if request.stable is None else f"of {request.stable}",
+        jitter=scale * made.jitter,
+        scale=scale,
+        measured_scale=fitted.measured_scale,
+        topology_residual=fitted.residual,
+        faces_compared=fitted.faces_compared,
+        template_source=fitted.neutral.source,
+        template_frames=fitted.neutral.frames,
+        mismatch=samples / SAMPLE_RATE - seconds,
+        clips=len(clips),
+        splits=dict(Counter(clip.split for clip in clips)),
+        frames_written=clips[-1].stop,
+        warnings=warnings,
+        notes=read.notes,
+    )
+
+
+def _rms(values: npt.NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.square(values).mean()))

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.person.frames import read_frames
-from facediff.person.meshes import MESHES, Faces, read_frame_mesh
+from facediff.person.meshes import Faces
+from facediff.person.scratch import scratch_array
 
 FLAME_WIDTH = 403
 """Shape 300, expression 100 and jaw 3 in one row."""
@@ -117,39 +118,11 @@ def _read_flame(path: Path, model: Path, n_vertices: int, scratch: Path) -> Moti
     template = layer.vertices(shape, np.zeros_like(expression[:1]), np.zeros_like(jaw[:1]))[0]
     if len(template) != n_vertices:
         raise FaceDiffError(
-            f"{model}: has {len(template)} vertices, but the corpus has {n_vertices}; the corpus's topology is not FLAME"
+            f"{model}: has {len(template)} vertices, but the corpus has {n_vertices}; so its topology is not FLAME"
         )
-    frames = np.lib.format.open_memmap(
-        scratch, mode="w+", dtype=np.float32, shape=(len(expression), n_vertices, 3)
-    )  # type: ignore[no-untyped-call]
+    frames = scratch_array(scratch, (len(expression), n_vertices, 3))
     for first in range(0, len(expression), FLAME_FRAMES):
         part = slice(first, first + FLAME_FRAMES)
         frames[part] = layer.vertices(shape, expression[part], jaw[part])
     faces = np.asarray(layer.faces, np.int64)
     return Motion(frames, faces, np.asarray(template, np.float64), has_head_motion=False)
-
-
-def read_template(path: Path, n_vertices: int) -> tuple[npt.NDArray[np.float64], Faces | None]:
-    """A neutral face (V, 3) from .obj, .ply or .npy, with its faces if the file has them.
-
-    Raises:
-        FaceDiffError: if it is none of these, damaged, of another vertex count, or holds NaN.
-    """
-    suffix, faces = path.suffix.lower(), None
-    if suffix == ".npy":
-        array = open_array(path)
-        if array.size != 3 * n_vertices:
-            raise FaceDiffError(f"{path}: has shape {array.shape}; expected ({n_vertices}, 3) like the corpus")
-        vertices = np.array(array, np.float64).reshape(n_vertices, 3)
-    elif suffix in MESHES:
-        mesh = read_frame_mesh(path)
-        vertices, faces = mesh.vertices, mesh.faces
-        if len(vertices) != n_vertices:
-            raise FaceDiffError(
-                f"{path}: has {len(vertices)} vertices, but the corpus has {n_vertices}; its topology is another"
-            )
-    else:
-        raise FaceDiffError(f"{path}: not a template that is known; expected .obj, .ply or .npy")
-    if not np.isfinite(vertices).all():
-        raise FaceDiffError(f"{path}: holds NaN or infinity; expected a neutral face")
-    return vertices, faces

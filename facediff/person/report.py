@@ -16,6 +16,7 @@ class Report:
         seconds: how long they last.
         frame_rate: their frames a second.
         corpus_frame_rate: frames a second that were written.
+        has_head_motion: whether there was head motion to remove; parameters without global pose have none.
         rotation_max: largest angle of the head from its mean pose, in degrees.
         rotation_rms: root mean square of these angles, in degrees.
         translation_max: largest distance of the head from its mean place.
@@ -42,6 +43,7 @@ class Report:
     seconds: float
     frame_rate: float
     corpus_frame_rate: float
+    has_head_motion: bool
     rotation_max: float
     rotation_rms: float
     translation_max: float
@@ -76,15 +78,22 @@ class Report:
         splits = ", ".join(f"{count} {split}" for split, count in self.splits.items())
         compared = "triangles equal" if self.faces_compared else "triangles not compared"
         told = f"told by {self.stable_vertices} vertices {self.stable_source}"
-        rows = [
-            ("read", f"{self.frames} frames at {self.frame_rate:g} frames/s, {self.seconds:.2f} s"),
+        head = [
             ("rotation removed", f"at most {self.rotation_max:.3f}°, RMS {self.rotation_rms:.3f}°"),
             ("translation removed", f"at most {self.translation_max:.4g} {of}, RMS {self.translation_rms:.4g} {of}"),
+        ]
+        none = [("head motion", "none in it: the parameters' global pose is left out")]
+        rows = [
+            ("read", f"{self.frames} frames at {self.frame_rate:g} frames/s, {self.seconds:.2f} s"),
+            *(head if self.has_head_motion else none),
             ("stable vertices", f"{told}; they still jitter by {self.jitter:.3g} {of} RMS"),
             ("scale", f"{self.scale:.6g} (measured {self.measured_scale:.6g})"),
             ("topology", f"residual {self.topology_residual:.3f} of the face's size, {compared}"),
             ("template", self.template_source),
-            ("sound and motion", f"sound is {abs(self.mismatch):.2f} s {'longer' if self.mismatch >= 0 else 'shorter'}"),
+            (
+                "sound and motion",
+                f"sound is {abs(self.mismatch):.2f} s {'longer' if self.mismatch >= 0 else 'shorter'}",
+            ),
             ("written", f"{self.clips} clips ({splits}), {self.frames_written} frames at {self.corpus_frame_rate:g}/s"),
         ]
         return [

@@ -1,4 +1,4 @@
-"""What is done by the loudness of speech: finding the neutral face, and cutting into clips."""
+"""What is done by the loudness of speech: finding frames of a neutral face, and cutting into clips."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.audio import SAMPLE_RATE
-from facediff.person.stabilise import Stabilised
 
 Array = npt.NDArray[np.float64]
 Speech = npt.NDArray[np.float32]
@@ -40,13 +39,6 @@ def neutral_frames(loud: Array, speed: Array) -> npt.NDArray[np.int64]:
     least, most = NEUTRAL_FRAMES
     count = min(len(loud), max(least, min(most, round(NEUTRAL_SHARE * len(loud)))))
     return np.sort(np.argsort(worse, kind="stable")[:count])
-
-
-def neutral_face(made: Stabilised, speech: Speech, frame_rate: float) -> tuple[Array, list[int]]:
-    """The median of the neutral frames (V, 3), and which they are."""
-    covered = max(1, min(len(made.frames), round(len(speech) / SAMPLE_RATE * frame_rate)))
-    chosen = neutral_frames(loudness(speech, covered, frame_rate), made.speed[:covered])
-    return np.median(made.frames[chosen], axis=0).astype(np.float64), chosen.tolist()
 
 
 def cut_points(loud: Array, clip_frames: float) -> list[tuple[int, int]]:

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.regions import find_region
 from facediff.errors import FaceDiffError
 from facediff.person.motion import Motion
-from facediff.topology import face_size, median_face, remove_rigid_motion, stable_vertices
+from facediff.person.scratch import scratch_array
+from facediff.topology import face_size, median_face, remove_rigid_motion
 from facediff.topology.rigid_motion import Indices, chunks
 
 Array = npt.NDArray[np.float64]
@@ -30,7 +32,7 @@ class Stabilised:
         turns: (T,) angle of the head from its mean pose, in radians.
         shifts: (T,) distance of the head from its mean place, in the motion's unit.
         jitter: root-mean-square distance of the stable vertices from ``face``, in the motion's unit.
-        speed: (T,) root-mean-square step of the vertices from frame to frame, in the motion's unit.
+        speed: (T,) mean step of the vertices from frame to frame, in the motion's unit.
     """
 
     frames: npt.NDArray[np.floating]
@@ -42,25 +44,20 @@ class Stabilised:
     speed: Array
 
 
-def find_stable(motion: Motion, stable: str | None) -> Indices:
-    """Stable vertices from a region file, else the ones that are found to move least.
+def read_stable(source: str, n_vertices: int) -> Indices:
+    """Stable vertices from a region file.
 
     Args:
-        motion: the frames.
-        stable: a text file of indices, or ``FLAME_masks.pkl:scalp+forehead``.
+        source: a text file of indices, or ``FLAME_masks.pkl:scalp+forehead``.
+        n_vertices: vertices of the topology.
 
     Raises:
         FaceDiffError: if the file is missing or unfit.
     """
-    if stable is None:
-        return stable_vertices(motion.frames)
-    from facediff.data.regions import find_region
-
-    file = Path(stable.partition(".pkl:")[0] + ".pkl" if ".pkl:" in stable else stable)
+    file = Path(source.partition(".pkl:")[0] + ".pkl" if ".pkl:" in source else source)
     if not file.is_file():
         raise FaceDiffError(f"--stable {file}: no such file; expected vertex indices separated by commas")
-    source = Path(stable).name
-    region = find_region(file.parent, [source], "stable vertices", motion.frames.shape[1])
+    region = find_region(file.parent, [Path(source).name], "stable vertices", n_vertices)
     return np.array(region.indices, np.int64)
 
 
@@ -78,17 +75,13 @@ def stabilise(motion: Motion, face: Array, stable: Indices, scratch: Path) -> St
     """
     count = len(motion.frames)
     if motion.has_head_motion:
-        frames = np.lib.format.open_memmap(
-            scratch, mode="w+", dtype=np.float32, shape=motion.frames.shape
-        )  # type: ignore[no-untyped-call]
+        frames = scratch_array(scratch, motion.frames.shape)
         laid = remove_rigid_motion(motion.frames, face, stable, out=frames)
         turns, shifts = _head_motion(laid.rotations, laid.translations, face[stable].mean(axis=0))
         residuals = laid.residuals
     else:
         frames, turns, shifts = motion.frames, np.zeros(count), np.zeros(count)
-        residuals = np.array(
-            [np.sqrt(np.square(frame[stable] - face[stable]).sum(axis=-1).mean()) for frame in frames]
-        )
+        residuals = np.array([np.sqrt(np.square(frame[stable] - face[stable]).sum(axis=-1).mean()) for frame in frames])
     speed = _speed(frames)
     if speed.max() < STILL * face_size(face):
         raise FaceDiffError("the motion holds none: every frame is the same face; expected the frames of a video")
@@ -116,12 +109,15 @@ def _head_motion(rotations: Array, translations: Array, centre: Array) -> tuple[
 
 
 def _speed(frames: npt.NDArray[np.floating]) -> Array:
-    """Mean of the steps to the frame before and after, (T,)."""
+    """Mean of the steps to the frame before and after, (T,).
+
+    The mean length over vertices: a few that jitter count for less than in a root mean square.
+    """
     steps = np.zeros(len(frames) + 1)
     last: Array | None = None
     for part, chunk in chunks(frames):
         joined = chunk if last is None else np.concatenate([last[None], chunk])
-        moved = np.sqrt(np.square(np.diff(joined, axis=0)).sum(axis=-1).mean(axis=-1))
+        moved = np.sqrt(np.square(np.diff(joined, axis=0)).sum(axis=-1)).mean(axis=-1)
         steps[part.stop - len(moved) : part.stop] = moved
         last = chunk[-1]
     if len(frames) > 1:

@@ -75,6 +75,8 @@ def plan(
     """
     chosen = _chosen(subjects)
     missing: dict[str, str] = {}
+    found_regions = find_regions(raw, regions)
+    _miss_regions(found_regions, missing)
     sequences, neutral = _find_sequences(raw, chosen)
     meshes = _find_meshes(raw, chosen, {subject for subject, _ in sequences}, missing)
     sounds = _find_sounds(raw)
@@ -109,8 +111,6 @@ def plan(
     if not jobs:
         reasons = "; ".join(f"{name}: {text}" for name, text in list(missing.items())[:3])
         raise FaceDiffError(f"{raw}: no sequence of BIWI can be prepared ({reasons})")
-    found_regions = find_regions(raw, regions)
-    _miss_regions(found_regions, missing)
     templates = {subject: _template(path, normalise) for subject, path in meshes.items()}
     return Plan(
         corpus="biwi",

@@ -88,10 +88,13 @@ def _blocks(
         yield (slice(first, first + len(times)), *_reflected(weights, sources, frames))
 
 
-def _filter(distance: npt.NDArray[np.float64], band: float, reach: float) -> npt.NDArray[np.float64]:
+def _filter(distance: npt.NDArray[np.floating], band: float, reach: float) -> npt.NDArray[np.float64]:
     """The windowed sinc at distances in input frames."""
     inside = np.sqrt(np.clip(1.0 - np.square(distance / reach), 0.0, None))
-    return np.where(np.abs(distance) < reach, np.sinc(band * distance) * np.i0(KAISER * inside), 0.0)
+    weights: npt.NDArray[np.float64] = np.where(
+        np.abs(distance) < reach, np.sinc(band * distance) * np.i0(KAISER * inside), 0.0
+    )
+    return weights
 
 
 def _reflected(
@@ -108,7 +111,7 @@ def _reflected(
     for end, beyond in ((0, sources < 0), (last, sources > last)):
         mirrored = np.clip(2 * end - sources[beyond], 0, last)
         folded[:, end] += 2.0 * weights[:, beyond].sum(axis=1)
-        np.subtract.at(folded, (slice(None), mirrored), weights[:, beyond])
+        np.subtract.at(folded.T, mirrored, weights[:, beyond].T)
     used = np.flatnonzero(folded.any(axis=0))
     span = slice(int(used[0]), int(used[-1]) + 1)
     return span, folded[:, span]

@@ -123,6 +123,8 @@ def _carry_out(
                 raise FaceDiffError(outcome.problem)
             if outcome.frames is None:
                 failed[outcome.name] = outcome.problem
+                for file in _files(out, outcome.name):  # damaged ones of an earlier run
+                    file.unlink(missing_ok=True)
             else:
                 clips[outcome.name] = outcome.frames
             bar.update()
@@ -209,7 +211,7 @@ def _refuse_strays(plan: Plan, out: Path) -> None:
     for path in (*sorted(out.glob("vertices_npy/*.npy")), *sorted(out.glob("wav/*.wav"))):
         if not path.name.startswith(".") and path.stem not in names:
             raise FaceDiffError(
-                f"{path}: the raw folder has no such clip any more; choose another folder to write to, or remove the file"
+                f"{path}: is no clip of the raw folder (any more); choose another folder to write to, or remove the file"
             )
 
 

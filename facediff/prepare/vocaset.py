@@ -87,6 +87,9 @@ def plan(
     missing: dict[str, str] = {}
     notes: list[str] = []
     jobs = []
+    extras = [path for name in OPTIONAL if (path := find_file(raw, name)) is not None]
+    found_regions = find_regions(raw, regions)
+    _miss_extras(extras, found_regions, missing)
     for subject in sorted({*row_map, *sounds}):
         if subject not in templates:
             missing[f"template of {subject}"] = (
@@ -96,7 +99,7 @@ def plan(
         rows_of, sound_of = row_map.get(subject, {}), sounds.get(subject, {})
         for sentence in sorted({*SENTENCES, *rows_of, *sound_of}):
             name = f"{subject}_{sentence}"
-            lacking = [file for file, there in ((ROWS, rows_of), (AUDIO, sound_of)) if not there.get(sentence)]
+            lacking = [file for file, there in ((ROWS, rows_of), (AUDIO, sound_of)) if there.get(sentence) is None]
             if lacking:
                 missing[name] = f"not in {' nor in '.join(lacking)}; the distribution lacks some"
                 continue
@@ -109,9 +112,6 @@ def plan(
     if not jobs:
         reasons = "; ".join(f"{name}: {text}" for name, text in list(missing.items())[:3])
         raise FaceDiffError(f"{raw}: no clip of VOCASET can be prepared ({reasons or 'the files name none'})")
-    extras = [path for name in OPTIONAL if (path := find_file(raw, name)) is not None]
-    found_regions = find_regions(raw, regions)
-    _miss_extras(extras, found_regions, missing)
     return Plan(
         corpus="vocaset",
         frame_rate=float(frame_rate),
@@ -149,7 +149,10 @@ def write_clip(
     samples, rate = read_samples(recording.audio, recording.where)
     frames = min(len(recording.rows), round(len(samples) / rate * RAW_RATE))
     if not frames:
-        raise FaceDiffError(f"{recording.where}: its sound has {len(samples)} samples, which is less than a frame")
+        raise FaceDiffError(
+            f"{recording.where}: has {len(recording.rows)} frames in {ROWS} and {len(samples)} samples in {AUDIO}; "
+            f"expected at least one frame of both"
+        )
     rows = recording.rows[:frames]
     store = open_vertices(vertices)
     wrong = (rows < 0) | (rows >= len(store))
@@ -198,10 +201,11 @@ def read_samples(entry: object, where: str) -> tuple[npt.NDArray[np.float32], fl
         raise FaceDiffError(
             f"{where}: sample rate {rate:g} in {AUDIO}; expected {SAMPLE_RATES[0]} to {SAMPLE_RATES[1]}"
         )
-    if samples.ndim not in (1, 2) or samples.size == 0 or samples.dtype.kind not in "if":
+    channels = min(samples.shape) if samples.ndim == 2 else 1
+    if samples.ndim not in (1, 2) or channels > 2 or samples.size == 0 or samples.dtype.kind not in "if":
         raise FaceDiffError(
-            f"{where}: its sound in {AUDIO} has shape {samples.shape} and type {samples.dtype}; expected signed samples, "
-            f"one row or two"
+            f"{where}: its sound in {AUDIO} has shape {samples.shape} and type {samples.dtype}; expected one row of "
+            f"signed samples, or two"
         )
     if samples.ndim == 2 and samples.shape[0] < samples.shape[1]:
         samples = samples.T
@@ -273,7 +277,7 @@ def _rows(frames: object, name: str, notes: list[str]) -> npt.NDArray[np.int64]:
         raise FaceDiffError(
             f"{ROWS}: {name}: expected a dict from frame to row ({error}); get the file anew"
         ) from error
-    if pairs[-1][0] != len(pairs) - 1:
+    if pairs and pairs[-1][0] != len(pairs) - 1:
         notes.append(f"{name}: {ROWS} leaves out some of the frames up to {pairs[-1][0]}; it is written without them")
     return np.array([row for _, row in pairs], np.int64)
 

@@ -202,18 +202,19 @@ def _similarity(rotation: Array, translation: Array, factor: Array) -> Similarit
 def _checked(
     source: npt.NDArray[np.floating], target: npt.NDArray[np.floating], weights: npt.NDArray[np.floating] | None
 ) -> tuple[Array, Array, Array]:
-    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
-    if source.shape != target.shape or source.ndim != 2 or source.shape[-1] != 3:
+    points: Array = np.asarray(source, np.float64)
+    goal: Array = np.asarray(target, np.float64)
+    if points.shape != goal.shape or points.ndim != 2 or points.shape[-1] != 3:
         raise FaceDiffError(
-            f"alignment: source has shape {source.shape} and target {target.shape}; expected two equal ones (points, 3)"
+            f"alignment: source has shape {points.shape} and target {goal.shape}; expected two equal ones (points, 3)"
         )
-    used = np.ones(len(source)) if weights is None else np.asarray(weights, np.float64)
-    if used.shape != source.shape[:1] or (used < 0).any():
+    used: Array = np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
+    if used.shape != points.shape[:1] or (used < 0).any():
         raise FaceDiffError(
-            f"alignment: weights have shape {used.shape} for {len(source)} points; expected one each, none negative"
+            f"alignment: weights have shape {used.shape} for {len(points)} points; expected one each, none negative"
         )
-    if not (np.isfinite(source).all() and np.isfinite(target).all() and np.isfinite(used).all()):
+    if not (np.isfinite(points).all() and np.isfinite(goal).all() and np.isfinite(used).all()):
         raise FaceDiffError("alignment: a point or a weight is NaN or infinite; leave it out")
     if np.count_nonzero(used) < 3:
         raise FaceDiffError("alignment: fewer than three points have weight; expected three that are not on a line")
-    return source, target, used
+    return points, goal, used

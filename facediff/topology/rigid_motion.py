@@ -76,7 +76,11 @@ def remove_rigid_motion(
         raise FaceDiffError(f"rigid motion: out has shape {out.shape}, expected that of the frames, {frames.shape}")
     every = np.arange(len(target)) if stable is None else np.asarray(stable)
     goal = np.asarray(target, np.float64)[every]
-    rotations, translations, residuals = np.empty((len(frames), 3, 3)), np.empty((len(frames), 3)), np.empty(len(frames))
+    rotations, translations, residuals = (
+        np.empty((len(frames), 3, 3)),
+        np.empty((len(frames), 3)),
+        np.empty(len(frames)),
+    )
     for part, chunk in chunks(frames, chunk_bytes):
         rotation, translation, _ = robust_fit(chunk[:, every], goal)
         chunk = chunk @ rotation.swapaxes(1, 2)
@@ -116,9 +120,7 @@ def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST
     return stable
 
 
-def median_face(
-    frames: npt.NDArray[np.floating], stable: Indices | None = None, *, sample: int = SAMPLE
-) -> Array:
+def median_face(frames: npt.NDArray[np.floating], stable: Indices | None = None, *, sample: int = SAMPLE) -> Array:
     """The median over frames of every vertex (V, 3), once the head's rigid motion is out; centred at the origin.
 
     It has the pose of the frame in the middle, and takes the part of a template where there is none.
@@ -147,16 +149,21 @@ def chunks(frames: npt.NDArray[np.floating], chunk_bytes: int = CHUNK_BYTES) -> 
         chunk = np.array(frames[first : first + step], np.float64)
         finite = np.isfinite(chunk).all(axis=(1, 2))
         if not finite.all():
-            raise FaceDiffError(
-                f"frame {first + int(np.argmin(finite))} (counted from 0) holds NaN or infinity; repair or remove it"
-            )
+            raise FaceDiffError(_not_finite(first + int(np.argmin(finite))))
         yield slice(first, first + len(chunk)), chunk
+
+
+def _not_finite(frame: int) -> str:
+    return f"frame {frame} (counted from 0) holds NaN or infinity; repair or remove it"
 
 
 def _sample(frames: npt.NDArray[np.floating], sample: int) -> Array:
     """Evenly spread frames, each moved to the origin."""
     taken = np.unique(np.linspace(0, len(frames) - 1, min(sample, len(frames))).round().astype(int))
-    some = np.stack([chunk[0] for place in taken for _, chunk in chunks(frames[place : place + 1])])
+    some = np.array(frames[taken], np.float64)
+    finite = np.isfinite(some).all(axis=(1, 2))
+    if not finite.all():
+        raise FaceDiffError(_not_finite(int(taken[np.argmin(finite)])))
     return some - some.mean(axis=1, keepdims=True)
 
 

@@ -1,0 +1,105 @@
+"""Looking at many clips in several processes; a file that kills the process which reads it is found out."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Generic, TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_work: Callable[[Any], Any] | None = None
+
+
+class Died(Generic[Task]):
+    """Stands for the result of a task that killed its process.
+
+    Args:
+        task: the task.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+
+
+def processors() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_all(
+    work: Callable[[Task], Result], tasks: Sequence[Task], workers: int
+) -> Iterator[tuple[Task, Result | Died[Task]]]:
+    """Results as they come; in this process if there is one worker.
+
+    Args:
+        work: a function of a module, or a partial of one; it goes to each process once.
+        tasks: what it is called with.
+        workers: number of processes.
+    """
+    if min(workers, len(tasks)) <= 1 or not _can_start(work):
+        for task in tasks:
+            yield task, work(task)
+        return
+    left = dict(enumerate(tasks))
+    with _pool(work, workers) as pool:
+        running = {pool.submit(_do, task): index for index, task in left.items()}
+        try:
+            for future in as_completed(running):
+                result = future.result()
+                yield left.pop(running[future]), result
+        except BrokenProcessPool:
+            pass  # found out below
+        finally:
+            _drop(running)
+    yield from _one_by_one(work, list(left.values()))
+
+
+def _can_start(work: Callable[[Any], Any]) -> bool:
+    """Whether processes start at all: from an interactive session, or a script without a main guard, they do not."""
+    try:
+        with _pool(work, 1) as pool:
+            return pool.submit(os.getpid).result() != os.getpid()
+    except BrokenProcessPool:
+        return False
+
+
+def _one_by_one(work: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[tuple[Task, Result | Died[Task]]]:
+    """With one task in one process at a time it is known which task killed the process."""
+    waiting = list(reversed(tasks))
+    while waiting:
+        with _pool(work, 1) as pool:
+            while waiting:
+                task = waiting.pop()
+                try:
+                    yield task, pool.submit(_do, task).result()
+                except BrokenProcessPool:
+                    yield task, Died(task)
+                    break
+
+
+def _pool(work: Callable[[Any], Any], workers: int) -> ProcessPoolExecutor:
+    # Never a plain fork: the caller may have started threads.
+    return ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(work,)
+    )
+
+
+def _drop(futures: dict[Future[Any], int]) -> None:
+    for future in futures:
+        future.cancel()
+
+
+def _start(work: Callable[[Any], Any]) -> None:
+    global _work
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
+    _work = work
+
+
+def _do(task: Any) -> Any:  # noqa: ANN401
+    return _work(task) if _work is not None else None
