@@ -126,7 +126,8 @@ def device(name: str) -> str:
 def read_style(style: str, identity: str, assets: Assets, checkpoint: Path) -> Reference:
     """A style reference from a file, from the checkpoint, or from the corpus that the checkpoint was trained on.
 
-    A file holds absolute vertices; its subject is told by its name (``F1_e03.npy``), else it is the identity.
+    A file holds absolute vertices; its subject is told by its name (``F1_e03.npy``), else it is the identity. A file in
+    the ``vertices_npy`` of a corpus folder comes with that folder's templates and frame rate.
     """
     if not style.endswith(".npy"):
         for reference in assets.references.values():
@@ -134,7 +135,43 @@ def read_style(style: str, identity: str, assets: Assets, checkpoint: Path) -> R
                 return reference
     path = Path(style) if style.endswith(".npy") else corpus_clip(style, checkpoint)
     subject = path.stem.split("_condition_")[0].rpartition("_")[0]
-    return read_reference(path, assets, subject if subject in assets.templates else identity)
+    templates, stored = folder_facts(path, assets, checkpoint)
+    who = next((name for name in (subject, identity) if name in templates), None)
+    template = templates[who] if who is not None else assets.template(identity)
+    return read_reference(path, assets, who or identity, template, stride_of(path, stored, assets.frame_rate))
+
+
+def folder_facts(path: Path, assets: Assets, checkpoint: Path) -> tuple[dict[str, Tensor], float]:
+    """Templates that a motion file may belong to, and its motion frames a second."""
+    from facediff.data import SpeechMotionDataModule
+    from facediff.data.assets import DATA_SOURCE_KEY
+    from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
+    from facediff.systems.checkpoint import imported, read_checkpoint
+
+    templates: dict[str, Tensor] = dict(assets.templates)
+    root = path.resolve().parent.parent
+    if path.resolve().parent.name not in MOTION_FOLDERS:
+        return templates, assets.frame_rate
+    if (root / "templates.pkl").is_file():
+        templates |= read_templates(root / "templates.pkl", assets.n_vertices)
+    source = read_checkpoint(checkpoint).get(DATA_SOURCE_KEY, {})
+    module = imported(str(source.get("class_path")), SpeechMotionDataModule)  # type: ignore[type-abstract]
+    usual = module.stored_frame_rate if module is not None and str(root) == source.get("root") else None
+    return templates, float(read_manifest(root).get("frame_rate") or usual or assets.frame_rate)
+
+
+def stride_of(path: Path, stored: float, wanted: float) -> int:
+    """Every how many-th frame of a file is taken.
+
+    Raises:
+        FaceDiffError: if the file's frame rate is no whole multiple of the checkpoint's.
+    """
+    stride = round(stored / wanted)
+    if stride < 1 or abs(stride * wanted - stored) > 1e-6:
+        raise FaceDiffError(
+            f"--style {path}: has {stored:g} frames a second, the checkpoint {wanted:g}; give a motion at that rate"
+        )
+    return stride
 
 
 def corpus_clip(name: str, checkpoint: Path) -> Path:
@@ -150,8 +187,8 @@ def corpus_clip(name: str, checkpoint: Path) -> Path:
     return path
 
 
-def read_reference(path: Path, assets: Assets, subject: str) -> Reference:
-    """Offsets from a subject's template, from a file of absolute vertices (T, V, 3) or (T, 3V)."""
+def read_reference(path: Path, assets: Assets, subject: str, template: Tensor, stride: int = 1) -> Reference:
+    """Offsets from a subject's template (V, 3), from a file of absolute vertices (T, V, 3) or (T, 3V)."""
     import numpy as np
     import torch
 
@@ -169,10 +206,10 @@ def read_reference(path: Path, assets: Assets, subject: str) -> Reference:
             f"--style {path}: has shape {array.shape}; the checkpoint's faces have {vertices} vertices, "
             f"so (frames, {vertices}, 3) or (frames, {3 * vertices}) is expected"
         )
-    motion = np.array(array, np.float32).reshape(len(array), vertices, 3)
+    motion = np.array(array[::stride], np.float32).reshape(-1, vertices, 3)
     if not np.isfinite(motion).all():
         raise FaceDiffError(f"--style {path}: holds NaN or infinity")
-    offsets = torch.from_numpy(motion) - assets.template(subject)
+    offsets = torch.from_numpy(motion) - template
     refuse_stranger(path, offsets, assets, subject)
     return Reference(path.stem, offsets)
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import inspect
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import UnionType
+from typing import TYPE_CHECKING, Literal, get_args, get_origin, get_type_hints
 
 from facediff.errors import FaceDiffError
 
@@ -14,63 +18,76 @@ if TYPE_CHECKING:
     from facediff.prepare.job import Plan
     from facediff.prepare.runner import Report
 
+CORPORA = ("biwi", "vocaset")
+"""Modules of :mod:`facediff.prepare`; each has a ``plan(raw, *, …)`` whose keyword parameters are its options."""
 SHOWN = 20
 """Lines of a list on the screen; the whole list is in the manifest."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Options of the command."""
+    """Options of the command: those that all corpora have, and each one's own."""
     made = argparse.ArgumentParser(
         "facediff data prepare",
         description="Write a corpus folder from a data set as its authors distribute it. A run that was stopped is "
         "taken up where it was by the same command.",
     )
     corpora = made.add_subparsers(dest="corpus", required=True, metavar="corpus")
-    _add_biwi(corpora)
-    _add_vocaset(corpora)
+    for name in CORPORA:
+        module = importlib.import_module(f"facediff.prepare.{name}")
+        title = (module.__doc__ or "").partition("\n")[0]
+        corpus = corpora.add_parser(name, help=title, description=title)
+        corpus.add_argument("raw", type=Path, help="the raw data set, unpacked")
+        corpus.add_argument("out", type=Path, help="folder to write: a new one, or one that this command has begun")
+        for parameter in own_options(module.plan):
+            _add_option(corpus, parameter, get_type_hints(module.plan)[parameter.name], _meanings(module.plan))
+        corpus.add_argument("--workers", type=int, help="processes (default: as many as processors)")
+        corpus.add_argument("--quiet", action="store_true", help="no progress bars")
     return made
 
 
-def _add_corpus(
-    corpora: argparse._SubParsersAction[argparse.ArgumentParser], name: str, title: str
-) -> argparse.ArgumentParser:
-    """A corpus with the options that all of them have."""
-    made = corpora.add_parser(name, help=title, description=title)
-    made.add_argument("raw", type=Path, help="the raw data set, unpacked")
-    made.add_argument("out", type=Path, help="folder to write: a new one, or one that this command has begun")
-    made.add_argument("--dtype", choices=["float32", "float64"], default="float32", help="of the motion on disk")
-    made.add_argument("--workers", type=int, help="processes (default: as many as processors)")
-    made.add_argument("--quiet", action="store_true", help="no progress bars")
-    return made
+def own_options(plan: Callable[..., Plan]) -> list[inspect.Parameter]:
+    """Keyword parameters of a corpus's ``plan``: each is an option of the command line."""
+    return [found for found in inspect.signature(plan).parameters.values() if found.kind is found.KEYWORD_ONLY]
 
 
-def _add_biwi(corpora: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    made = _add_corpus(corpora, "biwi", "BIWI, B3D(AC)^2: .vl frames, rigid scans, wav or flv")
-    made.add_argument(
-        "--normalise",
-        choices=["codetalker", "none"],
-        default="codetalker",
-        help="codetalker: turned, centred and scaled frame by frame, as published work has it; none: raw mm",
-    )
-    made.add_argument("--subjects", type=_names, help="only these, e.g. F2,F3,M5 (default: all that are there)")
-    made.add_argument("--regions", type=Path, help="folder with lve.txt and fdd.txt (default: regions/ of RAW)")
+def _meanings(plan: Callable[..., Plan]) -> dict[str, str]:
+    """What the docstring says of each parameter."""
+    text = inspect.getdoc(plan) or ""
+    entries = re.findall(r"^ {4}(\w+): ((?:.+\n)(?: {8}.+\n)*)", text.partition("Args:\n")[2] + "\n", re.MULTILINE)
+    return {name: " ".join(meaning.split()).replace("``", "").replace("%", "%%") for name, meaning in entries}
 
 
-def _add_vocaset(corpora: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    made = _add_corpus(corpora, "vocaset", "VOCASET: data_verts.npy and its pickles")
-    made.add_argument(
-        "--frame-rate", type=int, choices=[30, 60], default=30, help="30 (default), or 60 for other projects' loaders"
-    )
-    made.add_argument(
-        "--decimate",
-        choices=["every_second", "filtered"],
-        default="every_second",
-        help="how 60 becomes 30: every second frame, as published work has it, or low-pass filtered",
-    )
-    made.add_argument("--regions", type=Path, help="folder with lists of vertices (default: regions/ of RAW)")
+def _add_option(
+    parser: argparse.ArgumentParser, parameter: inspect.Parameter, kind: object, meanings: dict[str, str]
+) -> None:
+    """An option of the parameter's name, type, default and meaning."""
+    needed = parameter.default is parameter.empty
+    default = None if needed else parameter.default
+    told = "" if default is None or isinstance(default, bool) else f" (default: {default})"
+    flag, meaning = f"--{parameter.name.replace('_', '-')}", meanings[parameter.name] + told
+    if isinstance(kind, UnionType):
+        kind = next(choice for choice in get_args(kind) if choice is not type(None))
+    if kind is bool:
+        action = argparse.BooleanOptionalAction
+        parser.add_argument(flag, dest=parameter.name, action=action, default=default, help=meaning)
+    elif get_origin(kind) is Literal:
+        values = get_args(kind)
+        parser.add_argument(
+            flag,
+            dest=parameter.name,
+            type=type(values[0]),
+            choices=values,
+            default=default,
+            required=needed,
+            help=meaning,
+        )
+    else:
+        read = _names if get_origin(kind) in (Sequence, list, tuple) else kind
+        parser.add_argument(flag, dest=parameter.name, type=read, default=default, required=needed, help=meaning)  # type: ignore[arg-type]
 
 
 def _names(words: str) -> list[str]:
+    """Words separated by commas."""
     return [word for word in words.replace(",", " ").split() if word]
 
 
@@ -95,17 +112,9 @@ def run(name: str, arguments: Sequence[str]) -> int:
 
 def make_plan(args: argparse.Namespace) -> Plan:
     """The plan that the arguments ask for."""
-    if args.corpus == "biwi":
-        from facediff.prepare import biwi
-
-        return biwi.plan(
-            args.raw, normalise=args.normalise, dtype=args.dtype, subjects=args.subjects, regions=args.regions
-        )
-    from facediff.prepare import vocaset
-
-    return vocaset.plan(
-        args.raw, frame_rate=args.frame_rate, decimate=args.decimate, dtype=args.dtype, regions=args.regions
-    )
+    plan = importlib.import_module(f"facediff.prepare.{args.corpus}").plan
+    made: Plan = plan(args.raw, **{option.name: getattr(args, option.name) for option in own_options(plan)})
+    return made
 
 
 def describe(report: Report) -> list[str]:

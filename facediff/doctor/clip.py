@@ -111,7 +111,7 @@ def _examine_sound(facts: ClipFacts, rules: Rules, path: Path) -> None:
 
 
 def _hash(facts: ClipFacts, rules: Rules, path: Path, where: str) -> None:
-    if not rules.quick and path.is_file():
+    if not rules.quick and path.is_file() and path.stat().st_size:
         facts.hashes[where] = sha256(path)
 
 

@@ -94,10 +94,10 @@ def number(value: int) -> str:
     return f"{value:,}".replace(",", " ")
 
 
-def counted(value: int, word: str) -> str:
+def counted(value: int, one: str, many: str | None = None) -> str:
     """A number and its noun.
 
-    >>> counted(1, "clip"), counted(3879, "frame")
-    ('1 clip', '3 879 frames')
+    >>> counted(1, "clip"), counted(3879, "frame"), counted(2, "vertex", "vertices")
+    ('1 clip', '3 879 frames', '2 vertices')
     """
-    return f"{number(value)} {word}{'' if value == 1 else 's'}"
+    return f"{number(value)} {one if value == 1 else many or one + 's'}"

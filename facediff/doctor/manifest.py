@@ -24,7 +24,9 @@ def read_record(root: Path, name: str, findings: list[Finding]) -> dict[str, Any
             try:
                 record = json.loads(path.read_bytes())
             except (ValueError, RecursionError) as error:
-                raise FaceDiffError(f"not readable as JSON ({error}); prepare the folder anew, or remove the file") from error
+                raise FaceDiffError(
+                    f"not readable as JSON ({error}); prepare the folder anew, or remove the file"
+                ) from error
             if not isinstance(record, dict):
                 raise FaceDiffError("holds no JSON object; prepare the folder anew, or remove the file")
             return record
@@ -71,17 +73,23 @@ def check_files(
         if not isinstance(said, dict) or not _is_below(root, path):
             message = f'"{name}" is no entry of a file below the folder; prepare the folder anew'
             findings.append(Finding("error", "manifest_entry", MANIFEST, message))
-        elif not path.is_file():
-            found["missing"].append(name)
-            message = "is in manifest.json and is not there; prepare the folder anew"
-            findings.append(Finding("error", "file_missing", name, message))
-        elif path.stat().st_size != said.get("bytes") or (
-            not quick and (hashes.get(name) or sha256(path)) != said.get("sha256")
-        ):
-            found["changed"].append(name)
-            message = "is not what was written (manifest.json): changed since, or damaged; prepare the folder anew"
-            findings.append(Finding("error", "file_changed", name, message))
+            continue
+        with guarded(findings, "file_unreadable", path, root):
+            if not path.is_file():
+                found["missing"].append(name)
+                message = "is in manifest.json and is not there; prepare the folder anew"
+                findings.append(Finding("error", "file_missing", name, message))
+            elif not _is_as_recorded(path, said, hashes.get(name), quick=quick):
+                found["changed"].append(name)
+                message = "is not what was written (manifest.json): changed since, or damaged; prepare the folder anew"
+                findings.append(Finding("error", "file_changed", name, message))
     return found
+
+
+def _is_as_recorded(path: Path, said: Mapping[str, Any], known: str | None, *, quick: bool) -> bool:
+    if path.stat().st_size != said.get("bytes"):
+        return False
+    return quick or (known or sha256(path)) == said.get("sha256")
 
 
 def _is_below(root: Path, path: Path) -> bool:

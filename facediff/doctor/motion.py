@@ -69,7 +69,9 @@ def look_at_motion(
         return facts
     facts.n_vertices = vertices_of(array)
     if not np.issubdtype(array.dtype, np.floating):
-        facts.add("error", "motion_dtype", where, f"holds {array.dtype}, expected floating-point vertices; write it anew")
+        facts.add(
+            "error", "motion_dtype", where, f"holds {array.dtype}, expected floating-point vertices; write it anew"
+        )
         return facts
     if facts.n_vertices != n_vertices:
         found = "which is no number of vertices" if facts.n_vertices is None else f"{facts.n_vertices} vertices"
@@ -113,7 +115,9 @@ def unreadable(path: Path, error: Exception) -> str:
     """The sentence for a file that NumPy cannot open."""
     if "mmap length" in str(error):
         return f"is cut short: its {path.stat().st_size} bytes are fewer than its header says; copy it anew"
-    return f"not a readable NumPy array ({error}); expected a .npy file with (frames, 3 x vertices) floats, copy it anew"
+    return (
+        f"not a readable NumPy array ({error}); expected a .npy file with (frames, 3 x vertices) floats, copy it anew"
+    )
 
 
 def vertices_of(array: npt.NDArray[Any]) -> int | None:

@@ -8,7 +8,10 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
+
+from facediff.errors import MissingExtraError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -30,6 +33,20 @@ class Died(Generic[Task]):
 def processors() -> int:
     """Processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def steps(total: int, *, shown: bool) -> Iterator[Callable[[], object]]:
+    """A progress bar on standard error, if it is a terminal; what is given is called after each clip."""
+    if not shown:
+        yield lambda: None
+        return
+    try:
+        from tqdm import tqdm
+    except ImportError as error:
+        raise MissingExtraError("tqdm", "prepare", "the progress bar (--quiet does without)") from error
+    with tqdm(total=total, desc="clips", unit="clip", disable=None) as bar:
+        yield bar.update
 
 
 def run_all(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,9 @@ from facediff.doctor.motion import Array
 from facediff.doctor.view import View
 from facediff.errors import FaceDiffError
 from facediff.pickles import load_pickle
+
+if TYPE_CHECKING:
+    from facediff.data.corpus import Corpus
 
 AREA_TOLERANCE = 1e-3
 """How far a surface area may be from one; float32 templates are within 1e-6."""
@@ -33,7 +36,8 @@ def check_templates(root: Path, view: View, findings: list[Finding]) -> tuple[di
         the usable templates (V, 3) by subject, float32, and the report's section.
     """
     path = root / "templates.pkl"
-    section: dict[str, Any] = {"file": None, "subjects": [], "blob": None, "origin": None, "areas": None}
+    section: dict[str, Any] = {"file": None, "subjects": [], "broken": [], "blob": None}
+    section |= {"origin": None, "areas": None}
     templates: dict[str, Array] = {}
     with guarded(findings, "templates_unreadable", path, root):
         loaded = load_pickle(path)
@@ -44,6 +48,7 @@ def check_templates(root: Path, view: View, findings: list[Finding]) -> tuple[di
             problem, template = read_template(value, view.n_vertices)
             if template is None:
                 where = f"templates.pkl:{subject}"
+                section["broken"].append(str(subject))
                 findings.append(Finding("error", "template_broken", where, f"{problem}; get templates.pkl anew"))
             else:
                 templates[str(subject)] = template
@@ -64,7 +69,7 @@ def read_template(value: object, n_vertices: int) -> tuple[str, Array | None]:
         return f"has shape {array.shape}, expected ({n_vertices}, 3)", None
     if not np.isfinite(array).all():
         bad = int((~np.isfinite(array.reshape(-1, 3)).all(axis=1)).sum())
-        return f"holds NaN or infinity in {counted(bad, 'vertex').replace('vertexs', 'vertices')}", None
+        return f"holds NaN or infinity in {counted(bad, 'vertex', 'vertices')}", None
     return "", array.reshape(n_vertices, 3)
 
 
@@ -177,7 +182,7 @@ def _check_region(
     with guarded(findings, "region_missing" if source is None else "region_broken", path, root):
         region = find_region(root, sources, name, view.n_vertices, view.region_help)
         if region.duplicates:
-            message = f"{counted(region.duplicates, 'index').replace('indexs', 'indices')} of {name} repeated; counted once"
+            message = f"{counted(region.duplicates, 'index', 'indices')} of {name} repeated; counted once"
             findings.append(Finding("note", "region_repeats", str(source), message))
         usual = facts.REGIONS.get(view.corpus, {}).get(str(source))
         if usual is not None and usual != region.count:
@@ -186,7 +191,7 @@ def _check_region(
                     "note",
                     "region_unusual",
                     str(source),
-                    f"{name} has {counted(region.count, 'vertex').replace('vertexs', 'vertices')}, the list that "
+                    f"{name} has {counted(region.count, 'vertex', 'vertices')}, the list that "
                     f"circulates under this name has {number(usual)}: scores over it are others than published ones",
                 )
             )
@@ -205,8 +210,8 @@ def _used(root: Path, sources: Iterable[str]) -> str | None:
     return next((source for source in sources if (root / source.partition(":")[0]).is_file()), None)
 
 
-def check_pairs(root: Path, view: View, findings: list[Finding]) -> None:
+def check_pairs(opened: Corpus, findings: list[Finding]) -> None:
     """Check the pairs of vertices on the inner lips, where a corpus has them."""
-    path = root / "regions" / "inner_lip_pairs.txt"
-    with guarded(findings, "region_broken", path, root):
-        view.open(root).read_pairs(path.name)
+    path = opened.root / "regions" / "inner_lip_pairs.txt"
+    with guarded(findings, "region_broken", path, opened.root):
+        opened.read_pairs(path.name)

@@ -64,7 +64,9 @@ def look_at_sound(path: Path, where: str, *, quick: bool) -> SoundFacts:
             if not quick:
                 _listen(facts, file, where, frames)
     except Exception as problem:  # the decoder raises its own and others on damaged files
-        return error("sound_unreadable", f"not a readable sound file ({problem}); expected a .wav recording, copy it anew")
+        return error(
+            "sound_unreadable", f"not a readable sound file ({problem}); expected a .wav recording, copy it anew"
+        )
     facts.sample_rate, facts.channels = int(rate), int(channels)
     if not any(finding.severity == "error" for finding in facts.findings):
         facts.seconds = frames / rate

@@ -65,10 +65,11 @@ def plan(
 
     Args:
         raw: the folder, or the folder above the one that the archives unpacked to.
-        normalise: ``codetalker`` (see :mod:`facediff.prepare.normalise`) or ``none``: as it is in the raw files, in mm.
-        dtype: of the motion on disk.
-        subjects: only these; all 14 if None.
-        regions: folder with ``lve.txt`` and ``fdd.txt``; ``regions/`` of the raw folder if None.
+        normalise: ``codetalker``: turned, centred and scaled frame by frame, as published work has it; ``none``: as it
+            is in the raw files, in mm
+        dtype: of the motion on disk; ``float64`` is what CodeTalker writes and takes twice the space
+        subjects: only these, e.g. F2,F3,M5; all that are there if not given
+        regions: folder with lve.txt and fdd.txt; regions/ of the raw folder if not given
 
     Raises:
         FaceDiffError: if there is no usable sequence, a subject is unknown, or the templates do not fit together.

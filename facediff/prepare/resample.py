@@ -105,13 +105,18 @@ def _reflected(
     What reaches beyond the other end, in motion shorter than the filter, stops there.
     """
     last = frames - 1
-    folded = np.zeros((len(weights), frames))
-    inside = (sources >= 0) & (sources <= last)
-    folded[:, sources[inside]] = weights[:, inside]
-    for end, beyond in ((0, sources < 0), (last, sources > last)):
-        mirrored = np.clip(2 * end - sources[beyond], 0, last)
-        folded[:, end] += 2.0 * weights[:, beyond].sum(axis=1)
-        np.subtract.at(folded.T, mirrored, weights[:, beyond].T)
-    used = np.flatnonzero(folded.any(axis=0))
-    span = slice(int(used[0]), int(used[-1]) + 1)
-    return span, folded[:, span]
+    mirrored = np.where(sources < 0, -sources, np.where(sources > last, 2 * last - sources, sources)).clip(0, last)
+    first, stop = int(mirrored.min()), int(mirrored.max()) + 1
+    before, after = sources < 0, sources > last
+    if before.any():
+        first = 0
+    if after.any():
+        stop = frames
+    folded = np.zeros((len(weights), stop - first))
+    sign = np.where(before | after, -1.0, 1.0)
+    np.add.at(folded.T, mirrored - first, (sign * weights).T)
+    if before.any():
+        folded[:, 0] += 2.0 * weights[:, before].sum(axis=1)
+    if after.any():
+        folded[:, -1] += 2.0 * weights[:, after].sum(axis=1)
+    return slice(first, stop), folded

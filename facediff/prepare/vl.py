@@ -46,11 +46,11 @@ def frame_files(folder: Path) -> dict[int, Path]:
         FaceDiffError: if two files claim the same number.
     """
     found: dict[int, Path] = {}
-    for entry in os.scandir(folder):
-        match = FRAME_NAME.fullmatch(entry.name)
+    for name in os.listdir(folder):
+        match = FRAME_NAME.fullmatch(name)
         if match is None:
             continue
-        number, path = int(match[1]), folder / entry.name
+        number, path = int(match[1]), folder / name
         if number in found:
             raise FaceDiffError(f"{path}: has the same frame number as {found[number].name}; remove one of them")
         found[number] = path

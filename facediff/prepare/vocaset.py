@@ -71,11 +71,11 @@ def plan(
 
     Args:
         raw: the folder, or the folder above it.
-        frame_rate: 30, which every published model uses; or 60, as it is in the raw files.
-        decimate: how 60 becomes 30: ``every_second`` frame, beginning with the first, as all projects do; or
-            ``filtered``, which takes off what would alias first.
-        dtype: of the motion on disk.
-        regions: folder with lists of vertices; ``regions/`` of the raw folder if None.
+        frame_rate: 30, which every published model uses; or 60, as in the raw files, for other projects' loaders
+        decimate: how 60 becomes 30: ``every_second`` frame, beginning with the first, as published work has it; or
+            ``filtered``, which takes away first what would alias
+        dtype: of the motion on disk
+        regions: folder with lists of vertices; regions/ of the raw folder if not given
 
     Raises:
         FaceDiffError: if a file is missing or is not what it should be, or no clip is complete.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import nn
@@ -16,6 +16,8 @@ from facediff.registry import KINDS
 
 if TYPE_CHECKING:
     from facediff.systems.base import SpeechAnimator
+
+T = TypeVar("T")
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -75,11 +77,16 @@ def is_component(kind: str, path: str) -> bool:
     return is_imported(path, nn.Module) or is_imported(path, Sampler)
 
 
-def is_imported(path: str, base: type) -> bool:
-    """Whether an import path is that of a subclass of ``base``; a module that is not imported yet stays so."""
+def imported(path: str, base: type[T]) -> type[T] | None:
+    """The subclass of ``base`` of an import path; None if there is none, or its module is not imported yet."""
     module, _, name = path.rpartition(".")
     found = getattr(sys.modules.get(module), name, None)
-    return isinstance(found, type) and issubclass(found, base)
+    return found if isinstance(found, type) and issubclass(found, base) else None
+
+
+def is_imported(path: str, base: type) -> bool:
+    """Whether an import path is that of a subclass of ``base``; a module that is not imported yet stays so."""
+    return imported(path, base) is not None
 
 
 def names_a_class(value: object) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import av
@@ -141,3 +142,26 @@ def test_a_checkpoint_of_another_topology_says_so(
     torch.save(loaded, tmp_path / "other.ckpt")
     assert animate(speech, "--checkpoint", tmp_path / "other.ckpt", "-o", tmp_path / "x.npy") == 2
     assert "vertices are {24} in the model and {20} in the corpus" in capsys.readouterr().err
+
+
+def test_a_style_from_another_folder_comes_with_its_template_and_frame_rate(
+    speech: Path, checkpoint: Path, tiny_root: Path, tmp_path: Path
+) -> None:
+    """The same motion of the same face, moved away in space and stored at twice the frame rate, is the same style."""
+    person = tmp_path / "ada"
+    (person / "vertices_npy").mkdir(parents=True)
+    templates = pickle.loads((tiny_root / "templates.pkl").read_bytes())  # noqa: S301 - written by the fake
+    motion = np.load(tiny_root / "vertices_npy" / "A_e02.npy").reshape(-1, 24, 3)
+    (person / "templates.pkl").write_bytes(pickle.dumps({"Ada": templates["A"] + 5.0}))
+    np.save(person / "vertices_npy" / "Ada_s01.npy", np.repeat(motion + 5.0, 2, axis=0))
+    (person / "manifest.json").write_text('{"person": "Ada", "frame_rate": 50}')
+
+    def made(style: str) -> np.ndarray:
+        assert animate(speech, "--checkpoint", checkpoint, "--style", style, "-o", tmp_path / "out.npy") == 0
+        return np.load(tmp_path / "out.npy")
+
+    # Coordinates around 5 hold a millionth part less than those around 0.
+    np.testing.assert_allclose(made(str(person / "vertices_npy" / "Ada_s01.npy")), made("A_e02"), rtol=0, atol=1e-5)
+    (person / "manifest.json").write_text('{"person": "Ada", "frame_rate": 30}')
+    style = person / "vertices_npy" / "Ada_s01.npy"
+    assert animate(speech, "--checkpoint", checkpoint, "--style", style, "-o", tmp_path / "out.npy") == 2

@@ -61,10 +61,10 @@ def test_shape_type_and_coordinates_are_independent() -> None:
 
 
 def test_it_works_from_disk_to_disk(tmp_path: Path) -> None:
-    motion = np.random.default_rng(0).normal(size=(3000, 120)).astype(np.float32)
+    motion = np.random.default_rng(0).normal(size=(6000, 300)).astype(np.float32)
     np.save(tmp_path / "in.npy", motion)
     source = np.load(tmp_path / "in.npy", mmap_mode="r")
-    out = np.lib.format.open_memmap(tmp_path / "out.npy", mode="w+", dtype=np.float32, shape=(2500, 120))
+    out = np.lib.format.open_memmap(tmp_path / "out.npy", mode="w+", dtype=np.float32, shape=(5000, 300))
     tracemalloc.start()
     resample_frames(source, 30, 25, out=out)
     _, peak = tracemalloc.get_traced_memory()

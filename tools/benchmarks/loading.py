@@ -1,8 +1,8 @@
 """How quickly a BIWI-sized corpus is read, and in how much memory, against the way other projects read it.
 
 Run ``python tools/benchmarks/loading.py``: makes 24 clips of 160 frames and 23 370 vertices, float64 as
-CodeTalker writes them (2.2 GB in a temporary folder), and reads them in several ways, each in a process of its own. All of them hand
-out float32 tensors, one clip (or window) a batch, with its speech.
+CodeTalker writes them (2.2 GB in a temporary folder), and reads them in several ways, each in a process of its own. All
+of them hand out float32 tensors, one clip (or window) a batch, with its speech.
 
 - ``file by file``: ``np.load`` of the whole file for each sample, as FaceDiffuser's training loop does.
 - ``all at start``: ``np.load`` of all files before the first sample, as FaceFormer, CodeTalker, SelfTalk and
