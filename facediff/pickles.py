@@ -57,16 +57,23 @@ def _stand_in(origin: str) -> type[StandIn]:
     return type("StandIn", (StandIn,), {"origin": origin})
 
 
-def _reconstructor(wanted: object, base: object, state: object) -> StandIn:
-    """In place of ``copyreg._reconstructor``, by which old pickles make their objects."""
-    if not (isinstance(wanted, type) and issubclass(wanted, StandIn)):
-        raise pickle.UnpicklingError("it makes an object in an unknown way")
-    return wanted()
+class _Reconstructor:
+    """In place of ``copyreg._reconstructor``, by which old pickles make their objects.
+
+    An object without attributes: a pickle could set attributes of a function.
+    """
+
+    __slots__ = ()
+
+    def __call__(self, wanted: object, base: object, state: object) -> StandIn:
+        if not (isinstance(wanted, type) and issubclass(wanted, StandIn)):
+            raise pickle.UnpicklingError("it makes an object in an unknown way")
+        return wanted()
 
 
 FOR_STAND_INS: dict[tuple[str, str], Any] = {
-    ("copy_reg", "_reconstructor"): _reconstructor,
-    ("copyreg", "_reconstructor"): _reconstructor,
+    ("copy_reg", "_reconstructor"): _Reconstructor(),
+    ("copyreg", "_reconstructor"): _Reconstructor(),
     ("__builtin__", "object"): object,
     ("builtins", "object"): object,
 }

@@ -17,15 +17,11 @@ def parser() -> argparse.ArgumentParser:
         "changed. Exit status: 0 sound (warnings allowed), 1 not sound, 2 wrong usage.",
     )
     made.add_argument("root", type=Path, help="the corpus folder")
-    made.add_argument(
-        "--corpus", help="what it is: biwi, vocaset, mead3d, puppet, or package.module.Class"
-    )
+    made.add_argument("--corpus", help="what it is: biwi, vocaset, mead3d, puppet, or package.module.Class")
     made.add_argument("--split", help="totals of one way to split the corpus only (3DMEAD: sentence, identity)")
     made.add_argument("--quick", action="store_true", help="read headers only, and compare files by size")
     made.add_argument("--json", action="store_true", help="machine-readable: one object")
-    made.add_argument(
-        "--workers", type=int, help="processes (default: as many as processors if there is much to read)"
-    )
+    made.add_argument("--workers", type=int, help="processes (default: as many as processors if there is much to read)")
     made.add_argument("--quiet", action="store_true", help="no progress bar")
     return made
 

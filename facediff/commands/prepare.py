@@ -64,7 +64,7 @@ def _add_option(
     needed = parameter.default is parameter.empty
     default = None if needed else parameter.default
     told = "" if default is None or isinstance(default, bool) else f" (default: {default})"
-    flag, meaning = f"--{parameter.name.replace('_', '-')}", meanings[parameter.name] + told
+    flag, meaning = f"--{parameter.name.replace('_', '-')}", meanings.get(parameter.name, "") + told
     if isinstance(kind, UnionType):
         kind = next(choice for choice in get_args(kind) if choice is not type(None))
     if kind is bool:

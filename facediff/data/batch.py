@@ -34,6 +34,7 @@ class Sample:
         reference_name: the clip that the reference was taken from.
         decoy_audio: speech of another sentence, as long as ``audio``; only for evaluation against shuffled audio.
         features: what the frozen part of the audio encoder makes of the clip's speech; None where it is not cached.
+        repeated: whether another process scores the same clip.
     """
 
     audio: Float[Tensor, " samples"]
@@ -47,6 +48,7 @@ class Sample:
     reference_name: str
     decoy_audio: Float[Tensor, " samples"] | None = None
     features: Float[Tensor, "steps channels"] | None = None
+    repeated: bool = False
 
 
 @dataclass
@@ -69,6 +71,7 @@ class Batch:
         decoy_audio: padded speech of other sentences, with the lengths of ``audio``; evaluation only.
         features: padded features of the frozen part of the audio encoder; None unless all clips have them.
         feature_lengths: valid steps of the features.
+        repeated: whether other processes score these clips, so that this one must not.
     """
 
     audio: Float[Tensor, "batch samples"]
@@ -86,6 +89,7 @@ class Batch:
     decoy_audio: Float[Tensor, "batch samples"] | None = None
     features: Float[Tensor, "batch steps channels"] | None = None
     feature_lengths: Int[Tensor, " batch"] | None = None
+    repeated: bool = False
 
     @property
     def mask(self) -> Bool[Tensor, "batch frames"]:
@@ -158,4 +162,5 @@ def collate(samples: Sequence[Sample]) -> Batch:
         decoy_audio=pad(decoys) if len(decoys) == len(samples) else None,
         features=pad(features) if cached else None,
         feature_lengths=torch.tensor([len(f) for f in features]) if cached else None,
+        repeated=samples[0].repeated,
     )

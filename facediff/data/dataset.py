@@ -122,6 +122,7 @@ class MotionDataset(Dataset[Sample]):
             reference_name=reference_name,
             decoy_audio=self._decoy(index, stop - start) if self.decoys else None,
             features=self._features(clip, start, stop, frames),
+            repeated=pick.repeated,
         )
 
     def frames(self) -> list[int]:

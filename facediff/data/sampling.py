@@ -21,10 +21,12 @@ class Pick:
     Attributes:
         index: which clip.
         seed: seed of its random draws (window, style reference).
+        repeated: whether another process has the same clip, so that it must not be scored here.
     """
 
     index: int
     seed: int
+    repeated: bool = False
 
 
 class ClipBatches(DistributedSampler[list[Pick]]):
@@ -35,8 +37,9 @@ class ClipBatches(DistributedSampler[list[Pick]]):
 
     It is a ``DistributedSampler`` in the sense that each process iterates over its own share of the same batches, so
     Lightning leaves it as it is. All processes get equally many batches, for they wait for one another at each. In
-    training that may repeat some batches of an epoch's last step. In evaluation every clip is there once: batches are
-    split, or where all are single clips put together, until their number goes up in the processes.
+    training that may repeat some batches of an epoch's last step. In evaluation every clip is scored once: batches are
+    split, or where all are single clips put together, until their number goes up in the processes; if there are fewer
+    clips than processes, the idle ones get a clip that is marked as repeated.
 
     Args:
         lengths: frames of every clip; looked at with ``max_frames`` only.
@@ -68,13 +71,15 @@ class ClipBatches(DistributedSampler[list[Pick]]):
 
     def __len__(self) -> int:
         """Number of batches of this process; the same in every epoch."""
-        return len(self._share(self._batches(torch.Generator())))
+        return -(-len(self._all(torch.Generator())) // self.num_replicas)
 
     def __iter__(self) -> Iterator[list[Pick]]:
         """This process's batches of the present epoch."""
-        generator = torch.Generator().manual_seed(self._hash("order"))
-        for batch in self._share(self._batches(generator), generator):
-            yield [Pick(index, self._hash(index) if self.training else 0) for index in batch]
+        batches = self._all(torch.Generator().manual_seed(self._hash("order")))
+        for place in range(self.rank, len(batches), self.num_replicas):
+            # With fewer clips than processes every batch is one clip, and those behind the last clip repeat one.
+            repeated = not self.training and place >= len(self.lengths)
+            yield [Pick(i, self._hash(i) if self.training else 0, repeated) for i in batches[place]]
 
     def _hash(self, what: object) -> int:
         return zlib.crc32(f"{self.seed}:{self.epoch}:{what}".encode())
@@ -95,17 +100,20 @@ class ClipBatches(DistributedSampler[list[Pick]]):
                 batches.append([index])
         return batches
 
-    def _share(self, batches: list[list[int]], generator: torch.Generator | None = None) -> list[list[int]]:
-        """This process's part. In training, batches of one step are neighbours in length, and steps are shuffled."""
-        world = self.num_replicas
+    def _all(self, generator: torch.Generator) -> list[list[int]]:
+        """The batches of all processes, in turn.
+
+        In training, batches of one step are neighbours in length, and steps are shuffled.
+        """
+        world, batches = self.num_replicas, self._batches(generator)
         if not self.training:
-            return evened(batches, world)[self.rank :: world]
+            return evened(batches, world)
         steps = [batches[i : i + world] for i in range(0, len(batches), world)]
         if steps and len(steps[-1]) < world:
             steps[-1] = [*steps[-1], *(batches * world)[: world - len(steps[-1])]]
-        if self.max_frames is not None and generator is not None:
+        if self.max_frames is not None:
             steps = [steps[i] for i in torch.randperm(len(steps), generator=generator).tolist()]
-        return [step[self.rank] for step in steps]
+        return [batch for step in steps for batch in step]
 
 
 def evened(batches: list[list[int]], world_size: int) -> list[list[int]]:
@@ -124,5 +132,6 @@ def evened(batches: list[list[int]], world_size: int) -> list[list[int]]:
         while len(batches) > up - world_size:
             batches[-2:] = [batches[-2] + batches[-1]]
     else:
-        batches += [batches[i % len(batches)] for i in range(up - len(batches))]
+        singles = [[index] for batch in batches for index in batch]
+        batches = [singles[i % clips] for i in range(world_size)]
     return batches

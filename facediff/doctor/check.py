@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff.doctor import corpus as together
-from facediff.doctor import shared
 from facediff.doctor.clip import ClipFacts, ClipFiles, Rules, examine
 from facediff.doctor.corpora import by_name, known, named, recognise
 from facediff.doctor.findings import Finding, by_severity, few, guarded, number
@@ -18,6 +17,8 @@ from facediff.doctor.motion import Array
 from facediff.doctor.pool import Died, processors, run_all, steps
 from facediff.doctor.raw import LOOKED_FOR, prepare_command, raw_distribution
 from facediff.doctor.report import Report
+from facediff.doctor.templates import check_areas, check_templates
+from facediff.doctor.topology import check_mesh, check_pairs, check_regions
 from facediff.doctor.totals import count_splits, count_subjects
 from facediff.doctor.view import View, view_of, view_of_person
 from facediff.errors import FaceDiffError, MissingExtraError
@@ -65,7 +66,7 @@ def check(
     state = read_record(root, STATE, findings)
     folder = list_folder(root, MOTION_FOLDERS)
     said = manifest.get("corpus", state.get("corpus"))
-    view = _find_view(report, folder, said, corpus, split, manifest)
+    view = identify(report, folder, said, corpus, split, manifest)
     report.manifest = {
         "there": (root / MANIFEST).is_file(),
         "ended": check_ended(root, said if isinstance(said, str) else None, findings),
@@ -78,48 +79,6 @@ def check(
         _check_corpus(report, view, folder, manifest, partial(_examine_all, workers=processes, progress=progress))
     report.findings = by_severity(findings)
     return report
-
-
-def _find_view(
-    report: Report, folder: Folder, said: object, corpus: str | None, split: str | None, manifest: dict[str, Any]
-) -> View | None:
-    """The corpus that a folder holds; None, with a finding, if it holds none or cannot be told."""
-    root, n_vertices = folder.root, folder.n_vertices()
-    module = None if corpus is None else by_name(corpus, n_vertices)
-    if not folder.motions and (raw := raw_distribution(root)) is not None:
-        report.raw = raw[0]
-        message = f"this is the raw distribution of {raw[0]} and no corpus yet: run `{prepare_command(raw[0], root)}`"
-        report.findings.append(Finding("error", "raw", raw[1], message))
-        return None
-    if module is None and isinstance(manifest.get("person"), str):
-        with guarded(report.findings, "manifest_unreadable", root / MANIFEST, root):
-            return view_of_person(manifest, n_vertices)
-        return None
-    module = module or recognise(folder, said, n_vertices)
-    if module is None:
-        report.findings.append(_unrecognised(folder, said, n_vertices))
-        return None
-    return view_of(module, root, split)
-
-
-def _unrecognised(folder: Folder, said: object, n_vertices: int | None) -> Finding:
-    have = [
-        f"{MANIFEST} names {said!r}, which no data module reads"
-        if said is not None
-        else f"no {MANIFEST} names a corpus"
-    ]
-    if folder.names:
-        vertices = "unreadable motion" if n_vertices is None else f"{number(n_vertices)} vertices"
-        have.append(f"there are clips {few(folder.names)} with {vertices}, which fit none of {few(_corpora())}")
-    else:
-        patterns = ", ".join(pattern for patterns in LOOKED_FOR.values() for pattern in patterns)
-        have.append(f"there is no wav/*.wav or vertices_npy/*.npy, and nothing of a raw distribution ({patterns})")
-    message = f"not recognised: {'; '.join(have)}. Give the right folder, or say what it is with --corpus"
-    return Finding("error", "unrecognised", str(folder.root), message)
-
-
-def _corpora() -> Iterable[str]:
-    return dict.fromkeys(str(named(module)) for module in known())
 
 
 def _check_corpus(
@@ -137,13 +96,13 @@ def _check_corpus(
         opened = view.open(root)
     stored = _stored_rate(manifest, view)
     report.stored_frame_rate = stored
-    templates, report.templates = shared.check_templates(root, view, findings)
-    faces, report.mesh = shared.check_mesh(root, view, findings)
+    templates, report.templates = check_templates(root, view, findings)
+    faces, report.mesh = check_mesh(root, view, findings)
     if faces is not None:
-        report.templates["areas"] = shared.check_areas(view, manifest.get("unit"), templates, faces, findings)
-    report.regions = shared.check_regions(root, view, findings)
+        report.templates["areas"] = check_areas(view, manifest.get("unit"), templates, faces, findings)
+    report.regions = check_regions(root, view, findings)
     if opened is not None:
-        shared.check_pairs(opened, findings)
+        check_pairs(opened, findings)
     clips = _clips(opened, view, folder, findings)
     together.check_names(view, folder, clips, findings)
     together.check_pairs_of_files(view, folder, findings)
@@ -176,7 +135,7 @@ def _clips(opened: Corpus | None, view: View, folder: Folder, findings: list[Fin
         return plain
     with guarded(findings, "clips_table", folder.root / "clips.csv", folder.root):
         read = opened.clips
-        return {name: read.get(name, clip) for name, clip in plain.items()}
+        plain = {name: read.get(name, clip) for name, clip in plain.items()}
     return plain
 
 
@@ -194,9 +153,7 @@ def _examine_all(rules: Rules, view: View, folder: Folder, *, workers: int, prog
     with steps(len(tasks), shown=progress) as step:
         for task, result in run_all(partial(examine, rules), tasks, workers):
             if isinstance(result, Died):
-                message = (
-                    "killed the process that read it, so it is damaged badly (or memory is short); get its files anew"
-                )
+                message = "killed the process that read it: badly damaged, or memory is short; get its files anew"
                 result = ClipFacts(task.name, findings=[Finding("error", "clip_unreadable", task.name, message)])
             done[task.name] = result
             step()

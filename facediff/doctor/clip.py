@@ -1,4 +1,7 @@
-"""Looking at one clip: its motion, its speech, and whether they go together. Runs in worker processes, so it is light."""
+"""Looking at one clip: its motion, its speech, and whether they go together.
+
+Worker processes import this, so it imports nothing heavy.
+"""
 
 from __future__ import annotations
 

@@ -27,8 +27,9 @@ def known() -> list[Module]:
     """Every data module that can be made, facediff's own first."""
     from facediff.data import SpeechMotionDataModule
 
-    def below(module: Module) -> Iterator[Module]:
-        for child in module.__subclasses__():
+    def below(module: type) -> Iterator[Module]:
+        children: list[Module] = module.__subclasses__()
+        for child in children:
             yield child
             yield from below(child)
 
@@ -42,7 +43,7 @@ def named(module: Module) -> str | None:
 
 
 def by_name(name: str, n_vertices: int | None) -> Module:
-    """The data module of a corpus name (``biwi``), a class name (``Biwi``) or an import path (``package.module.Class``).
+    """The data module of a corpus name (``biwi``), a class name (``Biwi``) or an import path (``package.Class``).
 
     Args:
         name: what was asked for.

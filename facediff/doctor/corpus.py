@@ -25,8 +25,8 @@ def check_names(view: View, folder: Folder, clips: Mapping[str, Clip], findings:
     if hubert:
         message = (
             f"{counted(len(hubert), 'clip')} with names in the manner of FaceXHuBERT ({few(hubert)}): NN is a neutral "
-            f"sequence and NN + 40 the emotional eNN, and its vertices are scaled axis by axis. Renaming would not make "
-            f"them comparable; prepare the folder anew from the raw files (`facediff data prepare biwi RAW OUT`)"
+            f"sequence and NN + 40 the emotional eNN, and its vertices are scaled axis by axis. Renaming would not "
+            f"make them comparable; prepare the folder anew from the raw files (`facediff data prepare biwi RAW OUT`)"
         )
         findings.append(Finding("error", "facexhubert_names", "vertices_npy", message))
     unknown = [name for name in odd if name not in set(hubert)]
@@ -79,9 +79,7 @@ def check_sounds(facts: Iterable[ClipFacts], findings: list[Finding]) -> None:
     for (rate, channels), count in forms.most_common():
         if (rate, channels) != (16_000, 1):
             form = f"{number(rate or 0)} Hz, {counted(channels or 0, 'channel')}"
-            message = (
-                f"{counted(count, 'file')} with {form}; read as 16 000 Hz mono, decoded once and kept in the cache"
-            )
+            message = f"{counted(count, 'file')} with {form}; heard as 16 000 Hz mono, decoded once, then cached"
             findings.append(Finding("note", "sound_form", "wav", message))
 
 
@@ -112,8 +110,8 @@ def check_frame_rate(
     )
     said = "manifest.json says" if recorded else f"copies of {view.corpus} have"
     message = (
-        f"there are about {other:g} motion frames for each second of speech, but {said} {stored:g}: motion would run at "
-        f"{stored / other:g} times its speed; {remedy}"
+        f"there are about {other:g} motion frames for each second of speech, but {said} {stored:g}: motion would run "
+        f"at {stored / other:g} times its speed; {remedy}"
     )
     findings.append(Finding("error", "frame_rate", "vertices_npy", message))
     return False

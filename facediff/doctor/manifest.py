@@ -42,8 +42,8 @@ def check_ended(root: Path, corpus: str | None, findings: list[Finding]) -> bool
             "error",
             "unfinished",
             STATE,
-            f"preparing this folder has not ended: run the same `facediff data prepare {corpus or 'CORPUS'} RAW {root}` "
-            f"again (it goes on where it was), or wait if it is at work",
+            f"preparing this folder has not ended: run the same `facediff data prepare {corpus or 'CORPUS'} RAW "
+            f"{root}` again (it goes on where it was), or wait if it is at work",
         )
     )
     return False

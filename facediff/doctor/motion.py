@@ -115,9 +115,7 @@ def unreadable(path: Path, error: Exception) -> str:
     """The sentence for a file that NumPy cannot open."""
     if "mmap length" in str(error):
         return f"is cut short: its {path.stat().st_size} bytes are fewer than its header says; copy it anew"
-    return (
-        f"not a readable NumPy array ({error}); expected a .npy file with (frames, 3 x vertices) floats, copy it anew"
-    )
+    return f"not a readable NumPy array ({error}); expected .npy with (frames, 3 x vertices) floats, copy it anew"
 
 
 def vertices_of(array: npt.NDArray[Any]) -> int | None:
@@ -188,8 +186,8 @@ def _compare_with_templates(
             "error",
             "motion_far_from_template",
             where,
-            f"its frames lie {share:.0%} of the face's size away from {subject}'s template{scaled}, where speech moves a "
-            f"face by a few percent: another unit, another normalisation, head motion left in, or the template of "
+            f"its frames lie {share:.0%} of the face's size away from {subject}'s template{scaled}, where speech moves "
+            f"a face by a few percent: another unit, another normalisation, head motion left in, or the template of "
             f"somebody else; prepare motion and templates.pkl together",
         )
 

@@ -28,7 +28,8 @@ class Report:
         findings: errors first, then warnings, then notes.
         splits: one row a split: way, split, expected, present, missing, frames, seconds.
         subjects: one row a subject: subject, trained_on, clips, frames, seconds, template.
-        templates: file, subjects, broken (those whose template cannot be used), blob (git blob id), origin (whose file it is), areas.
+        templates: file, subjects, broken (subjects whose template cannot be used), blob (git blob id), origin (whose
+            file it is), areas.
         mesh: the mesh file that is used; None if there is none.
         regions: by name: source, count, hash, duplicates, circulating_count; None for one that cannot be used.
         manifest: there, ended (whether preparing has ended), facediff (version that wrote it), changed, missing.

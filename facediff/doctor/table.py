@@ -8,6 +8,9 @@ from typing import Any
 from facediff.doctor.findings import Finding, counted, few, grouped, number
 from facediff.doctor.report import Report
 
+LISTED = 4
+"""Findings of a kind that are told one by one; of more, only the first is."""
+
 SPLIT_NAMES = {"test_a": "test A", "test_b": "test B", "none": "(style references only)"}
 
 
@@ -26,10 +29,10 @@ def text(report: Report) -> str:
 
 
 def printable(line: str) -> str:
-    """A line in which characters that do not print are spelled out: names of files may hold anything.
+    r"""A line in which characters that do not print are spelled out: names of files may hold anything.
 
-    >>> printable("a\\x1b[2Jb")
-    'a\\\\x1b[2Jb'
+    >>> printable("a\x1b[2Jb")
+    'a\\x1b[2Jb'
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
 
@@ -103,14 +106,15 @@ def _manifest(manifest: Mapping[str, Any]) -> str:
 
 
 def _remark(group: Sequence[Finding]) -> list[str]:
-    """One finding, or the first of several equal ones with the places of the others."""
+    """Findings of one kind: each of them if they are few, else the first and the places of the others."""
     first = group[0]
     label = first.severity.upper() if first.severity != "note" else "note"
-    several = f"{number(len(group))} times {first.kind}, the first: " if len(group) > 1 else ""
-    lines = [f"{label:<8} {several}{first.where}: {first.message}"]
-    if len(group) > 1:
-        lines.append(f"{'':<8} also {few(finding.where for finding in group[1:])}")
-    return lines
+    if len(group) <= LISTED:
+        return [f"{label:<8} {finding.where}: {finding.message}" for finding in group]
+    return [
+        f"{label:<8} {number(len(group))} times {first.kind}, the first: {first.where}: {first.message}",
+        f"{'':<8} also {few(finding.where for finding in group[1:])}",
+    ]
 
 
 def _verdict(report: Report) -> str:

@@ -104,7 +104,7 @@ def _instance(module: type[SpeechMotionDataModule], root: Path, way: str | None)
         return module(root=str(root), **options)
     except TypeError as error:
         raise FaceDiffError(
-            f"--corpus {module.__name__}: cannot be made from a folder alone ({error}); give its further arguments defaults"
+            f"--corpus {module.__name__}: cannot be made from a folder alone ({error}); give the rest defaults"
         ) from error
 
 

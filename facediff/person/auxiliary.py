@@ -151,7 +151,7 @@ def relative_residual(face: Array, target: Array) -> float:
     return float(np.sqrt(np.square(face - target).sum(axis=-1).mean())) / face_size(target)
 
 
-def into_coordinates(face: Array, corpus: Auxiliary, measured: float, given: float | None) -> Similarity:
+def into_coordinates(face: Array, best: Similarity, given: float | None) -> Similarity:
     """The one similarity that takes a person into the corpus's coordinates.
 
     Its scale changes the unit and leaves the person's size alone: where the measured scale is near a power of ten
@@ -159,12 +159,12 @@ def into_coordinates(face: Array, corpus: Auxiliary, measured: float, given: flo
 
     Args:
         face: (V, 3) the person's neutral face.
-        corpus: the corpus.
-        measured: scale of the best similarity between the two.
+        best: the similarity that lays it onto the corpus's mean face best; kept but for its scale, about the face's
+            centre.
         given: the scale to use instead.
     """
-    power = round(math.log10(measured))
-    is_unit = abs(math.log10(measured) - power) < math.log10(SAME_UNIT)
-    scale = given if given is not None else 10.0**power if is_unit else measured
-    rigid = robust_align(scale * face, corpus.mean)
-    return Similarity(rigid.rotation, rigid.translation, scale)
+    power = round(math.log10(best.scale))
+    is_unit = abs(math.log10(best.scale) - power) < math.log10(SAME_UNIT)
+    scale = given if given is not None else 10.0**power if is_unit else best.scale
+    centre = face.mean(axis=0)
+    return Similarity(best.rotation, best.apply(centre) - scale * best.rotation @ centre, scale)

@@ -187,7 +187,7 @@ def _fit(request: Request, read: Motion, known: Auxiliary, speech: Speech, scrat
         made = stabilise(read, face, stable, scratch / "stable.npy")
     neutral = choose_neutral(read, made, given, speech, request.frame_rate)
     best, residual = lay_onto_corpus(request.template or request.motion, neutral.face, known)
-    place = into_coordinates(neutral.face, known, best.scale, request.scale)
+    place = into_coordinates(neutral.face, best, request.scale)
     return Fitted(made, neutral, place, best.scale, residual, compared)
 
 

@@ -211,7 +211,7 @@ def _refuse_strays(plan: Plan, out: Path) -> None:
     for path in (*sorted(out.glob("vertices_npy/*.npy")), *sorted(out.glob("wav/*.wav"))):
         if not path.name.startswith(".") and path.stem not in names:
             raise FaceDiffError(
-                f"{path}: is no clip of the raw folder (any more); choose another folder to write to, or remove the file"
+                f"{path}: is no clip of the raw folder (any more); remove the file, or choose another folder"
             )
 
 

@@ -205,7 +205,7 @@ class SpeechAnimator(LightningModule, ABC):
         """Loss with fixed draws and the protocol's metrics of sampled motion, so that epochs compare."""
         losses = self.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
         logged = {f"val/{name}": value for name, value in losses.items()}
-        self.log_dict(logged, batch_size=len(batch), sync_dist=True)
+        self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
         self.evaluation.update("val", "model", self.generate(batch, seed=0), batch)
 
     def on_validation_epoch_end(self) -> None:

@@ -49,7 +49,9 @@ class Evaluation:
         }
 
     def update(self, split: str, method: str, motion: Tensor, batch: Batch) -> None:
-        """Add a batch's motion (offsets from the template)."""
+        """Add a batch's motion (offsets from the template), unless another process adds the same clips."""
+        if batch.repeated:
+            return
         metrics = self.metrics[split][method].to(motion.device)
         metrics.update(motion, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
 

@@ -17,7 +17,7 @@ MEDIAN_TO_SCALE = 1.5382
 """Median length of a 3-D normal vector of unit standard deviation (the Maxwell distribution's median)."""
 TRIALS = 64
 """Random triples for the robust start: with 42 % outliers, all triples hold one once in ten million times."""
-JUDGES = 512
+JUDGES = 256
 """Points that judge the trials."""
 ITERATIONS = 60
 TOLERANCE = 1e-9
@@ -108,9 +108,11 @@ def robust_align(
 
 
 def robust_fit(
-    source: Array, target: Array, weights: Array | None = None, *, scale: bool = False
+    source: Array, target: Array, weights: Array | None = None, *, scale: bool = False, near: bool = False
 ) -> tuple[Array, Array, Array]:
     """:func:`robust_align` of many sources (B, N, 3) to one target (N, 3) at a time; inputs are not checked.
+
+    With ``near``, the sources lie on the target but for little, and the search for a start is left out.
 
     Returns:
         rotations (B, 3, 3), translations (B, 3) and scales (B,).
@@ -120,7 +122,10 @@ def robust_fit(
     if not used.all():
         source, target, base = source[:, used], target[used], base[used]
     size = face_size(target)
-    rotation, translation, factor = _start(source, target, base, scale)
+    if near:
+        rotation, translation, factor = _unmoved(len(source))
+    else:
+        rotation, translation, factor = _start(source, target, base, scale)
     for _ in range(ITERATIONS):
         before = rotation, translation, factor
         residual = _residuals(source, target, *before)
@@ -139,6 +144,10 @@ def face_size(vertices: npt.NDArray[np.floating]) -> float:
     """Size of a set of points (N, 3): their root-mean-square distance from their mean."""
     centred = np.asarray(vertices, np.float64) - np.mean(vertices, axis=0, dtype=np.float64)
     return float(np.sqrt(np.square(centred).sum(axis=-1).mean()))
+
+
+def _unmoved(count: int) -> tuple[Array, Array, Array]:
+    return np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.ones(count)
 
 
 def _start(source: Array, target: Array, base: Array, scale: bool) -> tuple[Array, Array, Array]:

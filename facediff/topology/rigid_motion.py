@@ -172,8 +172,8 @@ def _laid_onto_median(some: Array, stable: Indices) -> tuple[Array, Array]:
     anchors = stable[np.linspace(0, len(stable) - 1, min(len(stable), ANCHORS)).round().astype(int)]
     median = some[len(some) // 2]
     laid = some
-    for _ in range(3):
-        rotation, translation, _ = robust_fit(some[:, anchors], median[anchors])
-        laid = some @ rotation.swapaxes(1, 2) + translation[:, None]
+    for near in (False, True, True):
+        rotation, translation, _ = robust_fit(laid[:, anchors], median[anchors], near=near)
+        laid = laid @ rotation.swapaxes(1, 2) + translation[:, None]
         median = np.median(laid, axis=0)
     return laid, median

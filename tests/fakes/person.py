@@ -17,7 +17,7 @@ COLUMNS, ROWS = 18, 20
 VERTICES = COLUMNS * ROWS
 RATE = 30.0
 MILLIMETRES = 1000.0
-FRAMES = 360
+FRAMES = 240
 
 
 def grid_faces() -> npt.NDArray[np.int64]:
@@ -27,10 +27,10 @@ def grid_faces() -> npt.NDArray[np.int64]:
 
 
 def face() -> Array:
-    """A face-like surface in metres, some 15 cm wide, with a nose; left and right differ a little."""
+    """A face-like surface in metres, some 15 cm wide, with a nose and a narrow chin; left and right differ a little."""
     x, y = np.meshgrid(np.linspace(-1, 1, COLUMNS), np.linspace(-1, 1, ROWS))
     z = 0.06 * np.sqrt(np.clip(1 - 0.45 * (x**2 + y**2), 0, None)) + 0.02 * np.exp(-8 * (x**2 + (y - 0.1) ** 2))
-    return np.stack([0.075 * x + 0.004 * y * x**2, 0.1 * y, z + 0.003 * x], -1).reshape(-1, 3)
+    return np.stack([0.075 * x * (0.8 + 0.2 * y) + 0.004 * y * x**2, 0.1 * y, z + 0.003 * x], -1).reshape(-1, 3)
 
 
 def lower_face() -> npt.NDArray[np.bool_]:

@@ -40,7 +40,7 @@ class Python2Pickler(pickle._Pickler):
         self.write(pickle.BINSTRING + struct.pack("<i", len(data)) + data)
         self.memoize(value)
 
-    def save_global(self, obj: Any, name: str | None = None) -> None:
+    def save_global(self, obj: type, name: str | None = None) -> None:
         module = obj.__module__.replace("numpy._core", "numpy.core")
         self.write(pickle.GLOBAL + f"{module}\n{name or obj.__name__}\n".encode())
         self.memoize(obj)

@@ -395,7 +395,7 @@ def test_templates_open_without_facediff(raw: Path) -> None:
     """Other projects' loaders open the file just so."""
     out, _ = prepared(raw)
     with (out / "templates.pkl").open("rb") as stream:
-        templates = pickle.load(stream, encoding="latin1")
+        templates = pickle.load(stream, encoding="latin1")  # noqa: S301 - just written here
     assert templates["F2"].reshape(-1).shape == (3 * VERTICES,)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import functools
 import hashlib
+import importlib
 import json
 import os
 import shutil
@@ -21,7 +23,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.commands.prepare import grouped, run
+from facediff.commands.prepare import CORPORA, grouped, make_plan, own_options, parser, run
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.prepare import biwi, runner
 from facediff.prepare.job import Job, Plan, write_motion, write_speech, write_templates
@@ -369,3 +371,33 @@ def test_workers_must_be_positive(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="--workers: is 0"):
         prepare(toy_plan(), tmp_path / "out", workers=0)
     assert runner._processors() >= 1
+
+
+@pytest.mark.parametrize("corpus", CORPORA)
+def test_every_option_of_a_corpus_is_explained_and_reaches_its_plan(corpus: str, tmp_path: Path) -> None:
+    module = importlib.import_module(f"facediff.prepare.{corpus}")
+    (choose,) = (action for action in parser()._actions if action.dest == "corpus")
+    actions = {action.dest: action for action in choose.choices[corpus]._actions}  # type: ignore[index, call-overload]
+    own = own_options(module.plan)
+    assert {option.name for option in own} <= set(actions)
+    for option in own:
+        assert len(actions[option.name].help) > 10
+        assert actions[option.name].default == (None if option.default is option.empty else option.default)
+
+
+def test_options_are_read_by_their_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = {}
+    monkeypatch.setattr(biwi, "plan", with_signature_of(biwi.plan, seen))
+    words = ["biwi", "r", "o", "--subjects", "F2,F3", "--regions", "lists", "--dtype", "float64"]
+    make_plan(parser().parse_args(words))
+    expected = {"normalise": "codetalker", "dtype": "float64", "subjects": ["F2", "F3"], "regions": Path("lists")}
+    assert seen == {"raw": Path("r"), **expected}
+
+
+def with_signature_of(plan: Callable[..., Plan], seen: dict[str, object]) -> Callable[..., Plan]:
+    @functools.wraps(plan)
+    def record(raw: Path, **options: object) -> Plan:
+        seen.update(raw=raw, **options)
+        return toy_plan()
+
+    return record

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -142,7 +141,7 @@ RAMP = np.linspace(-20000, 20000, 500).astype(np.int16)
     ],
     ids=["int16", "int64", "row", "list", "float of 16 bit", "float", "channels first", "channels last"],
 )
-def test_sound_of_any_type_means_the_same(audio: Any) -> None:
+def test_sound_of_any_type_means_the_same(audio: object) -> None:
     samples, rate = read_samples({"audio": audio, "sample_rate": np.int64(22050)}, "A sentence01")
     assert rate == 22050
     mono = samples if samples.ndim == 1 else samples.mean(1)
@@ -297,7 +296,7 @@ def test_the_fake_pickles_are_python_2s(raw: Path) -> None:
     assert b"cnumpy.core.multiarray\n_reconstruct" in data
     assert b"_codecs" not in data
     with pytest.raises(UnicodeDecodeError):
-        pickle.loads(data)  # as it is with the real file: an encoding must be given
-    masks = pickle.loads(python2_pickle(flame_masks()), encoding="latin1")
+        pickle.loads(data)  # noqa: S301 - as it is with the real file: an encoding must be given
+    masks = pickle.loads(python2_pickle(flame_masks()), encoding="latin1")  # noqa: S301 - just written here
     assert masks["lips"].dtype == np.int64
     assert len(masks["lips"]) > len(set(masks["lips"]))
