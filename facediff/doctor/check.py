@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff.doctor import corpus as together
-from facediff.doctor.clip import ClipFacts, ClipFiles, Rules, examine
-from facediff.doctor.corpora import by_name, known, named, recognise
-from facediff.doctor.findings import Finding, by_severity, few, guarded, number
+from facediff.doctor.clip import LENGTHS, ClipFacts, ClipFiles, Rules, examine
+from facediff.doctor.findings import Finding, by_severity, counted, few, guarded
 from facediff.doctor.folder import Folder, list_folder
+from facediff.doctor.identify import identify
 from facediff.doctor.manifest import MANIFEST, STATE, check_account, check_ended, check_files, read_record
 from facediff.doctor.motion import Array
 from facediff.doctor.pool import Died, processors, run_all, steps
-from facediff.doctor.raw import LOOKED_FOR, prepare_command, raw_distribution
 from facediff.doctor.report import Report
 from facediff.doctor.templates import check_areas, check_templates
 from facediff.doctor.topology import check_mesh, check_pairs, check_regions
 from facediff.doctor.totals import count_splits, count_subjects
-from facediff.doctor.view import View, view_of, view_of_person
+from facediff.doctor.view import View
 from facediff.errors import FaceDiffError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -92,8 +91,9 @@ def _check_corpus(
     report.corpus, report.data_module = view.corpus, view.data_module
     report.frame_rate, report.n_vertices = view.frame_rate, view.n_vertices
     opened: Corpus | None = None
-    with guarded(findings, "frame_rate", root / MANIFEST, root):
-        opened = view.open(root)
+    if not any(finding.where == MANIFEST for finding in findings):  # whoever opens the folder stumbles over it again
+        with guarded(findings, "frame_rate", root / MANIFEST, root):
+            opened = view.open(root)
     stored = _stored_rate(manifest, view)
     report.stored_frame_rate = stored
     templates, report.templates = check_templates(root, view, findings)
@@ -164,7 +164,7 @@ def _tell_clips(view: View, stored: float, facts: list[ClipFacts], findings: lis
     right = together.check_frame_rate(view, stored, facts, findings, recorded=recorded)
     for clip in facts:
         # Where the frame rate is wrong, every clip has the wrong length: once is enough.
-        findings += [finding for finding in clip.findings if right or finding.kind != "length"]
+        findings += [finding for finding in clip.findings if right or finding.kind not in LENGTHS]
     together.check_vertex_counts(facts, findings)
     together.check_sounds(facts, findings)
     together.check_copies(facts, findings)
@@ -178,9 +178,7 @@ def _tell_subjects(
         if report.templates["file"] and clip.subject not in {*templates, *report.templates["broken"]}:
             lacking.setdefault(clip.subject, []).append(name)
     for subject, names in lacking.items():
-        message = (
-            f"no usable template of {subject}, needed by its {len(names)} clips ({few(names)}); get templates.pkl anew"
-        )
+        message = f"no template of {subject}, needed by {counted(len(names), 'clip')} ({few(names)}); get the file anew"
         findings.append(Finding("error", "template_missing", "templates.pkl", message))
 
 

@@ -19,6 +19,9 @@ SLIGHT = 0.1
 MUCH = (0.5, 0.1)
 """Speech and motion that differ by more than so many seconds and by more than this share do not belong together."""
 
+LENGTHS = ("length", "speech_shorter", "speech_longer")
+"""Kinds of findings about motion and speech that do not last equally long."""
+
 
 @dataclass(frozen=True)
 class ClipFiles:

@@ -37,9 +37,9 @@ def check_templates(root: Path, view: View, findings: list[Finding]) -> tuple[di
     templates: dict[str, Array] = {}
     with guarded(findings, "templates_unreadable", path, root):
         loaded = load_pickle(path)
-        section["file"] = "templates.pkl"
         if not isinstance(loaded, dict):
             raise FaceDiffError(f"expected a dict from subject to (V, 3) array, got {type(loaded).__name__}")
+        section["file"] = "templates.pkl"
         for subject, value in loaded.items():
             problem, template = read_template(value, view.n_vertices)
             if template is None:

@@ -122,9 +122,7 @@ def view_of_person(manifest: dict[str, Any], n_vertices: int | None) -> View:
 
     person, rate, vertices = manifest["person"], manifest.get("frame_rate"), manifest.get("n_vertices", n_vertices)
     if not (isinstance(rate, int | float) and rate > 0 and isinstance(vertices, int) and vertices > 0):
-        raise FaceDiffError(
-            f"manifest.json: tells neither the frame rate nor the vertices of {person}; import the person anew"
-        )
+        raise FaceDiffError(f"does not tell both frame rate and vertices of {person}; import the person anew")
 
     def split(clip: Clip) -> str | None:
         said = clip.attributes.get("split")

@@ -157,8 +157,8 @@ def _bar(paths: list[Path], progress: bool) -> Iterable[Path]:
     return tqdm(paths, desc="reading meshes", unit="frame", leave=False)
 
 
-def spans(places: list[int]) -> str:
-    """Sorted whole numbers in short: ``3-7, 12``.
+def spans(places: list[int], most: int = 10) -> str:
+    """Sorted whole numbers in short: ``3-7, 12``; an ellipsis after ``most`` spans.
 
     >>> spans([3, 4, 5, 12])
     '3-5, 12'
@@ -169,4 +169,5 @@ def spans(places: list[int]) -> str:
             parts[-1][1] = place
         else:
             parts.append([place, place])
-    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in parts)
+    words = [str(a) if a == b else f"{a}-{b}" for a, b in parts]
+    return ", ".join(words if len(words) <= most else [*words[:most], "…"])

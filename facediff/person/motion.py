@@ -115,7 +115,7 @@ def _read_flame(path: Path, model: Path, n_vertices: int, scratch: Path) -> Moti
 
     parameters, layer = read_parameters(path), Flame.read(model)
     shape, expression, jaw = parameters.shape, parameters.expression, parameters.jaw
-    template = layer.vertices(shape, np.zeros_like(expression[:1]), np.zeros_like(jaw[:1]))[0]
+    template = layer.shaped(shape)
     if len(template) != n_vertices:
         raise FaceDiffError(
             f"{model}: has {len(template)} vertices, but the corpus has {n_vertices}; so its topology is not FLAME"

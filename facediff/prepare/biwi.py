@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal
@@ -29,7 +29,7 @@ from facediff.prepare.job import (
     write_templates,
 )
 from facediff.prepare.normalise import codetalker
-from facediff.prepare.raw import bases, copy_files, find_regions, read_obj, region_files
+from facediff.prepare.raw import bases, copy_files, find_regions, folders_in, read_obj, region_files
 from facediff.prepare.vl import check_sizes, frame_files, gaps, read_vl
 
 SUBJECTS = [*(f"F{i}" for i in range(1, 9)), *(f"M{i}" for i in range(1, 7))]
@@ -81,34 +81,15 @@ def plan(
     sequences, neutral = _find_sequences(raw, chosen)
     meshes = _find_meshes(raw, chosen, {subject for subject, _ in sequences}, missing)
     sounds = _find_sounds(raw)
-    jobs, notes = [], []
+    notes: list[str] = []
     if neutral:
         notes.append(f"{neutral} neutral sequences (01 to 40 without an e) are left out, as in all published work")
-    for subject in chosen:
-        if not any(key[0] == subject for key in sequences):
-            missing[subject] = f"expected frames in {raw / 'faces' / subject / 'e01'} … e40"
-            continue
-        for sentence in SENTENCES:
-            name = f"{subject}_{sentence}"
-            folder = sequences.get((subject, sentence))
-            if folder is None:
-                missing[name] = f"expected frames in {raw / 'faces' / subject / sentence}"
-            elif name not in sounds:
-                missing[name] = f"expected its sound, {raw / 'audio' / name}.wav or {raw / 'videos' / name}.flv"
-            elif subject in meshes:
-                numbers = _numbers(folder)
-                jobs.append(
-                    Job(
-                        name,
-                        partial(write_clip, name, folder, sounds[name], meshes[subject], normalise, dtype),
-                        len(numbers),
-                    )
-                )
-                if lost := gaps(numbers):
-                    notes.append(
-                        f"{name}: frames {', '.join(lost)} are not in {folder}; it is written without them, so that "
-                        f"speech and motion part company there"
-                    )
+    jobs = []
+    for name, folder in _complete(raw, chosen, sequences, sounds, missing):
+        mesh = meshes.get(name.partition("_")[0])
+        if mesh is not None:
+            work = partial(write_clip, name, folder, sounds[name], mesh, normalise, dtype)
+            jobs.append(Job(name, work, _count(name, folder, notes)))
     if not jobs:
         reasons = "; ".join(f"{name}: {text}" for name, text in list(missing.items())[:3])
         raise FaceDiffError(f"{raw}: no sequence of BIWI can be prepared ({reasons})")
@@ -206,8 +187,8 @@ def _find_sequences(raw: Path, chosen: Sequence[str]) -> tuple[dict[tuple[str, s
     for base in bases(raw):
         for subject in chosen:
             folder = base / "faces" / subject
-            for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-                if path.name in SENTENCES and path.is_dir() and _numbers(path):
+            for path in folders_in(folder) if folder.is_dir() else ():
+                if path.name in SENTENCES and _numbers(path):
                     found.setdefault((subject, path.name), path)
                 neutral += f"e{path.name}" in SENTENCES
     return found, neutral
@@ -219,6 +200,39 @@ def _numbers(folder: Path) -> list[int]:
         return list(frame_files(folder))
     except FaceDiffError:
         return [1]
+
+
+def _complete(
+    raw: Path,
+    chosen: Sequence[str],
+    sequences: dict[tuple[str, str], Path],
+    sounds: dict[str, Path],
+    missing: dict[str, str],
+) -> Iterator[tuple[str, Path]]:
+    """Name and folder of every sequence that has a sound; the others go to ``missing``."""
+    for subject in chosen:
+        if not any(key[0] == subject for key in sequences):
+            missing[subject] = f"expected frames in {raw / 'faces' / subject / 'e01'} … e40"
+            continue
+        for sentence in SENTENCES:
+            name, folder = f"{subject}_{sentence}", sequences.get((subject, sentence))
+            if folder is None:
+                missing[name] = f"expected frames in {raw / 'faces' / subject / sentence}"
+            elif name not in sounds:
+                missing[name] = f"expected its sound, {raw / 'audio' / name}.wav or {raw / 'videos' / name}.flv"
+            else:
+                yield name, folder
+
+
+def _count(name: str, folder: Path, notes: list[str]) -> int:
+    """Frames of a sequence; gaps in their numbers are noted."""
+    numbers = _numbers(folder)
+    if lost := gaps(numbers):
+        notes.append(
+            f"{name}: frames {', '.join(lost)} are not in {folder}; it is written without them, so that speech and "
+            f"motion part company there"
+        )
+    return len(numbers)
 
 
 def _find_meshes(raw: Path, chosen: Sequence[str], needed: set[str], missing: dict[str, str]) -> dict[str, Path]:

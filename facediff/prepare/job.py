@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.files import atomic
 
 Precision = Literal["float32", "float64"]
@@ -109,8 +109,10 @@ def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
 
     Reading it back gives ``round(32768 x) / 32768``: 16-bit speech at 16 kHz goes through unchanged.
     """
-    import soundfile
-
+    try:
+        import soundfile
+    except ImportError as error:
+        raise MissingExtraError("soundfile", "audio", "writing speech") from error
     from facediff.data.audio import SAMPLE_RATE
 
     whole = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)

@@ -18,10 +18,19 @@ def bases(raw: Path) -> list[Path]:
     """
     if not raw.is_dir():
         raise FaceDiffError(f"{raw}: no such folder; expected the raw data set as it was distributed")
+    return [raw, *folders_in(raw)]
+
+
+def folders_in(folder: Path) -> list[Path]:
+    """Folders in a folder, sorted, without hidden ones.
+
+    Raises:
+        FaceDiffError: if it cannot be read.
+    """
     try:
-        return [raw, *sorted(path for path in raw.iterdir() if path.is_dir() and not path.name.startswith("."))]
+        return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
     except OSError as error:
-        raise FaceDiffError(f"{raw}: cannot be read ({error.strerror}); check its permissions") from error
+        raise FaceDiffError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
 
 
 def find_file(raw: Path, name: str) -> Path | None:

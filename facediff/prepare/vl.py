@@ -43,10 +43,14 @@ def frame_files(folder: Path) -> dict[int, Path]:
     """The frames of a sequence by number, in numeric order.
 
     Raises:
-        FaceDiffError: if two files claim the same number.
+        FaceDiffError: if the folder cannot be read, or two files claim the same number.
     """
     found: dict[int, Path] = {}
-    for name in os.listdir(folder):
+    try:
+        names = os.listdir(folder)
+    except OSError as error:
+        raise FaceDiffError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
+    for name in names:
         match = FRAME_NAME.fullmatch(name)
         if match is None:
             continue

@@ -7,6 +7,7 @@ frame), ``raw_audio_fixed.pkl`` and ``templates.pkl``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -86,27 +87,13 @@ def plan(
     templates = _read_templates(templates_path, shape[1], vertices)
     missing: dict[str, str] = {}
     notes: list[str] = []
-    jobs = []
     extras = [path for name in OPTIONAL if (path := find_file(raw, name)) is not None]
     found_regions = find_regions(raw, regions)
     _miss_extras(extras, found_regions, missing)
-    for subject in sorted({*row_map, *sounds}):
-        if subject not in templates:
-            missing[f"template of {subject}"] = (
-                f"expected in {templates_path}; no clip of {subject} is written without it"
-            )
-            continue
-        rows_of, sound_of = row_map.get(subject, {}), sounds.get(subject, {})
-        for sentence in sorted({*SENTENCES, *rows_of, *sound_of}):
-            name = f"{subject}_{sentence}"
-            lacking = [file for file, there in ((ROWS, rows_of), (AUDIO, sound_of)) if there.get(sentence) is None]
-            if lacking:
-                missing[name] = f"not in {' nor in '.join(lacking)}; the distribution lacks some"
-                continue
-            rows = _rows(rows_of[sentence], name, notes)
-            recording = Recording(rows, sound_of[sentence], f"{subject} {sentence}")
-            frames = len(rows) if frame_rate == RAW_RATE else -(-len(rows) // 2)
-            jobs.append(Job(name, partial(write_clip, name, recording, vertices, frame_rate, decimate, dtype), frames))
+    jobs = []
+    for name, recording in _complete(row_map, sounds, templates, missing, notes):
+        frames = len(recording.rows) if frame_rate == RAW_RATE else -(-len(recording.rows) // 2)
+        jobs.append(Job(name, partial(write_clip, name, recording, vertices, frame_rate, decimate, dtype), frames))
     if len(row_map) < SUBJECTS:
         notes.append(f"{ROWS} has {len(row_map)} of the {SUBJECTS} subjects")
     if not jobs:
@@ -123,6 +110,29 @@ def plan(
         missing=missing,
         notes=notes,
     )
+
+
+def _complete(
+    row_map: dict[str, dict[str, Any]],
+    sounds: dict[str, dict[str, Any]],
+    templates: dict[str, Array],
+    missing: dict[str, str],
+    notes: list[str],
+) -> Iterator[tuple[str, Recording]]:
+    """Name and recording of every clip that has motion, sound and a template; the others go to ``missing``."""
+    for subject in sorted({*row_map, *sounds}):
+        if subject not in templates:
+            missing[f"template of {subject}"] = f"expected in {TEMPLATES}; no clip of {subject} is written without it"
+            continue
+        rows_of, sound_of = row_map.get(subject, {}), sounds.get(subject, {})
+        for sentence in sorted({*SENTENCES, *rows_of, *sound_of}):
+            name = f"{subject}_{sentence}"
+            lacking = [file for file, there in ((ROWS, rows_of), (AUDIO, sound_of)) if there.get(sentence) is None]
+            if lacking:
+                missing[name] = f"not in {' nor in '.join(lacking)}; the distribution lacks some"
+            else:
+                rows = _rows(rows_of[sentence], name, notes)
+                yield name, Recording(rows, sound_of[sentence], f"{subject} {sentence}")
 
 
 def write_clip(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import subprocess
 import sys
@@ -200,3 +201,40 @@ def test_two_processes_train_together(tiny_root: Path, tmp_path: Path) -> None:
     # Eight training clips, two clips a batch, two processes: two steps.
     assert torch.load(run / "last.ckpt", weights_only=True)["global_step"] == 2
     load_system(run / "best.ckpt")
+
+
+def test_three_processes_score_as_one_does(
+    checkpoint: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four clips of test A and two of test B: neither number fits three processes, and one of them gets no clip.
+
+    With the sampler that adds noise all the way: it must not depend on which clips share a batch.
+    """
+    words = ["test", "--ckpt_path", str(checkpoint), "--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}"]
+    words += ["--model.sampler=ddpm", "--model.sampler.steps=3", "--trainer.enable_progress_bar=false"]
+    ddp = ["--trainer.accelerator=cpu", "--trainer.devices=3", "--trainer.strategy=ddp"]
+    (tmp_path / "one").mkdir()
+    (tmp_path / "three").mkdir()
+    monkeypatch.chdir(tmp_path / "one")
+    assert main([*words, "--data.batch_size=3"]) == 0
+    done = subprocess.run(
+        [sys.executable, "-m", "facediff", *words, *ddp, "--data.batch_size=2"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path / "three",
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"},
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    (mine,) = (tmp_path / "one").rglob("test_scores.csv")
+    (theirs,) = (tmp_path / "three").rglob("test_scores.csv")
+    one, three = (list(csv.DictReader(path.read_text().splitlines())) for path in (mine, theirs))
+    assert len(one) == len(three) == 6
+    assert {row["sequences"] for row in one if row["split"] == "test_b"} == {"2"}
+    for row, other in zip(one, three, strict=True):
+        for column, value in row.items():
+            if column in ("mve", "lve", "fdd"):
+                assert float(other[column]) == pytest.approx(float(value), rel=1e-5)
+            else:
+                assert other[column] == value

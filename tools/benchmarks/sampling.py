@@ -165,7 +165,7 @@ class Bench:
         """Median seconds of the scheduler's step, after two that warm up."""
         scheduler, spent = sampler.make_scheduler(), []
         for step in scheduler.timesteps[: self.repeats + 2].tolist():
-            work = partial(scheduler.step, clean, step, noisy, return_dict=False, **sampler.step_options())
+            work = partial(sampler.advance, scheduler, clean, step, noisy, torch.randn_like)
             spent.append(self.clock(work))
         return statistics.median(spent[2:] or spent)
 

@@ -16,6 +16,9 @@ from facediff.errors import FaceDiffError
 Denoiser = Callable[[Tensor, int], Tensor]
 """(noisy motion, step counted from 0) to predicted clean motion of the same shape."""
 
+NoiseSource = Callable[[Tensor], Tensor]
+"""Fresh unit Gaussian noise like a tensor; one for each clip of its own, so that a clip does not depend on others."""
+
 
 class Sampler(ABC):
     """Runs the reverse process from noise to clean motion (algorithm 2).
@@ -46,16 +49,26 @@ class Sampler(ABC):
     def make_scheduler(self) -> Any:  # noqa: ANN401 - diffusers' schedulers share no typed base class
         """A fresh scheduler of diffusers with its timesteps set."""
 
-    def step_options(self) -> dict[str, Any]:
-        """Extra keyword arguments for the scheduler's ``step``."""
-        return {}
+    def advance(
+        self,
+        scheduler: Any,  # noqa: ANN401
+        clean: Tensor,
+        step: int,
+        noisy: Tensor,
+        noise: NoiseSource,
+    ) -> Tensor:
+        """From the motion at ``step`` and the clean prediction to the motion at the scheduler's next step.
+
+        A sampler that adds noise on the way overrides this and takes the noise from ``noise``.
+        """
+        return scheduler.step(clean, step, noisy, return_dict=False)[0]
 
     def run(
         self,
         denoise: Denoiser,
         start: Float[Tensor, "*shape"],
         *,
-        generator: torch.Generator | None = None,
+        noise: NoiseSource = torch.randn_like,
         progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
     ) -> Float[Tensor, "*shape"]:
         """Denoise ``start`` to clean motion.
@@ -63,7 +76,7 @@ class Sampler(ABC):
         Args:
             denoise: predicts the clean motion from the noisy one.
             start: unit Gaussian noise.
-            generator: source of the noise that stochastic samplers add.
+            noise: source of the noise that stochastic samplers add.
             progress: wraps the iteration over steps, e.g. in a progress bar.
         """
         scheduler = self.make_scheduler()
@@ -71,7 +84,7 @@ class Sampler(ABC):
         noisy = start
         for step in progress(steps) if progress is not None else steps:
             clean = denoise(noisy, step)
-            noisy = scheduler.step(clean, step, noisy, generator=generator, return_dict=False, **self.step_options())[0]
+            noisy = self.advance(scheduler, clean, step, noisy, noise)
         return noisy
 
 

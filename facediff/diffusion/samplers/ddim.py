@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from facediff.diffusion.process import NoiseProcess
-from facediff.diffusion.samplers.base import Sampler
+from facediff.diffusion.samplers.base import NoiseSource, Sampler
 from facediff.errors import FaceDiffError
 from facediff.registry import sampler
 
@@ -30,26 +30,13 @@ class DdimScheduler:
         self.timesteps = torch.tensor(places)
         self._signal = dict(zip(places, zip(signal, [*signal[1:], 1.0], strict=True), strict=True))
 
-    def step(
-        self,
-        clean: Tensor,
-        step: int,
-        noisy: Tensor,
-        *,
-        eta: float = 0.0,
-        generator: torch.Generator | None = None,
-        return_dict: bool = False,
-    ) -> tuple[Tensor]:
+    def step(self, clean: Tensor, step: int, noisy: Tensor, *, eta: float, noise: NoiseSource) -> Tensor:
         """From the motion at timestep ``step`` and the clean prediction to the motion at the next timestep."""
         now, then = self._signal[step]
-        noise = (noisy - now**0.5 * clean) / (1 - now) ** 0.5
+        direction = (noisy - now**0.5 * clean) / (1 - now) ** 0.5
         variance = eta**2 * (1 - then) / (1 - now) * (1 - now / then)
-        mean = then**0.5 * clean + max(1 - then - variance, 0.0) ** 0.5 * noise
-        if variance == 0:
-            return (mean,)
-        device = generator.device if generator is not None else noisy.device
-        fresh = torch.randn(noisy.shape, generator=generator, device=device, dtype=noisy.dtype)
-        return (mean + variance**0.5 * fresh.to(noisy.device),)
+        mean = then**0.5 * clean + max(1 - then - variance, 0.0) ** 0.5 * direction
+        return mean if variance == 0 else mean + variance**0.5 * noise(noisy)
 
 
 @sampler.register("ddim")
@@ -75,6 +62,13 @@ class DdimSampler(Sampler):
         """Even spacing from the process's last step to the clean end."""
         return DdimScheduler(self.process, self.places())
 
-    def step_options(self) -> dict[str, Any]:
-        """The noise share."""
-        return {"eta": self.eta}
+    def advance(
+        self,
+        scheduler: Any,  # noqa: ANN401
+        clean: Tensor,
+        step: int,
+        noisy: Tensor,
+        noise: NoiseSource,
+    ) -> Tensor:
+        """DDIM's update with the sampler's share of noise."""
+        return scheduler.step(clean, step, noisy, eta=self.eta, noise=noise)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from facediff.diffusion.process import NoiseProcess
-from facediff.diffusion.samplers.base import Sampler
+from facediff.diffusion.samplers.ddim import DdimSampler
 from facediff.registry import sampler
 
 
 @sampler.register("ddpm")
-class DdpmSampler(Sampler):
+class DdpmSampler(DdimSampler):
     """Ancestral sampling from the Gaussian posterior q(Mⁿ⁻¹ | Mⁿ, M̂⁰); the reference (Ho et al. 2020).
 
-    No noise is added in the last step.
+    It is DDIM's update at η = 1 (Song et al. 2021, section 4.1). No noise is added in the last step, and nothing is
+    clipped, since motion has no fixed range.
 
     Args:
         process: the noise process; given by the system.
@@ -21,17 +20,4 @@ class DdpmSampler(Sampler):
     """
 
     def __init__(self, *, process: NoiseProcess, steps: int | None = None) -> None:
-        super().__init__(process, process.steps if steps is None else steps)
-
-    def make_scheduler(self) -> Any:  # noqa: ANN401
-        """The posterior's own variance; nothing is clipped, since motion has no fixed range."""
-        from diffusers import DDPMScheduler
-
-        scheduler = DDPMScheduler(
-            **self.process.scheduler_config(),
-            variance_type="fixed_small",
-            clip_sample=False,
-        )
-        # Given by hand: the library's own spacing has one step too many for some numbers of steps, by rounding.
-        scheduler.set_timesteps(timesteps=self.places())
-        return scheduler
+        super().__init__(process=process, steps=process.steps if steps is None else steps, eta=1.0)

@@ -191,24 +191,39 @@ class DualPathDiffusion(SpeechAnimator):
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Algorithm 2 with the system's sampler; conditions are computed once.
 
-        Each clip starts from noise of its own. What a stochastic sampler adds on the way is drawn for the whole batch.
+        All noise of a clip follows from the seed and its name: its motion does not depend on the clips beside it.
         """
         conditions = self._conditions(batch)
-        start = self._noise(batch, seed)
-        generator = torch.Generator(start.device).manual_seed(seed)
+        noise = ClipNoise(batch, seed)
 
         def denoise(noisy: Tensor, step: int) -> Tensor:
             steps = torch.full((len(batch),), step, device=noisy.device)
             return self.network(noisy, steps, conditions)
 
-        motion = self.sampler.run(denoise, start, generator=generator, progress=progress) / self.scale
+        start = noise(batch.motion.flatten(2))
+        motion = self.sampler.run(denoise, start, noise=noise, progress=progress) / self.scale
         return motion.view(batch.motion.shape)
 
-    def _noise(self, batch: Batch, seed: int) -> Float[Tensor, "batch frames coordinates"]:
-        """Unit Gaussian noise by seed and clip name, zero on padding."""
-        device = batch.motion.device
-        noise = torch.zeros(batch.motion.flatten(2).shape, device=device)
-        for i, (name, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
-            generator = torch.Generator(device).manual_seed(zlib.crc32(name.encode()) + seed)
-            noise[i, :frames] = torch.randn((frames, noise.shape[2]), device=device, generator=generator)
+
+class ClipNoise:
+    """Unit Gaussian noise for the clips of a batch, zero on their padding; each clip has a stream of its own.
+
+    Args:
+        batch: the clips; their names and lengths are looked at.
+        seed: seed of all streams.
+    """
+
+    def __init__(self, batch: Batch, seed: int) -> None:
+        self.lengths = batch.frame_lengths.tolist()
+        self.streams = [
+            torch.Generator(batch.motion.device).manual_seed(zlib.crc32(name.encode()) + seed) for name in batch.names
+        ]
+
+    def __call__(self, like: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames coordinates"]:
+        """The next noise of the shape of ``like``."""
+        noise = torch.zeros_like(like)
+        for i, (stream, frames) in enumerate(zip(self.streams, self.lengths, strict=True)):
+            noise[i, :frames] = torch.randn(
+                (frames, like.shape[2]), device=like.device, dtype=like.dtype, generator=stream
+            )
         return noise
