@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,6 +36,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
     args = parser().parse_args(list(arguments))
     from facediff.doctor import check, text
 
+    if args.corpus and "." in args.corpus:
+        sys.path.append(os.getcwd())  # a data module of one's own may lie in the working folder
     report = check(
         args.root,
         args.corpus,

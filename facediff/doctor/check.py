@@ -19,7 +19,7 @@ from facediff.doctor.report import Report
 from facediff.doctor.templates import check_areas, check_templates
 from facediff.doctor.topology import check_mesh, check_pairs, check_regions
 from facediff.doctor.totals import count_splits, count_subjects
-from facediff.doctor.view import View
+from facediff.doctor.view import View, is_rate
 from facediff.errors import FaceDiffError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -123,8 +123,7 @@ def _check_corpus(
 
 def _stored_rate(manifest: dict[str, Any], view: View) -> float:
     said = manifest.get("frame_rate")
-    usable = isinstance(said, int | float) and not isinstance(said, bool) and 0 < said < 1e6
-    return float(said) if usable else view.stored_frame_rate  # type: ignore[arg-type]
+    return said if is_rate(said) else view.stored_frame_rate
 
 
 def _clips(opened: Corpus | None, view: View, folder: Folder, findings: list[Finding]) -> dict[str, Clip]:

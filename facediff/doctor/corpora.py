@@ -69,7 +69,7 @@ def _import(path: str) -> Module:
     place, _, name = path.rpartition(".")
     try:
         module = getattr(importlib.import_module(place), name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except Exception as error:  # a module can fail in any way while it is imported
         raise FaceDiffError(f"--corpus {path}: cannot be imported ({error}); expected package.module.Class") from error
     if not (isinstance(module, type) and issubclass(module, SpeechMotionDataModule)) or inspect.isabstract(module):
         raise FaceDiffError(f"--corpus {path}: is no data module; expected a subclass of SpeechMotionDataModule")

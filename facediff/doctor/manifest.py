@@ -19,7 +19,7 @@ STATE = "prepare.json"
 def read_record(root: Path, name: str, findings: list[Finding]) -> dict[str, Any]:
     """One of the two records; empty if there is none, or none that can be read."""
     path = root / name
-    if path.exists():
+    if path.is_file():
         with guarded(findings, "manifest_unreadable", path, root):
             try:
                 record = json.loads(path.read_bytes())

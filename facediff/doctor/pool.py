@@ -59,7 +59,7 @@ def run_all(
         tasks: what it is called with.
         workers: number of processes.
     """
-    if min(workers, len(tasks)) <= 1 or not _can_start(work):
+    if min(workers, len(tasks)) <= 1 or not _can_start():
         for task in tasks:
             yield task, work(task)
         return
@@ -77,10 +77,13 @@ def run_all(
     yield from _one_by_one(work, list(left.values()))
 
 
-def _can_start(work: Callable[[Any], Any]) -> bool:
-    """Whether processes start at all: from an interactive session, or a script without a main guard, they do not."""
+def _can_start() -> bool:
+    """Whether processes start at all: from standard input, or a script without a main guard, they do not.
+
+    Without arguments: handing much to a process that dies at its start blocks for ever (as of Python 3.11).
+    """
     try:
-        with _pool(work, 1) as pool:
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
             return pool.submit(os.getpid).result() != os.getpid()
     except BrokenProcessPool:
         return False

@@ -26,7 +26,7 @@ class Report:
         stored_frame_rate: motion frames a second on disk.
         n_vertices: vertices of the topology.
         findings: errors first, then warnings, then notes.
-        splits: one row a split: way, split, expected, present, missing, frames, seconds.
+        splits: one row a split: way, split, expected, present, missing, frames, seconds, missing_clips.
         subjects: one row a subject: subject, trained_on, clips, frames, seconds, template.
         templates: file, subjects, broken (subjects whose template cannot be used), blob (git blob id), origin (whose
             file it is), areas.

@@ -11,7 +11,7 @@ import numpy as np
 from facediff.doctor.findings import Finding
 
 BLOCK = 1 << 16
-"""Samples that are decoded at a time."""
+"""Samples of all channels together that are decoded at a time."""
 OPEN_END = 0xFFFF0000
 """Programs that write to a pipe put a size like this into the header, for they do not know it yet."""
 
@@ -76,7 +76,7 @@ def look_at_sound(path: Path, where: str, *, quick: bool) -> SoundFacts:
 def _listen(facts: SoundFacts, file: object, where: str, frames: int) -> None:
     """Decode the whole file."""
     heard, finite, loudest = 0, True, 0.0
-    for block in file.blocks(BLOCK, dtype="float32", always_2d=True):  # type: ignore[attr-defined]
+    for block in file.blocks(max(1, BLOCK // file.channels), dtype="float32", always_2d=True):  # type: ignore[attr-defined]
         heard += len(block)
         finite = finite and bool(np.isfinite(block).all())
         loudest = max(loudest, float(np.abs(block).max(initial=0.0)))

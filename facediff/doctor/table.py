@@ -91,6 +91,8 @@ def _shared(report: Report) -> list[str]:
         region_told = "none that can be used"
         if region is not None:
             region_told = f"{region['source']}, {counted(region['count'], 'vertex', 'vertices')}, hash {region['hash']}"
+            if region["count"] == region["circulating_count"]:
+                region_told += ", as many as the list that circulates has"
         rows.append([name.replace("_", " "), region_told])
     rows.append(["manifest", _manifest(report.manifest)])
     width = max(len(row[0]) for row in rows)

@@ -82,8 +82,8 @@ def _origin(view: View, blob: str, findings: list[Finding]) -> str | None:
         return None
     origin = next((who for start, who in circulating.items() if blob.startswith(start)), "own")
     others = ", ".join(f"{who} ({start})" for start, who in circulating.items() if who != origin)
-    if origin == "own" or others:
-        whose = "own templates, none of those that circulate" if origin == "own" else f"the templates of {origin}"
+    if len(circulating) > 1:
+        whose = "by its bytes none of the files that circulate" if origin == "own" else f"the templates of {origin}"
         findings.append(
             Finding(
                 "note",

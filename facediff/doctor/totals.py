@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from facediff.doctor import facts
-from facediff.doctor.findings import Finding, counted, few, number
+from facediff.doctor.findings import FEW, Finding, counted, few, number
 from facediff.doctor.view import SPLITS, View
 
 if TYPE_CHECKING:
@@ -50,29 +50,36 @@ def _row(
     way: str | None, split: str, names: list[str], wanted: list[str] | None, frames: Mapping[str, int], rate: float
 ) -> dict[str, Any]:
     total = sum(frames.get(name, 0) for name in names)
+    lacking = sorted(set(wanted or ()) - set(names))
     return {
         "way": way,
         "split": split,
         "expected": None if wanted is None else len(wanted),
         "present": len(names),
-        "missing": None if wanted is None else len(set(wanted) - set(names)),
+        "missing": None if wanted is None else len(lacking),
         "frames": total,
         "seconds": round(total / rate, 3),
+        "missing_clips": lacking,
     }
 
 
 def _tell_missing(view: View, clips: Mapping[str, Clip], findings: list[Finding]) -> None:
+    lacks = False
     for split, names in view.expected.items():
         missing = [name for name in names if name not in clips]
         if not missing:
             continue
         told = f"{counted(len(missing), 'clip')} of {number(len(names))} not there: {few(missing)}"
+        told += " (--json lists all)" if len(missing) > FEW else ""
+        where = f"split {split}"
         if view.corpus in facts.INCOMPLETE and len(missing) <= facts.NEVER_RECORDED * len(names):
-            message = f"{told}; some were never recorded"
-            findings.append(Finding("note", "clips_missing", f"split {split}", message))
+            findings.append(Finding("note", "clips_missing", where, f"{told}; some were never recorded"))
         else:
+            lacks = True
             message = f"{told}; scores go with published ones only if all are there"
-            findings.append(Finding("warning", "clips_missing", f"split {split}", message))
+            findings.append(Finding("warning", "clips_missing", where, message))
+    if lacks and view.obtain:
+        findings.append(Finding("note", "obtain", view.corpus, view.obtain))
 
 
 def _tell_check_figure(view: View, rows: Iterable[Mapping[str, Any]], findings: list[Finding]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from facediff.doctor.corpora import variants
 from facediff.errors import FaceDiffError, choices
@@ -34,6 +34,7 @@ class View:
         mesh_files: files with the faces.
         region_sources: files that say which vertices the regions are.
         region_help: where such files are had.
+        obtain: how the corpus is had.
     """
 
     corpus: str
@@ -48,6 +49,7 @@ class View:
     mesh_files: tuple[str, ...] = ()
     region_sources: dict[str, tuple[str, ...]] = field(default_factory=dict)
     region_help: str = ""
+    obtain: str = ""
 
     def open(self, root: Path) -> Corpus:
         """The folder as training reads it.
@@ -95,6 +97,7 @@ def view_of(module: type[SpeechMotionDataModule], root: Path, split: str | None)
         mesh_files=module.mesh_files,
         region_sources=dict(module.region_sources),
         region_help=module.region_help,
+        obtain=module.obtain,
     )
 
 
@@ -106,6 +109,11 @@ def _instance(module: type[SpeechMotionDataModule], root: Path, way: str | None)
         raise FaceDiffError(
             f"--corpus {module.__name__}: cannot be made from a folder alone ({error}); give the rest defaults"
         ) from error
+
+
+def is_rate(value: object) -> TypeGuard[float]:
+    """Whether a value of a record can be a frame rate."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 1 <= value <= 10_000
 
 
 def view_of_person(manifest: dict[str, Any], n_vertices: int | None) -> View:
@@ -121,7 +129,7 @@ def view_of_person(manifest: dict[str, Any], n_vertices: int | None) -> View:
     from facediff.data.corpus import parse_name
 
     person, rate, vertices = manifest["person"], manifest.get("frame_rate"), manifest.get("n_vertices", n_vertices)
-    if not (isinstance(rate, int | float) and rate > 0 and isinstance(vertices, int) and vertices > 0):
+    if not (is_rate(rate) and isinstance(vertices, int) and vertices > 0):
         raise FaceDiffError(f"does not tell both frame rate and vertices of {person}; import the person anew")
 
     def split(clip: Clip) -> str | None:
@@ -132,8 +140,8 @@ def view_of_person(manifest: dict[str, Any], n_vertices: int | None) -> View:
         corpus="person",
         data_module=None,
         n_vertices=vertices,
-        frame_rate=float(rate),
-        stored_frame_rate=float(rate),
+        frame_rate=rate,
+        stored_frame_rate=rate,
         parse=parse_name,
         split_of={None: split},
         identities=[person],

@@ -12,30 +12,128 @@ options and says in words what its numbers are. Needs torch and torchmetrics onl
 {'mve': 1.7321, 'lve': 3.0, 'fdd': 0.0}
 >>> print(metrics.summary())
 protocol paper: lips mouth (2 vertices, 83b97b85), upper brows (2 vertices, 46584c88); frames 5, sequences 1
+
+Every metric is a torchmetrics class and a function of the same name in lower case, which is the class used
+once; the class's docstring has the formula, its source, its unit, and what about it is a choice:
+
+- distance from the truth: `MeanVertexError`, `LipVertexError`, `UpperFaceVertexError`
+- amount of movement: `FaceDynamicsDeviation`
+- the mouth: `MouthOpeningDifference`, `BilabialClosureRate`
+- timing: `LipWarpingDistance` (lip DTW), `TemporalMisalignment` (MTM), `LipOpeningCorrelation` and
+  `LipSpeedCorrelation` (lip PCC)
+- loudness: `ClipSpeechLipCorrelation` and `FrameSpeechLipCorrelation` (SLCC)
+- several samples: `MeanEstimateError`, `CoverageError`, `SampleDiversity`
+- several identities: `IdentityDiversity`, `StyleRetrievalAccuracy`
+- speed: `RealTimeFactor`
+
+Lengths or masks say what is padding, which is never read. NaN and infinity are refused with the clip's name.
+Sums are float64 whatever comes in, and processes with unequal numbers of sequences get what one would.
 """
 
-from facediff.metrics.base import Coverage, SequenceMetric
+from facediff.metrics.base import ComparisonMetric, Coverage, SequenceMetric
+from facediff.metrics.closures import BilabialClosureRate, Closures, bilabial_closure_rate
+from facediff.metrics.correlation import (
+    LipOpeningCorrelation,
+    LipSpeedCorrelation,
+    lip_opening_correlation,
+    lip_speed_correlation,
+)
+from facediff.metrics.diversity import IdentityDiversity, SampleDiversity, identity_diversity, sample_diversity
+from facediff.metrics.exact import ExactMetric
 from facediff.metrics.face_dynamics import FaceDynamicsDeviation
-from facediff.metrics.functional import face_dynamics_deviation, lip_vertex_error, mean_vertex_error
+from facediff.metrics.functional import (
+    face_dynamics_deviation,
+    lip_vertex_error,
+    mean_vertex_error,
+    upper_face_vertex_error,
+)
+from facediff.metrics.lip_pairs import LipPairs
+from facediff.metrics.mouth import MouthOpeningDifference, OpeningMetric, mouth_opening_difference
 from facediff.metrics.protocol_metrics import ProtocolMetrics, Summary
 from facediff.metrics.protocols import PROTOCOLS, Protocol, protocol
 from facediff.metrics.regions import Region
-from facediff.metrics.vertex_errors import LipVertexError, MeanVertexError, VertexError
+from facediff.metrics.samples import (
+    CoverageError,
+    MeanEstimateError,
+    SamplesMetric,
+    coverage_error,
+    mean_estimate_error,
+)
+from facediff.metrics.speech import (
+    FrameSpeechLipCorrelation,
+    SpeechLipMetric,
+    frame_speech_lip_correlation,
+    speech_intensity,
+)
+from facediff.metrics.speech_clips import ClipSpeechLipCorrelation, clip_speech_lip_correlation
+from facediff.metrics.speed import RealTimeFactor, device_name, real_time_factor
+from facediff.metrics.style import StyleRetrievalAccuracy, style_retrieval_accuracy
+from facediff.metrics.timing import (
+    LipWarpingDistance,
+    TemporalMisalignment,
+    lip_warping_distance,
+    temporal_misalignment,
+)
+from facediff.metrics.topologies import TOPOLOGIES, Topology
+from facediff.metrics.vertex_errors import LipVertexError, MeanVertexError, UpperFaceVertexError, VertexError
+from facediff.metrics.warping import warp
 
 __all__ = [
     "PROTOCOLS",
+    "TOPOLOGIES",
+    "BilabialClosureRate",
+    "ClipSpeechLipCorrelation",
+    "Closures",
+    "ComparisonMetric",
     "Coverage",
+    "CoverageError",
+    "ExactMetric",
     "FaceDynamicsDeviation",
+    "FrameSpeechLipCorrelation",
+    "IdentityDiversity",
+    "LipOpeningCorrelation",
+    "LipPairs",
+    "LipSpeedCorrelation",
     "LipVertexError",
+    "LipWarpingDistance",
+    "MeanEstimateError",
     "MeanVertexError",
+    "MouthOpeningDifference",
+    "OpeningMetric",
     "Protocol",
     "ProtocolMetrics",
+    "RealTimeFactor",
     "Region",
+    "SampleDiversity",
+    "SamplesMetric",
     "SequenceMetric",
+    "SpeechLipMetric",
+    "StyleRetrievalAccuracy",
     "Summary",
+    "TemporalMisalignment",
+    "Topology",
+    "UpperFaceVertexError",
     "VertexError",
+    "bilabial_closure_rate",
+    "clip_speech_lip_correlation",
+    "coverage_error",
+    "device_name",
     "face_dynamics_deviation",
+    "frame_speech_lip_correlation",
+    "identity_diversity",
+    "lip_opening_correlation",
+    "lip_speed_correlation",
     "lip_vertex_error",
+    "lip_warping_distance",
+    "mean_estimate_error",
     "mean_vertex_error",
+    "mouth_opening_difference",
     "protocol",
+    "real_time_factor",
+    "sample_diversity",
+    "speech_intensity",
+    "style_retrieval_accuracy",
+    "temporal_misalignment",
+    "upper_face_vertex_error",
+    "warp",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -16,11 +16,25 @@ Lengths = Tensor | Sequence[int] | int
 
 @dataclass(frozen=True)
 class Clip:
-    """One sequence to score: prediction and truth (frames, vertices, 3), views of equal length."""
+    """One sequence to score, and what some metrics are given beside it.
+
+    Args:
+        name: What messages call the sequence.
+        prediction: (frames, vertices, 3), a view; (frames, samples, vertices, 3) where there are several.
+        truth: (frames, vertices, 3), a view; the prediction itself where a metric has no truth.
+        template: Neutral vertices (vertices, 3), as the metric reads them.
+        speech: Intensity of the speech in each frame (frames,), float64; empty if none was given.
+        closures: Closures of the mouth, each a first frame and the frame after the last.
+        identity: Number of the identity.
+    """
 
     name: str
     prediction: Tensor
     truth: Tensor
+    template: Tensor | None = None
+    speech: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.float64))
+    closures: tuple[tuple[int, int], ...] = ()
+    identity: int = 0
 
     @property
     def frames(self) -> int:
@@ -37,10 +51,10 @@ class Clips:
     cut_truth: int
     n_vertices: int
 
-    @property
-    def counts(self) -> tuple[int, int, int, int]:
-        """Frames, sequences, frames cut from predictions, frames cut from truths."""
-        return sum(clip.frames for clip in self.clips), len(self.clips), self.cut_prediction, self.cut_truth
+    def with_templates(self, templates: Sequence[Tensor | None]) -> Clips:
+        """The same with a template for each sequence."""
+        changed = (replace(clip, template=still) for clip, still in zip(self.clips, templates, strict=True))
+        return replace(self, clips=tuple(changed))
 
     def check_finite(self) -> None:
         """Refuse NaN and infinity in the frames that are scored.
@@ -48,19 +62,23 @@ class Clips:
         Raises:
             ValueError: Naming the first clip concerned and the side.
         """
-        motions = [motion for clip in self.clips for motion in (clip.truth, clip.prediction)]
-        if not motions:
+        sides = [
+            (clip.name, side, motion)
+            for clip in self.clips
+            for side, motion in (("truth", clip.truth), ("prediction", clip.prediction))
+            if side == "prediction" or motion is not clip.prediction
+        ]
+        if not sides:
             return
         # A sum is NaN or infinite if any term is, and costs a tenth of looking at every value. It can also
         # overflow by itself, so suspicion is followed by the exact test. One transfer for the whole batch.
-        sums = torch.stack([motion.sum(dtype=_wide(motion.dtype)).double() for motion in motions])
-        for place, fine in enumerate(sums.isfinite().tolist()):
-            if not fine and not bool(motions[place].isfinite().all()):
-                bad = (~motions[place].isfinite()).flatten(1).any(1).nonzero()[0].item()
-                side = ("truth", "prediction")[place % 2]
+        sums = torch.stack([motion.sum(dtype=_wide(motion.dtype)).double() for _, _, motion in sides])
+        for (name, side, motion), fine in zip(sides, sums.isfinite().tolist(), strict=True):
+            if not fine and not bool(motion.isfinite().all()):
+                bad = (~motion.isfinite()).flatten(1).any(1).nonzero()[0].item()
                 raise ValueError(
-                    f"the {side} of {self.clips[place // 2].name} holds NaN or infinity, first in frame "
-                    f"{bad}; a score over it would mean nothing: repair or leave out this clip"
+                    f"the {side} of {name} holds NaN or infinity, first in frame {bad}; "
+                    "a score over it would mean nothing: repair or leave out this clip"
                 )
 
 

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from facediff.metrics.base import SequenceMetric
+from facediff.metrics.base import ComparisonMetric
 from facediff.metrics.clips import Clip, Clips, Lengths, align
 from facediff.metrics.formulas import dynamics_deviation
 from facediff.metrics.options import SIGNS, LengthRule, Sign, check_option, dynamics_words
 from facediff.metrics.regions import RegionLike, as_region
 
 
-class FaceDynamicsDeviation(SequenceMetric):
+class FaceDynamicsDeviation(ComparisonMetric):
     r"""Face dynamics deviation (FDD): how much the upper face varies over time, truth against prediction.
 
     Per sequence d = mean_{v∈U} std_t ‖g − τ‖² − mean_{v∈U} std_t ‖p − τ‖² with truth g, prediction p, the
@@ -42,6 +42,7 @@ class FaceDynamicsDeviation(SequenceMetric):
     """
 
     # No higher_is_better: a signed deviation is best at zero.
+    indices: Tensor
 
     def __init__(
         self,
@@ -57,22 +58,16 @@ class FaceDynamicsDeviation(SequenceMetric):
         super().__init__(
             definition=dynamics_words(str(region), sign=sign),
             pooling="sequences",
+            region=region,
             length_rule=length_rule,
             check_finite=check_finite,
             **kwargs,
         )
-        self.region = region
         self.sign: Sign = sign
-        self.indices: Tensor
-        self.register_buffer("indices", region.tensor(), persistent=False)
 
-    def check_vertices(self, n_vertices: int) -> None:
-        """Refuse motion of a mesh that the region cannot belong to."""
-        self.region.check(n_vertices)
-
-    def clip_value(self, clip: Clip, template: Tensor | None = None) -> Tensor:
+    def clip_value(self, clip: Clip) -> Tensor:
         """The deviation of one sequence."""
-        value = dynamics_deviation(clip.prediction, clip.truth, template, self.indices)
+        value = dynamics_deviation(clip.prediction, clip.truth, clip.template, self.indices)
         return value if self.sign == "signed" else value.abs()
 
     def update(
@@ -93,12 +88,12 @@ class FaceDynamicsDeviation(SequenceMetric):
             template: Neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, when
                 prediction and truth are absolute vertices. **None means that they are offsets from the
                 template already**; absolute vertices without a template give another, meaningless number.
-            lengths: As for `SequenceMetric.update`.
-            prediction_lengths: As for `SequenceMetric.update`.
+            lengths: As for `ComparisonMetric.update`.
+            prediction_lengths: As for `ComparisonMetric.update`.
             clip_names: One name a sequence, for messages.
 
         Raises:
-            ValueError: As for `SequenceMetric.update`, and if the template does not fit. Nothing is added
+            ValueError: As for `ComparisonMetric.update`, and if the template does not fit. Nothing is added
                 then.
         """
         clips = align(
@@ -109,15 +104,16 @@ class FaceDynamicsDeviation(SequenceMetric):
             clip_names=clip_names,
             rule=self.length_rule,
         )
-        self._add(clips, split_template(template, clips))
+        self._add(clips.with_templates(split_template(template, clips)))
 
 
-def split_template(template: Tensor | None, clips: Clips) -> list[Tensor | None]:
+def split_template(template: Tensor | None, clips: Clips, name: str = "template") -> list[Tensor | None]:
     """One template (vertices, 3) for each sequence, or None for each.
 
     Args:
         template: (batch, vertices, 3), (vertices, 3) or None.
         clips: The sequences.
+        name: What the caller calls it.
 
     Raises:
         ValueError: If the shape does not fit or the template holds NaN or infinity.
@@ -127,7 +123,7 @@ def split_template(template: Tensor | None, clips: Clips) -> list[Tensor | None]
         return [None] * batch
     if template.shape not in ((batch, vertices, 3), (vertices, 3)):
         raise ValueError(
-            f"template has shape {tuple(template.shape)}; expected {(batch, vertices, 3)} or {(vertices, 3)}"
+            f"{name} has shape {tuple(template.shape)}; expected {(batch, vertices, 3)} or {(vertices, 3)}"
         )
     template = template.detach()
     each = list(template) if template.ndim == 3 else [template] * batch

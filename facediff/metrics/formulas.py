@@ -5,13 +5,10 @@ All arithmetic is in float64 whatever comes in: a deviation is a small differenc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
-from facediff.metrics.clips import Clips
-from facediff.metrics.options import Pooling, Reduction
+from facediff.metrics.options import Reduction
 
 # Coordinates widened to float64 at a time: on a CPU few enough to stay in its cache (five times the speed of
 # whole sequences), on other devices many enough that starting the work costs nothing.
@@ -66,13 +63,6 @@ def dynamics_deviation(prediction: Tensor, truth: Tensor, template: Tensor | Non
     return _variation(truth, template, indices) - _variation(prediction, template, indices)
 
 
-def pool(values: Sequence[Tensor], clips: Clips, pooling: Pooling) -> Tensor:
-    """Sum of the sequences' values, each weighted by its frames if pooling by frames; float64 scalar."""
-    weights = [clip.frames if pooling == "frames" else 1 for clip in clips.clips]
-    stacked = torch.stack(list(values))
-    return (stacked * torch.tensor(weights, dtype=torch.float64, device=stacked.device)).sum()
-
-
 def _variation(motion: Tensor, template: Tensor | None, indices: Tensor) -> Tensor:
     """Mean over vertices of the population standard deviation over time of the squared offset."""
     total = torch.zeros((), dtype=torch.float64, device=motion.device)
@@ -84,6 +74,68 @@ def _variation(motion: Tensor, template: Tensor | None, indices: Tensor) -> Tens
             offset = offset - template.index_select(0, some).double()
         total += _squared_norm(offset).std(0, correction=0).sum()
     return total / len(indices)
+
+
+def opening(motion: Tensor, offsets_from: Tensor | None, pairs: Tensor) -> Tensor:
+    """How far the mouth is open in each frame: the mean distance of the lip pairs.
+
+    Args:
+        motion: (frames, vertices, 3).
+        offsets_from: (vertices, 3) that ``motion`` is offsets from; None if it is absolute vertices.
+        pairs: (pairs, 2) int64, an upper and a lower vertex each.
+
+    Returns:
+        (frames,), float64, in the vertices' unit.
+    """
+    gap = motion.index_select(1, pairs[:, 0]).double() - motion.index_select(1, pairs[:, 1]).double()
+    if offsets_from is not None:
+        gap = gap + (offsets_from.index_select(0, pairs[:, 0]).double() - offsets_from.index_select(0, pairs[:, 1]))
+    return _squared_norm(gap).sqrt().mean(1)
+
+
+def speed(motion: Tensor, indices: Tensor) -> Tensor:
+    """How far the vertices move from each frame to the next, mean over the vertices.
+
+    Args:
+        motion: (frames, vertices, 3); a template would cancel.
+        indices: Vertices to look at, (region,) int64.
+
+    Returns:
+        (frames − 1,), float64, in the vertices' unit for each frame.
+    """
+    frames = len(motion)
+    out = torch.zeros(frames - 1, dtype=torch.float64, device=motion.device)
+    step = max(1, _chunk(motion) // (3 * len(indices)))
+    for start in range(0, frames - 1, step):
+        some = motion[start : start + step + 1].index_select(1, indices).double()
+        out[start : start + step] = _squared_norm(some[1:] - some[:-1]).sqrt().mean(1)
+    return out
+
+
+def correlation(reference: Tensor, other: Tensor) -> Tensor:
+    """Pearson's correlation coefficient of two series of equal length.
+
+    A series varies if its range exceeds 1e-12 of its largest absolute value, which rounding alone does not
+    reach.
+
+    Args:
+        reference: (frames,) float64, what is to be followed.
+        other: (frames,) float64, what should follow it.
+
+    Returns:
+        Scalar, float64; 0 where ``other`` does not vary, NaN where ``reference`` does not.
+    """
+    if len(reference) < 2:
+        return torch.full((), torch.nan, dtype=torch.float64, device=reference.device)
+    first, second = reference - reference.mean(), other - other.mean()
+    scale = (first.square().sum() * second.square().sum()).sqrt()
+    found = ((first * second).sum() / scale).clamp(-1, 1)
+    return torch.where(_steady(reference), torch.nan, torch.where(_steady(other), 0.0, found))
+
+
+def _steady(series: Tensor) -> Tensor:
+    low, high = series.aminmax()
+    return high - low <= 1e-12 * torch.maximum(high.abs(), low.abs())
 
 
 def _chunk(motion: Tensor) -> int:

@@ -1,7 +1,8 @@
-"""The metrics as functions of one sequence or one padded batch.
+"""MVE, LVE, UVE and FDD as functions of one sequence or one padded batch.
 
-They are the classes used once, so that both give the same number by construction. Inputs and errors are those
-of the classes' ``update``; an empty batch is a ValueError. Processes are not brought together.
+They, and the functions beside the other metrics' classes, are the classes used once, so that both give the
+same number by construction. Inputs and errors are those of the classes' ``update``; an empty batch is a
+ValueError. Processes are not brought together.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from facediff.metrics.clips import Lengths
 from facediff.metrics.face_dynamics import FaceDynamicsDeviation
 from facediff.metrics.options import LengthRule, Pooling, Reduction, Sign
 from facediff.metrics.regions import RegionLike
-from facediff.metrics.vertex_errors import LipVertexError, MeanVertexError
+from facediff.metrics.vertex_errors import LipVertexError, MeanVertexError, UpperFaceVertexError
 
 
 def mean_vertex_error(
@@ -98,6 +99,55 @@ def lip_vertex_error(
     metric = LipVertexError(lips, squared=squared, pooling=pooling, length_rule=length_rule, sync_on_compute=False).to(
         truth.device
     )
+    metric.update(prediction, truth, lengths=lengths, prediction_lengths=prediction_lengths, clip_names=clip_names)
+    return metric.compute()
+
+
+def upper_face_vertex_error(
+    prediction: Tensor,
+    truth: Tensor,
+    upper: RegionLike,
+    *,
+    reduction: Reduction = "mean",
+    squared: bool = False,
+    pooling: Pooling = "frames",
+    length_rule: LengthRule = "min",
+    lengths: Lengths | None = None,
+    prediction_lengths: Lengths | None = None,
+    clip_names: Sequence[str] | None = None,
+) -> Tensor:
+    """Upper-face vertex error (UVE): mean over frames of the mean or largest √e² over the upper face.
+
+    Args:
+        prediction: (batch, frames, vertices, 3) or (frames, vertices, 3).
+        truth: Likewise.
+        upper: Upper-face vertices, a `Region` or indices.
+        reduction: ``"mean"`` or ``"max"``.
+        squared: Whether e² replaces √e².
+        pooling: ``"frames"`` or ``"sequences"``.
+        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
+        lengths: Valid frames (batch,) or mask (batch, frames), of both sides unless the next is given.
+        prediction_lengths: Valid frames of the prediction.
+        clip_names: One name a sequence, for messages.
+
+    Returns:
+        Float64 scalar in the vertices' unit, squared if ``squared``.
+
+    Raises:
+        ValueError: As `UpperFaceVertexError.update`.
+
+    >>> import torch
+    >>> upper_face_vertex_error(torch.ones(4, 3, 3), torch.zeros(4, 3, 3), [0, 2], squared=True).item()
+    3.0
+    """
+    metric = UpperFaceVertexError(
+        upper,
+        reduction=reduction,
+        squared=squared,
+        pooling=pooling,
+        length_rule=length_rule,
+        sync_on_compute=False,
+    ).to(truth.device)
     metric.update(prediction, truth, lengths=lengths, prediction_lengths=prediction_lengths, clip_names=clip_names)
     return metric.compute()
 

@@ -19,14 +19,24 @@ prediction only and refuse a prediction that is shorter than the truth."""
 Sign = Literal["signed", "absolute"]
 """Whether a deviation keeps its sign, so that sequences can cancel, or is made positive in each sequence."""
 
+Subject = Literal["prediction", "truth", "gap"]
+"""Whose score: the prediction's, the truth's, which a prediction can be held against, or the prediction's minus
+the truth's."""
+
 REDUCTIONS: tuple[Reduction, ...] = get_args(Reduction)
 POOLINGS: tuple[Pooling, ...] = get_args(Pooling)
 LENGTH_RULES: tuple[LengthRule, ...] = get_args(LengthRule)
 SIGNS: tuple[Sign, ...] = get_args(Sign)
+SUBJECTS: tuple[Subject, ...] = get_args(Subject)
 
 POOLING_WORDS: dict[Pooling, str] = {
     "frames": "mean over the frames of all sequences",
     "sequences": "mean over the frames of each sequence, then mean over sequences",
+}
+SUBJECT_WORDS: dict[Subject, str] = {
+    "prediction": "of the prediction",
+    "truth": "of the truth",
+    "gap": "of the prediction minus that of the truth",
 }
 LENGTH_WORDS: dict[LengthRule, str] = {
     "min": "prediction and truth are both cut to the shorter of the two",

@@ -13,6 +13,7 @@ from facediff.metrics.base import Coverage, SequenceMetric
 from facediff.metrics.clips import Lengths, align
 from facediff.metrics.face_dynamics import FaceDynamicsDeviation, split_template
 from facediff.metrics.regions import Region
+from facediff.metrics.topologies import find_topology
 from facediff.metrics.vertex_errors import LipVertexError, MeanVertexError
 
 if TYPE_CHECKING:
@@ -28,12 +29,22 @@ class Summary:
         lips: Lip region.
         upper: Upper-face region, None if the protocol does not use one.
         coverage: Frames and sequences scored, frames cut.
+        topology: The mesh's name, if the protocol was given one.
     """
 
     protocol: str
     lips: Region
     upper: Region | None
     coverage: Coverage
+    topology: str | None = None
+
+    @property
+    def remarks(self) -> list[str]:
+        """Whether each region is one in use on the topology; empty where that is not known."""
+        if self.topology is None:
+            return []
+        found = [find_topology(self.topology).remark("lips", self.lips)]
+        return found if self.upper is None else [*found, find_topology(self.topology).remark("upper", self.upper)]
 
     def __str__(self) -> str:
         """One line for people."""
@@ -42,10 +53,10 @@ class Summary:
         text = f"protocol {self.protocol}: {regions}; frames {covered.frames}, sequences {covered.sequences}"
         if covered.cut_prediction or covered.cut_truth:
             text += f"; frames cut: prediction {covered.cut_prediction}, truth {covered.cut_truth}"
-        return text
+        return "; ".join([text, *self.remarks])
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON: protocol, regions (name, count, hash, duplicates), coverage."""
+        """Plain data for JSON: protocol, regions (name, count, hash, duplicates), coverage, topology."""
         found: dict[str, Any] = {"protocol": self.protocol, "regions": {}}
         for part, region in (("lips", self.lips), ("upper", self.upper)):
             if region is not None:
@@ -55,7 +66,9 @@ class Summary:
                     "hash": region.hash,
                     "duplicates": region.duplicates,
                 }
-        return found | asdict(self.coverage)
+        covered = asdict(self.coverage)
+        del covered["left_out"]  # the metrics of protocols have a value on every sequence
+        return found | covered | ({} if self.topology is None else {"topology": self.topology, "remarks": self.remarks})
 
 
 class ProtocolMetrics(MetricCollection):
@@ -63,8 +76,7 @@ class ProtocolMetrics(MetricCollection):
 
     `compute` gives a flat dictionary: ``mve``, ``lve``, ``fdd`` as far as the protocol has them; a second
     sign of FDD is called ``fdd_absolute`` or ``fdd_signed``. Under several processes `compute` and `summary`
-    are
-    collective: call them on every rank, also on one that had no sequence.
+    are collective: call them on every rank, also on one that had no sequence.
 
     Args:
         protocol: The setting; usually made by `Protocol.build`.
@@ -124,7 +136,7 @@ class ProtocolMetrics(MetricCollection):
             clip_names: One name a sequence, for messages.
 
         Raises:
-            ValueError: As `SequenceMetric.update`; no metric has changed then.
+            ValueError: As `ComparisonMetric.update`; no metric has changed then.
         """
         self._check(prediction, truth, template, lengths, prediction_lengths, clip_names)
         super().update(
@@ -168,8 +180,9 @@ class ProtocolMetrics(MetricCollection):
 
     def summary(self) -> Summary:
         """Regions, frames, sequences and cut frames behind the scores, over all processes."""
+        topology = self.protocol.topology
         first: Metric = next(iter(self.values(copy_state=False)))
-        return Summary(self.protocol.name, self.lips, self.upper, cast(SequenceMetric, first).coverage())
+        return Summary(self.protocol.name, self.lips, self.upper, cast(SequenceMetric, first).coverage(), topology)
 
     def describe(self) -> str:
         """The definition of every number, with the regions."""

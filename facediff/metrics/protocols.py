@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from facediff.metrics.options import (
     LENGTH_RULES,
@@ -20,6 +20,7 @@ from facediff.metrics.options import (
 )
 from facediff.metrics.protocol_metrics import ProtocolMetrics
 from facediff.metrics.regions import Region
+from facediff.metrics.topologies import find_topology
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class Protocol:
             ``fdd_<sign>``; empty leaves the metric out.
         pooling: Of MVE and LVE; FDD is always a mean over sequences.
         length_rule: What to do where prediction and truth differ in length.
+        topology: Name of the mesh, one of `TOPOLOGIES`. Then regions and motion of another mesh are refused,
+            and the summary says whether the regions are those in use on it. None for any mesh.
 
     Raises:
         ValueError: If an option is unknown.
@@ -49,6 +52,7 @@ class Protocol:
     fdd: tuple[Sign, ...] = ()
     pooling: Pooling = "frames"
     length_rule: LengthRule = "min"
+    topology: str | None = None
 
     def __post_init__(self) -> None:
         """Check the options."""
@@ -60,6 +64,8 @@ class Protocol:
             raise ValueError(f"protocol {self.name!r} names a sign of FDD twice: {self.fdd}")
         check_option("pooling", self.pooling, POOLINGS)
         check_option("length rule", self.length_rule, LENGTH_RULES)
+        if self.topology is not None:
+            find_topology(self.topology)
 
     def describe(self) -> str:
         """The definition in plain words, one line a number."""
@@ -85,8 +91,11 @@ class Protocol:
             upper: Upper-face vertices; needed if the protocol has FDD.
 
         Raises:
-            ValueError: If the upper face is needed and missing.
+            ValueError: If the upper face is needed and missing, or a region does not fit the topology.
         """
+        if self.topology is not None:
+            topology = find_topology(self.topology)
+            lips, upper = topology.bind(lips), None if upper is None else topology.bind(upper)
         return ProtocolMetrics(self, lips, upper)
 
 
@@ -116,11 +125,14 @@ PROTOCOLS: dict[str, Protocol] = {setting.name: setting for setting in _SETTINGS
 """Every named protocol."""
 
 
-def protocol(name: str = "paper") -> Protocol:
+def protocol(name: str = "paper", *, topology: str | None = None) -> Protocol:
     """The protocol of that name.
 
     Args:
         name: One of `PROTOCOLS`.
+        topology: One of `TOPOLOGIES`: the mesh that is scored, to have regions and motion of another mesh
+            refused and unusual regions pointed out. Regions are given to `Protocol.build` all the same: their
+            files belong to the data sets.
 
     Raises:
         ValueError: If there is none; the message lists them and the nearest.
@@ -130,6 +142,11 @@ def protocol(name: str = "paper") -> Protocol:
       lve: in each frame the largest distance over the lip vertices;
       mean over the frames of all sequences [unit]
       lengths: prediction and truth are both cut to the shorter of the two
+    >>> metrics = protocol("meshtalk", topology="biwi").build(Region.from_indices("mine", [7, 9]))
+    >>> print(metrics.summary())  # doctest: +NORMALIZE_WHITESPACE
+    protocol meshtalk: lips mine (2 vertices, 8944bbc1); frames 0, sequences 0;
+    lips of 2 vertices are not usual on biwi (4996: lve.txt of BIWI)
     """
     check_option("protocol", name, tuple(PROTOCOLS))
-    return PROTOCOLS[name]
+    setting = PROTOCOLS[name]
+    return setting if topology is None else replace(setting, topology=topology)

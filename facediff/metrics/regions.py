@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import operator
 import re
 from collections.abc import Iterable, Sequence
@@ -18,8 +19,9 @@ from torch import Tensor
 class Region:
     """A named set of vertex indices, sorted and distinct.
 
-    Make one with `Region.from_indices` or `Region.from_file`, which sort and remove duplicates; the plain
-    constructor takes indices that are sorted and distinct already and refuses others.
+    Make one with `Region.from_indices`, `Region.from_file` or `Region.from_weights`, which sort and remove
+    duplicates; the plain constructor takes indices that are sorted and distinct already and refuses others.
+    ``first | second`` is the union of two regions.
 
     Args:
         name: What the region is called beside a score, for example ``"biwi/lve"``.
@@ -142,23 +144,113 @@ class Region:
         """
         path = Path(path)
         try:
-            text = path.read_text(encoding="utf-8-sig")
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise ValueError(f"cannot read the region file {path}: {reason}; check the path") from error
-        except UnicodeDecodeError:
-            raise ValueError(f"{path} is not text; expected vertex indices separated by commas") from None
-        words = [word for word in re.split(r"[,\s]+", text) if word]
-        for place, word in enumerate(words, start=1):
-            if not (word.isascii() and word.isdigit()):
-                raise ValueError(
-                    f"{path}: entry {place} is {word[:40]!r}; expected vertex indices (whole numbers from 0) "
-                    "separated by commas, blanks or line ends"
-                )
-        try:
-            return cls.from_indices(name or path.stem, map(int, words), n_vertices=n_vertices)
+            return cls.from_indices(name or path.stem, read_indices(path), n_vertices=n_vertices)
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
+            raise ValueError(_naming(path, error)) from error
+
+    @classmethod
+    def from_weights(
+        cls, weights: Tensor | str | PathLike[str], threshold: float, *, name: str | None = None
+    ) -> Region:
+        """The vertices whose weight is above a threshold, strictly.
+
+        Multiface's regions are such masks: FaceDiffuser's script takes the mouth where it is above 0.1 and
+        the forehead where it is above 0.4.
+
+        Args:
+            weights: One finite weight for each vertex of the mesh, (vertices,), or a text file of them, one a
+                line.
+            threshold: Vertices of exactly this weight are left out.
+            name: What to call the region; by default the file's name without its ending, or "weights", with
+                the threshold.
+
+        Raises:
+            ValueError: If the file cannot be read or holds other things, or no weight is above the threshold.
+
+        >>> print(Region.from_weights(torch.tensor([0.0, 0.9, 0.1, 0.4]), 0.1))
+        weights > 0.1 (2 vertices, ef96f1f6)
+        """
+        if isinstance(weights, Tensor):
+            title, values = "weights", weights
+        else:
+            title = Path(weights).stem
+            values = torch.tensor(_read_weights(Path(weights)), dtype=torch.float64)
+        name = name or f"{title} > {threshold:g}"
+        if values.ndim != 1 or not values.is_floating_point() or not bool(values.isfinite().all()):
+            raise ValueError(f"the weights of region {name!r} must be a flat tensor of finite floating-point numbers")
+        chosen = (values > threshold).nonzero().flatten()
+        if not len(chosen):
+            raise ValueError(f"region {name!r}: none of the {len(values)} weights is above {threshold:g}; lower it")
+        return cls.from_indices(name, chosen, n_vertices=len(values))
+
+    def union(self, *others: Region, name: str | None = None) -> Region:
+        """The vertices of this region and others; vertices that they share count as duplicates.
+
+        Args:
+            *others: Regions of the same mesh.
+            name: What to call the union; the names joined by " + " by default.
+
+        Raises:
+            ValueError: If the regions are known to belong to different meshes.
+
+        >>> print(Region("forehead", (1, 2)).union(Region("eyes", (2, 3))))
+        forehead + eyes (3 vertices, 8a6ae151)
+        """
+        parts = (self, *others)
+        meshes = {part.n_vertices for part in parts} - {None}
+        if len(meshes) > 1:
+            told = ", ".join(f"{part} of {part.n_vertices}" for part in parts)
+            raise ValueError(f"regions of different meshes cannot be united: {told} vertices")
+        indices = (index for part in parts for index in part.indices)
+        title = name or " + ".join(part.name for part in parts)
+        return Region.from_indices(title, indices, n_vertices=meshes.pop() if meshes else None)
+
+    def __or__(self, other: Region) -> Region:
+        return self.union(other)
+
+
+def read_indices(path: Path) -> list[int]:
+    """Whole numbers of a text file, separated by commas, blanks or line ends.
+
+    Raises:
+        ValueError: If the file cannot be read or holds anything else; the message names the file.
+    """
+    words = [word for word in re.split(r"[,\s]+", _read_text(path, "vertex indices separated by commas")) if word]
+    for place, word in enumerate(words, start=1):
+        if not (word.isascii() and word.isdigit()):
+            raise ValueError(
+                f"{path}: entry {place} is {word[:40]!r}; expected vertex indices (whole numbers from 0) "
+                "separated by commas, blanks or line ends"
+            )
+    return list(map(int, words))
+
+
+def _read_weights(path: Path) -> list[float]:
+    found = []
+    for place, word in enumerate(_read_text(path, "one weight a line").split(), start=1):
+        try:
+            value = float(word)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ValueError(f"{path}: entry {place} is {word[:40]!r}; expected one finite weight a line")
+        found.append(value)
+    return found
+
+
+def _read_text(path: Path, expected: str) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ValueError(f"cannot read the region file {path}: {reason}; check the path") from error
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} is not text; expected {expected}") from None
+
+
+def _naming(path: Path, error: ValueError) -> str:
+    """The error's message, with the file in front unless it is named already."""
+    return str(error) if str(path) in str(error) else f"{path}: {error}"
 
 
 RegionLike = Region | Sequence[int] | Tensor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from facediff.metrics.base import SequenceMetric
+from facediff.metrics.base import ComparisonMetric
 from facediff.metrics.clips import Clip
 from facediff.metrics.formulas import vertex_error
 from facediff.metrics.options import (
@@ -19,7 +19,7 @@ from facediff.metrics.options import (
 from facediff.metrics.regions import RegionLike, as_region
 
 
-class VertexError(SequenceMetric):
+class VertexError(ComparisonMetric):
     """Distance between predicted and true vertices, over a region or the whole mesh.
 
     With e²[t, v] = Σ_c (g[t, v, c] − p[t, v, c])² of truth g and prediction p, each frame gives the mean or
@@ -59,23 +59,16 @@ class VertexError(SequenceMetric):
         super().__init__(
             definition=vertex_error_words(where, reduction=reduction, squared=squared, pooling=pooling),
             pooling=pooling,
+            region=named,
             length_rule=length_rule,
             check_finite=check_finite,
             **kwargs,
         )
-        self.region = named
         self.reduction: Reduction = reduction
         self.squared = squared
-        self.indices: Tensor | None
-        self.register_buffer("indices", None if named is None else named.tensor(), persistent=False)
 
-    def check_vertices(self, n_vertices: int) -> None:
-        """Refuse motion of a mesh that the region cannot belong to."""
-        if self.region is not None:
-            self.region.check(n_vertices)
-
-    def clip_value(self, clip: Clip, template: Tensor | None = None) -> Tensor:
-        """The error of one sequence, mean over its frames; the template cancels."""
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The error of one sequence, mean over its frames."""
         return vertex_error(clip.prediction, clip.truth, self.indices, reduction=self.reduction, squared=self.squared)
 
 
@@ -156,6 +149,47 @@ class LipVertexError(VertexError):
         super().__init__(
             as_region(lips, "lips"),
             reduction="max",
+            squared=squared,
+            pooling=pooling,
+            length_rule=length_rule,
+            check_finite=check_finite,
+            **kwargs,
+        )
+
+
+class UpperFaceVertexError(VertexError):
+    """Upper-face vertex error (UVE): how far the vertices of the upper face are from the truth.
+
+    The mean over frames of the mean (or largest) distance √e² over the upper-face vertices: what MVE is for
+    the whole mesh. There is no usual formula of that name; the mean of unsquared distances is a choice, and
+    ``reduction="max", squared=True`` is what LVE's formula gives on this region. Unlike FDD it tells a brow
+    that moves at the wrong moment from one that moves rightly, and so counts against a face whose upper part
+    is plausible but not the truth's.
+
+    Args:
+        upper: Upper-face vertices, a `Region` or indices.
+        reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
+        squared: Whether distances are squared.
+        pooling: ``"frames"`` or ``"sequences"``.
+        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
+        check_finite: Whether NaN and infinity are refused.
+        **kwargs: For `torchmetrics.Metric`.
+    """
+
+    def __init__(
+        self,
+        upper: RegionLike,
+        *,
+        reduction: Reduction = "mean",
+        squared: bool = False,
+        pooling: Pooling = "frames",
+        length_rule: LengthRule = "min",
+        check_finite: bool = True,
+        **kwargs: object,
+    ) -> None:
+        super().__init__(
+            as_region(upper, "upper"),
+            reduction=reduction,
             squared=squared,
             pooling=pooling,
             length_rule=length_rule,

@@ -48,7 +48,10 @@ def find_frames(folder: Path) -> FrameFiles:
     Raises:
         FaceDiffError: if there is none, if names differ in more than that number, or if two have the same number.
     """
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESHES and not p.name.startswith("."))
+    try:
+        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESHES and not p.name.startswith("."))
+    except OSError as error:
+        raise FaceDiffError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
     if not paths:
         raise FaceDiffError(f"{folder}: holds no mesh files; expected one a frame, {' or '.join(MESHES)}")
     pieces = [re.split(r"(\d+)", path.stem) for path in paths]

@@ -185,8 +185,10 @@ def _fit(request: Request, read: Motion, known: Auxiliary, speech: Speech, scrat
         face = middle_face(read, stable)
         lay_onto_corpus(request.motion, face, known)  # before the long work
         made = stabilise(read, face, stable, scratch / "stable.npy")
-    neutral = choose_neutral(read, made, given, speech, request.frame_rate)
-    best, residual = lay_onto_corpus(request.template or request.motion, neutral.face, known)
+    source = request.template or request.motion
+    with _naming(source):
+        neutral = choose_neutral(read, made, given, speech, request.frame_rate)
+        best, residual = lay_onto_corpus(source, neutral.face, known)
     place = into_coordinates(neutral.face, best, request.scale)
     return Fitted(made, neutral, place, best.scale, residual, compared)
 
@@ -245,7 +247,9 @@ def _naming(path: Path) -> Iterator[None]:
     try:
         yield
     except FaceDiffError as error:
-        raise error if str(error).startswith(str(path)) else FaceDiffError(f"{path}: {error}") from error
+        if str(error).startswith(str(path)):
+            raise
+        raise FaceDiffError(f"{path}: {error}") from error
 
 
 def _move(frames: npt.NDArray[np.floating], way: Similarity) -> npt.NDArray[np.floating]:

@@ -12,6 +12,8 @@ from facediff.errors import FaceDiffError
 from facediff.person.frames import read_frames
 from facediff.person.meshes import Faces
 from facediff.person.scratch import scratch_array
+from facediff.prepare.flame_parameters import read_parameters
+from facediff.topology.flame import Flame
 
 FLAME_WIDTH = 403
 """Shape 300, expression 100 and jaw 3 in one row."""
@@ -110,9 +112,6 @@ def _as_vertices(array: npt.NDArray[np.floating], n_vertices: int) -> npt.NDArra
 
 def _read_flame(path: Path, model: Path, n_vertices: int, scratch: Path) -> Motion:
     """Vertices of FLAME parameters without head pose; the neutral face is the shape without expression."""
-    from facediff.prepare.mead3d import read_parameters
-    from facediff.topology.flame import Flame
-
     parameters, layer = read_parameters(path), Flame.read(model)
     shape, expression, jaw = parameters.shape, parameters.expression, parameters.jaw
     template = layer.shaped(shape)

@@ -17,6 +17,7 @@ from facediff.topology.rigid_motion import Indices, chunks
 
 Array = npt.NDArray[np.float64]
 
+MIN_STABLE = 10
 STILL = 1e-6
 """Motion whose fastest frame moves by less than this share of the face's size is none."""
 
@@ -58,6 +59,10 @@ def read_stable(source: str, n_vertices: int) -> Indices:
     if not file.is_file():
         raise FaceDiffError(f"--stable {file}: no such file; expected vertex indices separated by commas")
     region = find_region(file.parent, [Path(source).name], "stable vertices", n_vertices)
+    if region.count < MIN_STABLE:
+        raise FaceDiffError(
+            f"--stable {file}: names {region.count} vertices; expected at least {MIN_STABLE}, spread over the skull"
+        )
     return np.array(region.indices, np.int64)
 
 

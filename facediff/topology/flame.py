@@ -123,18 +123,16 @@ class Flame:
         return result
 
     def _pose(self, face: Array, expression: Array, jaw: Array, result: Array) -> None:
-        turns = rotations(jaw)
-        features = (turns - np.eye(3)).reshape(-1, 9)
+        turns = rotations(jaw) - np.eye(3)
         count = expression.shape[1]
         flat = result.reshape(len(result), -1)
         np.matmul(expression, self._basis[:count], out=flat)
-        flat += features @ self._basis[EXPRESSIONS:]
+        flat += turns.reshape(-1, 9) @ self._basis[EXPRESSIONS:]
         result += face
         joint = (self._jaw_regressor @ face + expression @ self._jaw_basis[:count])[:, None]
-        # (1 − w) x + w (R (x − j) + j): eq. 2 with the identity for every joint that stays.
-        points = result[:, self._turning]
-        turned = (points - joint) @ turns.transpose(0, 2, 1) + joint
-        result[:, self._turning] = points + self._weights * (turned - points)
+        # Eq. 2, (1 − w) x + w (R (x − j) + j), with the identity for every joint that stays.
+        arms = result[:, self._turning] - joint
+        result[:, self._turning] += self._weights * (arms @ turns.transpose(0, 2, 1))
 
 
 def _ancestors(parents: npt.NDArray[np.int64], joint: int) -> list[int]:

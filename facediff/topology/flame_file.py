@@ -60,6 +60,8 @@ def read_flame_arrays(path: Path) -> FlameArrays:
     Raises:
         FaceDiffError: if the file is missing, is no FLAME model, or asks for code to be run; it is not run.
     """
+    if not path.is_file():
+        raise FaceDiffError(f"{path}: no such file; {HELP}")
     content = _read_npz(path) if path.suffix.lower() == ".npz" else load_pickle(path, stand_ins=PACKAGES)
     if not isinstance(content, Mapping):
         raise FaceDiffError(f"{path}: holds a {type(content).__name__}, no FLAME model; {HELP}")
@@ -86,12 +88,10 @@ def read_flame_arrays(path: Path) -> FlameArrays:
 
 
 def _read_npz(path: Path) -> dict[str, Values]:
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; {HELP}")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {key: archive[key] for key in KEYS if key in archive}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
         raise FaceDiffError(f"{path}: not a readable .npz of plain arrays ({error}); {HELP}") from error
 
 

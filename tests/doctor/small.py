@@ -9,7 +9,11 @@ import numpy as np
 import soundfile
 
 from facediff.data import Biwi, Mead3D, Vocaset
+from facediff.doctor import Report
 from tests.fakes import biwi, vocaset
+
+BIWI, VOCASET, MEAD = (f"tests.doctor.small.{name}" for name in ("SmallBiwi", "SmallVocaset", "SmallMead"))
+"""Import paths of the data modules below."""
 
 MEAD_VERTICES = 40
 MEAD_FRAMES = {
@@ -68,3 +72,18 @@ def write_small_mead(root: Path) -> Path:
     faces = biwi.faces_of(MEAD_VERTICES)
     (root / "FLAME.ply").write_bytes(biwi.ply_bytes(templates["M003"], faces, "float", "int"))
     return root
+
+
+def kinds(report: Report, severity: str = "error") -> list[str]:
+    return [finding.kind for finding in report.findings if finding.severity == severity]
+
+
+def message(report: Report, kind: str) -> str:
+    return next(finding.message for finding in report.findings if finding.kind == kind)
+
+
+def rows(report: Report) -> dict[tuple[str | None, str], tuple[object, ...]]:
+    return {
+        (row["way"], row["split"]): tuple(row[key] for key in ("expected", "present", "missing", "frames", "seconds"))
+        for row in report.splits
+    }

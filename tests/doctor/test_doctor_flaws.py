@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import shutil
 import struct
@@ -16,10 +15,29 @@ import soundfile
 import trimesh
 
 from facediff.commands.check import run
+from tests.doctor.planting import (
+    CLIP,
+    FRAMES,
+    Bomb,
+    add_stranger,
+    change,
+    change_sound,
+    change_templates,
+    cut_bytes,
+    motion,
+    remove_training_clips,
+    set_rows,
+    silent_header,
+    sound,
+    swap_for_archive,
+    swap_for_broken_link,
+    swap_for_folder,
+    swap_for_pipe,
+    wide,
+    write_manifest,
+    write_region,
+)
 from tests.fakes.tiny import VERTICES, write_tiny
-
-CLIP = "A_e07"
-FRAMES = 26
 
 
 @pytest.fixture(scope="module")
@@ -36,99 +54,6 @@ def examined(root: Path, capsys: pytest.CaptureFixture[str], *options: str) -> t
     """Exit status and report of the command."""
     status = run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--json", *options])
     return status, json.loads(capsys.readouterr().out)
-
-
-def motion(root: Path, clip: str = CLIP) -> Path:
-    return root / "vertices_npy" / f"{clip}.npy"
-
-
-def sound(root: Path, clip: str = CLIP) -> Path:
-    return root / "wav" / f"{clip}.wav"
-
-
-def change(path: Path, how: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Read, change and write a file of motion."""
-    np.save(path, how(np.load(path)))
-
-
-def change_sound(path: Path, how: Callable[[np.ndarray], np.ndarray], subtype: str = "PCM_16") -> None:
-    samples, rate = soundfile.read(path)
-    soundfile.write(path, how(samples), rate, subtype=subtype)
-
-
-def change_templates(root: Path, how: Callable[[dict], object]) -> None:
-    path = root / "templates.pkl"
-    templates = pickle.loads(path.read_bytes())  # noqa: S301 - written by the test
-    path.write_bytes(pickle.dumps(how(templates) or templates))
-
-
-def cut_bytes(path: Path, missing: int) -> None:
-    path.write_bytes(path.read_bytes()[:-missing])
-
-
-def set_rows(array: np.ndarray, rows: list[int], value: float) -> np.ndarray:
-    array[rows, 4] = value
-    return array
-
-
-class Bomb:
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return os.mkdir, ("bomb-went-off",)
-
-
-def other_clip(root: Path, name: str) -> None:
-    """A further clip whose files are nobody's copy."""
-    np.save(motion(root, name), np.load(motion(root)) + np.float32(1e-5))
-    samples, rate = soundfile.read(sound(root))
-    soundfile.write(sound(root, name), 0.9 * samples, rate)
-
-
-def add_stranger(root: Path) -> None:
-    other_clip(root, "Z_e01")
-    change_templates(root, lambda t: t.update(Z=t["A"] + 1e-5))
-
-
-def write_manifest(root: Path, **fields: object) -> None:
-    (root / "manifest.json").write_text(json.dumps(fields))
-
-
-def swap_for_folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def swap_for_pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-def swap_for_broken_link(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("nowhere")
-
-
-def swap_for_archive(path: Path) -> None:
-    with path.open("wb") as stream:
-        np.savez(stream, a=np.ones(3))
-
-
-def wide(array: np.ndarray) -> np.ndarray:
-    """The same motion with six vertices more."""
-    return np.concatenate([array, array[:, :18]], 1)
-
-
-def remove_training_clips(root: Path) -> None:
-    for path in (*root.glob("wav/[AB]_e0[1-4].wav"), *root.glob("vertices_npy/[AB]_e0[1-4].npy")):
-        path.unlink()
-
-
-def silent_header(root: Path) -> None:
-    """A wav whose header promises more than there is, as an interrupted copy has it."""
-    cut_bytes(sound(root), 20_000)
-
-
-def write_region(root: Path, text: str) -> None:
-    (root / "regions" / "lve.txt").write_text(text)
 
 
 Plant = Callable[[Path], object]
@@ -239,8 +164,18 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
     ("table without clips", lambda r: (r / "clips.csv").write_text("a,b\n1,2\n"), {"clips_table"}, "no column clip"),
     ("table of bytes", lambda r: (r / "clips.csv").write_bytes(b"\xff\xfe" * 9), {"clips_table"}, "cannot be read"),
     ("no training clip", remove_training_clips, {"no_training_clip"}, "nothing can be trained"),
-    ("manifest of text", lambda r: (r / "manifest.json").write_text("{"), {"manifest_unreadable"}, "no JSON"),
-    ("manifest too deep", lambda r: (r / "manifest.json").write_text("[" * 10**5), {"manifest_unreadable"}, "no JSON"),
+    (
+        "manifest of text",
+        lambda r: (r / "manifest.json").write_text("{"),
+        {"manifest_unreadable"},
+        "not readable as JSON",
+    ),
+    (
+        "manifest too deep",
+        lambda r: (r / "manifest.json").write_text("[" * 10**5),
+        {"manifest_unreadable"},
+        "not readable as JSON",
+    ),
     ("manifest of a list", lambda r: (r / "manifest.json").write_text("[]"), {"manifest_unreadable"}, "no JSON object"),
     ("odd frame rate", lambda r: write_manifest(r, frame_rate=26), {"frame_rate"}, "26, which is no whole multiple"),
     ("frame rate of words", lambda r: write_manifest(r, frame_rate="fast"), {"frame_rate"}, "cannot be read"),
@@ -377,3 +312,22 @@ def test_damaged_headers_of_all_sorts_are_told(root: Path, capsys: pytest.Captur
             assert status == (0 if report["sound"] else 1)
         path.write_bytes(data)
     assert examined(root, capsys)[0] == 0
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"frame_rate": 1e-320, "person": "A"},
+        {"frame_rate": float("inf"), "person": "A", "n_vertices": 24},
+        {"frame_rate": float("nan"), "n_vertices": True, "corpus": ["tiny"]},
+        {"person": "A", "frame_rate": 25, "n_vertices": 10**30},
+        {"corpus": {"a": 1}, "files": {"a\0b": {}, "x" * 5000: {"bytes": 1}}},
+        {"files": {"wav": {"bytes": 4096}, "clips.csv": {"bytes": [], "sha256": {}}}},
+        {"files": [], "failed": 3, "missing": [1], "facediff": {}, "unit": [], "frame_rate": False},
+    ],
+)
+def test_no_manifest_ends_the_check(root: Path, capsys: pytest.CaptureFixture[str], fields: dict[str, object]) -> None:
+    write_manifest(root, **fields)
+    for options in ([], ["--json"], ["--corpus", "tests.fakes.tiny.Tiny"]):
+        assert run("data check", [str(root), "--quiet", *options]) in (0, 1)
+        assert capsys.readouterr().out.strip()

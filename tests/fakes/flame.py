@@ -71,7 +71,7 @@ def compressed(dense: np.ndarray, module: str = "scipy.sparse.csc", name: str = 
 class ForeignPickler(pickle._Pickler):
     """Writes the names of classes that are not there to be imported."""
 
-    def save_global(self, obj: Any, name: str | None = None) -> None:
+    def save_global(self, obj: type, name: str | None = None) -> None:
         if obj.__module__.startswith(("chumpy.", "scipy.")):
             self.write(pickle.GLOBAL + f"{obj.__module__}\n{obj.__name__}\n".encode())
             self.memoize(obj)
@@ -82,7 +82,7 @@ class ForeignPickler(pickle._Pickler):
 class OldForeignPickler(Python2Pickler):
     """The same as Python 2 wrote it, whose built-in classes had another place."""
 
-    def save_global(self, obj: Any, name: str | None = None) -> None:
+    def save_global(self, obj: type, name: str | None = None) -> None:
         if obj.__module__ == "builtins":
             self.write(pickle.GLOBAL + f"__builtin__\n{name or obj.__name__}\n".encode())
             self.memoize(obj)

@@ -1,5 +1,7 @@
 """One of the processes of test_metric_processes.py: scores its share and writes what it got.
 
+Run as a file: its folder, with further_cases.py in it, is where Python looks for modules.
+
 Usage: distributed_worker.py RANK WORLD RENDEZVOUS CORPUS OUTPUT
 """
 
@@ -11,20 +13,37 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from facediff.metrics import Region, protocol
+from facediff.metrics import RealTimeFactor, Region, StyleRetrievalAccuracy, protocol
+
+# Rounds of sequences by rank: unequal shares, all on rank 0, none at all.
+ROUNDS: list[list[list[int]]] = [[[0, 1, 2], [3, 4]], [[0, 1, 2, 3, 4], []], [[], []]]
+
+
+def score(metric: Any, batches: list[dict[str, Any]]) -> Any:  # noqa: ANN401
+    """What a metric gives for the batches of this process and those of the others, or its complaint."""
+    metric.reset()
+    for batch in batches:
+        metric.update(**batch)
+    try:
+        value = metric.compute().item()
+    except ValueError as error:
+        return str(error)
+    counted = metric.coverage() if hasattr(metric, "coverage") else getattr(metric, "queries", int)()
+    return [value, str(counted)]
 
 
 def main(rank: int, world: int, rendezvous: str, corpus: str, output: str) -> None:
     """Score every round of shares and save the results."""
+    from further_cases import CASES  # not above: the doctest collector imports this file without its folder
+
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{rendezvous}", rank=rank, world_size=world)
-    clips: list[dict[str, Any]] = torch.load(corpus, weights_only=True)
+    given: dict[str, Any] = torch.load(corpus, weights_only=True)
+    clips: list[dict[str, Any]] = given["clips"]
     lips, upper = Region("lips", (3, 4, 9, 31)), Region("upper", (0, 1, 20, 25, 39))
     metrics = protocol("facediffuser").build(lips, upper)
     results: list[Any] = []
-    # Three rounds of sequences by rank: unequal shares, all on rank 0, none at all.
-    rounds: list[list[list[int]]] = [[[0, 1, 2], [3, 4]], [[0, 1, 2, 3, 4], []], [[], []]]
-    for shares in rounds:
+    for shares in ROUNDS:
         metrics.reset()
         for place in shares[rank]:
             metrics.update(**clips[place])
@@ -39,7 +58,13 @@ def main(rank: int, world: int, rendezvous: str, corpus: str, output: str) -> No
         results.append(scores | metrics.summary().as_dict())
     metrics.update(**clips[rank])  # after the error above every metric still works
     results.append({name: value.item() for name, value in metrics.compute().items()})
-    torch.save(results, output)
+    others = {case.name: case.make() for case in CASES if case.name in given["further"]}
+    others |= {"style": StyleRetrievalAccuracy(), "speed": RealTimeFactor("this machine")}
+    further = {
+        name: [score(metric, [given["further"][name][place] for place in shares[rank]]) for shares in ROUNDS]
+        for name, metric in others.items()
+    }
+    torch.save({"protocol": results, "further": further}, output)
     dist.destroy_process_group()
 
 

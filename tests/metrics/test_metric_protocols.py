@@ -101,6 +101,35 @@ def test_summary_names_regions_frames_and_cuts(corpus: Corpus, lips: tuple[int, 
     assert "lips (4 vertices" in metrics.describe()
 
 
+def test_a_topology_tells_usual_regions_from_others() -> None:
+    lips, upper = Region.from_indices("lve", range(4996)), Region.from_indices("fdd", range(9000, 9000 + 7784))
+    summary = protocol("codetalker", topology="biwi").build(lips, upper).summary()
+    assert summary.remarks == [
+        "lips of 4996 vertices are usual on biwi: lve.txt of BIWI",
+        "upper of 7784 vertices is usual on biwi: fdd.txt of BIWI",
+    ]
+    assert str(summary).endswith("; ".join(summary.remarks))
+    assert json.loads(json.dumps(summary.as_dict()))["remarks"] == summary.remarks
+    flame = protocol("codetalker", topology="vocaset")
+    small = flame.build(Region.from_indices("mask", range(250)), Region.from_indices("x", range(300, 400)))
+    assert "250 vertices are usual on vocaset: lips of FLAME's masks" in small.summary().remarks[0]
+    assert small.summary().remarks[1].startswith("upper of 100 vertices is not usual on vocaset (827: ")
+    assert "topology" not in protocol("codetalker").build(lips, upper).summary().as_dict()
+
+
+def test_a_topology_refuses_regions_and_motion_of_another() -> None:
+    flame = protocol("meshtalk", topology="mead3d")
+    with pytest.raises(ValueError, match="index 5023, a mesh of 5023 vertices ends at 5022"):
+        flame.build(Region("lips", (1, 5023)))
+    with pytest.raises(ValueError, match="belongs to a mesh of 23370 vertices"):
+        flame.build(Region("lips", (1,), 23370))
+    metrics = flame.build(Region("lips", (1,)))
+    with pytest.raises(ValueError, match="belongs to a mesh of 5023 vertices, the motion has 40"):
+        metrics.update(torch.zeros(2, 40, 3), torch.zeros(2, 40, 3))
+    with pytest.raises(ValueError, match="unknown topology 'biwy'.*Did you mean 'biwi'"):
+        protocol("meshtalk", topology="biwy")
+
+
 def test_codetalker_refuses_a_shorter_prediction(corpus: Corpus, lips: tuple[int, ...], upper: tuple[int, ...]) -> None:
     metrics = build("codetalker", lips, upper)
     with pytest.raises(ValueError, match="'prediction' refuses this"):

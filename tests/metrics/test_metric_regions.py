@@ -86,6 +86,54 @@ def test_a_region_of_another_mesh_is_refused() -> None:
         Region.from_indices("lips", [1], n_vertices=9).check(10)
 
 
+def test_weights_above_a_threshold(tmp_path: Path) -> None:
+    weights = [0.0, 0.1, 0.10001, 2e-12, 1.0]
+    path = tmp_path / "weighted_mouth_mask.txt"
+    path.write_text("\n".join(map(str, weights)), encoding="utf-8")
+    for given in (path, str(path)):
+        region = Region.from_weights(given, 0.1)
+        assert (region.indices, region.n_vertices, region.name) == ((2, 4), 5, "weighted_mouth_mask > 0.1")
+    for dtype in (torch.float32, torch.float64):  # strictly above, in either precision
+        assert Region.from_weights(torch.tensor(weights, dtype=dtype), 0.1, name="mouth").indices == (2, 4)
+    with pytest.raises(ValueError, match="belongs to a mesh of 5 vertices"):
+        region.check(6)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("0.1\nx\n", "entry 2 is 'x'; expected one finite weight a line"),
+        ("0.1\nnan", "entry 2 is 'nan'"),
+        ("0.1,0.2", "entry 1 is '0.1,0.2'"),
+        ("0.1\n0.2", "none of the 2 weights is above 0.5; lower it"),
+        ("", "none of the 0 weights is above"),
+    ],
+)
+def test_bad_weights_are_named(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "mask.txt"
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        Region.from_weights(path, 0.5)
+
+
+def test_weights_that_are_none_are_refused(tmp_path: Path) -> None:
+    for weights in (torch.ones(2, 2), torch.tensor([1, 0]), torch.tensor([1.0, float("nan")])):
+        with pytest.raises(ValueError, match="flat tensor of finite floating-point numbers"):
+            Region.from_weights(weights, 0.5)
+    with pytest.raises(ValueError, match=r"none\.txt: No such file"):
+        Region.from_weights(tmp_path / "none.txt", 0.5)
+
+
+def test_unions_hold_each_vertex_once_and_report_the_shared() -> None:
+    forehead, eyes = Region("forehead", (1, 2, 5)), Region.from_indices("eyes", [5, 2, 7], n_vertices=9)
+    both = forehead | eyes
+    assert (both.name, both.indices, both.duplicates, both.n_vertices) == ("forehead + eyes", (1, 2, 5, 7), 2, 9)
+    assert both == forehead.union(eyes, name="forehead + eyes")
+    assert forehead.union(eyes, Region("nose", (0,)), name="upper").indices == (0, 1, 2, 5, 7)
+    with pytest.raises(ValueError, match="regions of different meshes cannot be united"):
+        eyes | Region("x", (1,), 8)
+
+
 def test_repeated_lip_indices_change_nothing() -> None:
     truth, prediction = torch.randn(2, 5, 6, 3, generator=torch.manual_seed(0)).unbind(0)
     twice = lip_vertex_error(prediction, truth, [1, 3, 3, 1])

@@ -105,6 +105,16 @@ def test_agrees_with_torchmetrics() -> None:
     assert lip_vertex_error(prediction, truth, [1, 2, 7]).item() == pytest.approx(expected, rel=1e-6)
 
 
+def test_agrees_with_torchmetrics_over_a_ragged_corpus(corpus: Corpus, lips: tuple[int, ...]) -> None:
+    theirs = pytest.importorskip("torchmetrics.multimodal.lve").LipVertexError(list(lips))
+    ours = LipVertexError(lips)
+    for prediction, truth in zip(corpus.predictions, corpus.truths, strict=True):
+        both = torch.from_numpy(prediction), torch.from_numpy(truth)
+        theirs.update(*both)
+        ours.update(*both)
+    assert ours.compute().item() == pytest.approx(theirs.compute().item(), rel=1e-5)  # theirs is in float32
+
+
 def test_offsets_and_absolute_vertices_give_the_same(corpus: Corpus, upper: tuple[int, ...]) -> None:
     batch = corpus.batch([2, 3])
     template = batch.pop("template")

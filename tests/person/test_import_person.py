@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from facediff.cli import main
 from facediff.commands.import_person import run
 from facediff.data.corpus import Corpus, read_manifest
 from facediff.errors import FaceDiffError
@@ -258,6 +259,14 @@ def test_what_is_printed(files: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert len(imported(out)) == 225
 
 
+def test_the_command_line_leads_here(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = words(files, "motion.npy", tmp_path / "out")
+    assert main(["data", "import-person", *arguments]) == 0
+    assert main(["data", "import-person", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error == f"facediff: error: {tmp_path / 'out'}: is not empty; choose a new folder, or remove this one\n"
+
+
 def nothing_left(folder: Path) -> bool:
     return not [path for path in folder.rglob("*") if "partial" in path.name or path.name == "out"]
 
@@ -399,10 +408,11 @@ def test_a_flawed_folder_gets_one_sentence(
         (["--template", "{tmp}/small.npy"], r"small\.npy: has shape \(4, 3\)"),
         (["--template", "{tmp}/metres.npy"], r"metres\.npy: is 0\.001 times as large as the faces of the motion"),
         (["--template", "{tmp}/other.npy"], r"other\.npy: (is|does not lie)"),
+        (["--template", "{tmp}/zeros.npy"], r"zeros\.npy: alignment: the points do not determine a rotation"),
         (["--template", "{tmp}/face.stl"], r"face\.stl: not a template that is known"),
         (["--stable", "{tmp}/none.txt"], r"--stable .*none\.txt: no such file"),
         (["--stable", "{tmp}/beyond.txt"], r"beyond\.txt: .*360"),
-        (["--stable", "{tmp}/line.txt"], "do not determine a rotation"),
+        (["--stable", "{tmp}/line.txt"], r"line\.txt: names 2 vertices; expected at least 10"),
         (["--flame", "{tmp}/model.pkl"], "holds no FLAME parameters; leave --flame away"),
         (["-o", "{tmp}/full"], "full: is not empty"),
         (["-o", "{tmp}/silent.wav"], r"silent\.wav: is a file"),
@@ -416,6 +426,7 @@ def test_a_wrong_option_gets_one_sentence(files: Path, tmp_path: Path, options: 
     soundfile.write(tmp_path / "silent.wav", np.zeros(16000 * 8), 16000)
     np.save(tmp_path / "small.npy", np.zeros((4, 3)))
     np.save(tmp_path / "metres.npy", face())
+    np.save(tmp_path / "zeros.npy", np.zeros((VERTICES, 3)))
     np.save(tmp_path / "other.npy", 1000 * face()[::-1])
     (tmp_path / "beyond.txt").write_text("1, 2, 360")
     (tmp_path / "line.txt").write_text("5, 6")

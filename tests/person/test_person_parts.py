@@ -16,8 +16,9 @@ from facediff.person.meshes import differing_faces, read_frame_mesh
 from facediff.person.speech import cut_points, loudness, neutral_frames, splits
 from facediff.pickles import load_pickle
 from facediff.topology import read_mesh
+from facediff.topology.flame import Flame
 from tests.fakes.flame import flame_arrays, write_flame
-from tests.fakes.person import RATE, loud, speech, write_speech
+from tests.fakes.person import RATE, face, loud, speech, write_objs, write_speech
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -109,9 +110,7 @@ def flame_corpus(root: Path) -> Path:
 
 @pytest.mark.parametrize("form", ["npy", "hdf5"])
 def test_flame_parameters_become_vertices_without_head_pose(tmp_path: Path, form: str) -> None:
-    """Against the formula for a mesh whose every vertex hangs on neck and jaw; the person has the model's mean shape."""
-    from facediff.topology.flame import Flame
-
+    """Against the layer itself; the person has the model's mean shape, so that coordinates stay as they are."""
     random = np.random.default_rng(0)
     time = np.arange(90) / RATE
     expression = 0.3 * np.sin(time[:, None] * random.uniform(1, 3, 100))
@@ -164,8 +163,6 @@ def test_flame_of_another_topology(tmp_path: Path) -> None:
 
 
 def test_a_frame_s_faces_are_those_that_a_mesh_library_reads(tmp_path: Path) -> None:
-    from tests.fakes.person import face, write_objs
-
     path = write_objs(tmp_path / "frames", face()[None]) / "frame_1.obj"
     mesh, theirs = read_frame_mesh(path), read_mesh(path)
     np.testing.assert_allclose(mesh.vertices, theirs.vertices)

@@ -1,0 +1,150 @@
+"""Real-time factor: how long a system computes for one second of speech, and on what."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from facediff.metrics.exact import ExactMetric
+
+
+class RealTimeFactor(ExactMetric):
+    """Real-time factor (RTF): seconds of computing over seconds of speech, added up over clips.
+
+    RTF = Σ computing / Σ speech over all clips: below 1 is faster than speech. Clips count by their length;
+    it is no mean of factors. Over several processes the times of all are added, so the factor is that of one
+    process on one device, whatever their number. What is timed (audio features, sampling, copies,
+    files) and the batch size are for the caller to say: the first calls on a device are slow and are best
+    left out.
+
+    Args:
+        hardware: What it was computed on, for the summary: see `device_name`.
+        **kwargs: For `torchmetrics.Metric`.
+
+    Raises:
+        ValueError: If the hardware is not named.
+
+    >>> metric = RealTimeFactor("one core")
+    >>> metric.update(1.0, 10.0)
+    >>> metric.update(2.0, 2.0)
+    >>> metric.compute().item()
+    0.25
+    >>> metric.describe()
+    'seconds of computing for one second of speech, added up over clips, on one core [1]'
+    """
+
+    higher_is_better = False
+    seconds: Tensor
+
+    def __init__(self, hardware: str, **kwargs: object) -> None:
+        if not hardware.strip():
+            raise ValueError("hardware is empty; name what computes, a factor means nothing without it")
+        words = f"seconds of computing for one second of speech, added up over clips, on {hardware} [1]"
+        super().__init__(definition=words, settings="", **kwargs)
+        self.hardware = hardware
+        self.add_state("seconds", torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
+
+    def update(self, computing: float | Tensor, speech: float | Tensor) -> None:
+        """Add a clip or several.
+
+        Args:
+            computing: Seconds it took, not negative; a number or one for each clip.
+            speech: Seconds of speech, positive; likewise.
+
+        Raises:
+            ValueError: If a time is negative, not finite, or no speech. Nothing is added then.
+        """
+        device = self.seconds.device
+        times = [torch.as_tensor(value, device=device).double().reshape(-1) for value in (computing, speech)]
+        took, spoken = times
+        if took.shape != spoken.shape:
+            raise ValueError(f"computing times of {len(took)} clips, speech of {len(spoken)}")
+        if not bool(((took >= 0) & took.isfinite() & (spoken > 0) & spoken.isfinite()).all()):
+            raise ValueError(f"computing {took.tolist()} and speech {spoken.tolist()} must be positive seconds")
+        self.seconds = self.seconds + torch.stack([took.sum(), spoken.sum()])
+
+    @contextmanager
+    def measure(self, speech: float) -> Iterator[None]:
+        """Time what happens inside ``with`` and add it; work on GPUs is waited for before and after.
+
+        Args:
+            speech: Seconds of speech that it is computed for.
+
+        Raises:
+            ValueError: As `update`. An error inside passes through, and nothing is added then.
+        """
+        _wait_for_gpus()
+        start = time.perf_counter()
+        yield
+        _wait_for_gpus()
+        self.update(time.perf_counter() - start, speech)
+
+    def compute(self) -> Tensor:
+        """The factor over all clips so far, a float64 scalar.
+
+        Raises:
+            ValueError: If no process had any clip.
+        """
+        computing, speech = self.seconds
+        if float(speech) == 0:
+            self.leave_synchronised_state()
+            raise ValueError("RealTimeFactor has no clip; call update before compute")
+        return computing / speech
+
+
+def real_time_factor(computing: float | Tensor, speech: float | Tensor) -> Tensor:
+    """Real-time factor: seconds of computing over seconds of speech, each added up over clips.
+
+    Args:
+        computing: Seconds it took, a number or one for each clip.
+        speech: Seconds of speech; likewise.
+
+    Returns:
+        Float64 scalar.
+
+    Raises:
+        ValueError: As `RealTimeFactor.update`.
+
+    >>> real_time_factor(torch.tensor([1.0, 2.0]), torch.tensor([10.0, 2.0])).item()
+    0.25
+    """
+    metric = RealTimeFactor("unknown hardware", sync_on_compute=False)
+    metric.update(computing, speech)
+    return metric.compute()
+
+
+def device_name(device: torch.device | str) -> str:
+    """What a device is called: the GPU's product name, or the processor with torch's number of threads.
+
+    Args:
+        device: The device that computes.
+    """
+    device = torch.device(device)
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type != "cpu":
+        return str(device)
+    threads = torch.get_num_threads()
+    return f"{_processor()}, {threads} thread{'s' if threads != 1 else ''}"
+
+
+def _processor() -> str:
+    """The processor's product name where the system tells it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:
+            for line in lines:
+                if line.startswith("model name"):
+                    return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine() or "CPU"
+
+
+def _wait_for_gpus() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()

@@ -1,0 +1,432 @@
+"""Every further metric with every option: how to make it, what to feed it, and its formula in float64 NumPy.
+
+The formulas are written from the definitions, one sequence at a time, without looking at the package. A
+formula gives (value, weight) of a sequence, or None where the sequence has no value. Imported by the tests and, as a
+file beside it, by distributed_worker.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import combinations, product
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import facediff.metrics as fm
+
+Array = NDArray[Any]
+Corpus = Any  # the class of that name in conftest.py
+Formula = Callable[[Corpus, int], tuple[float, float] | None]
+
+LIPS = (3, 4, 9, 31)
+UPPER = (0, 1, 20, 25, 39)
+PAIRS = ((3, 9), (31, 4), (12, 13))
+SAMPLES = 4
+RATE, FPS = 410, 25  # 16.4 samples a frame: frames of 16 and of 17
+CLOSURES: list[list[tuple[int, int]]] = [[(0, 2), (3, 7)], [(0, 1)], [(4, 5), (5, 9), (20, 27)], [], [(1, 2)]]
+IDENTITIES = [1, 0, 1, 0, 0]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One setting of one metric."""
+
+    name: str
+    make: Callable[[], Any]
+    twin: Callable[..., Tensor]
+    arguments: Callable[[Corpus, Sequence[int], int], dict[str, Any]]
+    expected: Callable[[Corpus], float]
+
+    def __str__(self) -> str:
+        return self.name
+
+
+# --- what to feed -----------------------------------------------------------------------------------------
+
+
+def pair_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, Any]:
+    """Absolute vertices of both sides."""
+    batch: dict[str, Any] = corpus.batch(places, extra)
+    batch.pop("template")
+    return batch
+
+
+def offsets_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, Any]:
+    """The same as offsets from the templates, in float64 so that nothing is rounded."""
+    batch: dict[str, Any] = corpus.batch(places, extra)
+    template = batch.pop("template").double()
+    for side in ("prediction", "truth"):
+        batch[side] = batch[side].double() - template[:, None]
+    return batch | {"offsets_from": template}
+
+
+def late_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, Any]:
+    """Predictions two frames late, so that there is something to warp."""
+    batch = pair_batch(corpus, places, extra)
+    for row, frames in zip(batch["prediction"], batch["lengths"].tolist(), strict=True):
+        row[:frames] = row[:frames].roll(2, 0)
+    return batch
+
+
+def closure_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, Any]:
+    return pair_batch(corpus, places, extra) | {"closures": [CLOSURES[place] for place in places]}
+
+
+def loudness(corpus: Corpus, place: int) -> Array:
+    rng = np.random.default_rng(100 + place)
+    return rng.uniform(0.1, 1, len(corpus.truths[place]))
+
+
+def sound(corpus: Corpus, place: int) -> Array:
+    frames = len(corpus.truths[place])
+    envelope = np.repeat(loudness(corpus, place), 17)[: -(-frames * RATE // FPS)]
+    return envelope * np.random.default_rng(200 + place).standard_normal(len(envelope))
+
+
+def padded(rows: list[Array], width: int) -> Tensor:
+    out = torch.full((len(rows), width), float("nan"), dtype=torch.float64)
+    for row, values in zip(out, rows, strict=True):
+        row[: len(values)] = torch.from_numpy(values)
+    return out
+
+
+def intensity_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, Any]:
+    batch = pair_batch(corpus, places, extra)
+    rows = [loudness(corpus, place) for place in places]
+    return batch | {"intensity": padded(rows, batch["truth"].shape[1])}
+
+
+def sound_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, Any]:
+    rows = [sound(corpus, place) for place in places]
+    return pair_batch(corpus, places, extra) | {"waveform": padded(rows, max(map(len, rows)) + extra)}
+
+
+def identity_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, Any]:
+    numbers = [IDENTITIES[place] for place in places]
+    return intensity_batch(corpus, places, extra) | {"identities": torch.tensor(numbers)}
+
+
+def several(corpus: Corpus, place: int) -> Array:
+    """Predictions of one sequence, (samples, frames, vertices, 3)."""
+    rng = np.random.default_rng(300 + place)
+    noise = 0.003 * rng.standard_normal((SAMPLES, *corpus.truths[place].shape))
+    return (corpus.predictions[place] + noise).astype(np.float32)
+
+
+def samples_batch(corpus: Corpus, places: Sequence[int], extra: int, name: str = "samples") -> dict[str, Any]:
+    batch = pair_batch(corpus, places, extra)
+    frames, vertices = batch["truth"].shape[1:3]
+    out = torch.full((len(places), SAMPLES, frames, vertices, 3), float("nan"))
+    for row, place in enumerate(places):
+        out[row, :, : len(corpus.truths[place])] = torch.from_numpy(several(corpus, place))
+    batch.pop("prediction")
+    return {name: out} | batch
+
+
+def lone_samples_batch(corpus: Corpus, places: Sequence[int], extra: int, name: str = "samples") -> dict[str, Any]:
+    batch = samples_batch(corpus, places, extra, name)
+    batch.pop("truth")
+    return batch
+
+
+# --- formulas ---------------------------------------------------------------------------------------------
+
+
+def pooled(formula: Formula, pooling: str) -> Callable[[Corpus], float]:
+    """Mean over what is weighed, or over sequences, of what a formula gives for each sequence."""
+
+    def over(corpus: Corpus) -> float:
+        found = [formula(corpus, place) for place in range(len(corpus.truths))]
+        values = np.array([pair[0] for pair in found if pair is not None])
+        weights = np.array([pair[1] for pair in found if pair is not None])
+        return float(np.average(values, weights=weights if pooling == "frames" else None))
+
+    return over
+
+
+def sides(corpus: Corpus, place: int) -> tuple[Array, Array]:
+    return corpus.predictions[place].astype(np.float64), corpus.truths[place].astype(np.float64)
+
+
+def late_sides(corpus: Corpus, place: int) -> tuple[Array, Array]:
+    p, g = sides(corpus, place)
+    return np.roll(p, 2, axis=0), g
+
+
+def upper_error(corpus: Corpus, place: int, *, reduction: str, squared: bool) -> tuple[float, float]:
+    p, g = sides(corpus, place)
+    error = np.linalg.norm(g - p, axis=-1)[:, UPPER] ** (2 if squared else 1)
+    frames = error.mean(1) if reduction == "mean" else error.max(1)
+    return frames.mean(), len(g)
+
+
+def opening(x: Array) -> Array:
+    return np.mean([np.linalg.norm(x[:, a] - x[:, b], axis=-1) for a, b in PAIRS], axis=0)
+
+
+def opening_difference(corpus: Corpus, place: int) -> tuple[float, float]:
+    p, g = sides(corpus, place)
+    return np.abs(opening(g) - opening(p)).mean(), len(g)
+
+
+def closure_rate(corpus: Corpus, place: int, *, threshold: float, count: str, of: str) -> tuple[float, float] | None:
+    p, g = map(opening, sides(corpus, place))
+    limit = g.min() + threshold * (g.max() - g.min())
+    if not CLOSURES[place]:
+        return None
+
+    def rate(o: Array) -> tuple[float, float]:
+        hits = [[o[t] <= limit for t in range(start, end)] for start, end in CLOSURES[place]]
+        counted = sum(hits, []) if count == "frames" else [any(closure) for closure in hits]
+        return float(np.mean(counted)), len(counted)
+
+    (of_p, weight), (of_g, _) = rate(p), rate(g)
+    return {"prediction": of_p, "truth": of_g, "gap": of_p - of_g}[of], weight
+
+
+def cheapest_path(distance: Array) -> list[tuple[int, int]]:
+    """Dynamic time warping as the recursion reads."""
+
+    @cache
+    def cost(i: int, j: int) -> float:
+        if i < 0 or j < 0:
+            return 0.0 if i == j == -1 else float("inf")
+        return float(distance[i, j]) + min(cost(i - 1, j - 1), cost(i - 1, j), cost(i, j - 1))
+
+    for i in range(distance.shape[0]):  # so that the recursion stays shallow
+        for j in range(distance.shape[1]):
+            cost(i, j)
+    i, j = distance.shape[0] - 1, distance.shape[1] - 1
+    path = [(i, j)]
+    while (i, j) != (0, 0):
+        i, j = min([(i - 1, j - 1), (i - 1, j), (i, j - 1)], key=lambda cell: cost(*cell))
+        path.append((i, j))
+    return path[::-1]
+
+
+def warped_distance(corpus: Corpus, place: int) -> tuple[float, float]:
+    p, g = (x[:, LIPS] for x in late_sides(corpus, place))
+    distance = np.sqrt(np.mean(np.sum((g[:, None] - p[None]) ** 2, axis=-1), axis=-1))
+    path = cheapest_path(distance)
+    return sum(distance[cell] for cell in path) / len(path), 1
+
+
+def gaussian(x: Array, deviation: float) -> Array:
+    radius = int(4 * deviation + 0.5)
+    if not radius:
+        return x
+    weights = np.exp(-0.5 * (np.arange(-radius, radius + 1) / deviation) ** 2)
+    return np.convolve(np.pad(x, radius, mode="symmetric"), weights / weights.sum(), mode="valid")
+
+
+def turning_points(x: Array) -> dict[int, str]:
+    """Inner frames above, or below, both neighbours; the corpus has no plateaus."""
+    found = {}
+    for t in range(1, len(x) - 1):
+        if x[t - 1] < x[t] > x[t + 1]:
+            found[t] = "max"
+        if x[t - 1] > x[t] < x[t + 1]:
+            found[t] = "min"
+    return found
+
+
+def misalignment(
+    corpus: Corpus, place: int, *, at: str, smoothing: float, milliseconds: float
+) -> tuple[float, float] | None:
+    p, g = (gaussian(opening(x), smoothing) for x in late_sides(corpus, place))
+    change_p, change_g = (np.diff(x, prepend=x[0]) for x in (p, g))
+    path = cheapest_path(np.abs(change_g[:, None] - change_p[None]))
+    turns_p, turns_g = turning_points(p), turning_points(g)
+    lags = []
+    for i, j in path:
+        if at == "path":
+            lags.append(abs(i - j))
+        elif i in turns_g and turns_p.get(j) == turns_g[i]:
+            before = max([t for t in turns_g if t < i], default=0)
+            after = min([t for t in turns_g if t > i], default=len(g) - 1)
+            if before <= j <= after:
+                lags.append(abs(i - j))
+    return (float(np.mean(lags)) * milliseconds, 1) if lags else None
+
+
+def speed(x: Array) -> Array:
+    return np.linalg.norm(np.diff(x[:, LIPS], axis=0), axis=-1).mean(axis=1)
+
+
+def follows(reference: Array, other: Array) -> float | None:
+    """Pearson's r; the corpus has no still face, so only short clips have none."""
+    return float(np.corrcoef(reference, other)[0, 1]) if len(reference) > 1 else None
+
+
+def opening_correlation(corpus: Corpus, place: int) -> tuple[float, float] | None:
+    p, g = map(opening, sides(corpus, place))
+    r = follows(g, p)
+    return None if r is None else (r, 1)
+
+
+def speed_correlation(corpus: Corpus, place: int) -> tuple[float, float] | None:
+    p, g = map(speed, sides(corpus, place))
+    r = follows(g, p)
+    return None if r is None else (r, 1)
+
+
+def frame_loudness(corpus: Corpus, place: int, *, given: str) -> Array:
+    if given == "intensity":
+        return loudness(corpus, place)
+    samples, frames = sound(corpus, place), len(corpus.truths[place])
+    edges = [int(np.floor(t * RATE / FPS + 0.5)) for t in range(frames + 1)]
+    return np.array([np.sqrt(np.mean(samples[a:b] ** 2)) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+
+
+def frame_slcc(corpus: Corpus, place: int, *, of: str, given: str) -> tuple[float, float] | None:
+    p, g = sides(corpus, place)
+    s = frame_loudness(corpus, place, given=given)[1:]
+    if len(s) < 2:
+        return None
+    of_p, of_g = (float(np.corrcoef(s, speed(x))[0, 1]) for x in (p, g))
+    return {"prediction": of_p, "truth": of_g, "gap": of_p - of_g}[of], 1
+
+
+def clip_slcc(corpus: Corpus, *, of: str, n_identities: int) -> float:
+    """As the released scripts go about it: standardise within each identity, then correlate what there is."""
+    places = [place for place in range(len(corpus.truths)) if len(corpus.truths[place]) > 1]
+    whose = np.array([IDENTITIES[place] if n_identities > 1 else 0 for place in places])
+
+    def standard(x: list[float]) -> Array:
+        values = np.array(x)
+        for k in set(whose):
+            values[whose == k] = (values[whose == k] - values[whose == k].mean()) / values[whose == k].std(ddof=1)
+        return values
+
+    s = standard([np.sqrt(np.mean(loudness(corpus, place) ** 2)) for place in places])
+    r = {}
+    for side, name in enumerate(("prediction", "truth")):
+        lips = standard([np.sqrt(np.mean(speed(sides(corpus, place)[side]) ** 2)) for place in places])
+        r[name] = float(np.corrcoef(s, lips)[0, 1])
+    return (r | {"gap": r["prediction"] - r["truth"]})[of]
+
+
+def sample_lip_errors(corpus: Corpus, place: int, predictions: Array, squared: bool) -> Array:
+    gap = corpus.truths[place].astype(np.float64) - predictions
+    return (np.linalg.norm(gap[:, :, LIPS], axis=-1) ** (2 if squared else 1)).max(-1)
+
+
+def mean_estimate(corpus: Corpus, place: int, *, squared: bool) -> tuple[float, float]:
+    mean = several(corpus, place).astype(np.float64).mean(0, keepdims=True)
+    return sample_lip_errors(corpus, place, mean, squared).mean(), len(corpus.truths[place])
+
+
+def coverage(corpus: Corpus, place: int, *, squared: bool) -> tuple[float, float]:
+    errors = sample_lip_errors(corpus, place, several(corpus, place).astype(np.float64), squared)
+    return errors[errors.sum(1).argmin()].mean(), errors.shape[1]
+
+
+def diversity(
+    corpus: Corpus, place: int, *, pairs: list[tuple[int, int]], region: Sequence[int]
+) -> tuple[float, float]:
+    x = several(corpus, place).astype(np.float64)[:, :, list(region)]
+    return float(np.mean([np.linalg.norm(x[a] - x[b], axis=-1).mean() for a, b in pairs])), x.shape[1]
+
+
+# --- the table --------------------------------------------------------------------------------------------
+
+
+def _cases() -> list[Case]:
+    cases: list[Case] = []
+    subjects, poolings = ("prediction", "truth", "gap"), ("frames", "sequences")
+
+    def add(
+        cls: type,
+        twin: Callable[..., Tensor],
+        given: tuple[Any, ...],
+        options: dict[str, Any],
+        arguments: Callable[[Corpus, Sequence[int], int], dict[str, Any]],
+        expected: Callable[[Corpus], float],
+        extra: str = "",
+        only_class: dict[str, Any] | None = None,
+    ) -> None:
+        words = [cls.__name__, *(str(value) for value in options.values()), extra]
+        make = partial(cls, *given, **options, **(only_class or {}))
+        cases.append(Case("-".join(filter(None, words)), make, twin, arguments, expected))
+
+    for reduction, squared, pooling in product(("mean", "max"), (True, False), poolings):
+        shape: dict[str, Any] = {"reduction": reduction, "squared": squared}
+        formula: Any = partial(upper_error, **shape)
+        options = shape | {"pooling": pooling}
+        twin: Any = partial(fm.upper_face_vertex_error, upper=UPPER, **options)
+        add(fm.UpperFaceVertexError, twin, (UPPER,), options, pair_batch, pooled(formula, pooling))
+    for pooling, (word, batch) in product(poolings, (("absolute", pair_batch), ("offsets", offsets_batch))):
+        options = {"pooling": pooling}
+        twin = partial(fm.mouth_opening_difference, pairs=PAIRS, **options)
+        expected = pooled(opening_difference, pooling)
+        add(fm.MouthOpeningDifference, twin, (PAIRS,), options, batch, expected, word)
+    for count, of, pooling in product(("frames", "closures"), subjects, poolings):
+        shape = {"threshold": 0.3, "count": count, "of": of}
+        options = shape | {"pooling": pooling}
+        twin = partial(fm.bilabial_closure_rate, pairs=PAIRS, **options)
+        expected = pooled(partial(closure_rate, **shape), pooling)
+        add(fm.BilabialClosureRate, twin, (PAIRS,), options, closure_batch, expected)
+    twin = partial(fm.lip_warping_distance, lips=LIPS)
+    add(fm.LipWarpingDistance, twin, (LIPS,), {}, late_batch, pooled(warped_distance, "sequences"))
+    for at, smoothing, fps in (("extrema", 2.0, None), ("extrema", 0.0, 25), ("path", 0.0, None), ("path", 1.5, 30.0)):
+        options = {"at": at, "smoothing": smoothing, "frames_per_second": fps}
+        formula = partial(misalignment, at=at, smoothing=smoothing, milliseconds=1000 / fps if fps else 1)
+        twin = partial(fm.temporal_misalignment, pairs=PAIRS, **options)
+        add(fm.TemporalMisalignment, twin, (PAIRS,), options, late_batch, pooled(formula, "sequences"))
+    for word, batch in (("absolute", pair_batch), ("offsets", offsets_batch)):
+        twin = partial(fm.lip_opening_correlation, pairs=PAIRS)
+        expected = pooled(opening_correlation, "sequences")
+        add(fm.LipOpeningCorrelation, twin, (PAIRS,), {}, batch, expected, word)
+    twin = partial(fm.lip_speed_correlation, lips=LIPS)
+    add(fm.LipSpeedCorrelation, twin, (LIPS,), {}, pair_batch, pooled(speed_correlation, "sequences"))
+    for of, (given, batch) in product(subjects, (("intensity", intensity_batch), ("waveform", sound_batch))):
+        options = {"of": of} | ({"sample_rate": RATE, "frames_per_second": FPS} if given == "waveform" else {})
+        twin = partial(fm.frame_speech_lip_correlation, lips=LIPS, **options)
+        expected = pooled(partial(frame_slcc, of=of, given=given), "sequences")
+        add(fm.FrameSpeechLipCorrelation, twin, (LIPS,), options, batch, expected)
+    for of, n_identities in product(subjects, (1, 2)):
+        expected = partial(clip_slcc, of=of, n_identities=n_identities)
+        batch = identity_batch if n_identities > 1 else intensity_batch
+        twin = partial(fm.clip_speech_lip_correlation, lips=LIPS, of=of)
+        add(
+            fm.ClipSpeechLipCorrelation,
+            twin,
+            (LIPS,),
+            {"of": of, "n_identities": n_identities},
+            batch,
+            expected,
+        )
+    for cls, function, make in (
+        (fm.MeanEstimateError, fm.mean_estimate_error, mean_estimate),
+        (fm.CoverageError, fm.coverage_error, coverage),
+    ):
+        for squared, pooling in product((True, False), poolings):
+            options = {"squared": squared, "pooling": pooling}
+            twin = partial(function, lips=LIPS, **options)
+            expected = pooled(partial(make, squared=squared), pooling)
+            add(cls, twin, (LIPS,), options, samples_batch, expected, only_class={"n_samples": SAMPLES})
+    for pairing, pooling, region in product(("shuffled", "all"), poolings, (None, LIPS)):
+        options = {"pairing": pairing, "pooling": pooling}
+        # Which halves are compared is tested on its own.
+        compared = fm.SampleDiversity(pairing=pairing, n_samples=SAMPLES).pairs(SAMPLES)
+        formula = partial(diversity, pairs=compared, region=region or range(40))
+        twin = partial(fm.sample_diversity, region=region, **options)
+        expected = pooled(formula, pooling)
+        word = "region" if region else ""
+        only = {"n_samples": SAMPLES}
+        add(fm.SampleDiversity, twin, (region,), options, lone_samples_batch, expected, word, only)
+    for pooling in poolings:
+        formula = partial(diversity, pairs=list(combinations(range(SAMPLES), 2)), region=range(40))
+        twin = partial(fm.identity_diversity, pooling=pooling)
+        batch = partial(lone_samples_batch, name="predictions")
+        add(fm.IdentityDiversity, twin, (), {"pooling": pooling}, batch, pooled(formula, pooling))
+    return cases
+
+
+CASES = _cases()

@@ -1,0 +1,147 @@
+"""Correlations of the lips with the truth's and with the voice: what has none, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from facediff.metrics import (
+    ClipSpeechLipCorrelation,
+    Coverage,
+    FrameSpeechLipCorrelation,
+    LipOpeningCorrelation,
+    clip_speech_lip_correlation,
+    frame_speech_lip_correlation,
+    lip_opening_correlation,
+    lip_speed_correlation,
+    speech_intensity,
+)
+
+Anything = Any  # right and wrong speech
+ADDED = {"waveform": torch.ones(2, 80), "intensity": torch.ones(2, 8)}
+
+
+def motion(seed: int, batch: int = 2, frames: int = 8) -> torch.Tensor:
+    return torch.randn(batch, frames, 4, 3, generator=torch.manual_seed(seed))
+
+
+def test_a_still_prediction_counts_zero_and_a_still_truth_is_left_out() -> None:
+    still = motion(0)[:, :1].expand(2, 8, 4, 3)
+    for correlate in (lip_opening_correlation, lip_speed_correlation):
+        region: Anything = [(0, 1), (2, 3)] if correlate is lip_opening_correlation else [0, 1]
+        assert correlate(still, motion(1), region).item() == 0
+        with pytest.raises(ValueError, match="has no value on any of its 2 sequences.*does not vary"):
+            correlate(motion(1), still, region)
+    metric = LipOpeningCorrelation([(0, 1)])
+    metric.update(motion(1), torch.cat([still[:1], motion(2)[:1]]))
+    assert metric.coverage() == Coverage(8, 1, 0, 0, left_out=1)
+    assert metric.compute() == lip_opening_correlation(motion(1)[1], motion(2)[0], [(0, 1)])
+
+
+def test_a_face_that_is_still_up_to_rounding_is_still() -> None:
+    neutral = torch.rand(4, 3, generator=torch.manual_seed(3))
+    nearly = torch.zeros(1, 8, 4, 3, dtype=torch.float64)
+    nearly[:, ::2] += 1e-17
+    assert lip_opening_correlation(nearly, motion(1)[:1].double(), [(0, 1)], offsets_from=neutral).item() == 0
+
+
+def test_lips_that_do_not_vary_follow_no_voice() -> None:
+    still = torch.zeros(2, 8, 4, 3)
+    loud = torch.rand(2, 8, generator=torch.manual_seed(0))
+    assert frame_speech_lip_correlation(still, motion(0), [0], intensity=loud).item() == 0
+    gap = frame_speech_lip_correlation(still, motion(0), [0], intensity=loud, of="gap")
+    assert gap == -frame_speech_lip_correlation(still, motion(0), [0], intensity=loud, of="truth")
+    assert clip_speech_lip_correlation(still, motion(0), [0], intensity=loud).item() == 0
+    monotone = torch.full((2, 8), 0.3)
+    with pytest.raises(ValueError, match="the intensity of the speech does not vary"):
+        frame_speech_lip_correlation(motion(0), motion(1), [0], intensity=monotone)
+    with pytest.raises(ValueError, match="on any of its 2 sequences: no identity has two clips"):
+        clip_speech_lip_correlation(motion(0), motion(1), [0], intensity=monotone)
+
+
+def test_identities_that_say_nothing_do_not_enter() -> None:
+    prediction, truth = motion(0, batch=6), motion(1, batch=6)
+    loud = torch.rand(6, 8, generator=torch.manual_seed(0))
+    loud[3:5] = 0.5  # identity 1 is always as loud; identity 2 has a single clip
+    metric = ClipSpeechLipCorrelation([0, 1], n_identities=4)
+    metric.update(prediction, truth, intensity=loud, identities=[0, 0, 0, 1, 1, 2])
+    assert metric.coverage() == Coverage(frames=24, sequences=3, cut_prediction=0, cut_truth=0, left_out=3)
+    assert metric.compute() == clip_speech_lip_correlation(prediction[:3], truth[:3], [0, 1], intensity=loud[:3])
+
+
+def test_standardising_takes_the_level_of_each_identity_out() -> None:
+    """Two people whose lips follow loudness, the louder of whom moves less: together they hide it."""
+    loud = torch.tensor([1.0, 2.0, 3.0, 11.0, 12.0, 13.0])
+    moves = torch.tensor([11.0, 12.0, 13.0, 1.0, 2.0, 3.0])
+    truth = (torch.arange(5.0) * moves[:, None])[..., None, None].expand(6, 5, 2, 3)
+    options: Anything = {"intensity": loud[:, None].expand(6, 5)}
+    assert clip_speech_lip_correlation(truth, truth, [0], **options) < -0.9
+    within = clip_speech_lip_correlation(truth, truth, [0], identities=[0, 0, 0, 1, 1, 1], **options)
+    assert within.item() == pytest.approx(1.0)
+
+
+def test_intensity_of_frames_of_unequal_size() -> None:
+    samples = np.random.default_rng(0).standard_normal(100)
+    edges = [0, 16, 33, 49, 66, 82]  # 16.4 samples a frame
+    expected = [np.sqrt(np.mean(samples[a:b] ** 2)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    found = speech_intensity(torch.from_numpy(samples), 5, 410, 25)
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-12, atol=0)
+    # The sound may end within the last frame, not before it.
+    short = speech_intensity(torch.from_numpy(samples[:70]), 5, 410, 25)
+    assert short[4].item() == pytest.approx(np.sqrt(np.mean(samples[66:70] ** 2)))
+    with pytest.raises(ValueError, match="the speech has 66 samples, 5 frames reach to sample 82"):
+        speech_intensity(torch.from_numpy(samples[:66]), 5, 410, 25)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "give the speech once"),
+        (ADDED, "give the speech once"),
+        ({"waveform": torch.ones(2, 80)}, "needs sample_rate= and frames_per_second="),
+        ({"intensity": torch.ones(2, 5)}, "F2: intensity of 5 frames for 8 frames of motion"),
+        ({"intensity": torch.ones(3, 8)}, r"intensity has shape \(3, 8\).*each of 2 sequences"),
+        ({"intensity": torch.ones(8)}, r"intensity has shape \(8,\)"),
+        ({"intensity": torch.ones(2, 8, dtype=torch.int64)}, "expected floating-point"),
+        ({"intensity": torch.full((2, 8), float("nan"))}, "the intensity of F2 holds NaN"),
+    ],
+)
+def test_speech_that_does_not_fit_is_refused(given: dict[str, torch.Tensor], message: str) -> None:
+    for metric in (FrameSpeechLipCorrelation([0]), ClipSpeechLipCorrelation([0])):
+        with pytest.raises(ValueError, match=message):
+            metric.update(motion(0), motion(1), clip_names=["F2", "M3"], **given)
+        assert metric.coverage().left_out == 0
+
+
+def test_sound_that_does_not_fit_names_the_clip() -> None:
+    metric = FrameSpeechLipCorrelation([0], sample_rate=100, frames_per_second=10)
+    sound = torch.ones(2, 80)
+    sound[1, 79] = float("nan")
+    with pytest.raises(ValueError, match="M3: the speech holds NaN"):
+        metric.update(motion(0), motion(1), waveform=sound, clip_names=["F2", "M3"])
+    metric.update(motion(0), motion(1), waveform=sound, lengths=[8, 7])
+    with pytest.raises(ValueError, match="F2: the speech has 60 samples, 8 frames reach to sample 80"):
+        metric.update(motion(0), motion(1), waveform=sound[:, :60], clip_names=["F2", "M3"])
+
+
+def test_options_and_identities_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match="sample_rate and frames_per_second belong together"):
+        FrameSpeechLipCorrelation([0], sample_rate=16000)
+    with pytest.raises(ValueError, match="25 frames a second do not fit 10 samples"):
+        FrameSpeechLipCorrelation([0], sample_rate=10, frames_per_second=25)
+    with pytest.raises(ValueError, match="unknown of"):
+        FrameSpeechLipCorrelation([0], of="x")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="n_identities is 0"):
+        ClipSpeechLipCorrelation([0], n_identities=0)
+    metric = ClipSpeechLipCorrelation([0], n_identities=2)
+    for numbers, message in (
+        (None, "identities= is missing"),
+        ([0], "must be 2 whole numbers"),
+        ([0.0, 1.0], "must be 2 whole numbers"),
+        ([0, 2], "identities hold 2; the metric was made for 0 to 1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            metric.update(motion(0), motion(1), intensity=ADDED["intensity"], identities=numbers)  # type: ignore[arg-type]

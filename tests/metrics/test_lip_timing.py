@@ -1,0 +1,140 @@
+"""Dynamic time warping and the misalignment read from it."""
+
+from __future__ import annotations
+
+import time
+from itertools import product
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from facediff.metrics import LipWarpingDistance, TemporalMisalignment, lip_warping_distance, temporal_misalignment, warp
+from facediff.metrics.extrema import extrema, matched_lags, smooth
+from tests.metrics.further_cases import cheapest_path, gaussian
+
+few = settings(max_examples=40, deadline=None)
+sizes = st.integers(1, 7)
+
+
+def every_path(rows: int, columns: int) -> list[list[tuple[int, int]]]:
+    """All warping paths, by following each step."""
+    if rows == columns == 1:
+        return [[(0, 0)]]
+    found = []
+    for down, right in ((1, 1), (1, 0), (0, 1)):
+        if rows - down >= 1 and columns - right >= 1:
+            found += [[*path, (rows - 1, columns - 1)] for path in every_path(rows - down, columns - right)]
+    return found
+
+
+@few
+@given(st.integers(1, 5), st.integers(1, 5), st.integers(0, 2**31))
+def test_no_path_is_cheaper(rows: int, columns: int, seed: int) -> None:
+    distances = torch.rand(rows, columns, dtype=torch.float64, generator=torch.manual_seed(seed))
+    cost, path = warp(distances)
+    paths = every_path(rows, columns)
+    assert path in paths
+    costs = [sum(distances[cell].item() for cell in some) for some in paths]
+    assert cost == pytest.approx(min(costs), rel=1e-12)
+    assert cost == pytest.approx(sum(distances[cell].item() for cell in path), rel=1e-12)
+
+
+@few
+@given(sizes, sizes, st.integers(0, 2**31))
+def test_ties_are_broken_as_documented(rows: int, columns: int, seed: int) -> None:
+    """Small whole numbers tie all the time and add up exactly."""
+    distances = torch.randint(0, 3, (rows, columns), generator=torch.manual_seed(seed)).double()
+    assert warp(distances)[1] == cheapest_path(distances.numpy())
+
+
+def test_long_sequences_are_quick() -> None:
+    truth, prediction = torch.randn(2, 600, 10, 3, generator=torch.manual_seed(0)).unbind(0)
+    start = time.perf_counter()
+    lip_warping_distance(prediction, truth, range(10))
+    assert time.perf_counter() - start < 5  # a tenth of a second alone on a core; a million steps of Python take longer
+
+
+def test_lips_that_are_only_late_are_at_no_distance() -> None:
+    still = torch.zeros(6, 4, 3, dtype=torch.float64)
+    motion = torch.cat([still, torch.randn(20, 4, 3, dtype=torch.float64, generator=torch.manual_seed(0)), still])
+    late = torch.cat([still[:4], motion])[:-4]
+    distance = lip_warping_distance(late, motion, [0, 3])
+    assert distance < 1e-12 < lip_warping_distance(-late, motion, [0, 3])
+
+
+def sines(shift: float, frames: int = 60) -> torch.Tensor:
+    motion = torch.zeros(frames, 2, 3, dtype=torch.float64)
+    moments = torch.arange(frames) - shift
+    motion[:, 0, 1] = 2 + torch.sin(moments / 3.1) + 0.3 * torch.sin(moments)
+    return motion
+
+
+@pytest.mark.parametrize("shift", [0, 1, 3])
+def test_a_late_mouth_is_late_by_its_delay(shift: int) -> None:
+    lag = temporal_misalignment(sines(shift), sines(0), [(0, 1)])
+    assert lag.item() == pytest.approx(shift, abs=0.35)
+    assert temporal_misalignment(sines(-shift), sines(0), [(0, 1)]).item() == pytest.approx(shift, abs=0.35)
+    in_time = temporal_misalignment(sines(shift), sines(0), [(0, 1)], frames_per_second=30)
+    assert in_time.item() == pytest.approx(lag.item() * 1000 / 30)
+
+
+def test_a_still_face_has_no_misalignment_unless_every_pair_counts() -> None:
+    still = torch.zeros(60, 2, 3, dtype=torch.float64)
+    metric = TemporalMisalignment([(0, 1)])
+    metric.update(still, sines(0))
+    assert metric.coverage().left_out == 1
+    with pytest.raises(ValueError, match="pairs no opening or closing"):
+        metric.compute()
+    assert temporal_misalignment(still, sines(0), [(0, 1)], at="path") >= 0
+
+
+@few
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=30), st.sampled_from([0.1, 0.5, 2.0, 3.3]))
+def test_smoothing_is_a_convolution_with_mirrored_ends(values: list[int], deviation: float) -> None:
+    series = torch.tensor(values, dtype=torch.float64)
+    expected = torch.from_numpy(gaussian(series.numpy(), deviation))
+    torch.testing.assert_close(smooth(series, deviation), expected, rtol=1e-12, atol=1e-12)
+    assert smooth(series, 0.0) is series
+
+
+def test_smoothing_keeps_plateaus_exactly() -> None:
+    series = torch.cat([torch.full((40,), 0.1), torch.full((40,), 0.3)]).double()
+    found = smooth(series, 2.0)
+    assert len(set(found[:30].tolist())) == len(set(found[50:].tolist())) == 1
+    assert not extrema(found.tolist())
+
+
+@few
+@given(st.lists(st.integers(0, 2), min_size=1, max_size=12))
+def test_extrema_are_runs_above_or_below_their_neighbours(values: list[int]) -> None:
+    expected = {}
+    for start, end in product(range(1, len(values)), repeat=2):
+        if start <= end < len(values) - 1 and len(set(values[start : end + 1])) == 1:
+            before, here, after = values[start - 1], values[start], values[end + 1]
+            if before < here > after:
+                expected[(start + end) // 2] = 1
+            if before > here < after:
+                expected[(start + end) // 2] = -1
+    assert extrema([float(value) for value in values]) == expected
+
+
+def test_lags_are_taken_where_both_turn_alike_and_not_beyond_a_neighbour() -> None:
+    truth, prediction = [0.0, 1, 0, 1, 0, 0, 0], [0.0, 0, 1, 0, 0, 1, 0]
+    # truth turns at 1 (up), 2 (down), 3 (up); prediction at 2 (up), 3 (down; of the plateau 3 to 4), 5 (up)
+    assert matched_lags([(1, 2), (2, 3), (3, 5), (1, 3), (3, 4)], truth, prediction) == [1, 1, 2]
+    assert matched_lags([(1, 5)], truth, prediction) == []  # beyond the truth's extremum at 2
+    assert matched_lags([(0, 0), (6, 6)], truth, prediction) == []
+    assert matched_lags([(0, 0)], [0.0], [0.0]) == []
+
+
+def test_options_out_of_range_are_refused() -> None:
+    with pytest.raises(ValueError, match="unknown at 'paths'.*Did you mean 'path'"):
+        TemporalMisalignment([(0, 1)], at="paths")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="smoothing is -1"):
+        TemporalMisalignment([(0, 1)], smoothing=-1)
+    with pytest.raises(ValueError, match="frames_per_second is 0"):
+        TemporalMisalignment([(0, 1)], frames_per_second=0)
+    with pytest.raises(ValueError, match="index 4, a mesh of 2 vertices"):
+        LipWarpingDistance([4]).update(sines(0), sines(0))
