@@ -36,6 +36,7 @@ ALLOWED: dict[str, set[str]] = {
     "prepare": {"data", "topology", *COMMON},
     "person": {"data", "prepare", "topology", *COMMON},
     "doctor": {"data", "metrics", "topology", *COMMON},
+    "evaluate": {"data", "metrics", *COMMON},
     "components": {"registry", "errors"},
     "systems": {"components", "data", "diffusion", "metrics", "topology", "losses", "hparams", "registry", *COMMON},
     "callbacks": {"systems", "data", "metrics", "topology", "render", "hparams", "registry", *COMMON},

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from facediff.prepare.job import Plan
     from facediff.prepare.runner import Report
 
-CORPORA = ("biwi", "vocaset")
+CORPORA = ("biwi", "vocaset", "mead3d")
 """Modules of :mod:`facediff.prepare`; each has a ``plan(raw, *, …)`` whose keyword parameters are its options."""
 SHOWN = 20
 """Lines of a list on the screen; the whole list is in the manifest."""
@@ -46,8 +46,9 @@ def parser() -> argparse.ArgumentParser:
 
 
 def own_options(plan: Callable[..., Plan]) -> list[inspect.Parameter]:
-    """Keyword parameters of a corpus's ``plan``: each is an option of the command line."""
-    return [found for found in inspect.signature(plan).parameters.values() if found.kind is found.KEYWORD_ONLY]
+    """Keyword parameters of a corpus's ``plan``: each is an option of the command line, beside the common ones."""
+    found = inspect.signature(plan).parameters.values()
+    return [option for option in found if option.kind is option.KEYWORD_ONLY and option.name != "quiet"]
 
 
 def _meanings(plan: Callable[..., Plan]) -> dict[str, str]:
@@ -113,7 +114,10 @@ def run(name: str, arguments: Sequence[str]) -> int:
 def make_plan(args: argparse.Namespace) -> Plan:
     """The plan that the arguments ask for."""
     plan = importlib.import_module(f"facediff.prepare.{args.corpus}").plan
-    made: Plan = plan(args.raw, **{option.name: getattr(args, option.name) for option in own_options(plan)})
+    options = {option.name: getattr(args, option.name) for option in own_options(plan)}
+    if "quiet" in inspect.signature(plan).parameters:  # scanning takes long enough for a progress bar
+        options["quiet"] = args.quiet
+    made: Plan = plan(args.raw, **options)
     return made
 
 

@@ -107,6 +107,11 @@ class Corpus:
         self._strides = {folder: self._stride(folder, stored) for folder in (root, *people)}
 
     def _stride(self, root: Path, default: float) -> int:
+        if (root / "prepare.json").is_file() and not (root / "manifest.json").is_file():
+            raise FaceDiffError(
+                f"{root}: was not prepared to its end (prepare.json is there, manifest.json is not); run the same "
+                f"`facediff data prepare` again, which goes on where it was stopped"
+            )
         stored = float(read_manifest(root).get("frame_rate") or default)
         stride = round(stored / self.frame_rate)
         if stride < 1 or abs(stride * self.frame_rate - stored) > 1e-6:

@@ -7,7 +7,6 @@ MEAD's own sound beside it or elsewhere; or ProbTalk3D's ``param/<clip>.npy`` an
 
 from __future__ import annotations
 
-import argparse
 import csv
 import hashlib
 from collections.abc import Sequence
@@ -37,7 +36,7 @@ from facediff.prepare.raw import copy_files, find_file, find_regions, region_fil
 from facediff.topology.flame import Flame
 from facediff.topology.flame_file import SHAPES
 
-__all__ = ["Parameters", "add_arguments", "plan", "plan_from", "read_parameters", "write_clip"]
+__all__ = ["Parameters", "plan", "read_parameters", "write_clip"]
 
 FRAME_RATE = 25.0
 MESH_FILE = "FLAME.ply"
@@ -291,41 +290,3 @@ def _write_mesh(flame: Flame, path: Path) -> None:
     mesh = trimesh.Trimesh(flame.template, flame.faces, process=False)
     with atomic(path) as temporary:
         temporary.write_bytes(mesh.export(file_type="ply"))
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that only this data set has."""
-    parser.add_argument(
-        "--flame",
-        type=Path,
-        required=True,
-        metavar="MODEL",
-        help="your FLAME model file: generic_model.pkl of FLAME 2020",
-    )
-    parser.add_argument("--audio", type=Path, metavar="DIR", help="folder with MEAD's sound (default: RAW)")
-    parser.add_argument(
-        "--shape",
-        choices=["subject", "clip"],
-        default="subject",
-        help="whose shape the vertices have: the speaker's mean, as the template, or each clip's own, as in EMOTE",
-    )
-    parser.add_argument("--subjects", type=_names, help="only these, e.g. M003,W009 (default: all that are there)")
-    parser.add_argument("--regions", type=Path, help="folder with lve.txt and fdd.txt (default: regions/ of RAW)")
-
-
-def _names(words: str) -> list[str]:
-    return [word for word in words.replace(",", " ").split() if word]
-
-
-def plan_from(args: argparse.Namespace) -> Plan:
-    """The plan that the arguments ask for."""
-    return plan(
-        args.raw,
-        flame=args.flame,
-        audio=args.audio,
-        shape=args.shape,
-        dtype=args.dtype,
-        subjects=args.subjects,
-        regions=args.regions,
-        quiet=args.quiet,
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 import shutil
 import sys
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from facediff.commands import prepare as command
 from facediff.data import Mead3D
 from facediff.data.audio import read_speech
 from facediff.errors import FaceDiffError, MissingExtraError
@@ -268,13 +268,9 @@ def test_sound_from_another_folder(tmp_path: Path, flame: Path) -> None:
 
 def test_options_of_the_command_line(tmp_path: Path, flame: Path) -> None:
     raw = write_raw_emote(tmp_path / "raw", audio="wav")
-    parser = argparse.ArgumentParser()
-    for name in ("raw", "--dtype"):
-        parser.add_argument(name, type=Path if name == "raw" else str)
-    parser.add_argument("--quiet", action="store_true")
-    mead3d.add_arguments(parser)
-    words = [str(raw), "--dtype", "float64", "--quiet", "--flame", str(flame), "--shape", "clip"]
-    plan = mead3d.plan_from(parser.parse_args([*words, "--subjects", "M003, W040", "--audio", str(raw / "MEAD")]))
+    words = ["mead3d", str(raw), str(tmp_path / "out"), "--dtype", "float64", "--quiet", "--flame", str(flame)]
+    words += ["--shape", "clip", "--subjects", "M003, W040", "--audio", str(raw / "MEAD")]
+    plan = command.make_plan(command.parser().parse_args(words))
     assert {job.name[:4] for job in plan.jobs} == {"M003", "W040"}
     assert plan.options["dtype"] == "float64"
     assert plan.options["shape"] == "clip"

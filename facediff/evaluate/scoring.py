@@ -1,0 +1,210 @@
+"""The numbers of one clip, from the metrics themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facediff.data.corpus import open_vertices
+from facediff.errors import FaceDiffError
+from facediff.evaluate.pairs import Pair
+from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMetric, VertexError
+from facediff.metrics.clips import Clips, align
+from facediff.metrics.options import LengthRule, Pooling
+
+NATIVE = (np.float16, np.float32, np.float64)
+"""Types that torch reads as they are."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One score of one protocol.
+
+    Attributes:
+        protocol: the protocol's name.
+        metric: the score's name there: ``mve``, ``lve``, ``fdd``, ``fdd_absolute``.
+        pooling: how sequences become one number.
+        rule: what the protocol does where lengths differ.
+        source: which of the scorer's metrics gives the value of a sequence.
+        absolute: whether its sign is dropped.
+    """
+
+    protocol: str
+    metric: str
+    pooling: Pooling
+    rule: LengthRule
+    source: str
+    absolute: bool = False
+
+    @property
+    def name(self) -> str:
+        """``<protocol>/<metric>``."""
+        return f"{self.protocol}/{self.metric}"
+
+
+@dataclass(frozen=True)
+class ClipScores:
+    """What one clip gave, the mean over its conditions where there are several.
+
+    Attributes:
+        values: a value for each column.
+        weights: frames behind it, for pooling by frames.
+        frames: frames scored, all conditions together.
+        cut_prediction: frames cut from predictions.
+        cut_truth: frames cut from the truth.
+    """
+
+    values: tuple[float, ...]
+    weights: tuple[float, ...]
+    frames: int
+    cut_prediction: int
+    cut_truth: int
+
+
+class Scorer:
+    """Scores clips by several protocols; what two protocols share is computed once.
+
+    May be used by several threads at once.
+
+    Args:
+        protocols: what to compute.
+        lips: lip vertices.
+        upper_face: upper-face vertices; None if no protocol has FDD.
+        templates: neutral face (V, 3) by subject; empty if no protocol has FDD.
+        n_vertices: vertices of the mesh.
+        truth_stride: 2 takes every second frame of the truth, and so on.
+
+    Raises:
+        FaceDiffError: if a protocol needs what is not given, or a region does not fit the mesh.
+    """
+
+    def __init__(
+        self,
+        protocols: Sequence[Protocol],
+        *,
+        lips: Region,
+        upper_face: Region | None,
+        templates: Mapping[str, Tensor],
+        n_vertices: int,
+        truth_stride: int = 1,
+    ) -> None:
+        self.columns: list[Column] = []
+        self.metrics: dict[str, SequenceMetric] = {}
+        self.templates = templates
+        self.n_vertices = n_vertices
+        self.truth_stride = truth_stride
+        self.remarks: list[str] = []
+        for protocol in protocols:
+            try:
+                built = protocol.build(lips, upper_face)
+                for region in (built.lips, built.upper):
+                    if region is not None:
+                        region.check(n_vertices)
+            except ValueError as error:
+                raise FaceDiffError(f"protocol {protocol.name}: {error}") from error
+            self.remarks += [remark for remark in built.summary().remarks if remark not in self.remarks]
+            for name, metric in cast(Sequence[tuple[str, SequenceMetric]], built.items(copy_state=False)):
+                self._add(protocol, name, metric)
+        self.needs_template = any(isinstance(metric, FaceDynamicsDeviation) for metric in self.metrics.values())
+        if self.needs_template and not templates:
+            raise FaceDiffError("FDD needs each subject's neutral face: give --templates, or a protocol without FDD")
+
+    def _add(self, protocol: Protocol, name: str, metric: SequenceMetric) -> None:
+        absolute = False
+        if isinstance(metric, FaceDynamicsDeviation):
+            absolute = metric.sign == "absolute"
+            source = f"fdd {metric.region}"
+            if metric.sign != "signed":
+                metric = FaceDynamicsDeviation(cast(Region, metric.region), sign="signed", check_finite=False)
+        elif isinstance(metric, VertexError):
+            source = f"{metric.reduction} {metric.squared} {metric.region}"
+        else:
+            source = f"{protocol.name} {name}"
+        self.metrics.setdefault(source, metric)
+        pooling: Pooling = "sequences" if source.startswith("fdd") else protocol.pooling
+        self.columns.append(Column(protocol.name, name, pooling, protocol.length_rule, source, absolute))
+
+    def score(self, pair: Pair) -> ClipScores | str:
+        """The scores of a clip; in words why it has none if a file of it cannot be used.
+
+        Raises:
+            FaceDiffError: if it holds NaN or infinity, or a protocol refuses its lengths.
+        """
+        subject = pair.truth.name.subject
+        template = self.templates.get(subject)
+        if self.needs_template and template is None:
+            return f"no template for {subject}"
+        try:
+            truth = read_vertices(pair.truth.path, self.n_vertices, self.truth_stride)
+            predictions = {
+                condition: read_vertices(path, self.n_vertices) for condition, path in pair.predictions.items()
+            }
+        except FaceDiffError as error:
+            return str(error)
+        done = [
+            self._score(pair.predictions[condition].stem, prediction, truth, template)
+            for condition, prediction in predictions.items()
+        ]
+        weights = np.array([each.weights for each in done])
+        values = np.array([each.values for each in done])
+        by_frames = np.array([column.pooling == "frames" for column in self.columns])
+        # A condition's share of the clip is its frames where all frames count alike; they differ only if one was cut.
+        shares = np.where(by_frames, weights, 1.0)
+        return ClipScores(
+            tuple(((values * shares).sum(0) / shares.sum(0)).tolist()),
+            tuple(weights.mean(0).tolist()),
+            sum(each.frames for each in done),
+            sum(each.cut_prediction for each in done),
+            sum(each.cut_truth for each in done),
+        )
+
+    def _score(self, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> ClipScores:
+        """One prediction."""
+        aligned: dict[str, Clips] = {}
+        found: dict[str, float] = {}
+        for column in self.columns:
+            if column.rule not in aligned:
+                # Every rule that does not refuse the lengths leaves the same frames, those that both sides have.
+                aligned[column.rule] = self._align(column, name, prediction, truth, template)
+            if column.source not in found:
+                clip = aligned[column.rule].clips[0]
+                found[column.source] = float(self.metrics[column.source].clip_value(clip))
+        each = [(found[column.source], column.absolute) for column in self.columns]
+        first = next(iter(aligned.values()))
+        frames = first.clips[0].frames
+        return ClipScores(
+            tuple(abs(value) if absolute else value for value, absolute in each),
+            (float(frames),) * len(each),
+            frames,
+            first.cut_prediction,
+            first.cut_truth,
+        )
+
+    @staticmethod
+    def _align(column: Column, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> Clips:
+        try:
+            clips = align(prediction, truth, clip_names=[name], rule=column.rule)
+            clips.check_finite()
+        except ValueError as error:
+            raise FaceDiffError(f"protocol {column.protocol}: {error}") from error
+        return clips.with_templates([template])
+
+
+def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
+    """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3) of any floating-point type, memory-mapped.
+
+    Raises:
+        FaceDiffError: if the file is unreadable or of another shape.
+    """
+    shape = open_vertices(path, n_vertices).shape
+    # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
+    array = np.load(path, mmap_mode="c", allow_pickle=False).reshape(shape)[::stride]
+    if array.dtype not in NATIVE or not array.dtype.isnative:
+        array = array.astype(array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64)
+    return torch.from_numpy(array)
