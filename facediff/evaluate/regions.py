@@ -28,8 +28,8 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
         n_vertices: vertices of the mesh.
         folder: where to look; the working folder if None.
         source: a text file of indices; a pickle; ``FLAME_masks.pkl:lips``, one or several (joined by "+") masks of a
-            pickle; ``mouth_mask.txt>0.1``, the vertices of a file of weights above a threshold; or ``all``. Without one,
-            ``lve.txt`` or ``fdd.txt`` is taken, else the masks of FLAME.
+            pickle; ``mouth_mask.txt>0.1``, the vertices of a file of weights above a threshold; or ``all``. Without
+            one, ``lve.txt`` or ``fdd.txt`` is taken, else the masks of FLAME.
 
     Raises:
         FaceDiffError: if it is not there, or not what it should be.

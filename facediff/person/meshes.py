@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
 from facediff.topology import read_mesh
+from facediff.topology.obj import read_obj
 
 Faces = npt.NDArray[np.int64]
 
@@ -45,40 +45,9 @@ def read_frame_mesh(path: Path, *, known: FrameMesh | None = None) -> FrameMesh:
     if path.suffix.lower() != ".obj":
         mesh = read_mesh(path)
         return FrameMesh(mesh.vertices, mesh.faces.astype(np.int64))
-    try:
-        lines = path.read_bytes().splitlines()
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected an OBJ mesh") from error
-    # Not through trimesh: it leaves out vertices of textured meshes that no face uses, and takes much longer.
-    points = [line[2:] for line in lines if line[:2] in (b"v ", b"v\t")]
-    try:
-        width = len(points[0].split()) if points else 3  # colours may follow the coordinates
-        table = np.array([float(word) for word in b" ".join(points).split()]).reshape(len(points), width)
-    except ValueError as error:
-        raise FaceDiffError(f"{path}: not a readable OBJ mesh ({error}); write it anew") from error
-    if not len(table) or width < 3:
-        raise FaceDiffError(f"{path}: holds no vertices; expected an OBJ mesh with lines `v x y z`")
-    text = b"\n".join(line for line in lines if line[:2] in (b"f ", b"f\t"))
-    same = known is not None and known.face_text == text
-    return FrameMesh(table[:, :3].copy(), known.faces if same and known else _faces(path, text, len(table)), text)
-
-
-def _faces(path: Path, text: bytes, n_vertices: int) -> Faces | None:
-    """Triangles (F, 3) of an OBJ's face lines; polygons become fans. None if there is none."""
-    triangles = []
-    try:
-        for line in text.splitlines():
-            corners = [int(word.partition(b"/")[0]) for word in line.split()[1:]]
-            corners = [corner - 1 if corner > 0 else n_vertices + corner for corner in corners]
-            triangles += [(corners[0], b, c) for b, c in zip(corners[1:-1], corners[2:], strict=True)]
-    except (ValueError, IndexError) as error:
-        raise FaceDiffError(f"{path}: not a readable OBJ mesh ({error}); write it anew") from error
-    if not triangles:
-        return None
-    faces = np.array(triangles, np.int64)
-    if faces.min() < 0 or faces.max() >= n_vertices:
-        raise FaceDiffError(f"{path}: a face names a vertex that is not there; the file has {n_vertices} vertices")
-    return faces
+    obj = read_obj(path)
+    same = known is not None and known.face_text == obj.face_text
+    return FrameMesh(obj.vertices, known.faces if same and known else obj.faces, obj.face_text)
 
 
 def differing_faces(one: Faces, other: Faces) -> int:

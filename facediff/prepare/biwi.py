@@ -29,8 +29,9 @@ from facediff.prepare.job import (
     write_templates,
 )
 from facediff.prepare.normalise import codetalker
-from facediff.prepare.raw import bases, copy_files, find_regions, folders_in, read_obj, region_files
+from facediff.prepare.raw import bases, copy_files, find_regions, folders_in, region_files
 from facediff.prepare.vl import check_sizes, frame_files, gaps, read_vl
+from facediff.topology.obj import read_obj
 
 SUBJECTS = [*(f"F{i}" for i in range(1, 9)), *(f"M{i}" for i in range(1, 7))]
 TRAINING_SUBJECTS = ["F2", "F3", "F4", "M3", "M4", "M5"]
@@ -150,11 +151,12 @@ def write_clip(
 @lru_cache(maxsize=2 * len(SUBJECTS))
 def read_template(path: Path) -> tuple[Array, npt.NDArray[np.int32]]:
     """Vertices (V, 3) in mm and faces (F, 3) of a personal template, vertices in the order of the file."""
-    vertices, faces = read_obj(path)
-    template = np.array(vertices, np.float64)
-    if not np.isfinite(template).all():
+    obj = read_obj(path)
+    if not np.isfinite(obj.vertices).all():
         raise FaceDiffError(f"{path}: holds NaN or infinity; copy it anew")
-    return template, np.array(faces, np.int32)
+    if obj.faces is None:
+        raise FaceDiffError(f"{path}: holds no triangles; expected a whole mesh, get it anew")
+    return obj.vertices, obj.faces.astype(np.int32)
 
 
 def _normalised(

@@ -65,33 +65,3 @@ def copy_files(sources: Sequence[Path], out: Path, folder: str = "") -> list[str
             shutil.copyfile(source, temporary)
         written.append(target.relative_to(out).as_posix())
     return written
-
-
-def read_obj(path: Path) -> tuple[list[list[float]], list[list[int]]]:
-    """Vertices and triangles of a Wavefront OBJ, every vertex in the order of the file, used by a face or not.
-
-    Further figures of a vertex (colours) and of a corner (texture, normal) are left out; polygons become fans.
-
-    Raises:
-        FaceDiffError: if the file is missing or damaged.
-    """
-    vertices: list[list[float]] = []
-    faces: list[list[int]] = []
-    try:
-        for line in path.read_text(encoding="latin-1").splitlines():
-            if line.startswith("v "):
-                x, y, z = line.split()[1:4]
-                vertices.append([float(x), float(y), float(z)])
-            elif line.startswith("f "):
-                corners = [int(word.partition("/")[0]) for word in line.split()[1:]]
-                corners = [corner - 1 if corner > 0 else len(vertices) + corner for corner in corners]
-                faces += [[corners[0], second, third] for second, third in zip(corners[1:], corners[2:], strict=False)]
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a mesh") from error
-    except ValueError as error:
-        raise FaceDiffError(f"{path}: not a readable OBJ mesh ({error}); get it anew") from error
-    if not faces or min(map(min, faces)) < 0 or max(map(max, faces)) >= len(vertices):
-        raise FaceDiffError(
-            f"{path}: has {len(vertices)} vertices and {len(faces)} triangles that do not fit; expected a whole mesh"
-        )
-    return vertices, faces

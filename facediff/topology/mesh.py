@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.topology.obj import read_obj
 
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
 
@@ -37,6 +38,8 @@ def read_mesh(path: Path) -> Mesh:
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such mesh file; expected one of {', '.join(SUFFIXES)}")
+    if path.suffix.lower() == ".obj":
+        return _read_obj(path)
     try:
         import trimesh
     except ImportError as error:
@@ -53,3 +56,11 @@ def read_mesh(path: Path) -> Mesh:
         np.array(mesh.faces, np.int32),
         np.array(mesh.visual.vertex_colors[:, :3], np.uint8) if coloured else None,
     )
+
+
+def _read_obj(path: Path) -> Mesh:
+    obj = read_obj(path)
+    if obj.faces is None:
+        raise FaceDiffError(f"{path}: holds no triangles; expected a mesh with faces")
+    colours = None if obj.colours is None else np.rint(obj.colours.clip(0, 1) * 255).astype(np.uint8)
+    return Mesh(obj.vertices, obj.faces.astype(np.int32), colours)

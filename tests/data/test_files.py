@@ -118,3 +118,15 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
         check_writable(tmp_path / "file" / "out.npy")
     check_writable(tmp_path / "a" / "b" / "out.npy")
     assert not (tmp_path / "a").exists()
+
+
+def test_an_obj_keeps_vertices_that_no_face_uses_and_its_colours(tmp_path: Path) -> None:
+    """As textured scans have them; a mesh library that drops them would shift all that follow."""
+    (tmp_path / "m.obj").write_text(
+        "vt 0 0\nv 0 0 0 1 0 0\nv 9 9 9 0 1 0\nv 1 0 0 0 0 1\nv 0 1 0 0.5 0.5 0.5\nf 1/1 3/1 4/1\nf -4//1 -2//1 -1//1\n"
+    )
+    mesh = read_mesh(tmp_path / "m.obj")
+    assert mesh.vertices.tolist() == [[0, 0, 0], [9, 9, 9], [1, 0, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == [[0, 2, 3], [0, 2, 3]]
+    assert mesh.colours is not None
+    assert mesh.colours.tolist() == [[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]]

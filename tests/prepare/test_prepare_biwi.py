@@ -17,10 +17,10 @@ from facediff.errors import FaceDiffError
 from facediff.pickles import load_pickle
 from facediff.prepare import biwi
 from facediff.prepare.normalise import codetalker, surface_area
-from facediff.prepare.raw import read_obj
 from facediff.prepare.runner import Report, prepare
 from facediff.prepare.vl import check_sizes, gaps, read_vl
 from facediff.topology import read_mesh
+from facediff.topology.obj import read_obj
 from tests.fakes.biwi import (
     RATE,
     VERTICES,
@@ -377,9 +377,10 @@ def test_obj_keeps_every_vertex_in_its_place(tmp_path: Path) -> None:
         "f 1/1/1 3/1/1 4/1/1 5/1/1\nf -5//1 -3//1 -1//1\n",
         encoding="latin-1",
     )
-    vertices, faces = read_obj(path)
-    assert vertices == [[0, 0, 0], [9, 9, 9], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
-    assert faces == [[0, 2, 3], [0, 3, 4], [0, 2, 4]]
+    obj = read_obj(path)
+    assert obj.faces is not None
+    assert obj.vertices.tolist() == [[0, 0, 0], [9, 9, 9], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert obj.faces.tolist() == [[0, 2, 3], [0, 3, 4], [0, 2, 4]]
 
 
 @pytest.mark.parametrize(
@@ -388,7 +389,7 @@ def test_obj_keeps_every_vertex_in_its_place(tmp_path: Path) -> None:
 def test_damaged_obj(tmp_path: Path, text: str) -> None:
     (tmp_path / "scan.obj").write_text(text)
     with pytest.raises(FaceDiffError, match=r"scan\.obj: "):
-        read_obj(tmp_path / "scan.obj")
+        read_mesh(tmp_path / "scan.obj")
 
 
 def test_templates_open_without_facediff(raw: Path) -> None:
