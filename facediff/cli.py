@@ -31,6 +31,7 @@ COMMANDS = {
     "validate": Command("facediff.commands.lightning", "score a system on the validation split"),
     "test": Command("facediff.commands.lightning", "score a system on the test splits"),
     "predict": Command("facediff.commands.lightning", "write a system's motion for a split"),
+    "evaluate": Command("facediff.commands.evaluate", "score anybody's predicted motion files by named protocols"),
     "data": Command("facediff.commands.data", "prepare and check corpora, import a person's video"),
     "components": Command("facediff.commands.components", "list what can be chosen by name"),
 }

@@ -10,6 +10,7 @@ from facediff.errors import FaceDiffError, choices
 COMMANDS = {
     "prepare": ("facediff.commands.prepare", "make a corpus folder from a raw distribution: biwi, vocaset, mead3d"),
     "check": ("facediff.commands.check", "say what a folder is, what is missing and what is wrong in it"),
+    "regions": ("facediff.commands.regions", "draw a corpus's lips and upper face on its mesh"),
     "import-person": ("facediff.commands.import_person", "make a person's reconstructed video a corpus entry"),
 }
 

@@ -91,7 +91,8 @@ def _check_corpus(
     report.corpus, report.data_module = view.corpus, view.data_module
     report.frame_rate, report.n_vertices = view.frame_rate, view.n_vertices
     opened: Corpus | None = None
-    if not any(finding.where == MANIFEST for finding in findings):  # whoever opens the folder stumbles over it again
+    # Whoever opens the folder stumbles over these again.
+    if not any(found.where == MANIFEST or found.kind == "unfinished" for found in findings):
         with guarded(findings, "frame_rate", root / MANIFEST, root):
             opened = view.open(root)
     stored = _stored_rate(manifest, view)

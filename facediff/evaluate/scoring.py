@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import cast
 
 import numpy as np
@@ -20,6 +21,10 @@ from facediff.metrics.options import LengthRule, Pooling
 
 NATIVE = (np.float16, np.float32, np.float64)
 """Types that torch reads as they are."""
+
+OPENING = Lock()
+"""Held while a file is opened: NumPy reads a file's header with ast, which two threads at once may break in
+Python 3.11 (SystemError, "AST constructor recursion depth mismatch")."""
 
 
 @dataclass(frozen=True)
@@ -202,9 +207,11 @@ def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
     Raises:
         FaceDiffError: if the file is unreadable or of another shape.
     """
-    shape = open_vertices(path, n_vertices).shape
-    # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
-    array = np.load(path, mmap_mode="c", allow_pickle=False).reshape(shape)[::stride]
+    with OPENING:
+        shape = open_vertices(path, n_vertices).shape
+        # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
+        array = np.load(path, mmap_mode="c", allow_pickle=False)
+    array = array.reshape(shape)[::stride]
     if array.dtype not in NATIVE or not array.dtype.isnative:
         array = array.astype(array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64)
     return torch.from_numpy(array)
