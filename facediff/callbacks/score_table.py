@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import WandbLogger
 
 from facediff.files import atomic
 from facediff.systems import SpeechAnimator
@@ -18,14 +19,17 @@ METHOD_NAMES = {"model": "model", "still": "still face", "shuffled": "model, shu
 class ScoreTable(Callback):
     """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
 
-    Beside the model stand a face that never moves, and the model given another sentence's speech.
+    Beside the model stand a face that never moves, and the model given another sentence's speech. Weights & Biases gets
+    the table of sequences as ``test/sequences``, and the protocol's definition in the run's config.
 
     Args:
         file: name of the CSV file in the run's folder; None writes none.
+        sequences_file: name of the CSV file with one row per clip and method; None writes none.
     """
 
-    def __init__(self, file: str | None = "test_scores.csv") -> None:
+    def __init__(self, file: str | None = "test_scores.csv", sequences_file: str | None = "test_sequences.csv") -> None:
         self.file = file
+        self.sequences_file = sequences_file
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print and write; runs before the system logs and empties its metrics."""
@@ -33,6 +37,7 @@ class ScoreTable(Callback):
             return
         evaluation = pl_module.evaluation
         rows = [row for split in evaluation.splits for row in evaluation.rows(split)]
+        sequences = evaluation.sequences()
         folder = trainer.log_dir  # asked for on every process: the answer is broadcast
         if not trainer.is_global_zero:
             return
@@ -43,7 +48,20 @@ class ScoreTable(Callback):
             path = Path(folder) / self.file
             write_csv(path, rows)
             print(f"written: {path}")
+        if self.sequences_file and folder:
+            write_rows(Path(folder) / self.sequences_file, sequences)
+            print(f"written: {Path(folder) / self.sequences_file}")
+        for logger in trainer.loggers:
+            if isinstance(logger, WandbLogger):
+                log_sequences(logger, sequences, evaluation.protocol.describe())
         sys.stdout.flush()
+
+
+def log_sequences(logger: WandbLogger, sequences: list[dict[str, Any]], definition: str) -> None:
+    """Give Weights & Biases the table of sequences and the words that define its numbers."""
+    columns = list(sequences[0])
+    logger.log_table("test/sequences", columns=columns, data=[[row[name] for name in columns] for row in sequences])
+    logger.experiment.config.update({"protocol_definition": definition}, allow_val_change=True)
 
 
 def format_table(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool) -> str:
@@ -73,7 +91,12 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
         for part, region in regions.items():
             line |= {f"{part}_vertices": region["count"], f"{part}_hash": region["hash"]}
         flat.append(line)
+    write_rows(path, flat)
+
+
+def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Rows of equal keys as CSV, whole or not at all."""
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, fieldnames=list(flat[0]))
+        writer = csv.DictWriter(stream, fieldnames=list(rows[0]))
         writer.writeheader()
-        writer.writerows(flat)
+        writer.writerows(rows)

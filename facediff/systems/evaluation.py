@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from facediff.data import Assets, Batch
-from facediff.metrics import ProtocolMetrics, Region, protocol
+from facediff.metrics import ProtocolMetrics, Region, SequenceMetric, protocol
+from facediff.metrics.clips import align
 
 METHODS = ("model", "still", "shuffled")
 """Who is scored: the model, a face that never moves, the model given another sentence's speech."""
@@ -28,6 +29,7 @@ class Evaluation:
         self.protocol = protocol(protocol_name)
         self.splits: list[str] = []
         self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}
+        self._sequences: list[dict[str, Any]] = []
 
     def prepare(self, assets: Assets, splits: Sequence[str], device: torch.device) -> None:
         """Make empty metrics for a corpus's regions, on the device where processes reduce them."""
@@ -40,6 +42,7 @@ class Evaluation:
             for name, indices in assets.regions.items()
         }
         self.splits = list(splits)
+        self._sequences = []
         methods = METHODS if self.splits != ["val"] else METHODS[:1]
         self.metrics = {
             split: {
@@ -54,6 +57,24 @@ class Evaluation:
             return
         metrics = self.metrics[split][method].to(motion.device)
         metrics.update(motion, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
+        if split == "val":
+            return
+        scorers = cast(Sequence[tuple[str, SequenceMetric]], metrics.items(copy_state=False))
+        clips = align(motion, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
+        for clip in clips.with_templates([None] * len(batch)).clips:
+            values = {name: float(metric.clip_value(clip)) for name, metric in scorers}
+            self._sequences.append(
+                {"split": split, "method": method, "clip": clip.name, "frames": clip.frames, **values}
+            )
+
+    def sequences(self) -> list[dict[str, Any]]:
+        """One row per test clip and method with its own scores, of all processes; collective under several."""
+        rows = self._sequences
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            shares: list[Any] = [None] * torch.distributed.get_world_size()
+            torch.distributed.all_gather_object(shares, rows)
+            rows = [row for share in shares for row in share]
+        return sorted(rows, key=lambda row: (row["split"], METHODS.index(row["method"]), row["clip"]))
 
     def scalars(self, split: str) -> dict[str, float]:
         """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics."""

@@ -227,14 +227,57 @@ def test_three_processes_score_as_one_does(
         timeout=240,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    (mine,) = (tmp_path / "one").rglob("test_scores.csv")
-    (theirs,) = (tmp_path / "three").rglob("test_scores.csv")
-    one, three = (list(csv.DictReader(path.read_text().splitlines())) for path in (mine, theirs))
-    assert len(one) == len(three) == 6
-    assert {row["sequences"] for row in one if row["split"] == "test_b"} == {"2"}
-    for row, other in zip(one, three, strict=True):
-        for column, value in row.items():
-            if column in ("mve", "lve", "fdd"):
-                assert float(other[column]) == pytest.approx(float(value), rel=1e-5)
-            else:
-                assert other[column] == value
+    for name in ("test_scores.csv", "test_sequences.csv"):
+        (mine,) = (tmp_path / "one").rglob(name)
+        (theirs,) = (tmp_path / "three").rglob(name)
+        one, three = (list(csv.DictReader(path.read_text().splitlines())) for path in (mine, theirs))
+        # Two splits by three methods; four clips of test A and two of test B, each with three methods.
+        assert len(one) == len(three) == {"test_scores.csv": 6, "test_sequences.csv": 18}[name]
+        for row, other in zip(one, three, strict=True):
+            for column, value in row.items():
+                if column in ("mve", "lve", "fdd"):
+                    assert float(other[column]) == pytest.approx(float(value), rel=1e-5)
+                else:
+                    assert other[column] == value
+
+
+def test_the_rows_of_the_sequences_add_up_to_the_scores(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false"]) == 0
+    tables = {}
+    for name in ("test_scores.csv", "test_sequences.csv"):
+        (path,) = tmp_path.rglob(name)
+        tables[name] = list(csv.DictReader(path.read_text().splitlines()))
+    for total in tables["test_scores.csv"]:
+        keys = ("split", "method")
+        rows = [row for row in tables["test_sequences.csv"] if all(row[key] == total[key] for key in keys)]
+        frames = np.array([int(row["frames"]) for row in rows])
+        assert frames.sum() == int(total["frames"])
+        for name in ("mve", "lve"):
+            values = np.array([float(row[name]) for row in rows])
+            assert (values * frames).sum() / frames.sum() == pytest.approx(float(total[name]), rel=1e-9)
+        assert np.mean([float(row["fdd"]) for row in rows]) == pytest.approx(float(total["fdd"]), rel=1e-9)
+
+
+def test_wandb_gets_the_sequences_and_the_protocol(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wandb = pytest.importorskip("wandb")
+    monkeypatch.chdir(tmp_path)
+    wandb.finish()  # another test's run in this process
+    logged: dict[str, object] = {}
+    original = wandb.Table
+
+    class Spy(original):  # type: ignore[misc,valid-type]
+        def __init__(self, columns: list[str], data: list[list[object]], **options: object) -> None:
+            logged.update(columns=columns, rows=len(data))
+            super().__init__(columns=columns, data=data, **options)
+
+    monkeypatch.setattr(wandb, "Table", Spy)
+    logger = ["--trainer.logger=lightning.pytorch.loggers.WandbLogger", f"--trainer.logger.save_dir={tmp_path}"]
+    words = ["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false", *logger]
+    assert main(words) == 0
+    wandb.finish()
+    assert logged == {"columns": ["split", "method", "clip", "frames", "mve", "lve", "fdd"], "rows": 18}
