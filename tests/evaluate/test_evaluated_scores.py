@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import shutil
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -150,6 +152,34 @@ def test_truth_at_a_higher_frame_rate_is_thinned(files: Files) -> None:
         frames = files.read(path)
         np.save(path, np.stack([frames, frames + 1], 1).reshape(-1, VERTICES, 3))
     assert scores_of(files.evaluate(protocols=list(PROTOCOLS), truth_stride=2)) == pytest.approx(wanted, rel=1e-12)
+
+
+@pytest.fixture
+def restless_threads() -> Iterator[None]:
+    """Python changes threads as often as it can."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+@pytest.mark.usefixtures("restless_threads")
+def test_many_small_files_are_opened_by_many_workers(tmp_path: Path) -> None:
+    """Headers are read with ast, which is not safe in threads under Python 3.11."""
+    for place in range(200):
+        for side in ("truth", "ours"):
+            (tmp_path / side).mkdir(exist_ok=True)
+            np.save(tmp_path / side / f"A_e{place:03d}.npy", np.full((2, 6), float(side == "ours")))
+    report = evaluate(
+        {"ours": tmp_path / "ours"},
+        tmp_path / "truth",
+        lips=Region.from_indices("lips", [1]),
+        n_vertices=2,
+        protocols=["meshtalk"],
+        workers=8,
+    )
+    (score,) = report.methods[0].scores
+    assert (score.value, score.sequences, score.frames) == (pytest.approx(3**0.5), 200, 400)
 
 
 @pytest.mark.parametrize("side", ["truth", "prediction"])
