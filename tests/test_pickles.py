@@ -73,3 +73,60 @@ def test_plain_pickles_are_read_as_before(file: Path) -> None:
     loaded = load_pickle(file, stand_ins=("chumpy",))
     np.testing.assert_array_equal(loaded["a"], np.arange(4))
     assert loaded["b"] == {1, 2}
+
+
+def crafted(state: tuple[object, ...], data: object = b"12345678") -> bytes:
+    """A pickle of an array of one element whose type has been given a state by hand."""
+
+    class Kind:
+        def __reduce__(self) -> tuple[object, ...]:
+            return np.dtype, ("V8", False, True), state
+
+    class Crafted:
+        def __reduce__(self) -> tuple[object, ...]:
+            reconstruct = np.zeros(1).__reduce__()[0]
+            return reconstruct, (np.ndarray, (0,), b"b"), (1, (1,), Kind(), False, data)
+
+    return pickle.dumps(Crafted(), 2)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        crafted((3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 8, 0)),
+        crafted((3, "|", (np.dtype("O"), (1,)), None, None, 8, 8, 0)),
+        crafted((3, "<", None, None, None, -1, -1, 0)),
+        pickle.dumps(np.array([object, 1], object)),
+        pickle.dumps(np.zeros(2, [("a", "f4"), ("b", "i4")])),
+    ],
+    ids=["field of objects", "subarray of objects", "void", "objects", "structured"],
+)
+def test_arrays_of_anything_but_plain_values_are_refused(tmp_path: Path, content: bytes) -> None:
+    """NumPy would take the bytes of such arrays for pointers and crash, or worse."""
+    (tmp_path / "t.pkl").write_bytes(content)
+    with pytest.raises(FaceDiffError, match=r"t\.pkl: not a pickle of plain NumPy arrays"):
+        load_pickle(tmp_path / "t.pkl")
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4, 5])
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(6.0).reshape(2, 3),
+        np.asfortranarray(np.arange(6, dtype="f4").reshape(2, 3)),
+        np.array([1, 2], ">i2"),
+        np.array(["a", "bc"]),
+        np.array([b"x"]),
+        np.array([True, False]),
+        np.array(3.5),
+        np.zeros((0, 3)),
+        np.array([1 + 2j]),
+    ],
+    ids=str,
+)
+def test_plain_arrays_of_every_kind_come_back(tmp_path: Path, protocol: int, array: np.ndarray) -> None:
+    (tmp_path / "t.pkl").write_bytes(pickle.dumps([array], protocol))
+    (found,) = load_pickle(tmp_path / "t.pkl")
+    assert np.asarray(found).dtype.newbyteorder("=") == array.dtype.newbyteorder("=")
+    assert np.array_equal(found, array)
+    assert found.shape == array.shape
