@@ -49,7 +49,9 @@ def real_type(kind: object) -> np.dtype[Any]:
     if not isinstance(words, str) or not isinstance(kind, PlainType) or not PLAIN.fullmatch(words):
         raise pickle.UnpicklingError(f"it holds an array of the type {words!r}")
     made = np.dtype(words)
-    return made.newbyteorder(kind.order) if kind.order in "<>" else made
+    if kind.order == ">":
+        return made.newbyteorder(">")
+    return made.newbyteorder("<") if kind.order == "<" else made
 
 
 class ArrayType:

@@ -101,6 +101,8 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     """Run one of Lightning's subcommands and hand back what it made: trainer, model, data module."""
     for kind in registry.KINDS.values():
         kind.load()
+    if os.getcwd() not in sys.path:  # a corpus or a component may be a file of the working folder
+        sys.path.append(os.getcwd())
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     keep_wandb_quiet()
     words = rewrite(name, list(arguments))

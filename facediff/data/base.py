@@ -15,6 +15,7 @@ from facediff.data.assets import Assets, Reference
 from facediff.data.batch import Batch, Sample, collate
 from facediff.data.corpus import Clip, Corpus, parse_name, read_manifest
 from facediff.data.dataset import BatchDataset, FeatureReader, MotionDataset, ReferenceChoice, ReferencePolicy
+from facediff.data.features import FeatureSlot
 from facediff.data.sampling import ClipBatches
 from facediff.errors import FaceDiffError
 from facediff.hparams import plain
@@ -110,7 +111,11 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             for name, chosen in (("lips", lips), ("upper_face", upper_face))
         }
         self.identities = [*map(person_name, self.people), *type(self).identities]
-        self.features: FeatureReader | None = None
+        for name in self.identities:
+            if self.identities.count(name) > 1:
+                raise FaceDiffError(f"data.people: {name} is there more than once; import the person by a new name")
+        self.feature_slot = FeatureSlot()
+        self.features: FeatureReader = self.feature_slot
         self._corpus: Corpus | None = None
         self._assets: Assets | None = None
         check_positive(batch_size=batch_size, window=window, reference_frames=reference_frames)
@@ -172,6 +177,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """The split of any clip: an imported person's own list says it of theirs, :meth:`split_of` of all others."""
         if clip.root in self.people:
             said = clip.attributes.get("split")
+            if said not in ("train", "val", "test"):
+                raise FaceDiffError(f"{clip.root / 'clips.csv'}: split of {clip.name} is {said!r}; train, val or test")
             return "test_a" if said == "test" else said
         return self.split_of(clip)
 
@@ -205,11 +212,14 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             raise FaceDiffError(
                 f"{self.root}: no clip of split {split}; `facediff data check {self.root}` tells what is missing"
             )
+        policy = self.reference_policy()
+        if not training or self.reference != "self":
+            policy.check(clips)
         return MotionDataset(
             self.corpus,
             clips,
             self.identities,
-            self.reference_policy(),
+            policy,
             training=training,
             window=self.window if training else None,
             decoys=split.startswith("test"),

@@ -112,7 +112,10 @@ class Corpus:
                 f"{root}: was not prepared to its end (prepare.json is there, manifest.json is not); run the same "
                 f"`facediff data prepare` again, which goes on where it was stopped"
             )
-        stored = float(read_manifest(root).get("frame_rate") or default)
+        said = read_manifest(root).get("frame_rate") or default
+        if not isinstance(said, int | float) or not 0 < said < float("inf"):
+            raise FaceDiffError(f"{root / 'manifest.json'}: frame_rate is {said!r}, expected frames a second, e.g. 25")
+        stored = float(said)
         stride = round(stored / self.frame_rate)
         if stride < 1 or abs(stride * self.frame_rate - stored) > 1e-6:
             raise FaceDiffError(
@@ -152,18 +155,28 @@ class Corpus:
         path = root / "clips.csv"
         if not path.is_file():
             return {}
-        with path.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream))
+        try:
+            with path.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets put a mark at the beginning
+                rows = [{key: value for key, value in row.items() if key} for row in csv.DictReader(stream)]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise FaceDiffError(f"{path}: not readable as a UTF-8 table ({error}); save it as CSV UTF-8") from error
         if rows and "clip" not in rows[0]:
             raise FaceDiffError(f"{path}: has no column clip; expected clip and further columns, one row a clip")
-        return {row.pop("clip"): row for row in rows}
+        return {str(row.pop("clip")): {key: (value or "").strip() for key, value in row.items()} for row in rows}
 
     @cached_property
     def templates(self) -> dict[str, Tensor]:
         """Neutral face (V, 3) of every subject, float32."""
         templates: dict[str, Tensor] = {}
-        for root in (self.root, *self.people):
-            templates |= read_templates(root / "templates.pkl", self.n_vertices)
+        templates |= read_templates(self.root / "templates.pkl", self.n_vertices)
+        for root in self.people:
+            name = str(read_manifest(root).get("person"))
+            own = read_templates(root / "templates.pkl", self.n_vertices)
+            if name in templates:
+                raise FaceDiffError(
+                    f"{root}: there is a {name} in {self.root} already; import the person by a new name"
+                )
+            templates |= {name: own[name]} if name in own else {}
         return templates
 
     def template(self, clip: Clip) -> Tensor:
@@ -196,9 +209,10 @@ class Corpus:
             chunk = motion[first : first + CHUNK]
             np.copyto(chunk, stored[first : first + CHUNK], casting="same_kind")
             if not np.isfinite(chunk.sum()):
-                bad = start + first + int(np.argmax(~np.isfinite(chunk).all((1, 2))))
+                bad = (start + first + int(np.argmax(~np.isfinite(chunk).all((1, 2))))) * self._strides[clip.root]
                 raise FaceDiffError(
-                    f"{motion_path(clip.root, clip.name)}: frame {bad} holds NaN or infinity; remove the clip"
+                    f"{motion_path(clip.root, clip.name)}: frame {bad} holds NaN or infinity (counted from 0); "
+                    f"remove the clip"
                 )
             chunk -= template
         return torch.from_numpy(motion)
@@ -257,9 +271,9 @@ def open_vertices(path: Path, n_vertices: int) -> npt.NDArray[np.floating]:
     """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+    except Exception as error:  # a damaged header makes NumPy raise anything
         raise FaceDiffError(f"{path}: not a readable NumPy array ({error}); expected (T, 3V) floats") from error
-    if array.ndim not in (2, 3) or array.size != len(array) * n_vertices * 3 or not len(array):
+    if array.ndim not in (2, 3) or array.shape[1:] not in ((3 * n_vertices,), (n_vertices, 3)) or not len(array):
         raise FaceDiffError(
             f"{path}: has shape {array.shape}, expected (frames, {3 * n_vertices}) with at least one frame"
         )
@@ -283,7 +297,7 @@ def read_templates(path: Path, n_vertices: int) -> dict[str, Tensor]:
             array = np.asarray(value, np.float32)
         except (TypeError, ValueError) as error:
             raise FaceDiffError(f"{path}: the template of {name} is no array of numbers; expected (V, 3)") from error
-        if array.size != n_vertices * 3:
+        if array.shape not in ((3 * n_vertices,), (n_vertices, 3)):
             raise FaceDiffError(f"{path}: the template of {name} has shape {array.shape}, expected ({n_vertices}, 3)")
         if not np.isfinite(array).all():
             raise FaceDiffError(f"{path}: the template of {name} holds NaN or infinity")

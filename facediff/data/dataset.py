@@ -37,6 +37,16 @@ class ReferencePolicy:
     choice: ReferenceChoice
     max_frames: int
 
+    def check(self, targets: Sequence[Clip]) -> None:
+        """Find out before training that a clip has nothing to take a style from.
+
+        Raises:
+            FaceDiffError: as :meth:`eligible`.
+        """
+        for clip in targets:
+            if len(self.candidates.get(clip.subject, [])) < 2:
+                self.eligible(clip)
+
     def eligible(self, target: Clip) -> list[Clip]:
         """The clips that may serve ``target``, the best matching ones, never ``target`` itself.
 

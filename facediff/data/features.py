@@ -12,6 +12,17 @@ from facediff.data.corpus import Clip, Corpus
 from facediff.data.store import ArrayStore
 
 
+class FeatureSlot:
+    """Where cached features are looked for when a sample is read; may be filled after the loaders were made."""
+
+    def __init__(self) -> None:
+        self.reader: CachedFeatures | None = None
+
+    def __call__(self, clip: Clip) -> Tensor | None:
+        """The features of a clip, if there are any."""
+        return None if self.reader is None else self.reader(clip)
+
+
 class CachedFeatures:
     """Reads the features of clips whose speech has been encoded before.
 

@@ -38,8 +38,8 @@ class ClipBatches(DistributedSampler[list[Pick]]):
     It is a ``DistributedSampler`` in the sense that each process iterates over its own share of the same batches, so
     Lightning leaves it as it is. All processes get equally many batches, for they wait for one another at each. In
     training that may repeat some batches of an epoch's last step. In evaluation every clip is scored once: batches are
-    split, or where all are single clips put together, until their number goes up in the processes; if there are fewer
-    clips than processes, the idle ones get a clip that is marked as repeated.
+    split until their number goes up in the processes; where all are single clips, a process that would be idle in the
+    last step gets a clip that is marked as repeated.
 
     Args:
         lengths: frames of every clip; looked at with ``max_frames`` only.
@@ -77,7 +77,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         """This process's batches of the present epoch."""
         batches = self._all(torch.Generator().manual_seed(self._hash("order")))
         for place in range(self.rank, len(batches), self.num_replicas):
-            # With fewer clips than processes every batch is one clip, and those behind the last clip repeat one.
+            # Where clips are repeated every batch is one clip, and those behind the last clip are the repeated ones.
             repeated = not self.training and place >= len(self.lengths)
             yield [Pick(i, self._hash(i) if self.training else 0, repeated) for i in batches[place]]
 
@@ -117,7 +117,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
 
 
 def evened(batches: list[list[int]], world_size: int) -> list[list[int]]:
-    """The same clips in a number of batches that ``world_size`` divides; clips are repeated only if there are fewer."""
+    """The same clips in a number of batches that ``world_size`` divides, some repeated if too few to split."""
     batches = list(batches)
     clips = sum(map(len, batches))
     if not clips:
@@ -128,10 +128,7 @@ def evened(batches: list[list[int]], world_size: int) -> list[list[int]]:
             largest = max(batches, key=len)
             place, half = batches.index(largest), len(largest) // 2
             batches[place : place + 1] = [largest[:half], largest[half:]]
-    elif up > world_size:
-        while len(batches) > up - world_size:
-            batches[-2:] = [batches[-2] + batches[-1]]
     else:
         singles = [[index] for batch in batches for index in batch]
-        batches = [singles[i % clips] for i in range(world_size)]
+        batches = [singles[i % clips] for i in range(-(-clips // world_size) * world_size)]
     return batches

@@ -41,7 +41,7 @@ class ArrayStore:
             return None
         try:
             return np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, OSError, EOFError):
+        except Exception:  # a damaged header makes NumPy raise anything
             warnings.warn(f"{path}: a damaged or half-written cache file; it is made anew", stacklevel=2)
             return None
 

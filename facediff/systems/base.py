@@ -165,7 +165,10 @@ class SpeechAnimator(LightningModule, ABC):
         self.adopt(data.assets().with_motion_scale(scale))
         if stage != "predict":
             self.evaluation.prepare(
-                self.assets, ["val"] if stage in ("fit", "validate") else data.test_splits, self.device
+                self.assets,
+                ["val"] if stage in ("fit", "validate") else data.test_splits,
+                # The system itself is moved to its device later; a process without clips must have its metrics there.
+                self.trainer.strategy.root_device,
             )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

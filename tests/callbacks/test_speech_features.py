@@ -40,10 +40,12 @@ def losses(
 ) -> Callable[..., tuple[list[float], int]]:
     """Losses of two epochs of training and validation, and how many clips went through the convolutions."""
 
-    def train(*callbacks: pl.Callback, window: int | None = None, frozen: int = 2) -> tuple[list[float], int]:
+    def train(
+        *callbacks: pl.Callback, window: int | None = None, frozen: int = 2, **options: object
+    ) -> tuple[list[float], int]:
         encoder = partial(registry.audio_encoder.hubert, source=str(hubert_source), frozen_layers=frozen)
         pl.seed_everything(1, workers=True, verbose=False)
-        system = make_system(audio_encoder=encoder)
+        system = make_system(audio_encoder=encoder, **options)
         clips: list[int] = []
         system.network.audio_encoder.hubert.feature_extractor.register_forward_pre_hook(
             lambda _, args: clips.append(len(args[0]))
@@ -70,6 +72,14 @@ def test_losses_are_the_same_with_and_without(
     # Eight training clips and two for validation, once each; then never again, though each is used in both epochs.
     # (Lightning's summary and sampling run no encoder; validation samples from cached features too.)
     assert (encoded, encoded_again) == (10, 0)
+
+
+def test_a_schedule_that_asks_for_the_number_of_steps_reads_the_cache_too(
+    losses: Callable[..., tuple[list[float], int]], tmp_path: Path
+) -> None:
+    """It has the loaders made before the features are there."""
+    _, encoded = losses(SpeechFeatureCache(str(tmp_path)), lr_schedule="cosine", warmup_steps=2)
+    assert encoded == 10
 
 
 def test_windows_take_their_part_of_the_whole_clips_features(

@@ -323,8 +323,48 @@ def test_a_persons_folder_must_be_one(tmp_path: Path) -> None:
     root = write(tmp_path / "biwi", ["F2_e01", "F2_e02"], {"F2"})
     with pytest.raises(FaceDiffError, match=r"data\.people: .*biwi is no person's folder"):
         MiniBiwi(root=str(root), people=[str(root)])
-    clash = write_person(tmp_path / "clash", "F2")
-    (clash / "wav" / "F2_s01.wav").rename(clash / "wav" / "F2_e01.wav")
-    (clash / "vertices_npy" / "F2_s01.npy").rename(clash / "vertices_npy" / "F2_e01.npy")
+    for name, sentence in (("F2", "data.people: F2 is there more than once"), ("M6", "has a M6 already")):
+        own = write(tmp_path / f"with {name}", ["F2_e01", "F2_e02"], {"F2", "M6"})
+        clash = write_person(tmp_path / f"clash {name}", name)
+        with pytest.raises(FaceDiffError, match=sentence):
+            _ = MiniBiwi(root=str(own), people=[str(clash)]).corpus.templates
+    other = write_person(tmp_path / "other", "Eve")
+    (other / "wav" / "Eve_s01.wav").rename(other / "wav" / "F2_e01.wav")
+    (other / "vertices_npy" / "Eve_s01.npy").rename(other / "vertices_npy" / "F2_e01.npy")
     with pytest.raises(FaceDiffError, match=r"its clip F2_e01 is also in"):
-        _ = MiniBiwi(root=str(root), people=[str(clash)]).corpus.clips
+        _ = MiniBiwi(root=str(root), people=[str(other)]).corpus.clips
+
+
+def test_a_persons_table_may_come_from_a_spreadsheet_but_must_name_splits(tmp_path: Path) -> None:
+    root = write(tmp_path / "biwi", ["F2_e01", "F2_e02"], {"F2"})
+    person = write_person(tmp_path / "ada")
+    table = (person / "clips.csv").read_text()
+    (person / "clips.csv").write_text(table.replace(",val", ", val "), encoding="utf-8-sig")
+    assert [clip.name for clip in MiniBiwi(root=str(root), people=[str(person)]).clips("val")] == ["Ada_s03"]
+    (person / "clips.csv").write_text(table.replace(",test", ",tset"))
+    with pytest.raises(FaceDiffError, match=r"clips\.csv: split of Ada_s04 is 'tset'; train, val or test"):
+        MiniBiwi(root=str(root), people=[str(person)]).clips("val")
+
+
+def test_a_person_with_one_clip_is_told_before_training(tmp_path: Path) -> None:
+    root = write(tmp_path / "biwi", ["F2_e01", "F2_e02"], {"F2"})
+    person = write_person(tmp_path / "ada")
+    for number in (2, 3, 4):
+        (person / "wav" / f"Ada_s{number:02d}.wav").unlink()
+    data = MiniBiwi(root=str(root), people=[str(person)])
+    with pytest.raises(FaceDiffError, match="Ada has no other clip to take a style reference from"):
+        data.dataset("train", training=True)
+    assert len(MiniBiwi(root=str(root), people=[str(person)], reference="self").dataset("train", training=True)) == 3
+
+
+def test_swapped_axes_and_damaged_headers_are_refused(tmp_path: Path) -> None:
+    root = write(tmp_path, ["F2_e01", "F2_e02"], {"F2"})
+    path = root / "vertices_npy" / "F2_e01.npy"
+    np.save(path, np.zeros((6, 3, VERTICES)))
+    with pytest.raises(FaceDiffError, match=r"F2_e01\.npy: has shape \(6, 3, 10\), expected \(frames, 30\)"):
+        MiniBiwi(root=str(root)).dataset("train")[0]
+    content = bytearray(path.read_bytes())
+    content[content.index(b"(6")] = ord("[")
+    path.write_bytes(bytes(content))
+    with pytest.raises(FaceDiffError, match=r"F2_e01\.npy: not a readable NumPy array"):
+        MiniBiwi(root=str(root)).dataset("train")[0]

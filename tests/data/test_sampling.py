@@ -58,7 +58,10 @@ def test_processes_share_evaluation_without_repeats(
     assert len({len(share) for share in shares}) == 1
     scored = Counter(pick.index for share in shares for batch in share for pick in batch if not pick.repeated)
     assert scored == Counter(range(len(lengths)))
-    assert len(lengths) < world or not any(pick.repeated for share in shares for batch in share for pick in batch)
+    assert sum(pick.repeated for share in shares for batch in share for pick in batch) < world
+    for batch in (batch for share in shares for batch in share):
+        longest = max(lengths[pick.index] for pick in batch)
+        assert len(batch) == 1 or (len(batch) <= size if budget is None else longest * len(batch) <= budget)
     assert all(len({pick.repeated for pick in batch}) == 1 for share in shares for batch in share)
 
 

@@ -162,7 +162,12 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         "0 to 23",
     ),
     ("table without clips", lambda r: (r / "clips.csv").write_text("a,b\n1,2\n"), {"clips_table"}, "no column clip"),
-    ("table of bytes", lambda r: (r / "clips.csv").write_bytes(b"\xff\xfe" * 9), {"clips_table"}, "cannot be read"),
+    (
+        "table of bytes",
+        lambda r: (r / "clips.csv").write_bytes(b"\xff\xfe" * 9),
+        {"clips_table"},
+        "save it as CSV UTF-8",
+    ),
     ("no training clip", remove_training_clips, {"no_training_clip"}, "nothing can be trained"),
     (
         "manifest of text",
@@ -178,7 +183,7 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
     ),
     ("manifest of a list", lambda r: (r / "manifest.json").write_text("[]"), {"manifest_unreadable"}, "no JSON object"),
     ("odd frame rate", lambda r: write_manifest(r, frame_rate=26), {"frame_rate"}, "26, which is no whole multiple"),
-    ("frame rate of words", lambda r: write_manifest(r, frame_rate="fast"), {"frame_rate"}, "cannot be read"),
+    ("frame rate of words", lambda r: write_manifest(r, frame_rate="fast"), {"frame_rate"}, "expected frames a second"),
     (
         "twice the frame rate",
         lambda r: write_manifest(r, frame_rate=50),

@@ -110,8 +110,8 @@ class HubertEncoder(AudioEncoder):
         digest = hashlib.sha256(json.dumps([self.frozen_layers, EDGE, config], sort_keys=True, default=str).encode())
         for name in self._frozen:
             for key, value in sorted(self.hubert.get_submodule(name).state_dict().items()):
-                digest.update(f"{name}.{key}".encode())
-                digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+                digest.update(f"{name}.{key}.{value.dtype}".encode())
+                digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
         return digest.hexdigest()
 
     def frozen_features(
