@@ -42,6 +42,10 @@ class PlainArray(np.ndarray[Any, Any]):
         data = data.encode("latin1") if isinstance(data, str) else data
         super().__setstate__((version, shape, real_type(kind), fortran, data))
 
+    def __reduce_ex__(self, protocol: Any) -> Any:  # noqa: ANN401
+        """Written anew it is an array like any other."""
+        return self.view(np.ndarray).__reduce_ex__(protocol)
+
 
 def real_type(kind: object) -> np.dtype[Any]:
     """The dtype that a :class:`PlainType` stands for."""
