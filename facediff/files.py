@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import secrets
 from collections.abc import Iterator
@@ -38,6 +39,12 @@ def atomic(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # not there, or below something that is no folder: the error above says it
             temporary.unlink()
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def check_writable(path: Path) -> None:

@@ -62,4 +62,4 @@ class SpeechFeatureCache(Callback):
                 encoded, lengths = encoder.frozen_features(batch, torch.tensor([audio.numel()], device=batch.device))
             features.put(clip, encoded[0, : int(lengths[0])])
         trainer.strategy.barrier("speech features")
-        data.feature_slot.reader = features
+        data.features.reader = features

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -69,7 +69,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     if args.sampler is not None or args.steps is not None:
         system.choose_sampler(args.sampler, args.steps)
     identity = args.identity or system.identities[0]
-    style = read_style(args.style, identity, system.assets, args.checkpoint) if args.style else None
+    style = read_style(args.style, identity, system.assets, system.data_source) if args.style else None
 
     import torch
 
@@ -123,7 +123,7 @@ def device(name: str) -> str:
     return name
 
 
-def read_style(style: str, identity: str, assets: Assets, checkpoint: Path) -> Reference:
+def read_style(style: str, identity: str, assets: Assets, source: Mapping[str, str]) -> Reference:
     """A style reference from a file, from the checkpoint, or from the corpus that the checkpoint was trained on.
 
     A file holds absolute vertices; its subject is told by its name (``F1_e03.npy``), else it is the identity. A file in
@@ -133,20 +133,19 @@ def read_style(style: str, identity: str, assets: Assets, checkpoint: Path) -> R
         for reference in assets.references.values():
             if reference.clip == style:
                 return reference
-    path = Path(style) if style.endswith(".npy") else corpus_clip(style, checkpoint)
+    path = Path(style) if style.endswith(".npy") else corpus_clip(style, source)
     subject = path.stem.split("_condition_")[0].rpartition("_")[0]
-    templates, stored = folder_facts(path, assets, checkpoint)
+    templates, stored = folder_facts(path, assets, source)
     who = next((name for name in (subject, identity) if name in templates), None)
     template = templates[who] if who is not None else assets.template(identity)
     return read_reference(path, assets, who or identity, template, stride_of(path, stored, assets.frame_rate))
 
 
-def folder_facts(path: Path, assets: Assets, checkpoint: Path) -> tuple[dict[str, Tensor], float]:
+def folder_facts(path: Path, assets: Assets, source: Mapping[str, str]) -> tuple[dict[str, Tensor], float]:
     """Templates that a motion file may belong to, and its motion frames a second."""
     from facediff.data import SpeechMotionDataModule
-    from facediff.data.assets import DATA_SOURCE_KEY
     from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
-    from facediff.systems.checkpoint import imported, read_checkpoint
+    from facediff.systems.checkpoint import imported
 
     templates: dict[str, Tensor] = dict(assets.templates)
     root = path.resolve().parent.parent
@@ -154,7 +153,6 @@ def folder_facts(path: Path, assets: Assets, checkpoint: Path) -> tuple[dict[str
         return templates, assets.frame_rate
     if (root / "templates.pkl").is_file():
         templates |= read_templates(root / "templates.pkl", assets.n_vertices)
-    source = read_checkpoint(checkpoint).get(DATA_SOURCE_KEY, {})
     module = imported(str(source.get("class_path")), SpeechMotionDataModule)  # type: ignore[type-abstract]
     usual = module.stored_frame_rate if module is not None and str(root) == source.get("root") else None
     return templates, float(read_manifest(root).get("frame_rate") or usual or assets.frame_rate)
@@ -174,12 +172,9 @@ def stride_of(path: Path, stored: float, wanted: float) -> int:
     return stride
 
 
-def corpus_clip(name: str, checkpoint: Path) -> Path:
+def corpus_clip(name: str, source: Mapping[str, str]) -> Path:
     """Where a clip of the training corpus lies, if the corpus is on this machine."""
-    from facediff.data.assets import DATA_SOURCE_KEY
-    from facediff.systems.checkpoint import read_checkpoint
-
-    root = read_checkpoint(checkpoint).get(DATA_SOURCE_KEY, {}).get("root")
+    root = source.get("root")
     path = Path(root) / "vertices_npy" / f"{name}.npy" if root else None
     if path is None or not path.is_file():
         where = f"in the checkpoint nor at {path}" if path else "in the checkpoint, and its corpus is not known"

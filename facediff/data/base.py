@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from facediff.data.assets import Assets, Reference
 from facediff.data.batch import Batch, Sample, collate
 from facediff.data.corpus import Clip, Corpus, parse_name, read_manifest
-from facediff.data.dataset import BatchDataset, FeatureReader, MotionDataset, ReferenceChoice, ReferencePolicy
+from facediff.data.dataset import BatchDataset, MotionDataset, ReferenceChoice, ReferencePolicy
 from facediff.data.features import FeatureSlot
 from facediff.data.sampling import ClipBatches
 from facediff.errors import FaceDiffError
@@ -114,8 +114,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         for name in self.identities:
             if self.identities.count(name) > 1:
                 raise FaceDiffError(f"data.people: {name} is there more than once; import the person by a new name")
-        self.feature_slot = FeatureSlot()
-        self.features: FeatureReader = self.feature_slot
+        self.features = FeatureSlot()
         self._corpus: Corpus | None = None
         self._assets: Assets | None = None
         check_positive(batch_size=batch_size, window=window, reference_frames=reference_frames)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -263,14 +263,19 @@ def motion_path(root: Path, name: str) -> Path:
     return next((path for path in paths if path.is_file()), paths[0])
 
 
-def open_vertices(path: Path, n_vertices: int) -> npt.NDArray[np.floating]:
+def open_vertices(path: Path, n_vertices: int, mode: Literal["r", "c"] = "r") -> npt.NDArray[np.floating]:
     """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3), memory-mapped.
+
+    Args:
+        path: the file.
+        n_vertices: vertices of the mesh.
+        mode: "r", or "c" for an array that may be written to without touching the file.
 
     Raises:
         FaceDiffError: if the file is unreadable or of another shape.
     """
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        array = np.load(path, mmap_mode=mode, allow_pickle=False)
     except Exception as error:  # a damaged header makes NumPy raise anything
         raise FaceDiffError(f"{path}: not a readable NumPy array ({error}); expected (T, 3V) floats") from error
     if array.ndim not in (2, 3) or array.shape[1:] not in ((3 * n_vertices,), (n_vertices, 3)) or not len(array):

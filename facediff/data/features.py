@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ class FeatureSlot:
     """Where cached features are looked for when a sample is read; may be filled after the loaders were made."""
 
     def __init__(self) -> None:
-        self.reader: CachedFeatures | None = None
+        self.reader: Callable[[Clip], Tensor | None] | None = None
 
     def __call__(self, clip: Clip) -> Tensor | None:
         """The features of a clip, if there are any."""

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 from facediff.data.base import SpeechMotionDataModule, Split
 from facediff.data.corpus import Clip
 from facediff.data.dataset import ReferenceChoice
+from facediff.data.regions import FLAME_SOURCES
 
 EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry", "contempt")
 TRAIN = (
@@ -49,14 +50,7 @@ class Mead3D(SpeechMotionDataModule):
     n_vertices = 5023
     identities = list(TRAIN)
     mesh_files: ClassVar[tuple[str, ...]] = ("FLAME.ply", "FLAME_sample.ply", "flame_sample.ply")
-    region_sources: ClassVar[dict[str, tuple[str, ...]]] = {
-        "lips": ("regions/lve.txt", "FLAME_masks.pkl:lips", "regions/FLAME_masks.pkl:lips", "regions/lip.txt"),
-        "upper_face": (
-            "regions/fdd.txt",
-            "FLAME_masks.pkl:forehead+eye_region",
-            "regions/FLAME_masks.pkl:forehead+eye_region",
-        ),
-    }
+    region_sources: ClassVar[dict[str, tuple[str, ...]]] = FLAME_SOURCES
     region_help: ClassVar[str] = (
         "lve.txt and fdd.txt are in datasets/regions of the ProbTalk3D repository "
         "(github.com/uuembodiedsocialai/ProbTalk3D); put them into regions/ of your corpus folder. Or take "

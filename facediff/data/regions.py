@@ -14,6 +14,16 @@ from facediff.pickles import load_pickle
 ALL = "all"
 """The source that stands for every vertex."""
 
+FLAME_SOURCES: dict[str, tuple[str, ...]] = {
+    "lips": ("regions/lve.txt", "FLAME_masks.pkl:lips", "regions/FLAME_masks.pkl:lips", "regions/lip.txt"),
+    "upper_face": (
+        "regions/fdd.txt",
+        "FLAME_masks.pkl:forehead+eye_region",
+        "regions/FLAME_masks.pkl:forehead+eye_region",
+    ),
+}
+"""Files that say which of FLAME's vertices are the lips and the upper face, in the order of preference."""
+
 
 def find_region(root: Path, sources: Sequence[str], name: str, n_vertices: int, help_text: str = "") -> Region:
     """The region of the first source whose file is there.

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from facediff.data.base import SpeechMotionDataModule
 from facediff.data.corpus import Clip
+from facediff.data.regions import FLAME_SOURCES
 
 TRAIN = (
     "FaceTalk_170728_03272_TA",
@@ -39,14 +40,7 @@ class Vocaset(SpeechMotionDataModule):
     n_vertices = 5023
     identities = list(TRAIN)
     mesh_files: ClassVar[tuple[str, ...]] = ("FLAME_sample.ply",)
-    region_sources: ClassVar[dict[str, tuple[str, ...]]] = {
-        "lips": ("regions/lve.txt", "FLAME_masks.pkl:lips", "regions/FLAME_masks.pkl:lips", "regions/lip.txt"),
-        "upper_face": (
-            "regions/fdd.txt",
-            "FLAME_masks.pkl:forehead+eye_region",
-            "regions/FLAME_masks.pkl:forehead+eye_region",
-        ),
-    }
+    region_sources: ClassVar[dict[str, tuple[str, ...]]] = FLAME_SOURCES
     region_help: ClassVar[str] = (
         "FLAME_masks.pkl is had from flame.is.tue.mpg.de (FLAME vertex masks); put it into your corpus folder. Or take "
         "lve.txt and fdd.txt from data/vocaset/regions of the FaceDiffuser repository "

@@ -14,13 +14,14 @@ from facediff.doctor.folder import Folder, list_folder
 from facediff.doctor.identify import identify
 from facediff.doctor.manifest import MANIFEST, STATE, check_account, check_ended, check_files, read_record
 from facediff.doctor.motion import Array
-from facediff.doctor.pool import Died, processors, run_all, steps
+from facediff.doctor.pool import Died, run_all, steps
 from facediff.doctor.report import Report
 from facediff.doctor.templates import check_areas, check_templates
 from facediff.doctor.topology import check_mesh, check_pairs, check_regions
 from facediff.doctor.totals import count_splits, count_subjects
 from facediff.doctor.view import View, is_rate
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.machine import processors
 
 if TYPE_CHECKING:
     from facediff.data.corpus import Clip, Corpus

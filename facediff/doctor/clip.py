@@ -5,7 +5,6 @@ Worker processes import this, so it imports nothing heavy.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 from facediff.doctor.findings import Finding, relative
 from facediff.doctor.motion import Array, look_at_motion
 from facediff.doctor.sound import look_at_sound
+from facediff.files import sha256
 
 SLIGHT = 0.1
 """Seconds by which the lengths of speech and motion may differ without a word."""
@@ -119,12 +119,6 @@ def _examine_sound(facts: ClipFacts, rules: Rules, path: Path) -> None:
 def _hash(facts: ClipFacts, rules: Rules, path: Path, where: str) -> None:
     if not rules.quick and path.is_file() and path.stat().st_size:
         facts.hashes[where] = sha256(path)
-
-
-def sha256(path: Path) -> str:
-    """SHA-256 of a file's bytes."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def compare_lengths(name: str, frames: int, frame_rate: float, seconds: float) -> list[Finding]:

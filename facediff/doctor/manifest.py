@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from facediff.doctor.clip import sha256
 from facediff.doctor.findings import Finding, counted, few, guarded
 from facediff.errors import FaceDiffError
+from facediff.files import sha256
 
 MANIFEST = "manifest.json"
 STATE = "prepare.json"

@@ -30,11 +30,6 @@ class Died(Generic[Task]):
         self.task = task
 
 
-def processors() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @contextmanager
 def steps(total: int, *, shown: bool) -> Iterator[Callable[[], object]]:
     """A progress bar on standard error, if it is a terminal; what is given is called after each clip."""

@@ -15,6 +15,7 @@ from facediff.doctor.motion import Array
 from facediff.doctor.view import View
 from facediff.errors import FaceDiffError
 from facediff.pickles import load_pickle
+from facediff.topology.area import surface_area
 
 AREA_TOLERANCE = 1e-3
 """How far a surface area may be from one; float32 templates are within 1e-6."""
@@ -127,9 +128,3 @@ def check_areas(
             )
         )
     return areas
-
-
-def surface_area(vertices: Array, faces: npt.NDArray[np.int32]) -> float:
-    """Area of a triangle mesh: vertices (V, 3), faces (F, 3); in the square of the vertices' unit."""
-    first, second, third = np.asarray(vertices, np.float64)[faces].transpose(1, 0, 2)
-    return float(np.linalg.norm(np.cross(second - first, third - first), axis=1).sum() / 2)

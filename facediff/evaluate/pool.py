@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ import torch
 
 from facediff.evaluate.pairs import Pair
 from facediff.evaluate.scoring import ClipScores, Scorer
+from facediff.machine import processors
 
 
 def score_all(
@@ -45,11 +45,6 @@ def score_all(
         finally:
             pool.shutdown(cancel_futures=True)
     return found
-
-
-def processors() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager

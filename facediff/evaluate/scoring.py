@@ -208,10 +208,8 @@ def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
         FaceDiffError: if the file is unreadable or of another shape.
     """
     with OPENING:
-        shape = open_vertices(path, n_vertices).shape
         # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
-        array = np.load(path, mmap_mode="c", allow_pickle=False)
-    array = array.reshape(shape)[::stride]
+        array = open_vertices(path, n_vertices, "c")[::stride]
     if array.dtype not in NATIVE or not array.dtype.isnative:
         array = array.astype(array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64)
     return torch.from_numpy(array)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from facediff.errors import FaceDiffError
-from facediff.files import atomic
+from facediff.files import atomic, sha256
 from facediff.prepare.job import Plan
 
 STATE = "prepare.json"
@@ -88,8 +87,7 @@ def describe_files(
 
     def describe(name: str) -> tuple[str, dict[str, int | str]]:
         path = out / name
-        with path.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        digest = sha256(path)
         step()
         return name, {"bytes": path.stat().st_size, "sha256": digest}
 

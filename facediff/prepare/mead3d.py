@@ -8,7 +8,6 @@ MEAD's own sound beside it or elsewhere; or ProbTalk3D's ``param/<clip>.npy`` an
 from __future__ import annotations
 
 import csv
-import hashlib
 from collections.abc import Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError, choices
-from facediff.files import atomic
+from facediff.files import atomic, sha256
 from facediff.pickles import load_pickle
 from facediff.prepare.flame_parameters import Parameters, read_parameters
 from facediff.prepare.job import (
@@ -238,8 +237,7 @@ def _miss_regions(regions: Path | None, extras: Sequence[Path], missing: dict[st
 
 
 def _digest(path: Path) -> str:
-    with path.open("rb") as stream:
-        return f"a model with SHA-256 {hashlib.file_digest(stream, 'sha256').hexdigest()[:16]}"
+    return f"a model with SHA-256 {sha256(path)[:16]}"
 
 
 def _write_shared(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
@@ -14,6 +13,7 @@ import numpy as np
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.files import check_writable
+from facediff.machine import processors
 from facediff.prepare.job import Job, Plan, motion_file, speech_file
 from facediff.prepare.manifest import (
     MANIFEST,
@@ -76,7 +76,7 @@ def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = 
         FaceDiffError: if the folder cannot be written, holds something else or was begun with other options, if the
             disk is too small, or if another run is at work in it.
     """
-    workers = _processors() if workers is None else workers
+    workers = processors() if workers is None else workers
     if workers < 1:
         raise FaceDiffError(f"--workers: is {workers}; expected 1 or more")
     if out.exists() and not out.is_dir():
@@ -155,10 +155,6 @@ def _files(out: Path, name: str) -> tuple[Path, Path]:
 
 def _dtype(plan: Plan) -> np.dtype[Any]:
     return np.dtype(plan.options.get("dtype", "float32"))
-
-
-def _processors() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _says(record: dict[str, Any], plan: Plan, finished: dict[str, int]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -15,6 +14,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from facediff.files import sha256
 
 _OWNER = ".owner"
 _FORGOTTEN_AFTER = 86_400.0
@@ -103,9 +104,7 @@ def write_manifest(folder: Path, facts: dict[str, Any]) -> None:
     files = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.name not in (_OWNER, "manifest.json"):
-            with path.open("rb") as stream:
-                digest = hashlib.file_digest(stream, "sha256").hexdigest()
-            files[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": digest}
+            files[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": sha256(path)}
     text = json.dumps({**facts, "files": files}, indent=1)
     (folder / "manifest.json").write_text(text + "\n", encoding="utf-8")
 

@@ -79,7 +79,7 @@ class SpeechAnimator(LightningModule, ABC):
         self.lr_schedule = lr_schedule
         self.warmup_steps = warmup_steps
         self._assets: Assets | None = None
-        self._data_source: dict[str, str] = {}
+        self.data_source: dict[str, str] = {}
         self.evaluation = Evaluation(protocol)
 
     @abstractmethod
@@ -155,7 +155,7 @@ class SpeechAnimator(LightningModule, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, SpeechMotionDataModule):
             raise FaceDiffError("facediff's systems train and test on a SpeechMotionDataModule; pass datamodule=…")
-        self._data_source = {
+        self.data_source = {
             "class_path": f"{type(data).__module__}.{type(data).__qualname__}",
             "root": str(data.root.resolve()),
         }
@@ -174,13 +174,13 @@ class SpeechAnimator(LightningModule, ABC):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the assets, so that the checkpoint animates without the corpus."""
         checkpoint[ASSETS_KEY] = self.assets.state()
-        checkpoint[DATA_SOURCE_KEY] = self._data_source
+        checkpoint[DATA_SOURCE_KEY] = self.data_source
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the assets from the checkpoint."""
         if ASSETS_KEY in checkpoint:
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
-            self._data_source = checkpoint.get(DATA_SOURCE_KEY, {})
+            self.data_source = checkpoint.get(DATA_SOURCE_KEY, {})
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW on everything trainable, with the learning-rate schedule per optimiser step."""

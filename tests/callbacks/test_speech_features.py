@@ -93,7 +93,7 @@ def test_windows_take_their_part_of_the_whole_clips_features(
 def test_a_window_of_features_lies_where_the_window_of_motion_lies(tiny_root: Path) -> None:
     data = Tiny(root=str(tiny_root), window=5)
     # Features that count frames in half steps, as an encoder with two steps a frame would give.
-    data.features = lambda clip: torch.arange(2.0 * data.corpus.frames(clip))[:, None]
+    data.features.reader = lambda clip: torch.arange(2.0 * data.corpus.frames(clip))[:, None]
     dataset = data.dataset("train", training=True)
     for _ in range(10):
         sample = dataset[0]

@@ -16,10 +16,11 @@ import soundfile
 from facediff.errors import FaceDiffError
 from facediff.pickles import load_pickle
 from facediff.prepare import biwi
-from facediff.prepare.normalise import codetalker, surface_area
+from facediff.prepare.normalise import codetalker
 from facediff.prepare.runner import Report, prepare
 from facediff.prepare.vl import check_sizes, gaps, read_vl
 from facediff.topology import read_mesh
+from facediff.topology.area import surface_area
 from facediff.topology.obj import read_obj
 from tests.fakes.biwi import (
     RATE,

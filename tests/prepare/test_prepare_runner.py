@@ -370,7 +370,7 @@ def test_lines_for_the_screen_are_grouped_by_subject_and_reason() -> None:
 def test_workers_must_be_positive(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="--workers: is 0"):
         prepare(toy_plan(), tmp_path / "out", workers=0)
-    assert runner._processors() >= 1
+    assert runner.processors() >= 1
 
 
 @pytest.mark.parametrize("corpus", CORPORA)

@@ -154,7 +154,7 @@ def main() -> None:
         print(json.dumps(measure(ways(args)[args.way])))
         return
     if args.workers is None:
-        from facediff.evaluate.pool import processors
+        from facediff.machine import processors
 
         args.workers = processors()
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:
