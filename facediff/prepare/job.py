@@ -121,7 +121,14 @@ def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
 
 
 def write_templates(path: Path, templates: Mapping[str, npt.NDArray[np.floating]]) -> None:
-    """Write neutral faces (V, 3) by subject as the pickle of NumPy arrays that the field's loaders open."""
-    plain = {str(name): np.ascontiguousarray(vertices) for name, vertices in templates.items()}
+    """Write neutral faces (V, 3) by subject as the pickle of NumPy arrays that the field's loaders open.
+
+    Equal faces give equal bytes: each array gets NumPy's own instance of its type, because a pickle also records which
+    arrays share a type's instance, and that depends on where they came from.
+    """
+    plain: dict[str, npt.NDArray[np.floating]] = {}
+    for name, vertices in templates.items():
+        plain[str(name)] = np.empty(vertices.shape, np.dtype(vertices.dtype.str))
+        plain[str(name)][...] = vertices
     with atomic(path) as temporary:
         temporary.write_bytes(pickle.dumps(plain, protocol=4))

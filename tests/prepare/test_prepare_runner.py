@@ -401,3 +401,13 @@ def with_signature_of(plan: Callable[..., Plan], seen: dict[str, object]) -> Cal
         return toy_plan()
 
     return record
+
+
+def test_equal_templates_give_equal_bytes_wherever_their_arrays_come_from(tmp_path: Path) -> None:
+    """NumPy may hand out several instances of one dtype, and a pickle tells them apart."""
+    faces = {"A": np.ones((2, 3), np.float32), "B": np.zeros((2, 3), np.float32)}
+    other = {**faces, "B": np.zeros((2, 3), np.dtype(np.float32).newbyteorder("<"))}
+    assert other["B"].dtype is not faces["B"].dtype
+    write_templates(tmp_path / "one.pkl", faces)
+    write_templates(tmp_path / "two.pkl", other)
+    assert (tmp_path / "one.pkl").read_bytes() == (tmp_path / "two.pkl").read_bytes()
