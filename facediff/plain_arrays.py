@@ -53,7 +53,9 @@ def real_type(kind: object) -> np.dtype[Any]:
     if not isinstance(words, str) or not isinstance(kind, PlainType) or not PLAIN.fullmatch(words):
         raise pickle.UnpicklingError(f"it holds an array of the type {words!r}")
     made = np.dtype(words)
-    return np.dtype(made.newbyteorder(kind.order).str) if kind.order in "<>" else made
+    if kind.order not in ("<", ">"):
+        return made
+    return np.dtype(made.newbyteorder(">" if kind.order == ">" else "<").str)
 
 
 class ArrayType:
