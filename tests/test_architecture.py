@@ -39,6 +39,7 @@ ALLOWED: dict[str, set[str]] = {
     "person": {"data", "prepare", "topology", *COMMON},
     "doctor": {"data", "metrics", "topology", *COMMON},
     "evaluate": {"data", "metrics", *COMMON},
+    "figures": {"evaluate", "data", "metrics", "render", "topology", *COMMON},
     "components": {"registry", "errors"},
     "systems": {"components", "data", "diffusion", "metrics", "topology", "losses", "hparams", "registry", *COMMON},
     "callbacks": {"systems", "data", "metrics", "topology", "render", "hparams", "registry", *COMMON},
