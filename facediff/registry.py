@@ -174,15 +174,17 @@ class Kind:
 
 audio_encoder = Kind("audio_encoder", "facediff.components.audio_encoder", "speech to one feature per frame")
 identity_encoder = Kind("identity_encoder", "facediff.components.identity_encoder", "who the face is, from a label")
+mesh_encoder = Kind("mesh_encoder", "facediff.components.mesh_encoder", "a mesh's motion to one feature per frame")
 style_encoder = Kind(
     "style_encoder", "facediff.components.style_encoder", "how the person moves, from a reference motion"
 )
 fusion = Kind("fusion", "facediff.components.fusion", "speech features meet the noisy motion")
+mesh_encoder = Kind("mesh_encoder", "facediff.components.mesh_encoder", "the vertices of each frame to one feature")
 decoder = Kind("decoder", "facediff.components.decoder", "fused features and style to clean motion")
 sampler = Kind("sampler", "facediff.diffusion.samplers", "runs the reverse diffusion process")
 
 KINDS: dict[str, Kind] = {
-    kind.kind: kind for kind in (audio_encoder, identity_encoder, style_encoder, fusion, decoder, sampler)
+    kind.kind: kind for kind in (audio_encoder, identity_encoder, mesh_encoder, style_encoder, fusion, decoder, sampler)
 }
 
 

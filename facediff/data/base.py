@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
 from lightning.pytorch import LightningDataModule
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from facediff.data.assets import Assets, Reference
@@ -22,6 +24,9 @@ from facediff.hparams import plain
 
 SCALE_FRAMES = 16
 """Frames of each training clip, evenly spread, from which the motion scale is measured."""
+
+PRINCIPAL_NUMBERS = 30_000_000
+"""Coordinates from which principal components are computed, about; bounds the memory (8 bytes each, twice)."""
 
 Split = Literal["train", "val", "test_a", "test_b"]
 
@@ -45,6 +50,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         reference_attributes: what a style reference shares with its target where possible.
         licence: under which terms the corpus is given out.
         obtain: how the corpus is had.
+
+    Attributes:
+        pair_sentences: whether neighbours in training batches say the same sentence; a system that learns from such
+            pairs sets it in its ``setup``.
 
     Args:
         root: the corpus folder.
@@ -115,6 +124,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             if self.identities.count(name) > 1:
                 raise FaceDiffError(f"data.people: {name} is there more than once; import the person by a new name")
         self.features = FeatureSlot()
+        self.pair_sentences = False
         self._corpus: Corpus | None = None
         self._assets: Assets | None = None
         check_positive(batch_size=batch_size, window=window, reference_frames=reference_frames)
@@ -254,15 +264,40 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         Offsets from the template are centred near zero. Measured on evenly spread frames of every training clip.
         """
         total, count = 0.0, 0
-        for clip in self.clips("train"):
-            frames = self.corpus.frames(clip)
-            for index in torch.linspace(0, frames - 1, min(frames, SCALE_FRAMES)).long().tolist():
-                motion = self.corpus.read_motion(clip, index, index + 1)
-                total += float(motion.double().square().sum())
-                count += motion.numel()
+        for motion in self._spread_frames(SCALE_FRAMES):
+            total += float(motion.double().square().sum())
+            count += motion.numel()
         if not total:
             raise FaceDiffError(f"{self.root}: the training split holds no motion at all; check vertices_npy/")
         return float((count / total) ** 0.5)
+
+    def principal_motion(self, count: int) -> tuple[Tensor, Tensor]:
+        """Mean and principal components of the training motion, from evenly spread frames of every training clip.
+
+        Args:
+            count: at most so many components are given.
+
+        Returns:
+            the mean (3V,), and components (at most count, 3V), each as long as its standard deviation, the largest
+            first; in the corpus's unit.
+        """
+        clips = max(1, len(self.clips("train")))
+        most = max(2, PRINCIPAL_NUMBERS // (3 * self.n_vertices * clips))
+        frames = torch.cat([motion.flatten(1) for motion in self._spread_frames(min(most, SCALE_FRAMES))]).double()
+        mean = frames.mean(0)
+        frames -= mean
+        # Of the frames' own products: a matrix as wide as the vertices would not fit into memory.
+        values, vectors = torch.linalg.eigh(frames @ frames.T)
+        kept = [i for i in reversed(range(len(values))) if values[i] > 1e-10 * values[-1]][:count]
+        shapes = vectors[:, kept].T @ frames / len(frames) ** 0.5
+        return mean.float(), shapes.float()
+
+    def _spread_frames(self, count: int) -> Iterator[Tensor]:
+        """At most ``count`` evenly spread frames of every training clip, one at a time (1, V, 3)."""
+        for clip in self.clips("train"):
+            frames = self.corpus.frames(clip)
+            for index in torch.linspace(0, frames - 1, min(frames, count)).long().tolist():
+                yield self.corpus.read_motion(clip, index, index + 1)
 
     def _default_references(self) -> dict[str, Reference]:
         references = {}
@@ -312,6 +347,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             seed=int(os.environ.get("PL_GLOBAL_SEED", "0")),
             rank=trainer.global_rank if trainer is not None else 0,
             world_size=trainer.world_size if trainer is not None else 1,
+            groups=[clip.sentence for clip in samples.clips] if self.pair_sentences else None,
         )
         # The sampler gives whole batches, so the loader must not batch again.
         return DataLoader(

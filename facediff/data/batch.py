@@ -35,6 +35,7 @@ class Sample:
         decoy_audio: speech of another sentence, as long as ``audio``; only for evaluation against shuffled audio.
         features: what the frozen part of the audio encoder makes of the clip's speech; None where it is not cached.
         repeated: whether another process scores the same clip.
+        style: a style vector that a system made, in place of what it would make of ``reference``.
     """
 
     audio: Float[Tensor, " samples"]
@@ -49,6 +50,7 @@ class Sample:
     decoy_audio: Float[Tensor, " samples"] | None = None
     features: Float[Tensor, "steps channels"] | None = None
     repeated: bool = False
+    style: Float[Tensor, " style_dim"] | None = None
 
 
 @dataclass
@@ -72,6 +74,7 @@ class Batch:
         features: padded features of the frozen part of the audio encoder; None unless all clips have them.
         feature_lengths: valid steps of the features.
         repeated: whether other processes score these clips, so that this one must not.
+        style: style vectors in place of what a system would make of the references; None unless all clips have one.
     """
 
     audio: Float[Tensor, "batch samples"]
@@ -90,6 +93,7 @@ class Batch:
     features: Float[Tensor, "batch steps channels"] | None = None
     feature_lengths: Int[Tensor, " batch"] | None = None
     repeated: bool = False
+    style: Float[Tensor, "batch style_dim"] | None = None
 
     @property
     def mask(self) -> Bool[Tensor, "batch frames"]:
@@ -145,6 +149,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
     """Pad samples to a batch."""
     decoys = [s.decoy_audio for s in samples if s.decoy_audio is not None]
     features = [s.features for s in samples if s.features is not None]
+    styles = [s.style for s in samples if s.style is not None]
     cached = len(features) == len(samples)
     return Batch(
         audio=pad([s.audio for s in samples]),
@@ -163,4 +168,5 @@ def collate(samples: Sequence[Sample]) -> Batch:
         features=pad(features) if cached else None,
         feature_lengths=torch.tensor([len(f) for f in features]) if cached else None,
         repeated=samples[0].repeated,
+        style=torch.stack(styles) if len(styles) == len(samples) else None,
     )

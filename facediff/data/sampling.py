@@ -41,6 +41,10 @@ class ClipBatches(DistributedSampler[list[Pick]]):
     split until their number goes up in the processes; where all are single clips, a process that would be idle in the
     last step gets a clip that is marked as repeated.
 
+    With ``groups``, training batches are made of pairs of neighbours: clips 2k and 2k + 1 of a batch are of one group
+    (one sentence, say) as far as there are such clips. A clip that is left over is paired with one that already has a
+    partner.
+
     Args:
         lengths: frames of every clip; looked at with ``max_frames`` only.
         batch_size: clips a batch.
@@ -49,6 +53,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         seed: of order and draws.
         rank: this process.
         world_size: number of processes.
+        groups: per clip what pairs have in common; None for no pairs.
     """
 
     def __init__(
@@ -61,6 +66,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         seed: int = 0,
         rank: int = 0,
         world_size: int = 1,
+        groups: Sequence[str] | None = None,
     ) -> None:
         clips: Any = range(len(lengths))  # only its length is looked at
         super().__init__(clips, num_replicas=world_size, rank=rank, shuffle=training, seed=seed)
@@ -68,6 +74,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         self.batch_size = batch_size
         self.max_frames = max_frames
         self.training = training
+        self.groups = list(groups) if groups is not None and training else None
 
     def __len__(self) -> int:
         """Number of batches of this process; the same in every epoch."""
@@ -87,17 +94,19 @@ class ClipBatches(DistributedSampler[list[Pick]]):
     def _batches(self, generator: torch.Generator) -> list[list[int]]:
         count = len(self.lengths)
         order = torch.randperm(count, generator=generator).tolist() if self.training else list(range(count))
+        units = [[index] for index in order] if self.groups is None else paired(order, self.groups, generator)
         if self.max_frames is None:
-            return [order[i : i + self.batch_size] for i in range(0, count, self.batch_size)]
+            each = max(1, self.batch_size // (1 if self.groups is None else 2))
+            return [sum(units[i : i + each], []) for i in range(0, len(units), each)]
         # Rounded up to a bucket, lengths give equally many batches in every epoch, whoever shares a bucket.
         width = max(1, self.max_frames // BUCKETS)
-        rounded = [-(-length // width) * width for length in self.lengths]
+        rounded = [-(-max(self.lengths[i] for i in unit) // width) * width for unit in units]
         batches: list[list[int]] = []
-        for index in sorted(order, key=lambda i: rounded[i]):  # stable: random within a bucket
-            if batches and rounded[index] * (len(batches[-1]) + 1) <= self.max_frames:
-                batches[-1].append(index)
+        for place in sorted(range(len(units)), key=lambda k: rounded[k]):  # stable: random within a bucket
+            if batches and rounded[place] * (len(batches[-1]) + len(units[place])) <= self.max_frames:
+                batches[-1] += units[place]
             else:
-                batches.append([index])
+                batches.append(list(units[place]))
         return batches
 
     def _all(self, generator: torch.Generator) -> list[list[int]]:
@@ -114,6 +123,29 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         if self.max_frames is not None:
             steps = [steps[i] for i in torch.randperm(len(steps), generator=generator).tolist()]
         return [batch for step in steps for batch in step]
+
+
+def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generator) -> list[list[int]]:
+    """Clips in pairs of one group, in random order; always equally many pairs.
+
+    Args:
+        order: the clips, shuffled.
+        groups: the group of every clip.
+        generator: shuffles the pairs.
+    """
+    members: dict[str, list[int]] = {}
+    for index in order:
+        members.setdefault(groups[index], []).append(index)
+    # Those that are alone in their group are paired with one another.
+    alone = [clips[0] for clips in members.values() if len(clips) == 1]
+    pools = [clips for clips in members.values() if len(clips) > 1] + ([alone] if alone else [])
+    pairs = []
+    for clips in pools:
+        pairs += [clips[i : i + 2] for i in range(0, len(clips) - 1, 2)]
+        if len(clips) % 2:
+            others = clips[:-1] or [index for index in order if index != clips[-1]] or clips
+            pairs.append([clips[-1], others[0]])
+    return [pairs[i] for i in torch.randperm(len(pairs), generator=generator).tolist()]
 
 
 def evened(batches: list[list[int]], world_size: int) -> list[list[int]]:

@@ -6,10 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
@@ -24,6 +24,20 @@ from facediff.systems.evaluation import Evaluation
 from facediff.systems.schedule import Schedule, lr_factor
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
+MotionScale = Literal["unit", "none"]
+
+
+@dataclass(frozen=True)
+class Style:
+    """A style vector.
+
+    Attributes:
+        name: what it was made of.
+        vector: as :meth:`SpeechAnimator.encode_style` gives it.
+    """
+
+    name: str
+    vector: Float[Tensor, " style_dim"]
 
 
 @dataclass
@@ -55,6 +69,8 @@ class SpeechAnimator(LightningModule, ABC):
         lr_schedule: constant, or a cosine down to zero at the end of training.
         warmup_steps: optimiser steps over which the learning rate rises from zero.
         protocol: the metrics' protocol for validation and test.
+        motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
+            leaves it as it is.
     """
 
     def __init__(
@@ -63,6 +79,7 @@ class SpeechAnimator(LightningModule, ABC):
         n_vertices: int,
         identities: list[str],
         frame_rate: float,
+        motion_scale: MotionScale,
         learning_rate: float,
         weight_decay: float,
         lr_schedule: Schedule,
@@ -78,6 +95,7 @@ class SpeechAnimator(LightningModule, ABC):
         self.weight_decay = float(weight_decay)
         self.lr_schedule = lr_schedule
         self.warmup_steps = warmup_steps
+        self.motion_scaling = motion_scale
         self._assets: Assets | None = None
         self.data_source: dict[str, str] = {}
         self.evaluation = Evaluation(protocol)
@@ -101,6 +119,20 @@ class SpeechAnimator(LightningModule, ABC):
             batch: clips; ``motion`` gives the number of frames only.
             seed: seed of the noise; a clip's noise depends on it and on the clip's name, not on the clips beside it.
             progress: wraps the iteration over steps, e.g. in a progress bar.
+        """
+
+    @abstractmethod
+    def encode_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Style vectors of reference motions, as a batch's ``style`` takes them.
+
+        Args:
+            reference: offsets from the template.
+            mask: True on valid frames.
+
+        Raises:
+            FaceDiffError: if the system was made without a style.
         """
 
     @property
@@ -130,6 +162,19 @@ class SpeechAnimator(LightningModule, ABC):
                 "the system knows no templates yet; train it with a data module or load a checkpoint first"
             )
         return self._assets
+
+    @property
+    def scale(self) -> float:
+        """Factor from offsets in the corpus's unit to the motion that the networks see.
+
+        Raises:
+            FaceDiffError: if it has not been measured, because the system was never trained.
+        """
+        if self.motion_scaling == "none":
+            return 1.0
+        if self.assets.motion_scale is None:
+            raise FaceDiffError("the model has never been trained: give a checkpoint (--ckpt_path, --checkpoint)")
+        return self.assets.motion_scale
 
     def adopt(self, assets: Assets) -> None:
         """Take over a corpus's assets after checking that they fit the system's sizes.
@@ -247,7 +292,7 @@ class SpeechAnimator(LightningModule, ABC):
         audio: Float[Tensor, " samples"],
         *,
         subject: str,
-        style: Reference | None = None,
+        style: Reference | Style | None = None,
         seed: int = 0,
         progress: Progress | None = None,
     ) -> Prediction:
@@ -256,7 +301,7 @@ class SpeechAnimator(LightningModule, ABC):
         Args:
             audio: speech at 16 kHz.
             subject: whose face and identity; any subject of the training corpus, also one not trained on.
-            style: reference motion; the subject's default one if None.
+            style: reference motion, or a style vector made by this system; the subject's default one if None.
             seed: seed of the noise; equal seeds give equal motion on one machine.
             progress: wraps the iteration over sampling steps.
 
@@ -266,11 +311,15 @@ class SpeechAnimator(LightningModule, ABC):
         """
         assets = self.assets
         template = assets.template(subject)
-        style = style or self.default_style(subject)
-        if style.motion.shape[1:] != template.shape:
+        chosen = style or self.default_style(subject)
+        # A vector goes past the style path, which then has nothing to look at.
+        reference = (
+            Reference(chosen.name, template.new_zeros(1, *template.shape)) if isinstance(chosen, Style) else chosen
+        )
+        if reference.motion.shape[1:] != template.shape:
             raise FaceDiffError(
-                f"style: the reference {style.clip} has {style.motion.shape[1]} vertices, the checkpoint's faces have "
-                f"{self.n_vertices}; give a motion of the same topology"
+                f"style: the reference {reference.clip} has {reference.motion.shape[1]} vertices, the checkpoint's "
+                f"faces have {self.n_vertices}; give a motion of the same topology"
             )
         frames = round(len(audio) * self.frame_rate / SAMPLE_RATE)
         if frames < 1:
@@ -281,16 +330,17 @@ class SpeechAnimator(LightningModule, ABC):
             motion=torch.zeros(frames, *template.shape),
             template=template,
             identity=assets.identity_index(subject),
-            reference=style.motion.float(),
+            reference=reference.motion.float(),
             name="speech",
             subject=subject,
             sentence="",
-            reference_name=style.clip,
+            reference_name=reference.clip,
+            style=chosen.vector if isinstance(chosen, Style) else None,
         )
         batch = collate([sample]).to(self.device)
         motion = self.generate(batch, seed=seed, progress=progress)
         identity = subject if sample.identity >= 0 else "unknown"
-        return Prediction(sample.name, identity, style.clip, (motion + batch.template[:, None])[0].cpu())
+        return Prediction(sample.name, identity, reference.clip, (motion + batch.template[:, None])[0].cpu())
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """Sample in another way from now on; a system that does not sample has no choice.

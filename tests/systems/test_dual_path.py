@@ -82,7 +82,7 @@ def test_ablations_leave_their_part_out(make_system: Make) -> None:
     full, bare = make_system(), make_system(style_encoder=registry.style_encoder.none)
     assert len(full.network.style_tokens.projections) == 4
     assert len(bare.network.style_tokens.projections) == 3
-    assert bare.network.embed_reference is None
+    assert bare.network.mesh_encoder is None
     assert len(make_system(style_tokens="single").network.style_tokens.projections) == 1
 
 

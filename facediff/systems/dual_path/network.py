@@ -15,6 +15,7 @@ from facediff.components.decoder import Decoder
 from facediff.components.fusion import Fusion
 from facediff.components.identity_encoder import IdentityEncoder
 from facediff.components.layers import frame_mask
+from facediff.components.mesh_encoder import MeshEncoder
 from facediff.components.style_encoder import StyleEncoder
 
 TokenForm = Literal["levels", "single"]
@@ -84,15 +85,16 @@ class StyleTokens(nn.Module):
 class DualPathNetwork(nn.Module):
     """Predicts clean motion from noisy motion under speech, identity and style.
 
-    Vertices appear in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V), and ``embed_reference`` in front
-    of the style encoder (X = Linear(M_ref)).
+    In the denoising loop vertices appear in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V). Outside it
+    ``mesh_encoder`` stands in front of the style encoder (X = Linear(M_ref) in the paper).
 
     Args:
         n_vertices: vertices V of the topology.
         dim: channels C.
         audio_encoder: speech to F_a.
         identity_encoder: identity to F_id.
-        style_encoder: reference motion to F_dyn.
+        mesh_encoder: reference motion to one feature per frame; None without a dynamic style.
+        style_encoder: these features to F_dyn.
         fusion: F_a and F_m to F_am.
         decoder: F_fused and style tokens to F_dec.
         token_form: how F_s is presented to the decoder.
@@ -105,6 +107,7 @@ class DualPathNetwork(nn.Module):
         dim: int,
         audio_encoder: AudioEncoder,
         identity_encoder: IdentityEncoder,
+        mesh_encoder: MeshEncoder | None,
         style_encoder: StyleEncoder,
         fusion: Fusion,
         decoder: Decoder,
@@ -116,8 +119,7 @@ class DualPathNetwork(nn.Module):
         self.style_encoder = style_encoder
         self.style_tokens = StyleTokens(identity_encoder.token_dims + style_encoder.token_dims, dim, token_form)
         self.embed = nn.Linear(3 * n_vertices, dim)
-        # Without a dynamic style there is nothing to embed, and no idle weights.
-        self.embed_reference = nn.Linear(3 * n_vertices, dim) if style_encoder.token_dims else None
+        self.mesh_encoder = mesh_encoder
         self.step_embedding = StepEmbedding(dim)
         self.fusion = fusion
         self.fused_norm = nn.LayerNorm(dim)
@@ -130,8 +132,7 @@ class DualPathNetwork(nn.Module):
         audio_lengths: Int[Tensor, " batch"],
         frame_lengths: Int[Tensor, " batch"],
         identity: Int[Tensor, " batch"],
-        reference: Float[Tensor, "batch reference_frames coordinates"],
-        reference_mask: Bool[Tensor, "batch reference_frames"],
+        dynamic_style: Float[Tensor, "batch dynamic_dim"],
         features: tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]] | None = None,
     ) -> Conditions:
         """Everything that is computed once per clip.
@@ -141,16 +142,25 @@ class DualPathNetwork(nn.Module):
             audio_lengths: valid samples.
             frame_lengths: motion frames wanted.
             identity: identity indices, −1 for unknown.
-            reference: scaled reference motion, flattened to 3V coordinates.
-            reference_mask: True on valid reference frames.
+            dynamic_style: F_dyn, as :meth:`dynamic_style` gives it.
             features: cached result of the audio encoder's frozen part, and its lengths.
         """
         encoded = self.audio_encoder(audio, audio_lengths, frame_lengths, *(features or ()))
-        style_parts = [self.identity_encoder(identity)]
-        if self.embed_reference is not None:
-            style_parts.append(self.style_encoder(self.embed_reference(reference), reference_mask))
-        mask = frame_mask(frame_lengths, encoded.shape[1])
-        return Conditions(encoded, self.style_tokens(torch.cat(style_parts, dim=-1)), mask)
+        style = torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1)
+        return Conditions(encoded, self.style_tokens(style), frame_mask(frame_lengths, encoded.shape[1]))
+
+    def dynamic_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch dynamic_dim"]:
+        """F_dyn of scaled reference motion; of width 0 without a dynamic style.
+
+        Args:
+            reference: scaled reference motion.
+            mask: True on valid frames.
+        """
+        if self.mesh_encoder is None:
+            return reference.new_zeros((len(reference), 0))
+        return self.style_encoder(self.mesh_encoder(reference), mask)
 
     def forward(
         self,

@@ -6,7 +6,7 @@ import zlib
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from facediff import losses, registry
@@ -18,13 +18,14 @@ from facediff.components.fusion import FusionFactory
 from facediff.components.fusion.cross_attention import BidirectionalCrossAttention
 from facediff.components.identity_encoder import IdentityEncoderFactory
 from facediff.components.identity_encoder.hierarchical import HierarchicalIdentity
+from facediff.components.mesh_encoder import MeshEncoderFactory
+from facediff.components.mesh_encoder.linear import LinearMeshEncoder
 from facediff.components.style_encoder import StyleEncoderFactory
 from facediff.components.style_encoder.tcn_gru_transformer import TcnGruTransformer
 from facediff.data import Batch
 from facediff.diffusion import NoiseProcess
 from facediff.diffusion.samplers import SamplerFactory
 from facediff.diffusion.samplers.ddim import DdimSampler
-from facediff.errors import FaceDiffError
 from facediff.hparams import describe
 from facediff.systems.base import Progress, SpeechAnimator
 from facediff.systems.dual_path.network import Conditions, DualPathNetwork, TokenForm
@@ -44,6 +45,7 @@ class DualPathDiffusion(SpeechAnimator):
         dim: model width C.
         audio_encoder: speech to features.
         identity_encoder: who the face is.
+        mesh_encoder: reference motion to one feature per frame, in front of the style encoder.
         style_encoder: how the person moves.
         fusion: where speech meets noisy motion.
         decoder: to clean motion.
@@ -73,6 +75,7 @@ class DualPathDiffusion(SpeechAnimator):
         dim: int = 256,
         audio_encoder: AudioEncoderFactory = MelEncoder,
         identity_encoder: IdentityEncoderFactory = HierarchicalIdentity,
+        mesh_encoder: MeshEncoderFactory = LinearMeshEncoder,
         style_encoder: StyleEncoderFactory = TcnGruTransformer,
         fusion: FusionFactory = BidirectionalCrossAttention,
         decoder: DecoderFactory = StyleTransformer,
@@ -101,8 +104,8 @@ class DualPathDiffusion(SpeechAnimator):
             lr_schedule=lr_schedule,
             warmup_steps=warmup_steps,
             protocol=protocol,
+            motion_scale=motion_scale,
         )
-        self.motion_scaling = motion_scale
         self.identity_dropout = identity_dropout
         self.loss_weights = {
             "reconstruction": 1.0,
@@ -112,18 +115,22 @@ class DualPathDiffusion(SpeechAnimator):
         }
         self.process = NoiseProcess(diffusion_steps, noise_schedule)
         self.sampler = sampler(process=self.process)
+        style = style_encoder(dim=dim)
         self.network = DualPathNetwork(
             n_vertices=n_vertices,
             dim=dim,
             audio_encoder=audio_encoder(dim=dim),
             identity_encoder=identity_encoder(dim=dim, n_identities=len(identities)),
-            style_encoder=style_encoder(dim=dim),
+            # Without a dynamic style there is nothing to embed, and no idle weights.
+            mesh_encoder=mesh_encoder(dim=dim, n_vertices=n_vertices) if style.token_dims else None,
+            style_encoder=style,
             fusion=fusion(dim=dim),
             decoder=decoder(dim=dim, style_dim=dim),
             token_form=style_tokens,
         )
         for kind in ("audio_encoder", "identity_encoder", "style_encoder", "fusion", "decoder"):
             arguments[kind] = describe(arguments[kind], getattr(self.network, kind))
+        arguments["mesh_encoder"] = describe(mesh_encoder, self.network.mesh_encoder)
         arguments["sampler"] = describe(sampler, self.sampler)
         self.remember(arguments)
 
@@ -131,19 +138,6 @@ class DualPathDiffusion(SpeechAnimator):
     def speech_encoder(self) -> AudioEncoder:
         """The audio encoder."""
         return self.network.audio_encoder
-
-    @property
-    def scale(self) -> float:
-        """Factor from offsets in the corpus's unit to the motion that is noised.
-
-        Raises:
-            FaceDiffError: if it has not been measured, because the system was never trained.
-        """
-        if self.motion_scaling == "none":
-            return 1.0
-        if self.assets.motion_scale is None:
-            raise FaceDiffError("the model has never been trained: give a checkpoint (--ckpt_path, --checkpoint)")
-        return self.assets.motion_scale
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """Sample in another way from now on; checkpoints keep the sampler that the system was made with."""
@@ -181,10 +175,15 @@ class DualPathDiffusion(SpeechAnimator):
             batch.audio_lengths,
             batch.frame_lengths,
             identity,
-            batch.reference.flatten(2) * self.scale,
-            batch.reference_mask,
+            self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style,
             batch.cached_features,
         )
+
+    def encode_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """F_dyn of reference motions (eq. 2 to 9); of width 0 if the dynamic path is left out."""
+        return self.network.dynamic_style(reference * self.scale, mask)
 
     def generate(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
