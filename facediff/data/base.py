@@ -67,6 +67,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         predict_split: the split that ``predict`` runs over; the first test split if None.
         people: folders of further people to train on, as ``facediff data import-person`` writes them; they come first
             in the order of the identity index.
+        newcomers: further subjects of the corpus to train on, with those of their clips that belong to no split; they
+            come next in the order of the identity index.
+        train_subjects: train on the clips of these people only; of all if None.
         lips: file that says which vertices are the lips, e.g. ``regions/lve.txt`` or ``FLAME_masks.pkl:lips``, or
             ``all``; the corpus's usual one if None.
         upper_face: the same for the upper face.
@@ -101,6 +104,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         reference_frames: int = 100,
         predict_split: Split | None = None,
         people: list[str] | None = None,
+        newcomers: list[str] | None = None,
+        train_subjects: list[str] | None = None,
         lips: str | None = None,
         upper_face: str | None = None,
     ) -> None:
@@ -119,10 +124,15 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             name: self.region_sources[name] if chosen is None else (chosen,)
             for name, chosen in (("lips", lips), ("upper_face", upper_face))
         }
-        self.identities = [*map(person_name, self.people), *type(self).identities]
+        self.newcomers = list(newcomers or [])
+        self.train_subjects = None if train_subjects is None else list(train_subjects)
+        self.identities = [*map(person_name, self.people), *self.newcomers, *type(self).identities]
         for name in self.identities:
             if self.identities.count(name) > 1:
-                raise FaceDiffError(f"data.people: {name} is there more than once; import the person by a new name")
+                raise FaceDiffError(
+                    f"data.people, data.newcomers: {name} is there more than once; import the person by a new name, or "
+                    f"leave the name away"
+                )
         self.features = FeatureSlot()
         self.pair_sentences = False
         self._corpus: Corpus | None = None
@@ -180,16 +190,24 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def clips(self, split: str) -> list[Clip]:
         """The clips of a split, sorted by name."""
-        return [clip for clip in self.corpus.clips.values() if self.find_split(clip) == split]
+        found = [clip for clip in self.corpus.clips.values() if self.find_split(clip) == split]
+        if split != "train" or self.train_subjects is None:
+            return found
+        return [clip for clip in found if clip.subject in self.train_subjects]
 
     def find_split(self, clip: Clip) -> str | None:
-        """The split of any clip: an imported person's own list says it of theirs, :meth:`split_of` of all others."""
+        """The split of any clip.
+
+        An imported person's own list says it of theirs, :meth:`split_of` of all others, and what newcomers have in no
+        split is trained on.
+        """
         if clip.root in self.people:
             said = clip.attributes.get("split")
             if said not in ("train", "val", "test"):
                 raise FaceDiffError(f"{clip.root / 'clips.csv'}: split of {clip.name} is {said!r}; train, val or test")
             return "test_a" if said == "test" else said
-        return self.split_of(clip)
+        split = self.split_of(clip)
+        return "train" if split is None and clip.subject in self.newcomers else split
 
     def missing_clips(self) -> dict[str, list[str]]:
         """Clips of a complete corpus that are not there, by split."""

@@ -28,7 +28,7 @@ from facediff.puppet.speech import SAMPLE_RATE, Phoneme, speak
 from facediff.puppet.visemes import visemes_of
 
 FORMAT = 1
-GENERATOR = "1.0"
+GENERATOR = "1.1"
 _CORPUS = "facediff-puppet"
 _SAMPLES_PER_FRAME = SAMPLE_RATE // FRAME_RATE
 _QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
