@@ -12,9 +12,10 @@ import torch
 from jaxtyping import Bool, Float
 from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
-from torch import Tensor
+from torch import Tensor, nn
 
 from facediff.components.audio_encoder import AudioEncoder
+from facediff.components.mesh_encoder import MeshEncoder
 from facediff.data import Assets, Batch, Reference, Sample, SpeechMotionDataModule, collate
 from facediff.data.assets import ASSETS_KEY, DATA_SOURCE_KEY
 from facediff.data.audio import SAMPLE_RATE, samples_for
@@ -22,6 +23,7 @@ from facediff.errors import FaceDiffError
 from facediff.hparams import plain
 from facediff.systems.evaluation import Evaluation
 from facediff.systems.schedule import Schedule, lr_factor
+from facediff.topology.hierarchy import mesh_hierarchy
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 MotionScale = Literal["unit", "none"]
@@ -135,6 +137,10 @@ class SpeechAnimator(LightningModule, ABC):
             FaceDiffError: if the system was made without a style.
         """
 
+    @abstractmethod
+    def personal_modules(self) -> list[nn.Module]:
+        """The parts that hold who somebody is and how they move; the others may stay frozen when one is learnt."""
+
     @property
     @abstractmethod
     def speech_encoder(self) -> AudioEncoder:
@@ -208,6 +214,7 @@ class SpeechAnimator(LightningModule, ABC):
         if scale is None and stage == "fit":
             scale = data.motion_scale()
         self.adopt(data.assets().with_motion_scale(scale))
+        self._attach_mesh()
         if stage != "predict":
             self.evaluation.prepare(
                 self.assets,
@@ -215,6 +222,20 @@ class SpeechAnimator(LightningModule, ABC):
                 # The system itself is moved to its device later; a process without clips must have its metrics there.
                 self.trainer.strategy.root_device,
             )
+
+    def _attach_mesh(self) -> None:
+        """Tell mesh encoders that have not been told yet about the mesh; their tables are kept in the checkpoint."""
+        waiting = [m for m in self.modules() if isinstance(m, MeshEncoder) and not m.attached]
+        if not waiting:
+            return
+        if self.assets.faces is None:
+            raise FaceDiffError(
+                f"mesh_encoder: {type(waiting[0]).__name__} needs the mesh, and {self.assets.corpus} has no "
+                f"mesh file; put one into its folder, or choose mesh_encoder=linear"
+            )
+        template = self.assets.templates[next(iter(sorted(self.assets.templates)))]
+        for encoder in waiting:
+            encoder.attach(mesh_hierarchy(template.numpy(), self.assets.faces.numpy(), **encoder.mesh_options))
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the assets, so that the checkpoint animates without the corpus."""

@@ -1,5 +1,5 @@
-"""Mesh encoders: the vertices of each frame to one feature."""
+"""Mesh encoders: the motion of a mesh to one feature per frame."""
 
-from facediff.components.mesh_encoder.base import MeshEncoder, MeshEncoderFactory, MeshTopology
+from facediff.components.mesh_encoder.base import MeshEncoder, MeshEncoderFactory
 
-__all__ = ["MeshEncoder", "MeshEncoderFactory", "MeshTopology"]
+__all__ = ["MeshEncoder", "MeshEncoderFactory"]

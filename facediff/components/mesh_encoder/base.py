@@ -1,92 +1,42 @@
-"""What every mesh encoder is, and what it is told about the mesh."""
+"""What every mesh encoder is, and what it is told about the mesh.
+
+LEAD'S NOTE (to be removed): this interface is fixed now and used by the systems: sizes at construction, the mesh later.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 
-class Array(Protocol):
-    """Anything that ``torch.as_tensor`` takes: a tensor or a NumPy array."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Entries along each dimension."""
-        ...
-
-
-class VertexOperator(Protocol):
-    """A sparse linear map from the vertices of a level to those of the next."""
-
-    @property
-    def rows(self) -> Array:
-        """(N,) vertex after the map of each entry, ascending."""
-        ...
-
-    @property
-    def columns(self) -> Array:
-        """(N,) vertex before the map of each entry."""
-        ...
-
-    @property
-    def weights(self) -> Array:
-        """(N,) weight of each entry."""
-        ...
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Vertices after and before the map."""
-        ...
-
-
-class TopologyLevel(Protocol):
-    """One resolution of the mesh."""
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of this level."""
-        ...
-
-    @property
-    def spirals(self) -> Array:
-        """(n_vertices, length) every vertex and those around it, in a fixed order."""
-        ...
-
-    @property
-    def down(self) -> VertexOperator | None:
-        """Map to the next level; None at the last."""
-        ...
-
-
-class MeshTopology(Protocol):
-    """A mesh at several resolutions; :class:`facediff.topology.hierarchy.MeshHierarchy` is one."""
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of the motion."""
-        ...
-
-    @property
-    def vertices(self) -> Array | None:
-        """Those of them that are encoded; None for all."""
-        ...
-
-    @property
-    def levels(self) -> Sequence[TopologyLevel]:
-        """Finest first."""
-        ...
-
-
 class MeshEncoder(nn.Module, ABC):
     """The vertices of each frame to one feature of ``dim`` channels; frames do not see one another.
 
-    What an encoder keeps of the mesh is in its state dict, next to the weights that were trained on it: a checkpoint
-    then means the same wherever and with whichever simplifier it is opened.
+    An encoder is made from sizes alone and told about the mesh later, before its first use: weight averaging copies the
+    module before a corpus is known. What it keeps of the mesh are buffers whose shapes follow from the sizes; they are
+    in its state dict, next to the weights that were trained on them, so that a checkpoint means the same wherever and
+    with whichever simplifier it is opened.
     """
+
+    @property
+    def attached(self) -> bool:
+        """Whether the encoder knows all that it needs of the mesh."""
+        return True
+
+    @property
+    def mesh_options(self) -> dict[str, Any]:
+        """What :func:`facediff.topology.hierarchy.mesh_hierarchy` is to make for :meth:`attach`."""
+        return {}
+
+    def attach(self, topology: Any) -> None:  # noqa: ANN401, B027 - an encoder that needs no mesh has nothing to do
+        """Take over what follows from the mesh.
+
+        Args:
+            topology: a :class:`facediff.topology.hierarchy.MeshHierarchy` of :attr:`mesh_options`.
+        """
 
     @abstractmethod
     def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
@@ -94,10 +44,10 @@ class MeshEncoder(nn.Module, ABC):
 
 
 class MeshEncoderFactory(Protocol):
-    """Makes a mesh encoder once the system's width and mesh are known."""
+    """Makes a mesh encoder once the system's sizes are known."""
 
-    def __call__(self, *, dim: int, topology: MeshTopology) -> MeshEncoder:
-        """Make one for features of ``dim`` channels and motion on the given mesh."""
+    def __call__(self, *, dim: int, n_vertices: int) -> MeshEncoder:
+        """Make one for features of ``dim`` channels and motion of ``n_vertices`` vertices."""
         ...
 
 

@@ -2,71 +2,60 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from facediff.components.mesh_encoder.base import MeshEncoder, MeshTopology, TopologyLevel, check_vertices
+from facediff.components.mesh_encoder.base import MeshEncoder, check_vertices
 from facediff.registry import mesh_encoder
 
 
 class SpiralDown(nn.Module):
-    """Spiral convolution, then vertex down-sampling.
+    """Spiral convolution, then vertex down-sampling by selection.
 
     Gong et al. 2019, SpiralNet++, eq. 1: a vertex's new feature is a linear map of the features along its spiral, one
-    after the other. Down-sampling is linear too, so the convolution is evaluated only at the vertices that it takes.
+    after the other. The convolution is evaluated only at the vertices that the down-sampling selects.
 
     Args:
-        level: spirals of the mesh and the map to the next level.
+        coarse: vertices after the down-sampling.
+        length: vertices of a spiral.
         in_channels: channels of a vertex.
-        out_channels: channels of a vertex of the next level.
-        source: (n_vertices,) where the level's vertices are found in the input; None where the input is just them.
+        out_channels: channels of a vertex after it.
     """
 
     table: Tensor
-    rows: Tensor | None
-    weights: Tensor | None
 
-    def __init__(self, level: TopologyLevel, in_channels: int, out_channels: int, source: Tensor | None) -> None:
+    def __init__(self, coarse: int, length: int, in_channels: int, out_channels: int) -> None:
         super().__init__()
-        down = level.down
-        if down is None:
-            raise ValueError("the topology ends here: it has fewer down-samplings than the encoder has convolutions")
-        rows, columns = (torch.as_tensor(part, dtype=torch.int64) for part in (down.rows, down.columns))
-        weights = torch.as_tensor(down.weights, dtype=torch.float32)
-        table = torch.as_tensor(level.spirals, dtype=torch.int64)[columns]
-        self.n_vertices = down.shape[0]
-        selection = len(rows) == self.n_vertices and bool((weights == 1).all())
-        self.register_buffer("table", table if source is None else source[table])
-        self.register_buffer("rows", None if selection else rows)
-        self.register_buffer("weights", None if selection else weights)
-        self.map = nn.Linear(table.shape[1] * in_channels, out_channels)
+        self.register_buffer("table", torch.zeros(coarse, length, dtype=torch.int64))
+        self.map = nn.Linear(length * in_channels, out_channels)
         nn.init.xavier_uniform_(self.map.weight)
         nn.init.zeros_(self.map.bias)
 
     def forward(self, x: Float[Tensor, "frames vertices in_channels"]) -> Float[Tensor, "frames coarse out_channels"]:
         """Features of the next level's vertices."""
         around = x.index_select(1, self.table.flatten()).view(len(x), len(self.table), -1)
-        out = self.map(around)
-        if self.rows is None or self.weights is None:
-            return out
-        weighted = out * self.weights[:, None]
-        return weighted.new_zeros(len(x), self.n_vertices, out.shape[-1]).index_add(1, self.rows, weighted)
+        return self.map(around)
 
 
 @mesh_encoder.register("spiral")
 class SpiralMeshEncoder(MeshEncoder):
     """Spiral convolutions with vertex down-sampling and leaky ReLU, then one linear map of all vertices' features.
 
-    Each step is [spiral convolution → down-sampling → leaky ReLU], without normalisation; the topology must have as
-    many down-samplings as there are steps, or more.
+    Each step is [spiral convolution → down-sampling → leaky ReLU], without normalisation (Chai et al., style-content
+    disentanglement).
 
     Args:
         dim: channels of a frame's feature; given by the system.
-        topology: the mesh; given by the system.
+        n_vertices: vertices of the mesh; given by the system.
         channels: channels of a vertex after each step.
+        factor: vertices before a down-sampling to one after it.
+        spiral_length: vertices of a spiral, its centre included.
+        dilation: distance along the spiral between two of them.
         negative_slope: slope of the leaky ReLU below zero.
         max_frames: frames to encode at a time in training; what lies between is computed again for the gradient, so
             that memory grows with this number only. None for all at once, which is faster.
@@ -76,28 +65,62 @@ class SpiralMeshEncoder(MeshEncoder):
         self,
         *,
         dim: int,
-        topology: MeshTopology,
+        n_vertices: int,
         channels: tuple[int, ...] = (16, 32, 32),
+        factor: int = 4,
+        spiral_length: int = 12,
+        dilation: int = 1,
         negative_slope: float = 0.2,
         max_frames: int | None = None,
     ) -> None:
         super().__init__()
-        if len(channels) >= len(topology.levels):
-            raise ValueError(
-                f"{len(channels)} channels need as many down-samplings; the topology has {len(topology.levels) - 1}"
-            )
         if max_frames is not None and max_frames < 1:
             raise ValueError(f"max_frames {max_frames}; expected at least 1, or None")
-        self.n_vertices = topology.n_vertices
+        self.n_vertices = n_vertices
+        self.factor = factor
+        self.spiral_length = spiral_length
+        self.dilation = dilation
         self.negative_slope = negative_slope
         self.max_frames = max_frames
-        chosen = None if topology.vertices is None else torch.as_tensor(topology.vertices, dtype=torch.int64)
         self.steps = nn.ModuleList()
-        width = 3
-        for level, wider in zip(topology.levels, channels, strict=False):
-            self.steps.append(SpiralDown(level, width, wider, None if self.steps else chosen))
+        width, vertices = 3, n_vertices
+        for wider in channels:
+            vertices = -(-vertices // factor)
+            self.steps.append(SpiralDown(vertices, spiral_length, width, wider))
             width = wider
-        self.map = nn.Linear(topology.levels[len(channels)].n_vertices * width, dim)
+        self.map = nn.Linear(vertices * width, dim)
+
+    @property
+    def attached(self) -> bool:
+        """Whether the tables of spirals are there; before, they are zero."""
+        return all(bool(step.table.any()) for step in self.steps)
+
+    @property
+    def mesh_options(self) -> dict[str, Any]:
+        """As many down-samplings as there are steps."""
+        return {
+            "levels": len(self.steps),
+            "factor": self.factor,
+            "spiral_length": self.spiral_length,
+            "dilation": self.dilation,
+            "pooling": "select",
+        }
+
+    def attach(self, topology: Any) -> None:  # noqa: ANN401 - a component does not import the topology's types
+        """Take over the spirals of the vertices that each down-sampling selects.
+
+        Args:
+            topology: a mesh hierarchy of :attr:`mesh_options`.
+
+        Raises:
+            ValueError: if it is of another mesh or other options.
+        """
+        for step, level in zip(self.steps, topology.levels, strict=False):
+            selected = torch.as_tensor(level.down.columns, dtype=torch.int64)
+            table = torch.as_tensor(level.spirals, dtype=torch.int64)[selected]
+            if table.shape != step.table.shape:
+                raise ValueError(f"spirals of the shape {tuple(table.shape)}; expected {tuple(step.table.shape)}")
+            step.table.copy_(table)
 
     def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
         """The feature of each frame."""

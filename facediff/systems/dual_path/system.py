@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from facediff import losses, registry
 from facediff.components.audio_encoder import AudioEncoder, AudioEncoderFactory
@@ -133,6 +133,12 @@ class DualPathDiffusion(SpeechAnimator):
         arguments["mesh_encoder"] = describe(mesh_encoder, self.network.mesh_encoder)
         arguments["sampler"] = describe(sampler, self.sampler)
         self.remember(arguments)
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The identity's and the dynamic style's encoders, and how both are presented to the decoder."""
+        network = self.network
+        parts = (network.identity_encoder, network.mesh_encoder, network.style_encoder, network.style_tokens)
+        return [part for part in parts if part is not None]
 
     @property
     def speech_encoder(self) -> AudioEncoder:

@@ -1,0 +1,5 @@
+"""Style-content disentanglement."""
+
+from facediff.systems.style_content.system import StyleContentDisentanglement
+
+__all__ = ["StyleContentDisentanglement"]

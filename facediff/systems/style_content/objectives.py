@@ -1,0 +1,174 @@
+"""The terms of style-content disentanglement, on padded batches with a frame mask."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from facediff.data import Batch
+from facediff.losses import masked_std
+from facediff.systems.style_content.readings import Readings
+
+Motion = Float[Tensor, "batch frames vertices 3"]
+Mask = Bool[Tensor, "batch frames"]
+EPSILON = 1e-6
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Each clip's partner, and where its frames lie in the partner's reading.
+
+    Attributes:
+        partner: index of the partner; a clip without one is its own.
+        frames: for each frame the partner's frame of the same sound; 0 where the two are not aligned.
+        aligned: True on valid frames of clips whose partner says the same sentence.
+    """
+
+    partner: Int[Tensor, " batch"]
+    frames: Int[Tensor, "batch frames"]
+    aligned: Mask
+
+    def of_partner(self, values: Tensor) -> Tensor:
+        """Values (batch, frames, …) of the partners, in the timing of the clips themselves."""
+        rows = self.partner[:, None].expand_as(self.frames)
+        return values[rows, self.frames]
+
+    @property
+    def unaligned(self) -> Bool[Tensor, " batch"]:
+        """Clips with a partner who says something else."""
+        alone = self.partner == torch.arange(len(self.partner), device=self.partner.device)
+        return ~alone & ~self.aligned.any(1)
+
+
+def pair_up(batch: Batch, readings: Readings | None) -> Pairing:
+    """Neighbours 2k and 2k + 1 are partners; those that say the same sentence are aligned in time.
+
+    Args:
+        batch: clips; one that is left over is its own partner.
+        readings: aligns; None aligns nobody.
+    """
+    count, frames = batch.mask.shape
+    partner = torch.arange(count)
+    paired = count // 2 * 2
+    partner[:paired] = partner[:paired] ^ 1
+    places = torch.zeros(count, frames, dtype=torch.long)
+    aligned = torch.zeros(count, frames, dtype=torch.bool)
+    for clip, other in enumerate(partner.tolist()):
+        same = clip != other and batch.sentences[clip] == batch.sentences[other]
+        if readings is not None and same and batch.names[clip] != batch.names[other]:
+            found = readings.frames(batch, clip, other)
+            places[clip, : len(found)] = found
+            aligned[clip, : len(found)] = True
+    device = batch.motion.device
+    return Pairing(partner.to(device), places.to(device), aligned.to(device))
+
+
+def frame_mean(values: Float[Tensor, "batch frames"], mask: Mask) -> Float[Tensor, ""]:
+    """Mean over valid frames; 0 if there is none."""
+    return (values * mask).sum() / mask.sum().clamp_min(1)
+
+
+class MotionDistance:
+    """How far two motions are apart: positions, velocities, the gap between the inner lips.
+
+    Mean squared differences; 0 for equal motions.
+
+    Args:
+        position: weight of the positions.
+        velocity: weight of the differences from frame to frame.
+        lip_gap: weight of the distance between the inner lips; looked at where the corpus says which vertices they are.
+    """
+
+    def __init__(self, position: float, velocity: float, lip_gap: float) -> None:
+        self.position = position
+        self.velocity = velocity
+        self.lip_gap = lip_gap
+
+    def __call__(
+        self,
+        motion: Motion,
+        truth: Motion,
+        mask: Mask,
+        *,
+        vertices: Int[Tensor, " region"] | None = None,
+        rest: Float[Tensor, "batch vertices 3"] | None = None,
+        pairs: Int[Tensor, "pairs 2"] | None = None,
+    ) -> Float[Tensor, ""]:
+        """The weighted sum.
+
+        Args:
+            motion: offsets from the template.
+            truth: what they should be.
+            mask: frames that count.
+            vertices: vertices that count; all if None.
+            rest: the templates in the motion's unit, for the gap.
+            pairs: upper and lower vertices of the inner lips.
+        """
+        gap = motion.new_zeros(())
+        if self.lip_gap and pairs is not None and rest is not None:
+            gap = frame_mean((_gaps(motion, rest, pairs) - _gaps(truth, rest, pairs)).square().mean(-1), mask)
+        if vertices is not None:
+            motion, truth = motion[:, :, vertices], truth[:, :, vertices]
+        error = motion - truth
+        both = mask[:, 1:] & mask[:, :-1]
+        moved = frame_mean(error.square().mean((2, 3)), mask)
+        changed = frame_mean(error.diff(dim=1).square().mean((2, 3)), both)
+        return self.position * moved + self.velocity * changed + self.lip_gap * gap
+
+
+def _gaps(motion: Motion, rest: Tensor, pairs: Tensor) -> Float[Tensor, "batch frames pairs"]:
+    """Distances between the paired vertices; its gradient is finite where they touch."""
+    upper, lower = (motion[:, :, pairs[:, side]] + rest[:, None, pairs[:, side]] for side in (0, 1))
+    return ((upper - lower).square().sum(-1) + EPSILON).sqrt()
+
+
+def relative_distance(
+    values: Float[Tensor, "batch frames dim"], others: Float[Tensor, "batch frames dim"], mask: Mask
+) -> Float[Tensor, ""]:
+    """Mean squared difference as a share of the variance of the values.
+
+    A share, so that it is not made small by making all values small.
+    """
+    kept, beside = values[mask], others[mask]
+    if len(kept) < 2:
+        return values.new_zeros(())
+    spread = kept.var(0, correction=0).mean() + beside.var(0, correction=0).mean()
+    return 2 * (kept - beside).square().mean() / (spread + EPSILON)
+
+
+def relative_style_distance(
+    styles: Float[Tensor, "batch dim"], others: Float[Tensor, "batch dim"], chosen: Bool[Tensor, " batch"] | None = None
+) -> Float[Tensor, ""]:
+    """The same for style vectors."""
+    mask = torch.ones(len(styles), dtype=torch.bool, device=styles.device) if chosen is None else chosen
+    return relative_distance(styles[:, None], others[:, None], mask[:, None])
+
+
+def dynamics_distance(
+    motion: Motion, truths: Motion, mask: Mask, truth_mask: Mask, chosen: Bool[Tensor, " batch"]
+) -> Float[Tensor, ""]:
+    """Mean over vertices of |σ − σ̂|, σ the spread over time of the length of a vertex's displacement.
+
+    The motions need not be aligned, nor be of one length.
+
+    Args:
+        motion: (B, T, V, 3).
+        truths: (B, T, V, 3), whose spread the motions should have.
+        mask: valid frames of the motions.
+        truth_mask: valid frames of the truths.
+        chosen: which clips count.
+    """
+    if not chosen.any():
+        return motion.new_zeros(())
+    lengths = [(each[chosen].square().sum(-1) + EPSILON).sqrt() for each in (motion, truths)]
+    spread, wanted = masked_std(lengths[0], mask[chosen]), masked_std(lengths[1], truth_mask[chosen])
+    return (spread - wanted).abs().mean()
+
+
+def total(terms: dict[str, Tensor], weights: dict[str, float], extra: Sequence[str] = ()) -> Tensor:
+    """The weighted sum of all terms that have a weight other than 0."""
+    return torch.stack([weights[name] * terms[name] for name in terms if name not in extra]).sum()

@@ -1,0 +1,162 @@
+"""Spiral sequences: every vertex and its neighbours in a fixed order, the reach of a spiral convolution."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+
+Indices = npt.NDArray[np.int64]
+Points = npt.NDArray[np.floating]
+
+
+def spirals(
+    faces: npt.NDArray[np.integer],
+    n_vertices: int,
+    length: int,
+    dilation: int = 1,
+    template: Points | None = None,
+) -> Indices:
+    """Every vertex followed by the vertices on the rings around it, ring by ring.
+
+    Gong, Chen, Bronstein and Zafeiriou, "SpiralNet++: A Fast and Highly Efficient Mesh Convolution Operator", ICCV
+    Workshops 2019, section 3.1: ring k + 1 holds the neighbours of ring k that are on no ring before it. The first
+    ring begins at the neighbour with the smallest index, or at the first one along the border where the fan of faces
+    is open. All rings run counter-clockwise as seen from the side on which the faces are. With a dilation, every
+    ``dilation``-th vertex of a spiral of ``length * dilation`` vertices is taken.
+
+    Where the rings end first (a small part of the mesh, a vertex without faces), the nearest vertices that are not in
+    the spiral follow. No vertex comes twice while there are others left; after that, the vertex itself fills the rest.
+
+    Args:
+        faces: (F, 3) vertex indices.
+        n_vertices: V.
+        length: entries of a spiral, the vertex itself included.
+        dilation: distance along the spiral between two entries.
+        template: (V, 3) positions, needed only where rings end too early.
+
+    Returns:
+        (V, length) vertex indices; column 0 is the vertex itself.
+
+    Raises:
+        FaceDiffError: if the faces do not fit the number of vertices, if length or dilation is below one, or if
+            positions are needed and not given.
+    """
+    faces = checked_faces(faces, n_vertices)
+    if length < 1 or dilation < 1:
+        raise FaceDiffError(f"spirals: length {length} and dilation {dilation}; expected at least 1 for both")
+    rings = ordered_rings(faces, n_vertices)
+    wanted = min(length * dilation, n_vertices)
+    table = np.empty((n_vertices, length), np.int64)
+    for vertex in range(n_vertices):
+        spiral = _spiral(vertex, rings, wanted)
+        if len(spiral) < wanted:
+            spiral += _nearest(vertex, spiral, wanted, template)
+        table[vertex] = _dilated(spiral, length, dilation) if dilation > 1 or wanted < length else spiral
+    return table
+
+
+def checked_faces(faces: npt.NDArray[np.integer], n_vertices: int) -> Indices:
+    """Faces as int64, without those that name a vertex twice.
+
+    Raises:
+        FaceDiffError: if the array is not (F, 3) or an index is not that of a vertex.
+    """
+    faces = np.asarray(faces)
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise FaceDiffError(f"faces: {faces.dtype} of shape {faces.shape}; expected integers of shape (F, 3)")
+    faces = faces.astype(np.int64)
+    if faces.size and not (faces.min() >= 0 and faces.max() < n_vertices):
+        raise FaceDiffError(
+            f"faces: indices from {faces.min()} to {faces.max()}, but the template has {n_vertices} vertices; "
+            f"use the mesh that belongs to the template"
+        )
+    return faces[_proper(faces)]
+
+
+def _proper(faces: Indices) -> npt.NDArray[np.bool_]:
+    first, second, third = faces.T
+    proper: npt.NDArray[np.bool_] = (first != second) & (second != third) & (third != first)
+    return proper
+
+
+def ordered_rings(faces: Indices, n_vertices: int) -> list[list[int]]:
+    """The neighbours of every vertex, counter-clockwise.
+
+    A closed fan of faces begins at the neighbour with the smallest index, an open one at its end. Where faces do not
+    form one fan (a border touched twice, more than two faces at an edge, faces that wind against one another), the
+    fans follow one another: open ones first, each kind by its smallest start; every neighbour comes once.
+    """
+    follows: list[dict[int, int]] = [{} for _ in range(n_vertices)]
+    loose: dict[int, set[int]] = {}
+    for a, b, c in faces.tolist():
+        for vertex, here, there in ((a, b, c), (b, c, a), (c, a, b)):
+            if follows[vertex].setdefault(here, there) != there:
+                loose.setdefault(vertex, set()).add(there)
+    return [_fan(follow, loose.get(vertex, set())) for vertex, follow in enumerate(follows)]
+
+
+def _fan(follow: dict[int, int], loose: set[int]) -> list[int]:
+    """Neighbours in order, from the neighbour that comes after each; ``loose`` are those that come after no other."""
+    ends = set(follow.values())
+    starts = [*sorted(follow.keys() - ends), *sorted(follow.keys() & ends), *sorted(loose)]
+    seen: dict[int, None] = {}
+    for start in starts:
+        step: int | None = start
+        while step is not None and step not in seen:
+            seen[step] = None
+            step = follow.get(step)
+    return list(seen)
+
+
+def _spiral(vertex: int, rings: list[list[int]], wanted: int) -> list[int]:
+    """The vertex and the rings around it, cut at ``wanted`` entries; shorter where the rings end."""
+    ring = rings[vertex]
+    spiral = [vertex, *ring]
+    seen = set(spiral)
+    while ring and len(spiral) < wanted:
+        outer: list[int] = []
+        for inner in ring:
+            around = rings[inner]
+            fresh = [near not in seen for near in around]
+            if not any(fresh):
+                continue
+            # Counter-clockwise, what is new begins behind what is known.
+            start = next((i for i, new in enumerate(fresh) if new and not fresh[i - 1]), 0)
+            order = (*range(start, len(around)), *range(start))
+            new = [around[i] for i in order if fresh[i]]
+            seen.update(new)
+            outer += new
+            if len(spiral) + len(outer) >= wanted:
+                break
+        spiral += outer
+        ring = outer
+    return spiral[:wanted]
+
+
+def _nearest(vertex: int, spiral: list[int], wanted: int, template: Points | None) -> list[int]:
+    """The vertices nearest to ``vertex`` that are not in the spiral, as many as it lacks."""
+    if template is None:
+        raise FaceDiffError(
+            f"spirals: the rings around vertex {vertex} hold {len(spiral)} vertices of {wanted}; give the template, "
+            f"so that the nearest vertices can fill the rest"
+        )
+    square = np.square(np.asarray(template, np.float64) - np.asarray(template[vertex], np.float64)).sum(axis=1)
+    square[spiral] = np.inf
+    missing = wanted - len(spiral)
+    reach = np.partition(square, missing - 1)[missing - 1]
+    near = np.flatnonzero(square <= reach)  # by index, so that ties go to the smaller one
+    nearest: list[int] = near[np.argsort(square[near], kind="stable")][:missing].tolist()
+    return nearest
+
+
+def _dilated(spiral: list[int], length: int, dilation: int) -> list[int]:
+    """Every ``dilation``-th entry, then the ones between if vertices are scarce, then the vertex itself."""
+    chosen = list(islice(spiral, 0, None, dilation))[:length]
+    if len(chosen) < length:
+        between = [entry for i, entry in enumerate(spiral) if i % dilation]
+        chosen += between[: length - len(chosen)]
+    return chosen + [spiral[0]] * (length - len(chosen))
