@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from facediff.data import Assets, Reference
+    from facediff.systems import SpeechAnimator, Style
 
 T = TypeVar("T")
 
@@ -43,7 +44,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--style",
         metavar="REFERENCE",
-        help="motion that carries the style: a .npy file of absolute vertices, or a clip's name (F1_e03); "
+        help="who lends the style: a .npy file of absolute vertices, a .npy file that `facediff style extract` wrote, "
+        "or a clip's name (F1_e03); "
         "the identity's stored reference if absent",
     )
     made.add_argument("--sampler", metavar="NAME", help="sampler by name; see `facediff components sampler`")
@@ -69,7 +71,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     if args.sampler is not None or args.steps is not None:
         system.choose_sampler(args.sampler, args.steps)
     identity = args.identity or system.identities[0]
-    style = read_style(args.style, identity, system.assets, system.data_source) if args.style else None
+    style = read_style(args.style, identity, system) if args.style else None
 
     import torch
 
@@ -123,17 +125,21 @@ def device(name: str) -> str:
     return name
 
 
-def read_style(style: str, identity: str, assets: Assets, source: Mapping[str, str]) -> Reference:
-    """A style reference from a file, from the checkpoint, or from the corpus that the checkpoint was trained on.
+def read_style(style: str, identity: str, system: SpeechAnimator) -> Reference | Style:
+    """A style from a file, from the checkpoint, or from the corpus that the checkpoint was trained on.
 
-    A file holds absolute vertices; its subject is told by its name (``F1_e03.npy``), else it is the identity. A file in
-    the ``vertices_npy`` of a corpus folder comes with that folder's templates and frame rate.
+    A file holds a style vector that ``facediff style extract`` wrote, or a motion in absolute vertices. A motion's
+    subject is told by its name (``F1_e03.npy``), else it is the identity. A file in the ``vertices_npy`` of a corpus
+    folder comes with that folder's templates and frame rate.
     """
+    assets, source = system.assets, system.data_source
     if not style.endswith(".npy"):
         for reference in assets.references.values():
             if reference.clip == style:
                 return reference
     path = Path(style) if style.endswith(".npy") else corpus_clip(style, source)
+    if open_array(path).ndim == 1:
+        return read_vector(path, system)
     subject = path.stem.split("_condition_")[0].rpartition("_")[0]
     templates, stored = folder_facts(path, assets, source)
     who = next((name for name in (subject, identity) if name in templates), None)
@@ -182,6 +188,36 @@ def corpus_clip(name: str, source: Mapping[str, str]) -> Path:
     return path
 
 
+def open_array(path: Path) -> npt.NDArray[np.generic]:
+    """A NumPy file, memory-mapped."""
+    import numpy as np
+
+    if not path.is_file():
+        raise FaceDiffError(f"--style {path}: no such file")
+    try:
+        array: npt.NDArray[np.generic] = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise FaceDiffError(f"--style {path}: not a readable NumPy array ({error})") from error
+    return array
+
+
+def read_vector(path: Path, system: SpeechAnimator) -> Style:
+    """A style vector, if it is as long as this system's are."""
+    import numpy as np
+    import torch
+
+    from facediff.systems import Style
+
+    vector = np.array(open_array(path), np.float32)
+    width = system.encode_style(torch.zeros(1, 1, system.n_vertices, 3), torch.ones(1, 1, dtype=torch.bool)).shape[1]
+    if len(vector) != width or not np.isfinite(vector).all():
+        raise FaceDiffError(
+            f"--style {path}: holds {len(vector)} numbers, but this checkpoint's style vectors have {width} (no NaN); "
+            f"make one with `facediff style extract` from this very checkpoint"
+        )
+    return Style(path.stem, torch.from_numpy(vector))
+
+
 def read_reference(path: Path, assets: Assets, subject: str, template: Tensor, stride: int = 1) -> Reference:
     """Offsets from a subject's template (V, 3), from a file of absolute vertices (T, V, 3) or (T, 3V)."""
     import numpy as np
@@ -189,12 +225,7 @@ def read_reference(path: Path, assets: Assets, subject: str, template: Tensor, s
 
     from facediff.data import Reference
 
-    if not path.is_file():
-        raise FaceDiffError(f"--style {path}: no such file")
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise FaceDiffError(f"--style {path}: not a readable NumPy array ({error})") from error
+    array = open_array(path)
     vertices = assets.n_vertices
     if array.ndim not in (2, 3) or not len(array) or array.shape[1:] not in ((vertices, 3), (3 * vertices,)):
         raise FaceDiffError(

@@ -1,7 +1,4 @@
-"""What every mesh encoder is, and what it is told about the mesh.
-
-LEAD'S NOTE (to be removed): this interface is fixed now and used by the systems: sizes at construction, the mesh later.
-"""
+"""What every mesh encoder is, and what it is told about the mesh."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from facediff.components.mesh_encoder.base import MeshEncoder, check_vertices
+from facediff.errors import FaceDiffError
 from facediff.registry import mesh_encoder
 
 
@@ -28,6 +30,7 @@ class SpiralDown(nn.Module):
     """
 
     table: Tensor
+    map: nn.Linear
 
     def __init__(self, coarse: int, length: int, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -61,6 +64,9 @@ class SpiralMeshEncoder(MeshEncoder):
             that memory grows with this number only. None for all at once, which is faster.
     """
 
+    steps: Sequence[SpiralDown]
+    map: nn.Linear
+
     def __init__(
         self,
         *,
@@ -74,6 +80,9 @@ class SpiralMeshEncoder(MeshEncoder):
         max_frames: int | None = None,
     ) -> None:
         super().__init__()
+        for name, value in {"factor": factor, "spiral_length": spiral_length, "dilation": dilation}.items():
+            if value < 1:
+                raise ValueError(f"{name} {value}; expected at least 1")
         if max_frames is not None and max_frames < 1:
             raise ValueError(f"max_frames {max_frames}; expected at least 1, or None")
         self.n_vertices = n_vertices
@@ -82,18 +91,22 @@ class SpiralMeshEncoder(MeshEncoder):
         self.dilation = dilation
         self.negative_slope = negative_slope
         self.max_frames = max_frames
-        self.steps = nn.ModuleList()
+        self._attached = False
+        steps = []
         width, vertices = 3, n_vertices
         for wider in channels:
             vertices = -(-vertices // factor)
-            self.steps.append(SpiralDown(vertices, spiral_length, width, wider))
+            steps.append(SpiralDown(vertices, spiral_length, width, wider))
             width = wider
+        self.steps = nn.ModuleList(steps)  # type: ignore[assignment] # behaves as a sequence of what it was given
         self.map = nn.Linear(vertices * width, dim)
 
     @property
     def attached(self) -> bool:
         """Whether the tables of spirals are there; before, they are zero."""
-        return all(bool(step.table.any()) for step in self.steps)
+        if not self._attached:  # looked up until it is true, since a device is waited for
+            self._attached = not self.steps or bool(self.steps[0].table.any())
+        return self._attached
 
     @property
     def mesh_options(self) -> dict[str, Any]:
@@ -113,22 +126,43 @@ class SpiralMeshEncoder(MeshEncoder):
             topology: a mesh hierarchy of :attr:`mesh_options`.
 
         Raises:
-            ValueError: if it is of another mesh or other options.
+            FaceDiffError: if it is of another mesh or other options.
         """
+        sizes = [level.n_vertices for level in topology.levels]
+        downs = [level.down for level in topology.levels[: len(self.steps)]]
+        expected = [self.n_vertices, *(len(step.table) for step in self.steps)]
+        if sizes != expected or any(len(down.columns) != down.shape[0] for down in downs):
+            raise FaceDiffError(
+                f"mesh encoder: the mesh has {sizes} vertices at its levels; expected {expected}, each selected from "
+                f"those of the level before: make the hierarchy with the encoder's mesh_options"
+            )
+        tables = []
         for step, level in zip(self.steps, topology.levels, strict=False):
             selected = torch.as_tensor(level.down.columns, dtype=torch.int64)
-            table = torch.as_tensor(level.spirals, dtype=torch.int64)[selected]
-            if table.shape != step.table.shape:
-                raise ValueError(f"spirals of the shape {tuple(table.shape)}; expected {tuple(step.table.shape)}")
+            tables.append(torch.as_tensor(level.spirals, dtype=torch.int64)[selected])
+            if tables[-1].shape != step.table.shape:
+                raise FaceDiffError(
+                    f"mesh encoder: the mesh has spirals of {tables[-1].shape[1]} vertices; expected "
+                    f"{step.table.shape[1]}: make the hierarchy with the encoder's mesh_options"
+                )
+        for step, table in zip(self.steps, tables, strict=True):
             step.table.copy_(table)
+        # From here on known, also while a weight average that was copied earlier lends its tables of zeros.
+        self._attached = True
 
     def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
-        """The feature of each frame."""
+        """The feature of each frame.
+
+        Raises:
+            FaceDiffError: if the encoder has not been told about the mesh.
+        """
         check_vertices(motion, self.n_vertices)
+        if not self.attached:
+            raise FaceDiffError("mesh encoder: the mesh is not known yet; attach a hierarchy, or load trained weights")
         frames = motion.flatten(0, 1)
         if self.max_frames is None or len(frames) <= self.max_frames:
             return self.encode(frames).view(*motion.shape[:2], -1)
-        parts = [self._part(part) for part in frames.split(self.max_frames)]
+        parts = [self._part(part) for part in torch.split(frames, self.max_frames)]
         return torch.cat(parts).view(*motion.shape[:2], -1)
 
     def encode(self, x: Float[Tensor, "frames vertices 3"]) -> Float[Tensor, "frames dim"]:

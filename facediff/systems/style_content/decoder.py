@@ -43,6 +43,7 @@ class MotionDecoder(nn.Module):
         if len(channels) != len(kernels):
             raise ValueError(f"{len(channels)} channels but {len(kernels)} kernels: give one of each per convolution")
         widths = [content_dim, *channels]
+        self.kernels = list(kernels)
         self.convolutions = nn.ModuleList(
             nn.Conv1d(width + style_dim, out, kernel)
             for width, out, kernel in zip(widths[:-1], channels, kernels, strict=True)
@@ -61,7 +62,7 @@ class MotionDecoder(nn.Module):
     @property
     def past_frames(self) -> int:
         """Frames before a frame that its motion depends on."""
-        return sum(conv.kernel_size[0] - 1 for conv in self.convolutions)
+        return sum(kernel - 1 for kernel in self.kernels)
 
     def start_from(self, mean: Float[Tensor, " coordinates"], shapes: Float[Tensor, "shapes coordinates"]) -> None:
         """Let the basis start from principal components, each scaled by its standard deviation.
@@ -83,9 +84,9 @@ class MotionDecoder(nn.Module):
         x = content
         beside = style[:, None].expand(-1, content.shape[1], -1)
         valid = mask[..., None].to(content.dtype)
-        for conv in self.convolutions:
+        for conv, kernel in zip(self.convolutions, self.kernels, strict=True):
             columns = (torch.cat([x, beside], dim=-1) * valid).transpose(1, 2)
-            columns = nn.functional.pad(columns, (conv.kernel_size[0] - 1, 0))
+            columns = nn.functional.pad(columns, (kernel - 1, 0))
             x = nn.functional.leaky_relu(conv(columns).transpose(1, 2), SLOPE)
         coefficients = self.connected(x)
         # In mixed precision the last map stays in float32: differences over time of half-precision motion are noise.

@@ -55,7 +55,7 @@ def align(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> np
         from dtaidistance import dtw_ndim
         from dtaidistance.dtw import best_path
     except ImportError as error:
-        raise MissingExtraError("dtaidistance", "train", "aligning two readings of one sentence") from error
+        raise MissingExtraError("dtaidistance", "mesh", "aligning two readings of one sentence") from error
     window = round(BAND * max(len(first), len(second))) + abs(len(first) - len(second)) + 1
     _, costs = dtw_ndim.warping_paths_fast(np.ascontiguousarray(first), np.ascontiguousarray(second), window=window)
     partners: list[list[int]] = [[] for _ in first]

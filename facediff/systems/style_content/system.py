@@ -286,10 +286,25 @@ class StyleContentDisentanglement(SpeechAnimator):
         """Style vectors of reference motions."""
         return self.network.style(reference * self.scale, mask)
 
+    def encode_content(
+        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames content_dim"]:
+        """Content of motion: what is said, without who says it; zero on padding."""
+        return self.network.content(motion * self.scale, mask)
+
+    def decode(
+        self,
+        content: Float[Tensor, "batch frames content_dim"],
+        style: Float[Tensor, "batch style_dim"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """Offsets from the template, zero on padding, of content and style that may be of different people."""
+        return self._decode(content, style, mask) / self.scale * mask[..., None, None]
+
     def generate(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Content from the speech, style from the reference; one pass, nothing is drawn."""
         heard = self.network.hear(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.cached_features)
         style = self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
-        return self._decode(heard, style, batch.mask) / self.scale * batch.mask[..., None, None]
+        return self.decode(heard, style, batch.mask)
