@@ -27,11 +27,16 @@ class Command:
 COMMANDS = {
     "demo": Command("facediff.commands.demo", "make a corpus, train, test and render a talking face, in ten minutes"),
     "animate": Command("facediff.commands.animate", "animate a face with a recording of speech"),
+    "adapt": Command("facediff.commands.adapt", "let a trained system get to know one person more"),
+    "style": Command("facediff.commands.style", "write how a person moves as a style vector"),
     "fit": Command("facediff.commands.lightning", "train a system"),
     "validate": Command("facediff.commands.lightning", "score a system on the validation split"),
     "test": Command("facediff.commands.lightning", "score a system on the test splits"),
     "predict": Command("facediff.commands.lightning", "write a system's motion for a split"),
     "evaluate": Command("facediff.commands.evaluate", "score anybody's predicted motion files by named protocols"),
+    "figure": Command(
+        "facediff.commands.figure", "draw the figures of a paper: faces, heat maps, lip and training curves"
+    ),
     "data": Command("facediff.commands.data", "prepare and check corpora, import a person's video"),
     "components": Command("facediff.commands.components", "list what can be chosen by name"),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence, Set
 from enum import Enum
 from functools import partial
@@ -68,13 +69,22 @@ def component_class(factory: Any) -> type:  # noqa: ANN401
     raise TypeError(f"{factory!r} is no component; give its class or functools.partial(class, option=value)")
 
 
-def describe(factory: Any, component: object) -> dict[str, Any]:  # noqa: ANN401
-    """A component's plain description for the checkpoint.
+def defaults(component: type) -> dict[str, Any]:
+    """A component's own options with their defaults, as plain data; what a system gives it has no default."""
+    parameters = inspect.signature(component).parameters.values()
+    return {p.name: plain(p.default) for p in parameters if p.default is not inspect.Parameter.empty}
 
-    A component may have a method ``checkpoint_init_args`` that returns constructor arguments which let it be built
-    without the files that it was first built from (a pretrained network, say).
+
+def describe(factory: Any, component: object) -> dict[str, Any]:  # noqa: ANN401
+    """A component's plain description for the checkpoint, with every option that it was made with.
+
+    Options left at their defaults are written down too: whoever rebuilds the component may fill what is missing from
+    the component that usually stands in its place. A component may have a method ``checkpoint_init_args`` that returns
+    constructor arguments which let it be built without the files that it was first built from (a pretrained network,
+    say).
     """
     description: dict[str, Any] = plain(factory)
+    description["init_args"] = {**defaults(component_class(factory)), **description["init_args"]}
     extra = getattr(component, "checkpoint_init_args", None)
     if extra is not None:
         description["init_args"] = {**description["init_args"], **plain(extra())}

@@ -179,7 +179,6 @@ style_encoder = Kind(
     "style_encoder", "facediff.components.style_encoder", "how the person moves, from a reference motion"
 )
 fusion = Kind("fusion", "facediff.components.fusion", "speech features meet the noisy motion")
-mesh_encoder = Kind("mesh_encoder", "facediff.components.mesh_encoder", "the vertices of each frame to one feature")
 decoder = Kind("decoder", "facediff.components.decoder", "fused features and style to clean motion")
 sampler = Kind("sampler", "facediff.diffusion.samplers", "runs the reverse diffusion process")
 

@@ -42,7 +42,7 @@ ALLOWED: dict[str, set[str]] = {
     "figures": {"evaluate", "data", "metrics", "render", "topology", *COMMON},
     "components": {"registry", "errors"},
     "systems": {"components", "data", "diffusion", "metrics", "topology", "losses", "hparams", "registry", *COMMON},
-    "callbacks": {"systems", "data", "metrics", "topology", "render", "hparams", "registry", *COMMON},
+    "callbacks": {"__init__", "systems", "data", "metrics", "topology", "render", "hparams", "registry", *COMMON},
     "cli": {"errors", "__init__"},
 }
 ALLOWED["commands"] = set(ALLOWED) - {"cli", "__main__"}

@@ -105,7 +105,8 @@ def test_a_component_may_add_to_its_description() -> None:
             return {"config": {"width": np.int64(4), "path": Path("x")}}
 
     description = describe(partial(registry.decoder.gru, num_layers=1), Loaded())
-    assert description["init_args"] == {"num_layers": 1, "config": {"width": 4, "path": "x"}}
+    usual = {"bidirectional": True, "dropout": 0.1}
+    assert description["init_args"] == {"num_layers": 1, **usual, "config": {"width": 4, "path": "x"}}
 
 
 def test_the_class_behind_a_factory() -> None:
@@ -115,3 +116,14 @@ def test_the_class_behind_a_factory() -> None:
     assert component_class(partial(print, GruDecoder)) is GruDecoder
     with pytest.raises(TypeError, match="is no component"):
         component_class("gru")
+
+
+def test_options_left_at_their_defaults_are_written_down_too() -> None:
+    """Else a component that is rebuilt takes equally named options of the one that usually stands in its place."""
+    described = describe(partial(registry.decoder.gru, num_layers=1), object())["init_args"]
+    assert described == {"num_layers": 1, "bidirectional": True, "dropout": 0.1}
+    assert describe(registry.style_encoder.lstm, object())["init_args"] == {
+        "style_dim": 32,
+        "num_layers": 1,
+        "pooling": "last",
+    }

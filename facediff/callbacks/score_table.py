@@ -10,6 +10,7 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import WandbLogger
 
+from facediff.callbacks.dashboard_media import measure_clips, wandb_media, worst_clips
 from facediff.files import atomic
 from facediff.systems import SpeechAnimator
 
@@ -20,16 +21,25 @@ class ScoreTable(Callback):
     """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
 
     Beside the model stand a face that never moves, and the model given another sentence's speech. Weights & Biases gets
-    the table of sequences as ``test/sequences``, and the protocol's definition in the run's config.
+    the table of sequences as ``test/sequences``, with sound and a picture of the errors for the worst clips, and the
+    protocol's definition in the run's config.
 
     Args:
         file: name of the CSV file in the run's folder; None writes none.
         sequences_file: name of the CSV file with one row per clip and method; None writes none.
+        media_clips: how many clips get sound and picture, the worst by LVE of all processes. They are predicted once
+            more, by the first process alone, one at a time; nothing is kept in memory during the test.
     """
 
-    def __init__(self, file: str | None = "test_scores.csv", sequences_file: str | None = "test_sequences.csv") -> None:
+    def __init__(
+        self,
+        file: str | None = "test_scores.csv",
+        sequences_file: str | None = "test_sequences.csv",
+        media_clips: int = 8,
+    ) -> None:
         self.file = file
         self.sequences_file = sequences_file
+        self.media_clips = media_clips
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print and write; runs before the system logs and empties its metrics."""
@@ -51,16 +61,36 @@ class ScoreTable(Callback):
         if self.sequences_file and folder:
             write_rows(Path(folder) / self.sequences_file, sequences)
             print(f"written: {Path(folder) / self.sequences_file}")
-        for logger in trainer.loggers:
-            if isinstance(logger, WandbLogger):
-                log_sequences(logger, sequences, evaluation.protocol.describe())
         sys.stdout.flush()
+        loggers = [logger for logger in trainer.loggers if isinstance(logger, WandbLogger)]
+        if loggers:
+            worst = worst_clips(sequences, self.media_clips)
+            media = wandb_media(pl_module, measure_clips(trainer, pl_module, worst))
+            for logger in loggers:
+                log_sequences(logger, sequences, evaluation.protocol.describe(), media)
 
 
-def log_sequences(logger: WandbLogger, sequences: list[dict[str, Any]], definition: str) -> None:
-    """Give Weights & Biases the table of sequences and the words that define its numbers."""
+def log_sequences(
+    logger: WandbLogger, sequences: list[dict[str, Any]], definition: str, media: dict[tuple[str, str], list[Any]]
+) -> None:
+    """Give Weights & Biases the table of sequences and the words that define its numbers.
+
+    Args:
+        logger: the logger.
+        sequences: one row per clip and method.
+        definition: what the protocol's numbers stand for.
+        media: sound and picture by split and clip; the model's rows that have them come first, in this order.
+    """
     columns = list(sequences[0])
-    logger.log_table("test/sequences", columns=columns, data=[[row[name] for name in columns] for row in sequences])
+    places = {key: place for place, key in enumerate(media)}
+    data: list[tuple[int, list[Any]]] = []
+    for row in sequences:
+        key = (row["split"], row["clip"])
+        shown = row["method"] == "model" and key in media
+        values = [*(row[name] for name in columns), *(media[key] if shown else (None, None))]
+        data.append((places[key] if shown else len(places), values))
+    data.sort(key=lambda entry: entry[0])  # stable: all others stay in their order
+    logger.log_table("test/sequences", columns=[*columns, "audio", "error"], data=[values for _, values in data])
     logger.experiment.config.update({"protocol_definition": definition}, allow_val_change=True)
 
 

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import netrc
 import os
 import re
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import NoReturn
-from urllib.parse import urlparse
+from typing import Any, NoReturn
 
+import yaml
 from jsonargparse import set_parsing_settings
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import WandbLogger
 
 from facediff import registry
-from facediff.callbacks import PredictionWriter, ScoreTable
+from facediff.callbacks import GradientNorm, PredictionWriter, RunDescription, ScoreTable
+from facediff.commands.wandb_mode import settle_wandb_mode
 from facediff.commands.words import LINKS, rewrite
 from facediff.data import SpeechMotionDataModule
 from facediff.errors import FaceDiffError, choices
@@ -87,8 +88,42 @@ class FaceDiffCLI(LightningCLI):
         for name in LINKS:
             parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
 
+    def before_instantiate_classes(self) -> None:
+        """Settle whether wandb uploads before anything starts it."""
+        settle_wandb_mode(self.config[str(self.subcommand)].trainer)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:  # noqa: ANN401
+        """Make the trainer; a callback that the config names stands in for the built-in one of its kind."""
+        trainer = super().instantiate_trainer(**kwargs)
+        built_in = self.trainer_defaults["callbacks"]
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        named = {type(callback) for callback in callbacks if callback not in built_in}
+        callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in named]
+        return trainer
+
     def _parse_ckpt_path(self) -> None:
         """Upstream merges a checkpoint's hyper-parameters over the flags; the module ``words`` does it under them."""
+
+
+class RunConfig(SaveConfigCallback):
+    """Saves the config as ``config.yaml`` in the run's folder, and as ``config`` in a wandb run's config."""
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Give wandb the config; called on one process only."""
+        for logger in trainer.loggers:
+            if isinstance(logger, WandbLogger):
+                config = yaml.safe_load(self.parser.dump(self.config, skip_none=False))
+                logger.log_hyperparams({"config": config})
+
+
+def built_in_callbacks(name: str) -> list[Callback]:
+    """What every run of a subcommand has beside the callbacks of its config."""
+    callbacks: list[Callback] = [ScoreTable(), RunDescription()]
+    if name == "fit":
+        callbacks.append(GradientNorm())
+    if name == "predict":
+        callbacks.append(PredictionWriter())
+    return callbacks
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
@@ -104,13 +139,11 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     if os.getcwd() not in sys.path:  # a corpus or a component may be a file of the working folder
         sys.path.append(os.getcwd())
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
-    keep_wandb_quiet()
     words = rewrite(name, list(arguments))
     if name == "test":
         words = ["--verbose=false", *words]  # ScoreTable prints the scores; Lightning's table repeats them per loader
     if name == "predict":
         words = ["--return_predictions=false", *words]  # they are on disk, and a corpus of them fills the memory
-    callbacks = [ScoreTable()] + ([PredictionWriter()] if name == "predict" else [])
     logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
     # Lightning starts the other processes of a distributed run with the words of this one.
     argv, sys.argv = sys.argv, [sys.argv[0], name, *words]
@@ -124,14 +157,20 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
                 subclass_mode_model=True,
                 subclass_mode_data=True,
                 auto_configure_optimizers=False,
-                trainer_defaults={"callbacks": callbacks, "logger": logger},
+                trainer_defaults={"callbacks": built_in_callbacks(name), "logger": logger},
                 parser_class=Parser,
                 parser_kwargs={"parser_mode": "omegaconf+"},
+                save_config_callback=RunConfig,
                 save_config_kwargs={"overwrite": True},
             )
     except Exception as error:
         # jsonargparse wraps what a constructor raises; our own sentence is the useful one.
         ours = next((cause for cause in causes(error) if isinstance(cause, FaceDiffError)), None)
+        if type(error).__module__.startswith("wandb.errors"):
+            raise FaceDiffError(
+                f"wandb could not start the run ({error}): put the key right with `wandb login --relogin`, or set "
+                f"WANDB_MODE=offline and upload the run later"
+            ) from error
         if ours is None or ours is error:
             raise
         raise ours from error
@@ -144,20 +183,3 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
-
-
-def keep_wandb_quiet() -> None:
-    """Without a key wandb would ask a question and wait for an answer: log offline then."""
-    os.environ.setdefault("WANDB_SILENT", "true")
-    if not os.environ.get("WANDB_API_KEY") and not has_wandb_login():
-        os.environ.setdefault("WANDB_MODE", "offline")
-
-
-def has_wandb_login() -> bool:
-    """Whether `wandb login` has left a key in the netrc file, which others use too."""
-    path = Path(os.environ.get("NETRC") or Path.home() / ".netrc")
-    host = urlparse(os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai")).hostname or ""
-    try:
-        return netrc.netrc(path).authenticators(host) is not None
-    except (OSError, netrc.NetrcParseError):
-        return False

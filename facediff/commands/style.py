@@ -59,6 +59,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
         raise FaceDiffError(f"{args.checkpoint}: was trained without a dynamic style, so it has no style vectors")
     with atomic(args.output) as temporary, temporary.open("wb") as stream:
         np.save(stream, vector.numpy(), allow_pickle=False)
-    print(f"{args.output}: style vector of {len(vector)} numbers from {', '.join(args.clips)}, for this checkpoint only")
+    print(
+        f"{args.output}: style vector of {len(vector)} numbers from {', '.join(args.clips)}, for this checkpoint only"
+    )
     print(f"next: facediff animate speech.wav --checkpoint {args.checkpoint} --style {args.output} -o speech.mp4")
     return 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -15,15 +14,12 @@ from facediff import registry
 from facediff.data import SpeechMotionDataModule
 from facediff.data.assets import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
-from facediff.hparams import plain
+from facediff.hparams import defaults
 from facediff.shipped import config_dir
 from facediff.systems.checkpoint import is_imported, read_checkpoint
 
 LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a system that the data module knows."""
-
-SIZES = ("dim", "style_dim", "n_identities", "process")
-"""Constructor arguments of a component that the system gives."""
 
 
 def rewrite(name: str, words: list[str]) -> list[str]:
@@ -58,14 +54,6 @@ def fresh_components(words: Sequence[str]) -> Iterator[str]:
             word = f"{flag}={value}" if joined else value
         flag = ""
         yield word
-
-
-def defaults(component: type) -> dict[str, Any]:
-    """A component's own options with their defaults, as plain data."""
-    parameters = inspect.signature(component).parameters.values()
-    return {
-        p.name: plain(p.default) for p in parameters if p.name not in SIZES and p.default is not inspect.Parameter.empty
-    }
 
 
 def from_checkpoint(name: str, arguments: list[str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from facediff.errors import FaceDiffError
 from facediff.evaluate.pairs import Pair
 from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMetric, VertexError
 from facediff.metrics.clips import Clips, align
+from facediff.metrics.one_pass import one_pass
 from facediff.metrics.options import LengthRule, Pooling
 
 NATIVE = (np.float16, np.float32, np.float64)
@@ -172,16 +174,13 @@ class Scorer:
     def _score(self, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> ClipScores:
         """One prediction."""
         aligned: dict[str, Clips] = {}
-        found: dict[str, float] = {}
         for column in self.columns:
             if column.rule not in aligned:
                 # Every rule that does not refuse the lengths leaves the same frames, those that both sides have.
                 aligned[column.rule] = self._align(column, name, prediction, truth, template)
-            if column.source not in found:
-                clip = aligned[column.rule].clips[0]
-                found[column.source] = float(self.metrics[column.source].clip_value(clip))
-        each = [(found[column.source], column.absolute) for column in self.columns]
         first = next(iter(aligned.values()))
+        found = self._values(first)
+        each = [(found[column.source], column.absolute) for column in self.columns]
         frames = first.clips[0].frames
         return ClipScores(
             tuple(abs(value) if absolute else value for value, absolute in each),
@@ -191,11 +190,39 @@ class Scorer:
             first.cut_truth,
         )
 
+    def _values(self, clips: Clips) -> dict[str, float]:
+        """What each source says of the one clip.
+
+        Raises:
+            FaceDiffError: if it holds NaN or infinity.
+        """
+        clip = clips.clips[0]
+        errors = {source: metric for source, metric in self.metrics.items() if isinstance(metric, VertexError)}
+        dynamics = {
+            source: metric for source, metric in self.metrics.items() if isinstance(metric, FaceDynamicsDeviation)
+        }
+        means, deviations = one_pass(
+            clip.prediction,
+            clip.truth,
+            errors=[metric.wanted() for metric in errors.values()],
+            template=clip.template,
+            uppers=[metric.indices for metric in dynamics.values()],
+        )
+        found = dict(zip([*errors, *dynamics], torch.stack([*means, *deviations]).tolist(), strict=True))
+        # An error over all vertices is finite only if every value of the frames is: the clip need not be read again.
+        whole = [found[source] for source, metric in errors.items() if metric.region is None]
+        if not whole or not all(map(math.isfinite, found.values())):
+            try:
+                clips.check_finite()
+            except ValueError as error:
+                raise FaceDiffError(f"protocol {self.columns[0].protocol}: {error}") from error
+        others = self.metrics.keys() - found.keys()
+        return found | {source: float(self.metrics[source].clip_value(clip)) for source in others}
+
     @staticmethod
     def _align(column: Column, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> Clips:
         try:
             clips = align(prediction, truth, clip_names=[name], rule=column.rule)
-            clips.check_finite()
         except ValueError as error:
             raise FaceDiffError(f"protocol {column.protocol}: {error}") from error
         return clips.with_templates([template])

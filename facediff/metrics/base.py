@@ -55,6 +55,8 @@ class SequenceMetric(ExactMetric):
     leaves_out = ""
     """Which sequences have no value, in words; empty if every sequence has one. `clip_value` gives NaN there."""
 
+    latest: Tensor | None
+    """What `clip_value` gave for each sequence of the last update, (batch,) float64; None before the first."""
     indices: Tensor | None
     total: Tensor
     counts: Tensor
@@ -76,6 +78,7 @@ class SequenceMetric(ExactMetric):
         self.length_rule: LengthRule = length_rule
         self.check_finite = check_finite
         self.region = region
+        self.latest: Tensor | None = None
         self.register_buffer("indices", None if region is None else region.tensor(), persistent=False)
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(5, dtype=torch.int64), dist_reduce_fx="sum")
@@ -98,8 +101,10 @@ class SequenceMetric(ExactMetric):
         if self.check_finite:
             clips.check_finite()
         if not clips.clips:
+            self.latest = self.total.new_empty(0)
             return
         values = torch.stack([self.clip_value(clip) for clip in clips.clips])
+        self.latest = values
         weights = torch.tensor([self.clip_weight(clip) for clip in clips.clips], device=values.device)
         # A NaN that comes out of a metric that has a value everywhere must stay visible.
         scored = ~values.isnan() if self.leaves_out else torch.ones_like(weights, dtype=torch.bool)

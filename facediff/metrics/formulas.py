@@ -8,12 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from facediff.metrics.one_pass import ErrorOf, one_pass, steps
 from facediff.metrics.options import Reduction
-
-# Coordinates widened to float64 at a time: on a CPU few enough to stay in its cache (five times the speed of
-# whole sequences), on other devices many enough that starting the work costs nothing.
-_CHUNK_CPU = 2**18
-_CHUNK_ELSEWHERE = 2**24
 
 
 def vertex_error(
@@ -31,21 +27,7 @@ def vertex_error(
     Returns:
         Scalar, float64.
     """
-    frames, vertices, _ = truth.shape
-    looked_at = vertices if indices is None else len(indices)
-    step = max(1, _chunk(truth) // (3 * looked_at))
-    total = torch.zeros((), dtype=torch.float64, device=truth.device)
-    for start in range(0, frames, step):
-        true, predicted = truth[start : start + step], prediction[start : start + step]
-        if indices is not None:
-            true, predicted = true.index_select(1, indices), predicted.index_select(1, indices)
-        error = _squared_norm(true.double() - predicted.double())
-        if reduction == "max":
-            frame_errors = error.amax(1)  # before the root: the root is monotone, and taken once a frame
-            total += (frame_errors if squared else frame_errors.sqrt()).sum()
-        else:
-            total += (error if squared else error.sqrt()).mean(1).sum()
-    return total / frames
+    return one_pass(prediction, truth, errors=[ErrorOf(indices, reduction, squared)])[0][0]
 
 
 def dynamics_deviation(prediction: Tensor, truth: Tensor, template: Tensor | None, indices: Tensor) -> Tensor:
@@ -60,20 +42,7 @@ def dynamics_deviation(prediction: Tensor, truth: Tensor, template: Tensor | Non
     Returns:
         Scalar, float64; positive if the prediction moves less.
     """
-    return _variation(truth, template, indices) - _variation(prediction, template, indices)
-
-
-def _variation(motion: Tensor, template: Tensor | None, indices: Tensor) -> Tensor:
-    """Mean over vertices of the population standard deviation over time of the squared offset."""
-    total = torch.zeros((), dtype=torch.float64, device=motion.device)
-    step = max(1, _chunk(motion) // (3 * len(motion)))
-    for start in range(0, len(indices), step):
-        some = indices[start : start + step]
-        offset = motion.index_select(1, some).double()
-        if template is not None:
-            offset = offset - template.index_select(0, some).double()
-        total += _squared_norm(offset).std(0, correction=0).sum()
-    return total / len(indices)
+    return one_pass(prediction, truth, template=template, uppers=[indices])[1][0]
 
 
 def opening(motion: Tensor, offsets_from: Tensor | None, pairs: Tensor) -> Tensor:
@@ -105,7 +74,7 @@ def speed(motion: Tensor, indices: Tensor) -> Tensor:
     """
     frames = len(motion)
     out = torch.zeros(frames - 1, dtype=torch.float64, device=motion.device)
-    step = max(1, _chunk(motion) // (3 * len(indices)))
+    step = steps(motion, len(indices))
     for start in range(0, frames - 1, step):
         some = motion[start : start + step + 1].index_select(1, indices).double()
         out[start : start + step] = _squared_norm(some[1:] - some[:-1]).sqrt().mean(1)
@@ -136,10 +105,6 @@ def correlation(reference: Tensor, other: Tensor) -> Tensor:
 def _steady(series: Tensor) -> Tensor:
     low, high = series.aminmax()
     return high - low <= 1e-12 * torch.maximum(high.abs(), low.abs())
-
-
-def _chunk(motion: Tensor) -> int:
-    return _CHUNK_CPU if motion.device.type == "cpu" else _CHUNK_ELSEWHERE
 
 
 def _squared_norm(vectors: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from torch import Tensor
 from facediff.metrics.base import ComparisonMetric
 from facediff.metrics.clips import Clip
 from facediff.metrics.formulas import vertex_error
+from facediff.metrics.one_pass import ErrorOf
 from facediff.metrics.options import (
     POOLINGS,
     REDUCTIONS,
@@ -66,6 +67,10 @@ class VertexError(ComparisonMetric):
         )
         self.reduction: Reduction = reduction
         self.squared = squared
+
+    def wanted(self) -> ErrorOf:
+        """The error, as `facediff.metrics.one_pass.one_pass` is asked for it."""
+        return ErrorOf(self.indices, self.reduction, self.squared)
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The error of one sequence, mean over its frames."""

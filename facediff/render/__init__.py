@@ -10,6 +10,8 @@ Example:
 """
 
 from facediff.render.camera import VIEWS, Camera
+from facediff.render.comparison import comparison
+from facediff.render.heat import heat_colours
 from facediff.render.panels import check_motion, contact_sheet, save_image, side_by_side
 from facediff.render.rasteriser import Renderer
 from facediff.render.shading import EVEN, STUDIO, Light, Look
@@ -24,7 +26,9 @@ __all__ = [
     "Look",
     "Renderer",
     "check_motion",
+    "comparison",
     "contact_sheet",
+    "heat_colours",
     "save_image",
     "side_by_side",
     "write_video",

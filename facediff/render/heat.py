@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.render.canvas import opencv
+from facediff.render.text import draw_text
 
 HEAT_MAP = "cividis"
 """Name of the colour map, in OpenCV and matplotlib alike; its lightness grows evenly and it reads the same to those who
@@ -41,3 +42,26 @@ def heat_colours(values: npt.NDArray[np.floating], highest: float, lowest: float
         raise FaceDiffError("a heat map of NaN or infinity cannot be drawn: check where the values come from")
     levels = np.rint((np.asarray(values, np.float64) - lowest) * (255 / (highest - lowest)))
     return heat_ramp()[np.clip(levels, 0, 255).astype(np.uint8)]
+
+
+def heat_key(
+    ground: npt.NDArray[np.uint8], lowest: str, highest: str, *, colour: tuple[int, int, int]
+) -> npt.NDArray[np.uint8]:
+    """A copy of a picture with the colour map as a bar in its middle, its ends named.
+
+    Args:
+        ground: (height, width, 3), what the bar is drawn upon.
+        lowest: text left of the bar.
+        highest: text right of it.
+        colour: of the letters, sRGB, 0 to 255.
+    """
+    height, width, _ = ground.shape
+    left, right = round(0.25 * width), round(0.7 * width)
+    top, bottom = round(0.3 * height), max(round(0.7 * height), round(0.3 * height) + 1)
+    key = ground.copy()
+    levels = np.rint(np.linspace(0, 255, right - left)).astype(np.uint8)
+    key[top:bottom, left:right] = heat_ramp()[levels]
+    for text, start, end in ((lowest, 2 * left - right // 2, left), (highest, right, width)):
+        start = max(start, 0)
+        key[:, start:end] = draw_text(key[:, start:end], text, colour=colour, scale=0.5)
+    return key

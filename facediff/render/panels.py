@@ -13,7 +13,7 @@ from facediff.render.text import draw_text
 Frame = npt.NDArray[np.uint8]
 
 _INK = (52, 56, 66)
-_FAINT = (104, 110, 122)
+FAINT = (104, 110, 122)
 
 
 def side_by_side(
@@ -79,7 +79,7 @@ def _frames(
             ]
         row = np.hstack(panels)
         ground = np.hstack([renderer.backdrop[-1:] for renderer in renderers])
-        yield row if not footer else _caption(row, footer, "bottom", _FAINT, ground)
+        yield row if not footer else _caption(row, footer, "bottom", FAINT, ground)
 
 
 def _caption(picture: Frame, text: str, edge: str, colour: tuple[int, int, int], ground: Frame | None = None) -> Frame:

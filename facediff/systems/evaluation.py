@@ -10,7 +10,6 @@ from torch import Tensor
 
 from facediff.data import Assets, Batch
 from facediff.metrics import ProtocolMetrics, Region, SequenceMetric, protocol
-from facediff.metrics.clips import align
 
 METHODS = ("model", "still", "shuffled")
 """Who is scored: the model, a face that never moves, the model given another sentence's speech."""
@@ -60,12 +59,10 @@ class Evaluation:
         if split == "val":
             return
         scorers = cast(Sequence[tuple[str, SequenceMetric]], metrics.items(copy_state=False))
-        clips = align(motion, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
-        for clip in clips.with_templates([None] * len(batch)).clips:
-            values = {name: float(metric.clip_value(clip)) for name, metric in scorers}
-            self._sequences.append(
-                {"split": split, "method": method, "clip": clip.name, "frames": clip.frames, **values}
-            )
+        values = {name: cast(Tensor, metric.latest).tolist() for name, metric in scorers}
+        for place, (clip, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
+            own = {name: each[place] for name, each in values.items()}
+            self._sequences.append({"split": split, "method": method, "clip": clip, "frames": frames, **own})
 
     def sequences(self) -> list[dict[str, Any]]:
         """One row per test clip and method with its own scores, of all processes; collective under several."""

@@ -22,6 +22,10 @@ The simplifier compares errors with thresholds in absolute units that grow from 
 edges of a reduction by four fall some fifteen to thirty passes in, where a threshold is little above the one before
 it; in metres all edges would be below the first threshold, and would be collapsed in the order of the file.
 """
+AGGRESSION = 7.0
+"""Power of the passes' thresholds; the simplifier's own default."""
+BLOCK = 64
+"""Points at a time in comparisons of all with all."""
 
 
 @dataclass(frozen=True)
@@ -129,11 +133,10 @@ def _clusters(points: Array, faces: Indices, n_vertices: int) -> Indices:
     used = np.unique(faces)
     if len(used) and spare:
         loose = np.setdiff1d(roots, used)
-        near, distance = nearest(points[loose], points[used])
+        near, distance = _nearest(points[loose], points[used])
         loose, near = (part[np.argsort(distance, kind="stable")][:spare] for part in (loose, near))
         pairs = _collapses(points[used], np.searchsorted(used, faces), max(len(used) - spare + len(loose), 1))
         kept, gone = used[pairs[: spare - len(loose)].T]
-        roots[gone] = kept
         # The last collapse first: by then it is known where the vertex that stays ends up.
         for stays, goes in zip(kept[::-1].tolist(), gone[::-1].tolist(), strict=True):
             roots[goes] = roots[stays]
@@ -156,7 +159,7 @@ def _collapses(points: Array, faces: Indices, n_vertices: int) -> Indices:
         raise MissingExtraError("fast-simplification", "mesh", "down-sampling a mesh") from error
     corners = points[faces]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).mean()
-    scaled = (points - points.mean(axis=0)) * (EDGE / max(edge, np.finfo(float).tiny))
+    scaled = (points - points.mean(axis=0)) * (EDGE / edge if edge > 0 else 1.0)
     # Two faces go with a vertex inside, one with a vertex at a border, so this is at least as far as needed.
     target = max(len(faces) - 2 * (len(points) - n_vertices) - 2, 0)
     pairs = fast_simplification.simplify(
@@ -165,11 +168,7 @@ def _collapses(points: Array, faces: Indices, n_vertices: int) -> Indices:
     return np.asarray(pairs, np.int64).reshape(-1, 2)
 
 
-AGGRESSION = 7.0
-"""Power of the passes' thresholds; the simplifier's own default."""
-
-
-def nearest(points: Array, targets: Array) -> tuple[Indices, Array]:
+def _nearest(points: Array, targets: Array) -> tuple[Indices, Array]:
     """Index of and distance to the target (M, 3) nearest to each point (N, 3); of equal ones the first."""
     index, square = np.zeros(len(points), np.int64), np.zeros(len(points))
     for start in range(0, len(points), BLOCK):
@@ -178,10 +177,6 @@ def nearest(points: Array, targets: Array) -> tuple[Indices, Array]:
         index[part] = away.argmin(axis=1)
         square[part] = away.min(axis=1)
     return index, np.sqrt(square)
-
-
-BLOCK = 64
-"""Points at a time in comparisons of all with all."""
 
 
 def _merged(points: Array, faces: Indices, labels: Indices, n_vertices: int) -> Indices:

@@ -82,7 +82,7 @@ class MeshHierarchy:
         """
         try:
             arrays = {name: np.asarray(array) for name, array in named.items()}
-            sizes = []
+            sizes: list[int] = []
             while f"{len(sizes)}.spirals" in arrays:
                 sizes.append(len(arrays[f"{len(sizes)}.spirals"]))
             levels = tuple(_level(arrays, number, sizes) for number in range(len(sizes)))
@@ -196,7 +196,8 @@ def _key(template: Points, faces: Indices, vertices: Indices | None, options: li
 def _read(path: Path) -> MeshHierarchy | None:
     """The hierarchy in a file; None if there is none or the file is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        # Opened here, since NumPy leaves a file open that turns out to be no archive.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             return MeshHierarchy.from_arrays(dict(stored))
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, FaceDiffError):
         return None

@@ -68,19 +68,14 @@ def checked_faces(faces: npt.NDArray[np.integer], n_vertices: int) -> Indices:
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise FaceDiffError(f"faces: {faces.dtype} of shape {faces.shape}; expected integers of shape (F, 3)")
-    faces = faces.astype(np.int64)
-    if faces.size and not (faces.min() >= 0 and faces.max() < n_vertices):
+    corners = faces.astype(np.int64)
+    if corners.size and not (corners.min() >= 0 and corners.max() < n_vertices):
         raise FaceDiffError(
-            f"faces: indices from {faces.min()} to {faces.max()}, but the template has {n_vertices} vertices; "
+            f"faces: indices from {corners.min()} to {corners.max()}, but the template has {n_vertices} vertices; "
             f"use the mesh that belongs to the template"
         )
-    return faces[_proper(faces)]
-
-
-def _proper(faces: Indices) -> npt.NDArray[np.bool_]:
-    first, second, third = faces.T
-    proper: npt.NDArray[np.bool_] = (first != second) & (second != third) & (third != first)
-    return proper
+    first, second, third = corners.T
+    return corners[(first != second) & (second != third) & (third != first)]
 
 
 def ordered_rings(faces: Indices, n_vertices: int) -> list[list[int]]:

@@ -280,4 +280,5 @@ def test_wandb_gets_the_sequences_and_the_protocol(
     words = ["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false", *logger]
     assert main(words) == 0
     wandb.finish()
-    assert logged == {"columns": ["split", "method", "clip", "frames", "mve", "lve", "fdd"], "rows": 18}
+    columns = ["split", "method", "clip", "frames", "mve", "lve", "fdd", "audio", "error"]
+    assert logged == {"columns": columns, "rows": 18}

@@ -1,5 +1,6 @@
 """What is in the video files, read back by readers that are not the writer."""
 
+import struct
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from facediff.errors import FaceDiffError
-from facediff.render import write_video
+from facediff.render import Renderer, write_video
 
 Frame = npt.NDArray[np.uint8]
 SAMPLE_RATE = 16000
@@ -97,6 +98,58 @@ def test_flash_and_click_agree(tmp_path: Path) -> None:
     assert seen == pytest.approx(moment, abs=0.5 / frame_rate)
     assert heard == pytest.approx(moment, abs=0.5 / frame_rate)
     assert abs(seen - heard) < 0.5 / frame_rate
+
+
+def _boxes(data: bytes, *path: bytes) -> Iterator[bytes]:
+    """Contents of the boxes at a path of an mp4 file (ISO 14496-12), without any library."""
+    place = 0
+    while path and place < len(data):
+        size, name = struct.unpack_from(">I4s", data, place)
+        content = data[place + 8 : place + size]
+        if name == path[0]:
+            yield from _boxes(content, *path[1:]) if len(path) > 1 else (content,)
+        place += size
+
+
+def test_a_mouth_opens_with_its_clicks(tmp_path: Path) -> None:
+    """A drawn mesh whose hole opens for one frame at every click: what is seen, what is heard, the file's edits."""
+    frame_rate, count, opened = 25, 75, [7, 31, 32, 60]
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), -1).reshape(-1, 2)
+    still = np.column_stack([grid, np.zeros(81)])
+    corner = np.array([row * 9 + column for row in range(8) for column in range(8) if (row, column) != (4, 4)])
+    faces = np.concatenate([np.stack([corner, corner + 1, corner + 9], 1), corner[:, None] + [1, 10, 9]])
+    motion = np.tile(still, (count, 1, 1))
+    lips = [40, 41], [49, 50]  # below and above the hole
+    motion[:, lips[0], 1] += 0.125
+    motion[:, lips[1], 1] -= 0.12
+    motion[np.ix_(opened, lips[0], [1])] -= 0.4
+    motion[np.ix_(opened, lips[1], [1])] += 0.4
+    clicks = np.zeros(count * SAMPLE_RATE // frame_rate, np.float32)
+    clicks[[frame * SAMPLE_RATE // frame_rate for frame in opened]] = 1
+    path = tmp_path / "a.mp4"
+    renderer = Renderer(faces, template=still, size=96)
+    write_video(path, renderer.animate(motion), frame_rate, clicks, SAMPLE_RATE)
+
+    capture = cv2.VideoCapture(str(path))
+    pictures = [capture.read()[1].astype(float) for _ in range(count)]
+    seen = [i / capture.get(cv2.CAP_PROP_FPS) for i in range(count) if np.abs(pictures[i] - pictures[0]).max() > 60]
+    capture.release()
+    np.testing.assert_allclose(seen, np.array(opened) / frame_rate)
+
+    sound, rate, start = _read_sound(path)
+    loud = start + np.flatnonzero(np.abs(sound) > 0.3 * np.abs(sound).max()) / rate
+    heard = [loud[np.abs(loud - moment).argmin()] for moment in seen]
+    np.testing.assert_allclose(heard, seen, atol=0.5 / frame_rate)
+    assert all(np.abs(np.array(seen) - moment).min() < 0.5 / frame_rate for moment in loud)  # and nothing else is
+
+    # Players follow the edit lists: the picture from its first sample on, the sound without the encoder's delay.
+    edits = [struct.unpack_from(">IIIi", box) for box in _boxes(path.read_bytes(), b"moov", b"trak", b"edts", b"elst")]
+    kinds = [box[8:12] for box in _boxes(path.read_bytes(), b"moov", b"trak", b"mdia", b"hdlr")]
+    assert kinds == [b"vide", b"soun"]
+    assert [edit[1] for edit in edits] == [1, 1]  # one edit each, from the start of the film
+    (offsets,) = _boxes(path.read_bytes(), b"moov", b"trak", b"mdia", b"minf", b"stbl", b"ctts")
+    assert edits[0][3] == struct.unpack_from(">I", offsets, 12)[0]  # the first picture's delay by re-ordering
+    assert edits[1][3] == 1024  # AAC's priming, in samples
 
 
 def test_two_writes_are_equal_byte_by_byte(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_a_checkpoint_is_plain_data_and_animates_without_the_corpus(trained: Pat
     checkpoint = torch.load(trained, weights_only=True)
     assert checkpoint["hyper_parameters"]["decoder"] == {
         "class_path": "facediff.registry.decoder.gru",
-        "init_args": {"num_layers": 1},
+        "init_args": {"num_layers": 1, "bidirectional": True, "dropout": 0.1},
     }
     system = load_system(trained)
     assert isinstance(system, DualPathDiffusion)

@@ -22,5 +22,9 @@ def test_a_toy_run_gets_the_same_numbers_both_ways_and_prints_ratios() -> None:
     assert apart
     assert float(apart[1]) < 1e-6
     rows = [line for line in done.stdout.splitlines() if line.endswith(tuple("0123456789")) and "x " in line]
-    assert [row.split("  ")[0] for row in rows] == ["whole corpus in memory", "facediff, 1 worker"]
+    assert [row.split("  ")[0] for row in rows] == [
+        "whole corpus in memory",
+        "facediff, 1 worker",
+        "only reading, 1 thread",
+    ]
     assert re.search(r"1\.0x +1\.0000$", rows[0])

@@ -1,7 +1,11 @@
-"""How many pictures a second: facediff's renderer, and matplotlib's painter where it is installed.
+"""How many pictures a second: facediff's renderer, and matplotlib's ways where it is installed; what a preview costs.
 
-Run ``python tools/benchmarks/rendering.py``; a few seconds. The meshes are dented spheres with about as many
-vertices as FLAME (5 023) and BIWI (23 370). OpenCV is held to one thread.
+Run ``python tools/benchmarks/rendering.py``; half a minute. The meshes are dented spheres with about as many
+vertices as FLAME (5 023) and BIWI (23 370). OpenCV is held to one thread, and seconds are the process's own, so that
+other programs on the machine disturb little.
+
+``python tools/benchmarks/rendering.py preview`` trains on the built-in corpus for some epochs, and says what share of
+training the previews of `SamplingPreview` are; some minutes.
 """
 
 import importlib
@@ -9,8 +13,11 @@ import importlib.util
 import math
 import os
 import platform
+import sys
+import tempfile
 import time
 from collections.abc import Callable
+from statistics import median
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +26,9 @@ from facediff.render import Renderer
 
 SIZES = (5023, 23370)
 FRAMES = 12
+SLOW_FRAMES = 4
+"""Frames drawn by what takes seconds for one."""
+EPOCHS = 4
 
 Array = npt.NDArray[np.float64]
 Faces = npt.NDArray[np.int64]
@@ -49,13 +59,13 @@ def motion(vertices: Array) -> Array:
 
 
 def frames_per_second(draw: Callable[[Array], object], frames: Array) -> float:
-    """Median speed over the frames, after one to warm up."""
+    """Median speed over the frames, after one to warm up, per second of one core's time."""
     draw(frames[0])
     seconds = []
     for frame in frames:
-        start = time.perf_counter()
+        start = time.process_time()
         draw(frame)
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.process_time() - start)
     return 1 / float(np.median(seconds))
 
 
@@ -87,6 +97,25 @@ def matplotlib_painter(faces: Faces, pixels: int) -> Callable[[Array], object]:
     return draw
 
 
+def matplotlib_surface(faces: Faces, pixels: int) -> Callable[[Array], object]:
+    """What scripts of the field use most: ``plot_trisurf``, lit flat polygons sorted in three dimensions."""
+    agg, figures = (importlib.import_module(f"matplotlib.{name}") for name in ("backends.backend_agg", "figure"))
+    figure = figures.Figure(figsize=(pixels / 100, pixels / 100), dpi=100)
+    canvas = agg.FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1), projection="3d")
+
+    def draw(vertices: Array) -> object:
+        axes.clear()
+        axes.set_axis_off()
+        x, y, z = vertices.T
+        axes.plot_trisurf(x, z, y, triangles=faces, color=(0.9, 0.75, 0.66), linewidth=0)
+        axes.view_init(elev=0, azim=90)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())
+
+    return draw
+
+
 def machine() -> str:
     """Processor, cores and Python, in words."""
     name = platform.processor() or platform.machine()
@@ -98,13 +127,48 @@ def machine() -> str:
     return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
+def preview() -> None:
+    """Print what training epochs, default previews and those of the shipped config cost on the built-in corpus."""
+    import yaml
+
+    from facediff.commands.lightning import run_cli
+    from facediff.shipped import config_dir
+
+    callbacks = yaml.safe_load((config_dir() / "trainer" / "cpu.yaml").read_text(encoding="utf-8"))["callbacks"]
+    (shipped,) = (found["init_args"] for found in callbacks if found["class_path"].endswith("SamplingPreview"))
+    with tempfile.TemporaryDirectory() as folder:
+        words = ["--trainer.callbacks+=preview_clock.Clock", "--trainer.enable_progress_bar=false"]
+        words += [f"--trainer.max_epochs={EPOCHS}", "--trainer.check_val_every_n_epoch=2"]
+        for name, options in (("TimedPreview", {}), ("ShippedPreview", shipped)):
+            words.append(f"--trainer.callbacks+=preview_clock.{name}")
+            words += [f"--trainer.callbacks.{key}={value}" for key, value in {**options, "every_n_epochs": 2}.items()]
+        words += ["--trainer.enable_model_summary=false", f"--trainer.logger.save_dir={folder}"]
+        fitted = run_cli("fit", ["--config", "configs/experiment/puppet.yaml", *words])
+    costs = {type(found).__name__: getattr(found, "costs", []) for found in fitted.trainer.callbacks}
+    # Epochs with a validation, and so with previews, are left out.
+    epoch = [median(column) for column in zip(*costs["Clock"][::2], strict=True)]
+    print(f"machine: {machine()}; corpus puppet, model of configs/experiment/puppet.yaml")
+    print(f"{'':<46}{'seconds':>9}{'CPU s':>9}")
+    print(f"{'a training epoch':<46}{epoch[0]:>9.1f}{epoch[1]:>9.1f}")
+    every = shipped["every_n_epochs"]
+    for words_for, name, epochs in (
+        ("default", "TimedPreview", 10),
+        (f"shipped ({shipped['clips']} clip, {shipped['size']} pixels)", "ShippedPreview", every),
+    ):
+        cost = [median(column) for column in zip(*costs[name], strict=True)]
+        print(f"{f'a preview, {words_for}':<46}{cost[0]:>9.1f}{cost[1]:>9.1f}")
+        shares = [part / whole / epochs for part, whole in zip(cost, epoch, strict=True)]
+        print(f"{f'  share of training, every {epochs} epochs':<46}{shares[0]:>9.1%}{shares[1]:>9.1%}")
+
+
 def main() -> None:
     """Print one line per mesh and way of drawing."""
     import cv2
 
     cv2.setNumThreads(1)
     compare = importlib.util.find_spec("matplotlib") is not None
-    print(f"machine: {machine()}; OpenCV {cv2.__version__}, one thread; 512 x 512, median of {FRAMES} frames")
+    print(f"machine: {machine()}; OpenCV {cv2.__version__}, one thread, seconds of its core")
+    print(f"512 x 512, median of {FRAMES} frames")
     if not compare:
         print("matplotlib is not installed: no comparison")
     print(f"{'vertices':>9}{'faces':>9}  {'drawn by':<34}{'frames/s':>9}{'ratio':>7}")
@@ -121,14 +185,18 @@ def main() -> None:
             "facediff, 1 sample": coarse.render,
         }
         if compare:
-            ways = {"matplotlib, flat polygons": matplotlib_painter(faces, 512), **ways}
+            ways = {
+                "matplotlib, PolyCollection": matplotlib_painter(faces, 512),
+                "matplotlib, plot_trisurf": matplotlib_surface(faces, 512),
+                **ways,
+            }
         base: float | None = None
         for name, draw in ways.items():
-            speed = frames_per_second(draw, frames)
+            speed = frames_per_second(draw, frames[:SLOW_FRAMES] if "trisurf" in name else frames)
             base = speed if base is None and compare else base
             ratio = f"{speed / base:.1f}" if base else "-"
             print(f"{len(vertices):>9}{len(faces):>9}  {name:<34}{speed:>9.1f}{ratio:>7}")
 
 
 if __name__ == "__main__":
-    main()
+    preview() if sys.argv[1:] == ["preview"] else main()

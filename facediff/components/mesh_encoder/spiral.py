@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -17,24 +17,34 @@ from facediff.registry import mesh_encoder
 
 
 class SpiralDown(nn.Module):
-    """Spiral convolution, then vertex down-sampling by selection.
+    """Spiral convolution, then vertex down-sampling.
 
     Gong et al. 2019, SpiralNet++, eq. 1: a vertex's new feature is a linear map of the features along its spiral, one
-    after the other. The convolution is evaluated only at the vertices that the down-sampling selects.
+    after the other. The convolution is evaluated only at the vertices that the down-sampling takes.
 
     Args:
-        coarse: vertices after the down-sampling.
+        fine: vertices before the down-sampling.
+        coarse: vertices after it.
         length: vertices of a spiral.
         in_channels: channels of a vertex.
         out_channels: channels of a vertex after it.
+        mean: take the mean of several vertices, each being part of one such mean; else one vertex.
     """
 
     table: Tensor
+    rows: Tensor | None
+    weights: Tensor | None
     map: nn.Linear
 
-    def __init__(self, coarse: int, length: int, in_channels: int, out_channels: int) -> None:
+    def __init__(
+        self, fine: int, coarse: int, length: int, in_channels: int, out_channels: int, *, mean: bool = False
+    ) -> None:
         super().__init__()
-        self.register_buffer("table", torch.zeros(coarse, length, dtype=torch.int64))
+        self.sizes = fine, coarse
+        taken = fine if mean else coarse
+        self.register_buffer("table", torch.zeros(taken, length, dtype=torch.int64))
+        self.register_buffer("rows", torch.zeros(taken, dtype=torch.int64) if mean else None)
+        self.register_buffer("weights", torch.zeros(taken) if mean else None)
         self.map = nn.Linear(length * in_channels, out_channels)
         nn.init.xavier_uniform_(self.map.weight)
         nn.init.zeros_(self.map.bias)
@@ -42,7 +52,11 @@ class SpiralDown(nn.Module):
     def forward(self, x: Float[Tensor, "frames vertices in_channels"]) -> Float[Tensor, "frames coarse out_channels"]:
         """Features of the next level's vertices."""
         around = x.index_select(1, self.table.flatten()).view(len(x), len(self.table), -1)
-        return self.map(around)
+        out = self.map(around)
+        if self.rows is None or self.weights is None:
+            return out
+        shares = out * self.weights[:, None]
+        return shares.new_zeros(len(x), self.sizes[1], out.shape[-1]).index_add(1, self.rows, shares)
 
 
 @mesh_encoder.register("spiral")
@@ -59,6 +73,8 @@ class SpiralMeshEncoder(MeshEncoder):
         factor: vertices before a down-sampling to one after it.
         spiral_length: vertices of a spiral, its centre included.
         dilation: distance along the spiral between two of them.
+        pooling: whether down-sampling takes one vertex of each group, which leaves a few vertices of the motion unseen,
+            or the mean of the group, which sees all of them and takes five to ten times as long.
         negative_slope: slope of the leaky ReLU below zero.
         max_frames: frames to encode at a time in training; what lies between is computed again for the gradient, so
             that memory grows with this number only. None for all at once, which is faster.
@@ -76,6 +92,7 @@ class SpiralMeshEncoder(MeshEncoder):
         factor: int = 4,
         spiral_length: int = 12,
         dilation: int = 1,
+        pooling: Literal["select", "mean"] = "select",
         negative_slope: float = 0.2,
         max_frames: int | None = None,
     ) -> None:
@@ -89,15 +106,16 @@ class SpiralMeshEncoder(MeshEncoder):
         self.factor = factor
         self.spiral_length = spiral_length
         self.dilation = dilation
+        self.pooling = pooling
         self.negative_slope = negative_slope
         self.max_frames = max_frames
         self._attached = False
         steps = []
         width, vertices = 3, n_vertices
         for wider in channels:
-            vertices = -(-vertices // factor)
-            steps.append(SpiralDown(vertices, spiral_length, width, wider))
-            width = wider
+            fewer = -(-vertices // factor)
+            steps.append(SpiralDown(vertices, fewer, spiral_length, width, wider, mean=pooling == "mean"))
+            width, vertices = wider, fewer
         self.steps = nn.ModuleList(steps)  # type: ignore[assignment] # behaves as a sequence of what it was given
         self.map = nn.Linear(vertices * width, dim)
 
@@ -116,11 +134,11 @@ class SpiralMeshEncoder(MeshEncoder):
             "factor": self.factor,
             "spiral_length": self.spiral_length,
             "dilation": self.dilation,
-            "pooling": "select",
+            "pooling": self.pooling,
         }
 
     def attach(self, topology: Any) -> None:  # noqa: ANN401 - a component does not import the topology's types
-        """Take over the spirals of the vertices that each down-sampling selects.
+        """Take over the down-samplings, and the spirals of the vertices that each of them takes.
 
         Args:
             topology: a mesh hierarchy of :attr:`mesh_options`.
@@ -129,24 +147,25 @@ class SpiralMeshEncoder(MeshEncoder):
             FaceDiffError: if it is of another mesh or other options.
         """
         sizes = [level.n_vertices for level in topology.levels]
-        downs = [level.down for level in topology.levels[: len(self.steps)]]
-        expected = [self.n_vertices, *(len(step.table) for step in self.steps)]
-        if sizes != expected or any(len(down.columns) != down.shape[0] for down in downs):
+        expected = [self.n_vertices, *(step.sizes[1] for step in self.steps)]
+        if sizes != expected:
             raise FaceDiffError(
-                f"mesh encoder: the mesh has {sizes} vertices at its levels; expected {expected}, each selected from "
-                f"those of the level before: make the hierarchy with the encoder's mesh_options"
+                f"mesh encoder: the mesh has {sizes} vertices at its levels; expected {expected}: make the hierarchy "
+                f"with the encoder's mesh_options"
             )
         tables = []
         for step, level in zip(self.steps, topology.levels, strict=False):
-            selected = torch.as_tensor(level.down.columns, dtype=torch.int64)
-            tables.append(torch.as_tensor(level.spirals, dtype=torch.int64)[selected])
+            tables.append(torch.as_tensor(level.spirals, dtype=torch.int64)[torch.as_tensor(level.down.columns)])
             if tables[-1].shape != step.table.shape:
                 raise FaceDiffError(
-                    f"mesh encoder: the mesh has spirals of {tables[-1].shape[1]} vertices; expected "
-                    f"{step.table.shape[1]}: make the hierarchy with the encoder's mesh_options"
+                    f"mesh encoder: the mesh has spirals of the shape {tuple(tables[-1].shape)}; expected "
+                    f"{tuple(step.table.shape)}: make the hierarchy with the encoder's mesh_options"
                 )
-        for step, table in zip(self.steps, tables, strict=True):
+        for step, level, table in zip(self.steps, topology.levels, tables, strict=False):
             step.table.copy_(table)
+            if step.rows is not None and step.weights is not None:
+                step.rows.copy_(torch.as_tensor(level.down.rows))
+                step.weights.copy_(torch.as_tensor(level.down.weights))
         # From here on known, also while a weight average that was copied earlier lends its tables of zeros.
         self._attached = True
 

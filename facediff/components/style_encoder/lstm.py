@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -18,11 +20,16 @@ class LstmStyle(StyleEncoder):
         dim: channels of a frame; given by the system.
         style_dim: channels of the style.
         num_layers: recurrent layers.
+        pooling: the ``last`` state, as in the published work, or the ``mean`` of the states over all frames, which
+            forgets less of a long reference.
     """
 
-    def __init__(self, *, dim: int, style_dim: int = 32, num_layers: int = 1) -> None:
+    def __init__(
+        self, *, dim: int, style_dim: int = 32, num_layers: int = 1, pooling: Literal["last", "mean"] = "last"
+    ) -> None:
         super().__init__()
         self.lstm = nn.LSTM(dim, style_dim, num_layers, batch_first=True)
+        self.pooling = pooling
         self.token_dims = (style_dim,)
 
     def forward(
@@ -30,6 +37,8 @@ class LstmStyle(StyleEncoder):
     ) -> Float[Tensor, "batch style_dim"]:
         """The state after each clip's last frame."""
         states = self.states(reference, mask)
+        if self.pooling == "mean":
+            return (states * mask[..., None]).sum(1) / mask.sum(1)[:, None].clamp_min(1)
         last = mask.sum(1) - 1
         return states[torch.arange(len(states), device=states.device), last]
 

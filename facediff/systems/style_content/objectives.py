@@ -148,12 +148,41 @@ def relative_style_distance(
     return relative_distance(styles[:, None], others[:, None], mask[:, None])
 
 
+def style_contrast(
+    styles: Float[Tensor, "clips dim"], subjects: Sequence[str], temperature: float = 0.1
+) -> Float[Tensor, ""]:
+    """Pulls styles of one person together and those of different people apart.
+
+    For every style, the mean negative log-probability of picking another one of the same person among all others, with
+    cosine similarities over the temperature as logits (supervised contrast, Khosla et al. 2020, eq. 2). Pulling alone
+    would be satisfied by one style for everybody. 0 if nobody has two styles.
+
+    Args:
+        styles: style vectors.
+        subjects: whose they are.
+        temperature: how sharp the choice is.
+    """
+    same = torch.tensor([[one == other for other in subjects] for one in subjects], device=styles.device)
+    own = torch.eye(len(subjects), dtype=torch.bool, device=styles.device)
+    same &= ~own
+    directions = torch.nn.functional.normalize(styles.float(), dim=1)
+    logits = (directions @ directions.T / temperature).masked_fill(own, -torch.inf)
+    chances = logits.log_softmax(1).masked_fill(own, 0.0)
+    counts = same.sum(1)
+    if not counts.any() or bool(same.logical_or(own).all()):
+        return styles.new_zeros(())
+    each = -(chances * same).sum(1) / counts.clamp_min(1)
+    return each[counts > 0].mean()
+
+
 def dynamics_distance(
     motion: Motion, truths: Motion, mask: Mask, truth_mask: Mask, chosen: Bool[Tensor, " batch"]
 ) -> Float[Tensor, ""]:
-    """Mean over vertices of |σ − σ̂|, σ the spread over time of the length of a vertex's displacement.
+    """Mean over vertices of |σ − σ̂| / σ̄, σ the spread over time of the length of a vertex's displacement.
 
-    The motions need not be aligned, nor be of one length.
+    Each vertex counts in proportion to σ̄, its own mean spread, so that brows count like lips; vertices that hardly
+    move are kept from counting by a hundredth of the largest spread. The motions need not be aligned, nor be of one
+    length.
 
     Args:
         motion: (B, T, V, 3).
@@ -166,9 +195,5 @@ def dynamics_distance(
         return motion.new_zeros(())
     lengths = [(each[chosen].square().sum(-1) + EPSILON).sqrt() for each in (motion, truths)]
     spread, wanted = masked_std(lengths[0], mask[chosen]), masked_std(lengths[1], truth_mask[chosen])
-    return (spread - wanted).abs().mean()
-
-
-def total(terms: dict[str, Tensor], weights: dict[str, float], extra: Sequence[str] = ()) -> Tensor:
-    """The weighted sum of all terms that have a weight other than 0."""
-    return torch.stack([weights[name] * terms[name] for name in terms if name not in extra]).sum()
+    usual = wanted.mean(0)
+    return ((spread - wanted).abs() / (usual + 0.01 * usual.max() + EPSILON)).mean()

@@ -30,6 +30,7 @@ from facediff.systems.style_content.objectives import (
     pair_up,
     relative_distance,
     relative_style_distance,
+    style_contrast,
 )
 from facediff.systems.style_content.readings import Readings
 from facediff.systems.style_content.speech import WindowedTransformer
@@ -76,7 +77,7 @@ class StyleContentDisentanglement(SpeechAnimator):
         swap_dynamics_weight: of the swapped motion's spread over time against the partner's.
         speech_weight: factor of the same terms with content from speech.
         reading_content_weight: pulls the contents of two aligned readings of a sentence together.
-        person_style_weight: pulls the styles of two clips of a person together.
+        person_style_weight: pulls the styles of a person's clips together, and those of different people apart.
         speech_content_weight: pulls content from speech to content from motion.
         position_weight: of positions within each comparison of motions.
         velocity_weight: of velocities within it.
@@ -216,7 +217,7 @@ class StyleContentDisentanglement(SpeechAnimator):
         heard = network.hear(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.cached_features)
         terms = {
             "reading_content": relative_distance(content, pairing.of_partner(content), pairing.aligned),
-            "person_style": relative_style_distance(style, usual),
+            "person_style": style_contrast(torch.cat([style, usual]), batch.subjects * 2),
             "speech_content": relative_distance(content, heard, mask),
         }
         for prefix, said, own in (("", content, style), ("speech_", heard, usual)):
@@ -253,8 +254,11 @@ class StyleContentDisentanglement(SpeechAnimator):
         return terms
 
     def _pair(self, batch: Batch) -> Pairing:
-        whole = self.training and self.trainer.datamodule.window is None  # type: ignore[attr-defined]
-        return pair_up(batch, self.readings if self.aligned_pairs and whole else None)
+        return pair_up(batch, self.readings if self.aligned_pairs and self.readings_allowed() else None)
+
+    def readings_allowed(self) -> bool:
+        """Whether the clips of a training batch are whole: two windows of a sentence need not hold the same words."""
+        return self.training and self._trainer is not None and self.trainer.datamodule.window is None  # type: ignore[attr-defined]
 
     def _decode(self, content: Tensor, style: Tensor, mask: Bool[Tensor, "batch frames"]) -> Tensor:
         return self.network.decoder(content, style, mask).view(*content.shape[:2], self.n_vertices, 3)

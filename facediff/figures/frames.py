@@ -1,0 +1,114 @@
+"""The figure of chosen moments: truth and methods below one another, times or phonemes side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from facediff.errors import FaceDiffError
+from facediff.figures.grid import Grid, Heading
+from facediff.figures.material import Array, Material
+from facediff.figures.meshes import Painter
+from facediff.figures.page import Paper, check_output, save, style
+from facediff.figures.phonemes import Phoneme
+
+HIGHEST = 50.0
+"""Largest height of a picture in mm."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A moment of a clip.
+
+    Attributes:
+        time: in seconds.
+        phoneme: what is spoken then; None if it was chosen by its time alone.
+    """
+
+    time: float
+    phoneme: Phoneme | None = None
+
+    @property
+    def heading(self) -> Heading:
+        """What is written above its column."""
+        if self.phoneme is None or not self.phoneme.ipa:
+            return Heading(small=f"{self.time:.2f} s")
+        word = f" {self.phoneme.word}" if self.phoneme.word else ""
+        return Heading(f"/{self.phoneme.plain}/{word}", f"{self.time:.2f} s")
+
+
+def frame_at(time: float, frame_rate: float) -> int:
+    """Number of the frame that is shown at a time: frame k lasts from k / frame_rate to (k + 1) / frame_rate.
+
+    -1 for a time that is no number.
+    """
+    return int(np.floor(time * frame_rate + 1e-6)) if np.isfinite(time) else -1
+
+
+def pick_frames(material: Material, clip: str, moments: Sequence[Moment]) -> dict[str, list[Array]]:
+    """Faces (V, 3) of the truth and each method at every moment.
+
+    Raises:
+        FaceDiffError: if a moment is outside a motion, or a frame holds NaN or infinity.
+    """
+    picked: dict[str, list[Array]] = {}
+    for name, motion in material.open(clip).items():
+        picked[name] = []
+        for moment in moments:
+            frame, path = frame_at(moment.time, material.rate), material.path(clip, name)
+            if not 0 <= frame < len(motion):
+                raise FaceDiffError(
+                    f"{path}: has no frame at {moment.time:g} s; {name} lasts from 0 to "
+                    f"{len(motion) / material.rate:g} s ({len(motion)} frames at {material.rate:g} a "
+                    f"second; --frame-rate says another rate)"
+                )
+            face = np.asarray(motion[frame], np.float64)
+            if not np.isfinite(face).all():
+                raise FaceDiffError(f"{path}: frame {frame} holds NaN or infinity (counted from 0); choose another")
+            picked[name].append(face)
+    return picked
+
+
+def draw_frames(
+    material: Material,
+    clip: str,
+    moments: Sequence[Moment],
+    output: Path,
+    *,
+    paper: Paper | None = None,
+    view: str = "front",
+    region: Sequence[int] | None = None,
+) -> None:
+    """Draw truth and methods, a row each, at chosen moments, a column each.
+
+    Args:
+        material: what to draw from.
+        clip: ``<subject>_<sentence>``.
+        moments: the columns.
+        output: ``.png``, ``.pdf`` or ``.svg``.
+        paper: width, resolution and font.
+        view: a name in :data:`facediff.render.VIEWS`.
+        region: vertices to show closely, such as the lips; the whole face if None.
+
+    Raises:
+        FaceDiffError: if there is no moment, no mesh, or a file cannot be used.
+    """
+    check_output(output)
+    if not moments:
+        raise FaceDiffError("choose what the columns show, with --times or --phonemes")
+    paper = paper or Paper()
+    faces, shape = material.mesh([clip])
+    painter = Painter(faces, shape, view=view, colours=material.colours, region=region)
+    picked = pick_frames(material, clip, moments)
+    with style(paper):
+        headings = [moment.heading for moment in moments]
+        grid = Grid(paper, material.names, headings, aspect=painter.aspect, highest=HIGHEST, remark=material.remark)
+        painter.set_size(*grid.pixels)
+        page = grid.page()
+        for row, shown in enumerate(picked.values()):
+            for column, face in enumerate(shown):
+                page.picture(painter.paint(face), *grid.place(row, column))
+        save(page.figure, output)

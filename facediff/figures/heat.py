@@ -1,0 +1,185 @@
+"""Figures of numbers at vertices: how much each moves, and how far it is from the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.figures.grid import GAP, Grid, Heading
+from facediff.figures.maps import error_maps, motion_maps
+from facediff.figures.material import Array, Material
+from facediff.figures.meshes import FLAT, Painter
+from facediff.figures.page import SMALLEST_TEXT, Page, Paper, check_output, plain, save, style
+
+HIGHEST = 70.0
+"""Largest height of a picture in mm."""
+
+BAR, BAR_SPACE = 2.5, 16.0
+"""Width of a colour bar, and of the bar with its numbers and label, in mm."""
+
+Statistic = Literal["mean", "max", "both"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of pictures with one colour scale.
+
+    Attributes:
+        label: what the colour bar says, without the unit.
+        values: numbers (V,) by column, in the vertices' unit.
+        highest: value of the last colour, in the unit shown; the largest value of the row if None.
+    """
+
+    label: str
+    values: dict[str, Array]
+    highest: float | None = None
+
+
+def draw_heatmap(
+    material: Material,
+    clips: Sequence[str],
+    output: Path,
+    *,
+    paper: Paper | None = None,
+    view: str = "front",
+    highest: tuple[float | None, float | None] = (None, None),
+) -> list[str]:
+    """Draw mean and standard deviation over time of each vertex's distance from the template, truth and methods.
+
+    Args:
+        material: what to draw from.
+        clips: clips whose frames count.
+        output: ``.png``, ``.pdf`` or ``.svg``.
+        paper: width, resolution and font.
+        view: a name in :data:`facediff.render.VIEWS`.
+        highest: ends of the colour scales of mean and deviation, in the unit shown; the largest value if None.
+
+    Returns:
+        notes on what was left out.
+
+    Raises:
+        FaceDiffError: if there is no mesh, or a file cannot be used.
+    """
+    check_output(output)
+    mesh = material.mesh(clips)
+    maps, notes = motion_maps(material, clips)
+    rows = [
+        Row("mean of motion", {name: each.mean for name, each in maps.items()}, highest[0]),
+        Row("std of motion", {name: each.deviation for name, each in maps.items()}, highest[1]),
+    ]
+    _draw(material, mesh, rows, output, paper or Paper(), view)
+    return notes
+
+
+def draw_error(
+    material: Material,
+    clips: Sequence[str],
+    output: Path,
+    *,
+    paper: Paper | None = None,
+    view: str = "front",
+    statistic: Statistic = "mean",
+    highest: tuple[float | None, float | None] = (None, None),
+) -> list[str]:
+    """Draw how far each vertex is from the truth's, mean or maximum over frames, a column for each method.
+
+    Args:
+        material: what to draw from.
+        clips: clips whose frames count.
+        output: ``.png``, ``.pdf`` or ``.svg``.
+        paper: width, resolution and font.
+        view: a name in :data:`facediff.render.VIEWS`.
+        statistic: over frames: ``mean``, ``max``, or ``both``, a row each.
+        highest: ends of the colour scales of mean and maximum, in the unit shown; the largest value if None.
+
+    Returns:
+        notes on what was left out.
+
+    Raises:
+        FaceDiffError: if there is no mesh, or a file cannot be used.
+    """
+    check_output(output)
+    mesh = material.mesh(clips)
+    maps, notes = error_maps(material, clips)
+    rows = {
+        "mean": Row("mean error", {name: each.mean for name, each in maps.items()}, highest[0]),
+        "max": Row("maximum error", {name: each.maximum for name, each in maps.items()}, highest[1]),
+    }
+    chosen = list(rows.values()) if statistic == "both" else [rows[statistic]]
+    _draw(material, mesh, chosen, output, paper or Paper(), view)
+    return notes
+
+
+def _draw(
+    material: Material,
+    mesh: tuple[npt.NDArray[np.int32], Array],
+    rows: Sequence[Row],
+    output: Path,
+    paper: Paper,
+    view: str,
+) -> None:
+    from facediff.render.heat import heat_colours
+
+    factor, unit = material.scale
+    ends = [scale_end(row.values, factor, row.highest) for row in rows]
+    faces, shape = mesh
+    painter = Painter(faces, shape, view=view, look=FLAT)
+    names = list(rows[0].values)
+    with style(paper):
+        grid = Grid(
+            paper,
+            [""] * len(rows),
+            [Heading(name) for name in names],
+            aspect=painter.aspect,
+            highest=HIGHEST,
+            right=BAR_SPACE + 2 * GAP,
+            remark=material.remark,
+        )
+        painter.set_size(*grid.pixels)
+        page = grid.page()
+        for number, (row, end) in enumerate(zip(rows, ends, strict=True)):
+            for column, name in enumerate(names):
+                colours = heat_colours(row.values[name] * factor, end)
+                page.picture(painter.paint(shape, colours), *grid.place(number, column))
+            beyond = max(float(values.max()) for values in row.values.values()) * factor > end * (1 + 1e-9)
+            _bar(page, grid, number, end, f"{row.label} [{unit}]", beyond=beyond)
+        save(page.figure, output)
+
+
+def scale_end(values: Mapping[str, Array], factor: float, highest: float | None) -> float:
+    """Value of a row's last colour, in the unit shown.
+
+    Raises:
+        FaceDiffError: if it is not above 0.
+    """
+    if highest is not None:
+        if not (np.isfinite(highest) and highest > 0):
+            raise FaceDiffError(f"the end of a colour scale is {highest:g}; expected a number above 0")
+        return highest
+    largest = max(float(each.max()) for each in values.values()) * factor
+    return largest if largest > 0 else 1.0  # nothing moves: any scale is right
+
+
+def _bar(page: Page, grid: Grid, row: int, end: float, label: str, *, beyond: bool) -> None:
+    """A colour bar at the right of a row, of the very colours that the meshes have."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+    from matplotlib.ticker import MaxNLocator
+
+    from facediff.render.heat import heat_ramp
+
+    _, top = grid.place(row, 0)
+    height = min(grid.height * 0.9, 45.0)
+    axes = page.axes(grid.end + 2 * GAP, top + (grid.height - height) / 2, BAR, height)
+    shown = ScalarMappable(Normalize(0, end), ListedColormap(heat_ramp() / 255))
+    bar = page.figure.colorbar(shown, cax=axes, extend="max" if beyond else "neither")
+    bar.set_label(plain(label), size=SMALLEST_TEXT)
+    bar.outline.set_linewidth(0.4)
+    bar.locator = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
+    bar.update_ticks()

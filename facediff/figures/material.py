@@ -1,0 +1,240 @@
+"""What figures are drawn from: the clips that truth and all methods have, and what is known about their mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
+
+from facediff.errors import FaceDiffError, choices
+from facediff.evaluate.names import DEFAULT_PATTERNS, TRUTH_PATTERN, NamePattern, list_names
+from facediff.evaluate.pairs import ALL, OWN, Truth, index_truths, pair_up
+from facediff.evaluate.scoring import read_vertices
+
+TRUTH = "truth"
+"""What the truth is called in a figure."""
+
+CHUNK = 2**20
+"""Coordinates that are widened to float64 at a time: 8 MB, however long a clip is."""
+
+LISTED = 12
+"""Clips that a message names at most."""
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Material:
+    """The files of truth and methods, and what lies beside them.
+
+    Attributes:
+        truths: truths by clip, ``<subject>_<sentence>``.
+        methods: each method's predictions by clip; methods in the order in which they are drawn.
+        n_vertices: vertices V of the mesh.
+        frame_rate: frames a second of the predictions, and of the truth after ``truth_stride``; None if not known.
+        truth_stride: every how many-th frame of a truth is taken.
+        unit: unit of length of the vertices.
+        templates: neutral face (V, 3) by subject.
+        faces: triangles (F, 3); None if no mesh is known.
+        rest: positions (V, 3) of the mesh file; None if no mesh is known.
+        colours: sRGB (V, 3) of the mesh file; None if it has none.
+        corpus: the corpus folder that the truth belongs to, if it does.
+        remark: what is written below every figure, such as that the corpus is synthetic.
+    """
+
+    truths: dict[str, Truth]
+    methods: dict[str, dict[str, Path]]
+    n_vertices: int
+    frame_rate: float | None = None
+    truth_stride: int = 1
+    unit: str = ""
+    templates: Mapping[str, Tensor] = field(default_factory=dict)
+    faces: npt.NDArray[np.int32] | None = None
+    rest: Array | None = None
+    colours: npt.NDArray[np.uint8] | None = None
+    corpus: Path | None = None
+    remark: str = ""
+
+    @property
+    def names(self) -> list[str]:
+        """The truth's name and the methods'."""
+        return [TRUTH, *self.methods]
+
+    @property
+    def scale(self) -> tuple[float, str]:
+        """What lengths are multiplied with to be shown, and the unit that they are shown in."""
+        return (1000.0, "mm") if self.unit == "m" else (1.0, self.unit.partition(" (")[0] or "unit of the vertices")
+
+    @property
+    def rate(self) -> float:
+        """Frames a second.
+
+        Raises:
+            FaceDiffError: if nothing says it.
+        """
+        if self.frame_rate is None:
+            raise FaceDiffError("nothing says how many frames a second the predictions have; give --frame-rate")
+        return self.frame_rate
+
+    def choose(self, clips: Sequence[str] | None = None) -> list[str]:
+        """Clips to draw: those asked for, else all that the truth and every method have.
+
+        Raises:
+            FaceDiffError: if a clip is not there, or there is none that all have.
+        """
+        common = [clip for clip in self.truths if all(clip in files for files in self.methods.values())]
+        if clips is None:
+            if not common:
+                raise FaceDiffError(
+                    f"{' and '.join(self.names)} have no clip in common; the truth has {few(self.truths)}; "
+                    f"say how files are named with --pattern and --truth-pattern"
+                )
+            return common
+        for clip in clips:
+            if clip not in self.truths:
+                raise FaceDiffError(f'there is no clip "{clip}": {few(self.truths, clip)}')
+            for method, files in self.methods.items():
+                if clip not in files:
+                    raise FaceDiffError(f'{method} has no prediction of clip "{clip}": {few(files, clip)}')
+        return list(clips)
+
+    def open(self, clip: str) -> dict[str, Tensor]:
+        """Absolute vertices (T, V, 3) of the truth and of each method, memory-mapped, each in its own length.
+
+        Raises:
+            FaceDiffError: if a file is unreadable, empty, or of another mesh than the truth.
+        """
+        opened = {TRUTH: read_vertices(self.truths[clip].path, self.n_vertices, self.truth_stride)}
+        for method, files in self.methods.items():
+            try:
+                opened[method] = read_vertices(files[clip], self.n_vertices)
+            except FaceDiffError as error:
+                raise FaceDiffError(
+                    f"{method}: {error}; all methods of a figure have the truth's mesh of {self.n_vertices} vertices"
+                ) from error
+        return opened
+
+    def path(self, clip: str, name: str) -> Path:
+        """Where a clip's vertices lie, of the truth or of a method."""
+        return self.truths[clip].path if name == TRUTH else self.methods[name][clip]
+
+    def template(self, clip: str) -> Array:
+        """Neutral face (V, 3) of a clip's subject.
+
+        Raises:
+            FaceDiffError: if there is none.
+        """
+        subject = self.truths[clip].name.subject
+        if subject not in self.templates:
+            known = f"there are templates of {', '.join(self.templates)}" if self.templates else "give --templates FILE"
+            raise FaceDiffError(f"no template of {subject}, needed by clip {clip}; {known}")
+        return np.asarray(self.templates[subject], np.float64)
+
+    def mesh(self, clips: Sequence[str]) -> tuple[npt.NDArray[np.int32], Array]:
+        """Triangles (F, 3), and a face at rest (V, 3): the mean of the clips' templates, else the mesh file's own.
+
+        Raises:
+            FaceDiffError: if no mesh is known.
+        """
+        if self.faces is None or self.rest is None:
+            raise FaceDiffError(
+                "nothing says how the vertices are joined to faces; give --mesh FILE, a .ply or .obj of this topology"
+            )
+        subjects = dict.fromkeys(self.truths[clip].name.subject for clip in clips)
+        found = [np.asarray(self.templates[name], np.float64) for name in subjects if name in self.templates]
+        return self.faces, np.mean(found, axis=0) if found else self.rest
+
+
+def find_clips(
+    methods: Mapping[str, Path],
+    truth: Path,
+    *,
+    subjects: Sequence[str] = (),
+    patterns: Sequence[str] = DEFAULT_PATTERNS,
+    truth_pattern: str = TRUTH_PATTERN,
+    identity: str = OWN,
+) -> tuple[dict[str, Truth], dict[str, dict[str, Path]]]:
+    """Which file is which clip's, as ``facediff evaluate`` tells it.
+
+    Args:
+        methods: folder of predictions by method.
+        truth: folder of truths.
+        subjects: known subjects.
+        patterns: how predictions may be named.
+        truth_pattern: how truths are named.
+        identity: ``own``, or the identity whose predictions are drawn.
+
+    Returns:
+        truths by clip, and each method's predictions by clip.
+
+    Raises:
+        FaceDiffError: if a folder is missing or has no file that can be told, or a method none of a truth's clip.
+    """
+    if identity == ALL:
+        raise FaceDiffError("--identity all: a figure shows one condition; expected own or an identity's name")
+    if TRUTH in methods:
+        raise FaceDiffError(f'a method cannot be called "{TRUTH}"; name it with NAME=FOLDER')
+    names, _ = list_names(truth, [NamePattern(truth_pattern, subjects)])
+    truths = dict(sorted(index_truths(names).items()))
+    if not truths:
+        raise FaceDiffError(f"{truth}: no file is named like {truth_pattern}.npy; say how with --truth-pattern")
+    readers = [NamePattern(pattern, subjects) for pattern in patterns]
+    found: dict[str, dict[str, Path]] = {}
+    for method, folder in methods.items():
+        files, _ = list_names(folder, readers)
+        pairs = pair_up(files, truths, identity).pairs
+        if not pairs:
+            raise FaceDiffError(
+                f"{folder}: no file is a prediction of a truth's clip under the condition {identity}; the truth has "
+                f"{few(truths)}; say how files are named with --pattern, or choose another --identity"
+            )
+        found[method] = {pair.clip: next(iter(pair.predictions.values())) for pair in pairs}
+    return truths, found
+
+
+def few(clips: Mapping[str, object], like: str = "") -> str:
+    """The names of clips for a message, not more than a few, the nearest first."""
+    import difflib
+
+    if len(clips) <= LISTED:
+        return choices(like, clips) if like else ", ".join(clips)
+    near = difflib.get_close_matches(like, clips, n=LISTED, cutoff=0.3) if like else []
+    if near:
+        return f'did you mean "{near[0]}"? near are {", ".join(near)} of {len(clips)}'
+    return f"{', '.join(list(clips)[:LISTED])} … ({len(clips)} in all)"
+
+
+def shortest(motions: Mapping[str, Tensor]) -> tuple[int, str | None]:
+    """Frames that all motions have, and a note on what that cuts; None if they are of one length."""
+    lengths = {name: len(motion) for name, motion in motions.items()}
+    frames = min(lengths.values())
+    if len(set(lengths.values())) == 1:
+        return frames, None
+    told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+    return frames, f"lengths differ ({told} frames): cut to the first {frames}"
+
+
+def chunks(motion: Tensor, path: Path, frames: int | None = None) -> Iterator[tuple[int, Array]]:
+    """A motion (T, V, 3) in float64, a few frames at a time, each with the number of its first frame.
+
+    Args:
+        motion: the motion.
+        path: its file, for messages.
+        frames: frames to read; all if None.
+
+    Raises:
+        FaceDiffError: at NaN or infinity.
+    """
+    frames = len(motion) if frames is None else frames
+    step = max(1, CHUNK // max(1, motion[0].numel()))
+    for first in range(0, frames, step):
+        part = np.asarray(motion[first : min(first + step, frames)], np.float64)
+        finite = np.isfinite(part).all((1, 2))
+        if not finite.all():
+            bad = first + int(np.argmin(finite))
+            raise FaceDiffError(f"{path}: frame {bad} holds NaN or infinity (counted from 0); repair or leave it out")
+        yield first, part

@@ -1,0 +1,201 @@
+"""Vertex errors and dynamics of one sequence from a single pass over its frames.
+
+A sequence is larger than a processor's cache, and reading it from memory costs as much as some arithmetic on it. So a
+few frames at a time are widened to float64 in buffers that are used again, and all that is asked for is taken from
+them before the next frames are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from facediff.metrics.options import Reduction
+
+# Coordinates widened to float64 at a time: on a CPU few enough to stay near it, and enough that threads seldom wait for
+# one another to start the next operation; on other devices many enough that starting the work costs nothing.
+_CHUNK_CPU = 2**19
+_CHUNK_ELSEWHERE = 2**24
+
+
+@dataclass(frozen=True)
+class ErrorOf:
+    """Which vertex error to take.
+
+    Args:
+        indices: Vertices to look at, (region,) int64; None for all.
+        reduction: How the vertices of a frame become one number.
+        squared: Whether distances are squared.
+    """
+
+    indices: Tensor | None
+    reduction: Reduction
+    squared: bool
+
+
+@torch.no_grad()
+def one_pass(
+    prediction: Tensor,
+    truth: Tensor,
+    *,
+    errors: Sequence[ErrorOf] = (),
+    template: Tensor | None = None,
+    uppers: Sequence[Tensor] = (),
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Vertex errors, and how much less the prediction varies over time than the truth.
+
+    What is found does not depend on what else is asked for: each vertex goes through the same float64 operations.
+
+    Args:
+        prediction: (frames, vertices, 3).
+        truth: (frames, vertices, 3).
+        errors: Vertex errors wanted.
+        template: (vertices, 3), or None if prediction and truth are offsets from it already; for ``uppers``.
+        uppers: For each deviation wanted the vertices to look at, (region,) int64.
+
+    Returns:
+        For each of ``errors`` its mean over frames, and for each of ``uppers`` the signed deviation; float64 scalars.
+    """
+    frames, vertices, _ = truth.shape
+    step = steps(truth, vertices if len(errors) + len(uppers) > 1 else _looked_at(errors, uppers, vertices))
+    buffers = Buffers(truth.device)
+    everywhere = any(error.indices is None for error in errors)
+    totals = torch.zeros(len(errors), dtype=torch.float64, device=truth.device)
+    deviations = [
+        tuple(Variation(motion[0], template, indices, step, buffers) for motion in (truth, prediction))
+        for indices in uppers
+    ]
+    for start in range(0, frames, step):
+        true, predicted = truth[start : start + step], prediction[start : start + step]
+        whole = squared_errors(true, predicted, buffers) if everywhere else None
+        for place, error in enumerate(errors):
+            totals[place] += _sum_over_frames(error, whole, true, predicted, buffers)
+        for of_truth, of_prediction in deviations:
+            of_truth.add(true)
+            of_prediction.add(predicted)
+    means = list((totals / frames).unbind()) if errors else []
+    return means, [of_truth.mean(frames) - of_prediction.mean(frames) for of_truth, of_prediction in deviations]
+
+
+def steps(motion: Tensor, looked_at: int) -> int:
+    """How many frames of so many vertices to widen at a time."""
+    return max(1, (_CHUNK_CPU if motion.device.type == "cpu" else _CHUNK_ELSEWHERE) // (3 * looked_at))
+
+
+def _looked_at(errors: Sequence[ErrorOf], uppers: Sequence[Tensor], vertices: int) -> int:
+    regions = [*(error.indices for error in errors), *uppers]
+    return min((vertices if region is None else len(region) for region in regions), default=vertices)
+
+
+class Buffers:
+    """Memory that is used again for every few frames: fresh memory would cost more than the arithmetic on it.
+
+    Args:
+        device: Where.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.kept: dict[tuple[str, torch.dtype], Tensor] = {}
+
+    def get(self, name: str, *shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Memory of that shape, with anything in it; the same for the same name and type."""
+        size = 1
+        for length in shape:
+            size *= length
+        kept = self.kept.get((name, dtype))
+        if kept is None or len(kept) < size:
+            kept = self.kept[name, dtype] = torch.empty(size, dtype=dtype, device=self.device)
+        return kept[:size].view(shape)
+
+
+def widened(motion: Tensor, name: str, buffers: Buffers) -> Tensor:
+    """The same in float64: itself if it is so already, else in a buffer of that name."""
+    if motion.dtype == torch.float64:
+        return motion
+    return buffers.get(name, *motion.shape).copy_(motion)
+
+
+def squared_errors(true: Tensor, predicted: Tensor, buffers: Buffers) -> Tensor:
+    """Σ_c (g_c − p_c)² of every vertex.
+
+    Args:
+        true: (frames, vertices, 3), of any floating-point type.
+        predicted: Likewise.
+        buffers: Where the work is done.
+
+    Returns:
+        (frames, vertices), float64, in a buffer.
+    """
+    difference = buffers.get("difference", *true.shape)
+    torch.sub(widened(true, "difference", buffers), widened(predicted, "predicted", buffers), out=difference)
+    difference.mul_(difference)
+    # Three strided terms are much faster than a reduction of length three.
+    x, y, z = difference.unbind(-1)
+    return torch.add(x, y, out=buffers.get("errors", *x.shape)).add_(z)
+
+
+def _sum_over_frames(error: ErrorOf, whole: Tensor | None, true: Tensor, predicted: Tensor, buffers: Buffers) -> Tensor:
+    """The error of each frame, added up; from the squared errors of all vertices if there are any."""
+    if whole is None:
+        region = cast(Tensor, error.indices)
+        squares = squared_errors(true.index_select(1, region), predicted.index_select(1, region), buffers)
+    else:
+        squares = whole if error.indices is None else whole.index_select(1, error.indices)
+    if error.reduction == "max":
+        largest = squares.amax(1)  # before the root: the root is monotone, and taken once a frame
+        return (largest if error.squared else largest.sqrt()).sum()
+    roots = squares if error.squared else torch.sqrt(squares, out=buffers.get("roots", *squares.shape))
+    return roots.sum() / squares.shape[1]
+
+
+class Variation:
+    """Mean over vertices of the population standard deviation over time of the squared offset.
+
+    Sums of q − q₀ and of its square, q₀ being the squared offset in the first frame, are all that is kept. As q₀ is one
+    of the n values, (mean − q₀)² is at most n times the variance, so that subtracting the one sum from the other loses
+    no more than log₁₀ n + 1 of float64's digits.
+
+    Args:
+        first: First frame, (vertices, 3).
+        template: (vertices, 3); None if frames are offsets from it.
+        indices: Vertices to look at, (region,) int64.
+        step: The most frames that are added at a time.
+        buffers: Where the work is done.
+    """
+
+    def __init__(self, first: Tensor, template: Tensor | None, indices: Tensor, step: int, buffers: Buffers) -> None:
+        # All x, then all y, then all z: terms that lie side by side are added much faster than strided ones.
+        self.places = (3 * indices + torch.arange(3, device=indices.device)[:, None]).flatten()
+        self.still = None if template is None else template.reshape(-1).index_select(0, self.places).double()
+        self.buffers = buffers
+        self.count = len(indices)
+        self.first = self._squared_offsets(first[None])[0].clone()
+        self.sums = torch.zeros(step, self.count, dtype=torch.float64, device=first.device)
+        self.squares = torch.zeros_like(self.sums)
+
+    def add(self, motion: Tensor) -> None:
+        """Add frames (frames, vertices, 3)."""
+        moved = self._squared_offsets(motion).sub_(self.first)
+        self.sums[: len(motion)].add_(moved)
+        self.squares[: len(motion)].addcmul_(moved, moved)
+
+    def mean(self, frames: int) -> Tensor:
+        """The mean over vertices, float64 scalar, once so many frames have been added."""
+        variance = (self.squares.sum(0) - self.sums.sum(0).square() / frames) / frames
+        return variance.clamp(min=0).sqrt().mean()
+
+    def _squared_offsets(self, motion: Tensor) -> Tensor:
+        """(frames, region), in a buffer."""
+        chosen = self.buffers.get("chosen", len(motion), 3 * self.count, dtype=motion.dtype)
+        torch.index_select(motion.reshape(len(motion), -1), 1, self.places, out=chosen)
+        offset = widened(chosen, "offset", self.buffers)
+        if self.still is not None:
+            offset.sub_(self.still)
+        x, y, z = offset.view(len(motion), 3, self.count).unbind(1)
+        squared = torch.mul(x, x, out=self.buffers.get("squared", len(motion), self.count))
+        return squared.addcmul_(y, y).addcmul_(z, z)

@@ -1,0 +1,352 @@
+"""Previews show the averaged weights, the same clips and noise each time, and leave training as it is."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+import cv2
+import lightning.pytorch as pl
+import numpy as np
+import pytest
+import torch
+import yaml
+from lightning.pytorch.callbacks import EMAWeightAveraging
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
+from PIL import Image
+
+from facediff.callbacks import SamplingPreview
+from facediff.callbacks.sampling_preview_drawing import default_error_scale, first_of_each_subject, length
+from facediff.cli import main
+from facediff.data import collate
+from facediff.data.corpus import Clip
+from facediff.errors import FaceDiffError
+from facediff.render import Renderer
+from facediff.systems import DualPathDiffusion, load_system
+from tests.fakes.tiny import Tiny
+from tests.fakes.wandb_run import OfflineRun
+
+MakeSystem = Callable[..., DualPathDiffusion]
+MakeTrainer = Callable[..., pl.Trainer]
+
+SIZE = 64
+CLIPS = ["A_e05", "B_e05"]
+SMALL = {"every_n_epochs": 1, "size": SIZE, "steps": 3, "sampler": "ddim", "error_scale": 0.01}
+
+
+class Weights(pl.Callback):
+    """Keeps raw and averaged weights after every epoch, as a checkpoint would hold them."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        trainer.save_checkpoint(self.folder / f"{trainer.current_epoch + 1}.ckpt")
+
+
+class Losses(pl.Callback):
+    def __init__(self) -> None:
+        self.found: list[Any] = []
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
+    ) -> None:
+        self.found.append(outputs["loss"].item())  # type: ignore[index]
+        self.found.append((random.random(), np.random.rand(), torch.rand(()).item()))  # noqa: NPY002, S311
+        self.found.append(sum(module.training for module in pl_module.modules()))
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.found += [trainer.callback_metrics["val/loss"].item(), trainer.callback_metrics["val/lve"].item()]
+
+
+def shown(sheet: Path, system: DualPathDiffusion, clip: str, tiny: Tiny, seed: int = 0) -> bool:
+    """Whether the first picture of a sheet shows this system's motion, drawn here with the renderer alone."""
+    dataset = tiny.dataset("val")
+    sample = dataset[[found.name for found in dataset.clips].index(clip)]
+    system.choose_sampler("ddim", 3)
+    with torch.inference_mode():
+        motion = system.eval().generate(collate([sample]), seed=seed)[0]
+    mesh = tiny.assets()
+    assert mesh.faces is not None
+    width = SIZE * 3 // 4
+    renderer = Renderer(mesh.faces.numpy(), template=sample.template.numpy(), size=(SIZE, width), colours=mesh.colours)
+    first = round(0.5 * (len(motion) - 1) / 6)
+    truth, made = (renderer.render((found + sample.template)[first].numpy()) for found in (sample.motion, motion))
+    with Image.open(sheet) as image:
+        picture = np.asarray(image)
+    for top in range(SIZE):
+        if np.array_equal(picture[top : top + SIZE, :width], truth):
+            return np.array_equal(picture[top : top + SIZE, width : 2 * width], made)
+    raise AssertionError("the truth is not on the sheet")
+
+
+def system_of(checkpoint: Path, *, averaged: bool) -> DualPathDiffusion:
+    system = load_system(checkpoint)
+    weights = torch.load(checkpoint, weights_only=True)["state_dict" if averaged else "current_model_state"]
+    system.load_state_dict(weights)
+    return system
+
+
+def test_averaged_weights_are_shown(
+    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+) -> None:
+    """After epoch 2 from validation; after epoch 3, which has none, at the end of training.
+
+    Here the averaging callback comes first; with two processes, below, it comes last.
+    """
+    callbacks = [EMAWeightAveraging(decay=0.9, use_buffers=False), SamplingPreview(**{**SMALL, "clips": 1})]
+    trainer = make_trainer(max_epochs=3, check_val_every_n_epoch=2, callbacks=[*callbacks, Weights(str(tmp_path))])
+    system = make_system(learning_rate=3e-3)
+    trainer.fit(system, datamodule=tiny)
+    assert sorted(path.name for path in (tmp_path / "previews").iterdir()) == ["epoch_0002", "epoch_0003"]
+    for epoch in (2, 3):
+        sheet = tmp_path / "previews" / f"epoch_{epoch:04d}" / "A_e05.png"
+        for averaged in (True, False):
+            assert shown(sheet, system_of(tmp_path / f"{epoch}.ckpt", averaged=averaged), "A_e05", tiny) is averaged
+    final = system_of(tmp_path / "3.ckpt", averaged=True).state_dict()
+    assert all(torch.equal(tensor, final[name]) for name, tensor in system.state_dict().items())
+
+
+class Broken(SamplingPreview):
+    def _clip(self, *arguments: object) -> NoReturn:
+        raise RuntimeError("the disk is full")
+
+
+def test_two_processes(tiny: Tiny, tiny_root: Path, tmp_path: Path) -> None:
+    """One process draws, and fails where it must; the other neither draws nor waits for ever."""
+    here = "tests.callbacks.test_sampling_preview"
+    callbacks: list[dict[str, Any]] = [
+        {"class_path": "facediff.callbacks.SamplingPreview", "init_args": SMALL},
+        {"class_path": f"{here}.Broken", "init_args": SMALL},
+        {"class_path": "EMAWeightAveraging", "init_args": {"decay": 0.9, "use_buffers": False}},
+        {"class_path": f"{here}.Weights", "init_args": {"folder": str(tmp_path)}},
+    ]
+    # Forked processes are spared the imports.
+    options: dict[str, Any] = {"max_epochs": 3, "check_val_every_n_epoch": 2, "devices": 2, "strategy": "ddp_fork"}
+    options |= {"callbacks": callbacks, "default_root_dir": str(tmp_path)}
+    options |= dict.fromkeys(("logger", "enable_progress_bar", "enable_model_summary", "enable_checkpointing"), False)
+    (tmp_path / "two.yaml").write_text(yaml.safe_dump({"trainer": options}))
+    words = ["--config", "configs/experiment/puppet.yaml", "--config", str(tmp_path / "two.yaml")]
+    words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--data.batch_size=2"]
+    words += ["--model.dim=16", "--model.diffusion_steps=20", "--model.sampler.steps=2"]
+    done = subprocess.run(
+        [sys.executable, "-m", "facediff", "fit", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    for epoch in (2, 3):
+        assert done.stderr.count(f"of A_e05 after epoch {epoch} failed, and training goes on: the disk is full") == 1
+        assert done.stdout.count(f"preview after epoch {epoch}: A_e05, B_e05 in") == 1
+        folder = tmp_path / "previews" / f"epoch_{epoch:04d}"
+        assert sorted(path.name for path in folder.iterdir()) == [f"{c}.{s}" for c in CLIPS for s in ("mp4", "png")]
+        for averaged in (True, False):
+            system = system_of(tmp_path / f"{epoch}.ckpt", averaged=averaged)
+            assert shown(folder / "B_e05.png", system, "B_e05", tiny) is averaged
+
+
+@pytest.mark.parametrize("preview", [SamplingPreview, Broken])
+@pytest.mark.filterwarnings("ignore:the preview of:UserWarning")
+def test_training_is_the_same_digit_for_digit(
+    preview: type[SamplingPreview], make_system: MakeSystem, make_trainer: MakeTrainer, tiny_root: Path
+) -> None:
+    found = []
+    for callbacks in ([], [preview(**SMALL)]):
+        pl.seed_everything(3, verbose=False)
+        spy, system = Losses(), make_system()
+        trainer = make_trainer(max_epochs=2, val_check_interval=0.5, callbacks=[*callbacks, spy])
+        sampler = system.sampler
+        trainer.fit(system, datamodule=Tiny(root=str(tiny_root), window=9))
+        found.append([*spy.found, *(tensor.sum().item() for tensor in system.state_dict().values())])
+        assert system.sampler is sampler
+    assert len(found[0]) > 50
+    assert found[0] == found[1]
+
+
+def test_clips_and_noise_are_the_same_in_every_epoch(
+    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+) -> None:
+    """With weights that stand still, so do the pictures; another seed gives others."""
+    sheets = []
+    for seed in (0, 0, 1):
+        folder = tmp_path / str(len(sheets))
+        preview = SamplingPreview(**{**SMALL, "names": ["B_e05"], "seed": seed, "seconds": 0.4, "error_scale": None})
+        trainer = make_trainer(max_epochs=2, callbacks=[preview], default_root_dir=folder)
+        trainer.fit(make_system(learning_rate=0.0), datamodule=tiny)
+        one, two = sorted(folder.glob("previews/epoch_*/B_e05.png"))
+        sheets += [np.asarray(Image.open(path)) for path in (one, two)]
+        assert preview.state_dict() == {
+            "error_scale": default_error_scale([tiny.dataset("val")[1]]),
+            "drawn_epochs": 2,
+            "drawn_step": 16,
+        }
+        capture = cv2.VideoCapture(str(one.with_suffix(".mp4")))
+        assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 10  # of 23
+    panels = [sheet[20:60] for sheet in sheets]  # without the footer, where the epoch stands
+    assert all(np.array_equal(panel, panels[0]) for panel in panels[:4])
+    assert not np.array_equal(panels[4], panels[0])
+
+
+def test_it_is_drawn_when_it_is_due(
+    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+) -> None:
+    def epochs(folder: str, trainer_options: dict[str, Any], **options: object) -> list[int]:
+        preview = SamplingPreview(**{**SMALL, "clips": 1, "seconds": 0.1, **options})
+        trainer = make_trainer(callbacks=[preview], default_root_dir=tmp_path / folder, **trainer_options)
+        trainer.fit(make_system(), datamodule=tiny)
+        return sorted(int(path.name[-4:]) for path in (tmp_path / folder).glob("previews/*"))
+
+    often = {"max_epochs": 7, "check_val_every_n_epoch": 3, "limit_train_batches": 1}
+    assert epochs("a", often, every_n_epochs=2) == [3, 6, 7]
+    assert epochs("b", often, every_n_epochs=4, at_end=False) == [6]
+    assert epochs("c", often, every_n_epochs=None) == [7]
+    assert epochs("d", {"max_epochs": 1, "limit_val_batches": 0}) == [1]
+    assert epochs("e", {"fast_dev_run": True}) == []
+    assert epochs("f", {"max_epochs": 0, "num_sanity_val_steps": 2}) == []
+
+
+def test_a_resumed_run_goes_on_alike() -> None:
+    before, after, chosen = SamplingPreview(), SamplingPreview(), SamplingPreview(error_scale=2.0)
+    before.load_state_dict({"error_scale": 0.5, "drawn_epochs": 4, "drawn_step": 9})
+    after.load_state_dict(before.state_dict())
+    chosen.load_state_dict(before.state_dict())
+    assert after.state_dict() == {"error_scale": 0.5, "drawn_epochs": 4, "drawn_step": 9}
+    assert chosen.state_dict()["error_scale"] == 2.0
+
+
+def test_a_failing_preview_warns_and_leaves_nothing_half_written(
+    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: Renderer, *arguments: object, **options: object) -> None:
+        raise MemoryError("no memory for pictures")
+
+    monkeypatch.setattr(Renderer, "render", interrupted)
+    trainer = make_trainer(callbacks=[SamplingPreview(**{**SMALL, "clips": 1})], logger=CSVLogger(tmp_path))
+    with pytest.warns(UserWarning, match="preview of A_e05 after epoch 1 failed, and .* no memory for pictures"):
+        trainer.fit(make_system(), datamodule=tiny)
+    assert trainer.current_epoch == 1
+    assert not [path for path in tmp_path.rglob("*") if "previews" in str(path)]
+
+
+def test_a_logger_that_fails_does_not_keep_the_others_from_showing(
+    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board, table = TensorBoardLogger(tmp_path / "board"), CSVLogger(tmp_path / "csv")
+    monkeypatch.setattr(type(board.experiment), "add_image", lambda *_, **__: 1 / 0)
+    trainer = make_trainer(callbacks=[SamplingPreview(**SMALL)], logger=[board, table])
+    with pytest.warns(UserWarning, match="after epoch 1 for TensorBoardLogger failed.*division by zero"):
+        trainer.fit(make_system(), datamodule=tiny)
+    assert "preview/seconds" in (Path(table.log_dir) / "metrics.csv").read_text()
+    assert len(list(Path(board.log_dir).glob("previews/epoch_0001/*"))) == 4
+
+
+def test_a_missing_package_is_told_once(
+    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    trainer = make_trainer(max_epochs=2, callbacks=[SamplingPreview(**SMALL)])
+    with pytest.warns(UserWarning, match=r"no previews in this run: .*facediff\[render\]") as told:
+        trainer.fit(make_system(), datamodule=tiny)
+    assert sum("no previews" in str(warning.message) for warning in told) == 1
+
+
+def test_a_corpus_without_a_mesh_is_told_once(
+    make_system: MakeSystem,
+    make_trainer: MakeTrainer,
+    tiny: Tiny,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(tiny, "mesh_files", ("absent.ply",))
+    make_trainer(max_epochs=2, callbacks=[SamplingPreview(**SMALL)]).fit(make_system(), datamodule=tiny)
+    told = capsys.readouterr().out
+    assert told.count(f"no previews in this run: {tiny.root} holds no mesh to draw (absent.ply)") == 1
+    assert told.count("preview") == 1
+    assert not (tmp_path / "previews").exists()
+
+
+def test_bad_options_are_refused_at_once(make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny) -> None:
+    with pytest.raises(FaceDiffError, match="seconds is 0, expected a number above zero"):
+        SamplingPreview(seconds=0)
+    trainer = make_trainer(callbacks=[SamplingPreview(names=["A_e05", "A_e06"])])
+    with pytest.raises(FaceDiffError, match="A_e06 is no validation clip"):
+        trainer.fit(make_system(), datamodule=tiny)
+
+
+def test_tensorboard_holds_pictures_and_sound(
+    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    logger = TensorBoardLogger(tmp_path)
+    make_trainer(callbacks=[SamplingPreview(**SMALL)], logger=logger).fit(make_system(), datamodule=tiny)
+    events = EventAccumulator(logger.log_dir).Reload()
+    assert events.Tags()["images"] == [f"preview/{clip}" for clip in CLIPS]
+    assert events.Tags()["audio"] == [f"preview/{clip}" for clip in CLIPS]
+    (image,), (sound,) = events.Images("preview/B_e05"), events.Audio("preview/B_e05")
+    seen = cv2.imdecode(np.frombuffer(image.encoded_image_string, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    (file,) = tmp_path.rglob("previews/epoch_0001/B_e05.png")
+    np.testing.assert_array_equal(seen, np.asarray(Image.open(file)))
+    assert (image.step, sound.sample_rate, sound.length_frames) == (8, 16000, 23 * 640)
+    assert events.Scalars("preview/seconds")[0].value > 0
+
+
+def test_wandb_holds_videos_and_a_growing_table(
+    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wandb = pytest.importorskip("wandb")
+    monkeypatch.chdir(tmp_path)
+    wandb.finish()  # another test's run in this process
+    logger = WandbLogger(project="facediff", save_dir=tmp_path, settings=wandb.Settings(console="off"))
+    trainer = make_trainer(max_epochs=2, callbacks=[SamplingPreview(**SMALL)], logger=logger)
+    trainer.fit(make_system(), datamodule=tiny)
+    # Ends wandb's own process too: all is on disk then, and a later test's starts in that test's folder.
+    wandb.finish()
+    wandb.teardown()
+    (folder,) = tmp_path.glob("wandb/offline-run-*")
+    run = OfflineRun(folder)
+    for clip in CLIPS:
+        videos = run.column(f"preview/{clip}")
+        assert [video["caption"] for video in videos] == [f"{clip} after epoch {epoch}" for epoch in (1, 2)]
+        for video in videos:
+            capture = cv2.VideoCapture(str(run.files / video["path"]))
+            assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == {"A_e05": 22, "B_e05": 23}[clip]
+    tables = [json.loads(path.read_text()) for name, path in run.media.items() if name.endswith("clips.table.json")]
+    assert tables[0]["columns"] == ["clip", "epoch", "video", "mve", "lve", "fdd"]
+    rows = [row for table in tables for row in table["data"]]
+    assert [row[:2] for row in rows] == [[clip, epoch] for epoch in (1, 2) for clip in CLIPS]
+    assert all(row[2]["_type"] == "video-file" and row[4] > 0 for row in rows)
+
+
+def test_the_shipped_configs_draw_and_the_last_one_counts(tiny_root: Path, tmp_path: Path) -> None:
+    words = ["--config", "configs/experiment/puppet.yaml", "--config", "configs/callbacks/preview.yaml"]
+    words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--model.dim=16", "--trainer.max_steps=1"]
+    words += ["--model.diffusion_steps=20", "--model.sampler.steps=2", "--trainer.log_every_n_steps=1"]
+    words += ["--trainer.limit_val_batches=0", "--trainer.enable_progress_bar=false"]
+    assert main(["fit", *words, f"--trainer.logger.save_dir={tmp_path}"]) == 0
+    sheets = list((tmp_path / "puppet/version_0/previews").glob("*/*.png"))
+    assert sorted(path.stem for path in sheets) == CLIPS  # the trainer's config alone draws one
+    with Image.open(sheets[0]) as image:
+        assert image.size[0] == 2 * 3 * 288 + 6
+
+
+def test_each_persons_first_clip_comes_before_any_second() -> None:
+    clips = [Clip(name, *name.split("_")) for name in ("A_e1", "A_e2", "A_e3", "B_e1", "C_e1", "C_e2")]  # type: ignore[call-arg]
+    assert first_of_each_subject(clips, 2) == ["A_e1", "B_e1"]
+    assert first_of_each_subject(clips, 5) == ["A_e1", "B_e1", "C_e1", "A_e2", "C_e2"]
+    assert first_of_each_subject(clips[:2], 9) == ["A_e1", "A_e2"]
+
+
+def test_lengths_are_for_people() -> None:
+    assert [length(0.0051, "m"), length(0.0051, "mm"), length(2, "unit")] == ["5.1 mm", "0.0051 mm", "2 unit"]
