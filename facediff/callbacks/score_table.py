@@ -98,7 +98,7 @@ def format_table(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool) ->
     """The scores as text, with what they were taken over."""
     names = [name for name in ("mve", "lve", "fdd", "fdd_absolute") if name in rows[0]]
     kind = "SYNTHETIC corpus" if synthetic else "corpus"
-    lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}"]
+    lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}, unseen people: {rows[0]['unseen_identity']}"]
     for region in rows[0]["regions"].values():
         lines.append(f"region {region['name']}: {region['count']} vertices, hash {region['hash']}")
     lines.append(

@@ -76,11 +76,11 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
     checkpoint = read_checkpoint(Path(str(path)))
     if name == "fit":
         return arguments
-    given = [word for word in arguments if re.match(r"--model(?!\.init_args\.sampler|\.sampler)\b", word)]
+    given = [word for word in arguments if re.match(r"--model(?!\.(init_args\.)?(sampler|unseen_identity)\b)\b", word)]
     if given:
         raise FaceDiffError(
             f"{given[0]}: the checkpoint {path} decides the model, and its weights fit no other; leave the flag away "
-            f"(only --model.sampler… may change)"
+            f"(only --model.sampler… and --model.unseen_identity may change)"
         )
     config = {"seed_everything": 0, "model": described(checkpoint["hyper_parameters"], drop=LINKS)}
     if option(arguments, "--data") is None:

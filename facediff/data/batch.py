@@ -126,6 +126,28 @@ class Batch:
         }
         return Batch(**moved)
 
+    def select(self, clips: Sequence[int]) -> Batch:
+        """Some of the clips, in the order given, padded to the longest of them."""
+        chosen = torch.as_tensor(clips, device=self.motion.device)
+        lengths = {
+            "audio": self.audio_lengths,
+            "decoy_audio": self.audio_lengths,
+            "motion": self.frame_lengths,
+            "reference": self.reference_lengths,
+            "features": self.feature_lengths,
+        }
+        picked: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                value = value[chosen]
+                own = lengths.get(field.name)
+                value = value if own is None else value[:, : int(own[chosen].max())]
+            elif isinstance(value, list):
+                value = [value[clip] for clip in clips]
+            picked[field.name] = value
+        return Batch(**picked)
+
     def pin_memory(self) -> Batch:
         """The same batch in page-locked memory; called by PyTorch's loaders."""
         for field in fields(self):

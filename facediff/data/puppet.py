@@ -35,7 +35,7 @@ class Puppet(SpeechMotionDataModule):
         reference_frames: longest style reference, in frames.
         predict_split: the split that ``predict`` runs over; test A if None.
         people: folders of further people with this face's topology to train on.
-        newcomers: further subjects of the corpus to train on, with their clips of no split; first in the identity index.
+        newcomers: further subjects of the corpus to train on, with their clips of no split.
         train_subjects: train on the clips of these people only; of all if None.
         lips: file that says which vertices are the lips, or ``all``; the corpus's own if None.
         upper_face: the same for the upper face.

@@ -15,7 +15,7 @@ from facediff.figures.grid import GAP, Grid, Heading
 from facediff.figures.maps import error_maps, motion_maps
 from facediff.figures.material import Array, Material
 from facediff.figures.meshes import FLAT, Painter
-from facediff.figures.page import SMALLEST_TEXT, Page, Paper, check_output, plain, save, style
+from facediff.figures.page import SMALLEST_TEXT, Page, Paper, check_output, plain, save, style, wrapped
 
 HIGHEST = 70.0
 """Largest height of a picture in mm."""
@@ -179,7 +179,8 @@ def _bar(page: Page, grid: Grid, row: int, end: float, label: str, *, beyond: bo
     axes = page.axes(grid.end + 2 * GAP, top + (grid.height - height) / 2, BAR, height)
     shown = ScalarMappable(Normalize(0, end), ListedColormap(heat_ramp() / 255))
     bar = page.figure.colorbar(shown, cax=axes, extend="max" if beyond else "neither")
-    bar.set_label(plain(label), size=SMALLEST_TEXT)
+    lines = wrapped(label, grid.height, SMALLEST_TEXT, page.paper.font)  # it must not run into the next row's
+    bar.set_label(plain("\n".join(lines)), size=SMALLEST_TEXT)
     bar.outline.set_linewidth(0.4)
     bar.locator = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
     bar.update_ticks()

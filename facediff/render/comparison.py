@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.render.heat import heat_colours, heat_key
-from facediff.render.panels import FAINT, Frame, check_motion, side_by_side
+from facediff.render.panels import INK, Frame, check_motion, side_by_side
 from facediff.render.rasteriser import Renderer
 from facediff.render.text import draw_text
 
@@ -58,7 +58,7 @@ def comparison(
     ground = renderer.backdrop[-1:]
     height = max(round(_KEY_SHARE * renderer.height / 2) * 2, _MIN_KEY)
     strip = np.repeat(np.hstack([ground, ground]), height, axis=0)
-    strip = draw_text(strip, footer, colour=FAINT, scale=0.5)
-    key = heat_key(np.repeat(ground, height, axis=0), "0", scale_label, colour=FAINT)
+    strip = draw_text(strip, footer, colour=INK, scale=0.5)
+    key = heat_key(np.repeat(ground, height, axis=0), "0", scale_label, colour=INK)
     foot = np.hstack([strip, key])
     return (np.concatenate([frame, foot]) for frame in frames)

@@ -12,8 +12,8 @@ from facediff.render.text import draw_text
 
 Frame = npt.NDArray[np.uint8]
 
-_INK = (52, 56, 66)
-FAINT = (104, 110, 122)
+INK = (52, 56, 66)
+_FAINT = (104, 110, 122)
 
 
 def side_by_side(
@@ -74,12 +74,12 @@ def _frames(
             panels.append(renderer.render(motion[index], colours=now))
         if any(label.strip() for label in labels):
             panels = [
-                _caption(panel, label, "top", _INK, renderer.backdrop[:1])
+                _caption(panel, label, "top", INK, renderer.backdrop[:1])
                 for renderer, panel, label in zip(renderers, panels, labels, strict=True)
             ]
         row = np.hstack(panels)
         ground = np.hstack([renderer.backdrop[-1:] for renderer in renderers])
-        yield row if not footer else _caption(row, footer, "bottom", FAINT, ground)
+        yield row if not footer else _caption(row, footer, "bottom", _FAINT, ground)
 
 
 def _caption(picture: Frame, text: str, edge: str, colour: tuple[int, int, int], ground: Frame | None = None) -> Frame:
@@ -138,7 +138,7 @@ def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str
     if labels is not None:
         if len(labels) != len(pictures):
             raise FaceDiffError(f"contact sheet of {len(pictures)} frames has {len(labels)} labels: give one for each.")
-        pictures = [_caption(picture, label, "top", _INK) for picture, label in zip(pictures, labels, strict=True)]
+        pictures = [_caption(picture, label, "top", INK) for picture, label in zip(pictures, labels, strict=True)]
     height, width, _ = pictures[0].shape
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)

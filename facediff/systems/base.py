@@ -22,6 +22,7 @@ from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
 from facediff.hparams import plain
 from facediff.systems.evaluation import Evaluation
+from facediff.systems.identity_policy import IdentityPolicy, conditioned
 from facediff.systems.schedule import Schedule, lr_factor
 from facediff.topology.hierarchy import mesh_hierarchy
 
@@ -73,6 +74,7 @@ class SpeechAnimator(LightningModule, ABC):
         protocol: the metrics' protocol for validation and test.
         motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
             leaves it as it is.
+        unseen_identity: as whom people are tested whom the model was not trained on.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class SpeechAnimator(LightningModule, ABC):
         identities: list[str],
         frame_rate: float,
         motion_scale: MotionScale,
+        unseen_identity: IdentityPolicy,
         learning_rate: float,
         weight_decay: float,
         lr_schedule: Schedule,
@@ -98,9 +101,10 @@ class SpeechAnimator(LightningModule, ABC):
         self.lr_schedule = lr_schedule
         self.warmup_steps = warmup_steps
         self.motion_scaling = motion_scale
+        self.unseen_identity: IdentityPolicy = unseen_identity
         self._assets: Assets | None = None
         self.data_source: dict[str, str] = {}
-        self.evaluation = Evaluation(protocol)
+        self.evaluation = Evaluation(protocol, unseen_identity)
 
     @abstractmethod
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
@@ -285,7 +289,8 @@ class SpeechAnimator(LightningModule, ABC):
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Score sampled motion, a still face, and the model's motion for another sentence's speech."""
         split = self.evaluation.splits[dataloader_idx]
-        self.evaluation.update(split, "model", self.generate(batch, seed=0), batch)
+        for name, view in conditioned(batch, self.unseen_identity, self.identities, self.assets.references):
+            self.evaluation.update(split, "model", self.generate(view, seed=0), view, name)
         self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
         if batch.decoy_audio is not None:
             decoy = replace(batch, audio=batch.decoy_audio, features=None)

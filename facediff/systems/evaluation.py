@@ -22,10 +22,12 @@ class Evaluation:
 
     Args:
         protocol_name: the protocol.
+        unseen_identity: as whom people are animated whom the model was not trained on; told beside the scores.
     """
 
-    def __init__(self, protocol_name: str) -> None:
+    def __init__(self, protocol_name: str, unseen_identity: str) -> None:
         self.protocol = protocol(protocol_name)
+        self.unseen_identity = unseen_identity
         self.splits: list[str] = []
         self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}
         self._sequences: list[dict[str, Any]] = []
@@ -50,8 +52,16 @@ class Evaluation:
             for split in self.splits
         }
 
-    def update(self, split: str, method: str, motion: Tensor, batch: Batch) -> None:
-        """Add a batch's motion (offsets from the template), unless another process adds the same clips."""
+    def update(self, split: str, method: str, motion: Tensor, batch: Batch, identity: str = "") -> None:
+        """Add a batch's motion (offsets from the template), unless another process adds the same clips.
+
+        Args:
+            split: the split.
+            method: who made the motion.
+            motion: offsets from the template.
+            batch: the clips with their true motion.
+            identity: the identity that all clips were animated as, if it is not their own.
+        """
         if batch.repeated:
             return
         metrics = self.metrics[split][method].to(motion.device)
@@ -62,7 +72,8 @@ class Evaluation:
         values = {name: cast(Tensor, metric.latest).tolist() for name, metric in scorers}
         for place, (clip, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
             own = {name: each[place] for name, each in values.items()}
-            self._sequences.append({"split": split, "method": method, "clip": clip, "frames": frames, **own})
+            told = {"split": split, "method": method, "clip": clip, "identity": identity, "frames": frames}
+            self._sequences.append({**told, **own})
 
     def sequences(self) -> list[dict[str, Any]]:
         """One row per test clip and method with its own scores, of all processes; collective under several."""
@@ -71,7 +82,7 @@ class Evaluation:
             shares: list[Any] = [None] * torch.distributed.get_world_size()
             torch.distributed.all_gather_object(shares, rows)
             rows = [row for share in shares for row in share]
-        return sorted(rows, key=lambda row: (row["split"], METHODS.index(row["method"]), row["clip"]))
+        return sorted(rows, key=lambda row: (row["split"], METHODS.index(row["method"]), row["clip"], row["identity"]))
 
     def scalars(self, split: str) -> dict[str, float]:
         """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics."""
@@ -92,5 +103,6 @@ class Evaluation:
             if not summary.coverage.sequences:
                 continue  # no clip of the split had speech of another sentence to shuffle with
             scores = {name: float(value) for name, value in metrics.compute().items()}
-            table.append({"split": split, "method": method, **scores, **summary.as_dict()})
+            told = {"split": split, "method": method, "unseen_identity": self.unseen_identity}
+            table.append({**told, **scores, **summary.as_dict()})
         return table

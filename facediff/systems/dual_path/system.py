@@ -29,6 +29,7 @@ from facediff.diffusion.samplers.ddim import DdimSampler
 from facediff.hparams import describe
 from facediff.systems.base import Progress, SpeechAnimator
 from facediff.systems.dual_path.network import Conditions, DualPathNetwork, TokenForm
+from facediff.systems.identity_policy import IdentityPolicy
 
 
 class DualPathDiffusion(SpeechAnimator):
@@ -64,6 +65,9 @@ class DualPathDiffusion(SpeechAnimator):
         lr_schedule: constant, or a cosine down to zero at the end of training.
         warmup_steps: optimiser steps over which the learning rate rises from zero.
         protocol: the metrics' protocol for validation and test.
+        unseen_identity: as whom people are tested whom the model was not trained on: as nobody known, with their own
+            style (``style_only``), as each training identity in turn with the mean of the scores (``each_seen``), or as
+            themselves, once the model is adapted to them (``adapted``).
     """
 
     def __init__(
@@ -93,6 +97,7 @@ class DualPathDiffusion(SpeechAnimator):
         lr_schedule: Literal["constant", "cosine"] = "constant",
         warmup_steps: int = 0,
         protocol: str = "paper",
+        unseen_identity: IdentityPolicy = "style_only",
     ) -> None:
         arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         super().__init__(
@@ -105,6 +110,7 @@ class DualPathDiffusion(SpeechAnimator):
             warmup_steps=warmup_steps,
             protocol=protocol,
             motion_scale=motion_scale,
+            unseen_identity=unseen_identity,
         )
         self.identity_dropout = identity_dropout
         self.loss_weights = {

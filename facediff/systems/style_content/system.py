@@ -20,6 +20,7 @@ from facediff.data import Batch, SpeechMotionDataModule
 from facediff.errors import FaceDiffError
 from facediff.hparams import describe
 from facediff.systems.base import Progress, SpeechAnimator
+from facediff.systems.identity_policy import IdentityPolicy
 from facediff.systems.schedule import Schedule
 from facediff.systems.style_content.decoder import MotionDecoder
 from facediff.systems.style_content.network import DisentanglementNetwork
@@ -82,11 +83,15 @@ class StyleContentDisentanglement(SpeechAnimator):
         position_weight: of positions within each comparison of motions.
         velocity_weight: of velocities within it.
         lip_gap_weight: of the gap between the inner lips within it.
+        upper_face_weight: of the upper face's positions within it, as a share of how much they vary.
         learning_rate: Adam's learning rate.
         weight_decay: decoupled weight decay.
         lr_schedule: constant, or a cosine down to zero at the end of training.
         warmup_steps: optimiser steps over which the learning rate rises from zero.
         protocol: the metrics' protocol for validation and test.
+        unseen_identity: as whom people are tested whom the model was not trained on: as nobody known, with their own
+            style (``style_only``), as each training identity in turn with the mean of the scores (``each_seen``), or as
+            themselves, once the model is adapted to them (``adapted``).
     """
 
     def __init__(
@@ -123,11 +128,13 @@ class StyleContentDisentanglement(SpeechAnimator):
         position_weight: float = 1.0,
         velocity_weight: float = 5.0,
         lip_gap_weight: float = 1.0,
+        upper_face_weight: float = 0.3,
         learning_rate: float = 1e-4,
         weight_decay: float = 0.0,
         lr_schedule: Schedule = "constant",
         warmup_steps: int = 0,
         protocol: str = "paper",
+        unseen_identity: IdentityPolicy = "style_only",
     ) -> None:
         arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         super().__init__(
@@ -140,6 +147,7 @@ class StyleContentDisentanglement(SpeechAnimator):
             warmup_steps=warmup_steps,
             protocol=protocol,
             motion_scale=motion_scale,
+            unseen_identity=unseen_identity,
         )
         self.basis_start = basis_start
         self.aligned_pairs = aligned_pairs
@@ -154,7 +162,7 @@ class StyleContentDisentanglement(SpeechAnimator):
             "person_style": person_style_weight,
             "speech_content": speech_content_weight,
         }
-        self.distance = MotionDistance(position_weight, velocity_weight, lip_gap_weight)
+        self.distance = MotionDistance(position_weight, velocity_weight, lip_gap_weight, upper_face_weight)
         self.readings = Readings(frame_rate)
         style = style_encoder(dim=dim)
         if not style.token_dims:
@@ -274,6 +282,7 @@ class StyleContentDisentanglement(SpeechAnimator):
             vertices=vertices,
             rest=batch.template * self.scale,
             pairs=None if pairs is None else pairs.to(motion.device),
+            upper=self.assets.regions["upper_face"].to(motion.device) if vertices is None else None,
         )
 
     def _supervised_vertices(self) -> Tensor | None:
