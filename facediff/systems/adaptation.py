@@ -35,7 +35,7 @@ def with_newcomers(system: SpeechAnimator, identities: list[str]) -> SpeechAnima
         )
     if not count:
         return system
-    described = {key: value for key, value in system.hparams.items() if key != "identities"}
+    described = {key: value for key, value in system.hparams.items() if not key.startswith("_")}
     grown: SpeechAnimator = instantiate_module(type(system), {**described, "identities": identities})
     before = system.state_dict()
     grown.load_state_dict({name: grow(before[name], value) for name, value in grown.state_dict().items()})
