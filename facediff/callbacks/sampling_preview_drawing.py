@@ -82,12 +82,12 @@ def default_error_scale(samples: Sequence[Sample]) -> float:
 
 @contextmanager
 def borrowed(system: SpeechAnimator, sampler: str | None, steps: int | None) -> Iterator[None]:
-    """A system in evaluation mode with another sampler; both are as they were afterwards."""
+    """A system in evaluation mode with another sampler, if it samples; both are as they were afterwards."""
     modes = [(module, module.training) for module in system.modules()]
     kept = {name: value for name, value in vars(system).items() if name == "sampler"}
     system.eval()
     try:
-        if sampler is not None or steps is not None:
+        if system.samples and (sampler is not None or steps is not None):
             system.choose_sampler(sampler, steps)
         yield
     finally:

@@ -128,16 +128,18 @@ def adaptation_data(args: argparse.Namespace) -> tuple[str, SpeechMotionDataModu
     from facediff.data.base import person_name
     from facediff.systems.checkpoint import imported, read_checkpoint
 
-    described = data_of(args.checkpoint, read_checkpoint(args.checkpoint))
+    checkpoint = read_checkpoint(args.checkpoint)
+    described = data_of(args.checkpoint, checkpoint)
     options: dict[str, Any] = dict(described["init_args"])
     if args.data_root is not None:
         options["root"] = str(args.data_root)
     folder = Path(args.person)
+    person = person_name(folder) if folder.is_dir() else args.person
+    if person in checkpoint["hyper_parameters"].get("identities", []):
+        raise FaceDiffError(f"--person {args.person}: the checkpoint knows {person}; train on with `facediff fit`")
     if folder.is_dir():
-        person = person_name(folder)
         options["people"] = [str(folder), *(options.get("people") or [])]
     else:
-        person = args.person
         options["newcomers"] = [person, *(options.get("newcomers") or [])]
     options["train_subjects"] = [person] if args.mode == FINETUNE else None
     module = imported(str(described["class_path"]), SpeechMotionDataModule)  # type: ignore[type-abstract]

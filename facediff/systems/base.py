@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -63,6 +63,9 @@ class Prediction:
 class SpeechAnimator(LightningModule, ABC):
     """Base of all systems.
 
+    Class attributes:
+        samples: whether motion is drawn by a sampler, which :meth:`choose_sampler` changes.
+
     Args:
         n_vertices: vertices of the topology.
         identities: training identities in the order of the identity index.
@@ -76,6 +79,8 @@ class SpeechAnimator(LightningModule, ABC):
             leaves it as it is.
         unseen_identity: as whom people are tested whom the model was not trained on.
     """
+
+    samples: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -148,7 +148,7 @@ def test_the_mean_of_several_clips(second: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--person", "A"], "knows A already"),
+        (["--person", "A"], "the checkpoint knows A"),
         (["--person", "nobody"], "neither a person's folder nor a subject"),
         (["--person", "C", "-o", "out.pt"], "ends in .ckpt"),
         (["--person", "C", "--epochs", "0"], "--epochs 0"),

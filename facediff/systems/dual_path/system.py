@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -69,6 +69,8 @@ class DualPathDiffusion(SpeechAnimator):
             style (``style_only``), as each training identity in turn with the mean of the scores (``each_seen``), or as
             themselves, once the model is adapted to them (``adapted``).
     """
+
+    samples: ClassVar[bool] = True
 
     def __init__(
         self,
