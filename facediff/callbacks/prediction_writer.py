@@ -11,7 +11,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 
 from facediff.files import atomic
-from facediff.systems.base import Prediction
+from facediff.systems.animation import Prediction
 
 
 class PredictionWriter(BasePredictionWriter):

@@ -125,7 +125,7 @@ def adaptation_data(args: argparse.Namespace) -> tuple[str, SpeechMotionDataModu
     """
     from facediff.commands.words import data_of
     from facediff.data import SpeechMotionDataModule
-    from facediff.data.base import person_name
+    from facediff.data.options import person_name
     from facediff.systems.checkpoint import imported, read_checkpoint
 
     checkpoint = read_checkpoint(args.checkpoint)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -13,20 +12,16 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from facediff.data import statistics
 from facediff.data.assets import Assets, Reference
 from facediff.data.batch import Batch, Sample, collate
 from facediff.data.corpus import Clip, Corpus, parse_name, read_manifest
 from facediff.data.dataset import BatchDataset, MotionDataset, ReferenceChoice, ReferencePolicy
 from facediff.data.features import FeatureSlot
+from facediff.data.options import check_positive, person_name
 from facediff.data.sampling import ClipBatches
 from facediff.errors import FaceDiffError
 from facediff.hparams import plain
-
-SCALE_FRAMES = 16
-"""Frames of each training clip, evenly spread, from which the motion scale is measured."""
-
-PRINCIPAL_NUMBERS = 30_000_000
-"""Coordinates from which principal components are computed, about; bounds the memory (8 bytes each, twice)."""
 
 Split = Literal["train", "val", "test_a", "test_b"]
 
@@ -129,10 +124,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.identities = [*map(person_name, self.people), *self.newcomers, *type(self).identities]
         for name in self.identities:
             if self.identities.count(name) > 1:
-                raise FaceDiffError(
-                    f"data.people, data.newcomers: {name} is there more than once; import the person by a new name, or "
-                    f"leave the name away"
+                told = (
+                    "among the corpus's people and data.newcomers; import the person by a new name, or leave one away"
                 )
+                raise FaceDiffError(f"data.people: {name} is there more than once {told}")
         self.features = FeatureSlot()
         self.pair_sentences = False
         self._corpus: Corpus | None = None
@@ -277,45 +272,16 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return self._assets
 
     def motion_scale(self) -> float:
-        """Factor that gives the training motion unit variance: one over the root mean square of its coordinates.
+        """Factor that gives the training motion unit variance.
 
-        Offsets from the template are centred near zero. Measured on evenly spread frames of every training clip.
+        Raises:
+            FaceDiffError: if the training clips hold no motion at all.
         """
-        total, count = 0.0, 0
-        for motion in self._spread_frames(SCALE_FRAMES):
-            total += float(motion.double().square().sum())
-            count += motion.numel()
-        if not total:
-            raise FaceDiffError(f"{self.root}: the training split holds no motion at all; check vertices_npy/")
-        return float((count / total) ** 0.5)
+        return statistics.motion_scale(self.corpus, self.clips("train"))
 
     def principal_motion(self, count: int) -> tuple[Tensor, Tensor]:
-        """Mean and principal components of the training motion, from evenly spread frames of every training clip.
-
-        Args:
-            count: at most so many components are given.
-
-        Returns:
-            the mean (3V,), and components (at most count, 3V), each as long as its standard deviation, the largest
-            first; in the corpus's unit.
-        """
-        clips = max(1, len(self.clips("train")))
-        most = max(2, PRINCIPAL_NUMBERS // (3 * self.n_vertices * clips))
-        frames = torch.cat([motion.flatten(1) for motion in self._spread_frames(min(most, SCALE_FRAMES))]).double()
-        mean = frames.mean(0)
-        frames -= mean
-        # Of the frames' own products: a matrix as wide as the vertices would not fit into memory.
-        values, vectors = torch.linalg.eigh(frames @ frames.T)
-        kept = [i for i in reversed(range(len(values))) if values[i] > 1e-10 * values[-1]][:count]
-        shapes = vectors[:, kept].T @ frames / len(frames) ** 0.5
-        return mean.float(), shapes.float()
-
-    def _spread_frames(self, count: int) -> Iterator[Tensor]:
-        """At most ``count`` evenly spread frames of every training clip, one at a time (1, V, 3)."""
-        for clip in self.clips("train"):
-            frames = self.corpus.frames(clip)
-            for index in torch.linspace(0, frames - 1, min(frames, count)).long().tolist():
-                yield self.corpus.read_motion(clip, index, index + 1)
+        """Mean (3V,) and at most ``count`` principal components (components, 3V) of the training motion."""
+        return statistics.principal_motion(self.corpus, self.clips("train"), count)
 
     def _default_references(self) -> dict[str, Reference]:
         references = {}
@@ -382,29 +348,3 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Move every tensor of the batch."""
         return batch.to(device)
-
-
-def person_name(folder: Path) -> str:
-    """Whose folder it is, as ``facediff data import-person`` wrote it.
-
-    Raises:
-        FaceDiffError: if it is no such folder.
-    """
-    name = read_manifest(folder).get("person")
-    if not isinstance(name, str):
-        raise FaceDiffError(
-            f"data.people: {folder} is no person's folder (its manifest.json names none); make one with "
-            f"`facediff data import-person`"
-        )
-    return name
-
-
-def check_positive(**values: int | None) -> None:
-    """Refuse numbers below one.
-
-    Raises:
-        FaceDiffError: naming the argument.
-    """
-    for name, value in values.items():
-        if value is not None and value < 1:
-            raise FaceDiffError(f"data.{name}: is {value}, expected a whole number above zero")

@@ -1,6 +1,7 @@
 """Systems: LightningModules that turn speech into facial motion."""
 
-from facediff.systems.base import SpeechAnimator, Style
+from facediff.systems.animation import Style
+from facediff.systems.base import SpeechAnimator
 from facediff.systems.checkpoint import load_system
 from facediff.systems.dual_path import DualPathDiffusion
 from facediff.systems.style_content import StyleContentDisentanglement

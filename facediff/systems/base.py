@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -16,11 +16,11 @@ from torch import Tensor, nn
 
 from facediff.components.audio_encoder import AudioEncoder
 from facediff.components.mesh_encoder import MeshEncoder
-from facediff.data import Assets, Batch, Reference, Sample, SpeechMotionDataModule, collate
+from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule, collate
 from facediff.data.assets import ASSETS_KEY, DATA_SOURCE_KEY
-from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
 from facediff.hparams import plain
+from facediff.systems.animation import Prediction, Style, speech_sample
 from facediff.systems.evaluation import Evaluation
 from facediff.systems.identity_policy import IdentityPolicy, conditioned
 from facediff.systems.schedule import Schedule, lr_factor
@@ -28,36 +28,6 @@ from facediff.topology.hierarchy import mesh_hierarchy
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 MotionScale = Literal["unit", "none"]
-
-
-@dataclass(frozen=True)
-class Style:
-    """A style vector.
-
-    Attributes:
-        name: what it was made of.
-        vector: as :meth:`SpeechAnimator.encode_style` gives it.
-    """
-
-    name: str
-    vector: Float[Tensor, " style_dim"]
-
-
-@dataclass
-class Prediction:
-    """Predicted motion of one clip; not frozen, since Lightning moves predictions between devices in place.
-
-    Attributes:
-        name: the clip.
-        identity: whose identity conditioned it: a training identity, or ``unknown``.
-        reference_name: the clip that gave the style.
-        vertices: absolute vertices.
-    """
-
-    name: str
-    identity: str
-    reference_name: str
-    vertices: Float[Tensor, "frames vertices 3"]
 
 
 class SpeechAnimator(LightningModule, ABC):
@@ -340,38 +310,12 @@ class SpeechAnimator(LightningModule, ABC):
             FaceDiffError: if the subject is unknown, the reference does not fit the topology, or the speech is
                 shorter than a frame.
         """
-        assets = self.assets
-        template = assets.template(subject)
-        chosen = style or self.default_style(subject)
-        # A vector goes past the style path, which then has nothing to look at.
-        reference = (
-            Reference(chosen.name, template.new_zeros(1, *template.shape)) if isinstance(chosen, Style) else chosen
-        )
-        if reference.motion.shape[1:] != template.shape:
-            raise FaceDiffError(
-                f"style: the reference {reference.clip} has {reference.motion.shape[1]} vertices, the checkpoint's "
-                f"faces have {self.n_vertices}; give a motion of the same topology"
-            )
-        frames = round(len(audio) * self.frame_rate / SAMPLE_RATE)
-        if frames < 1:
-            raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s); give more of it")
-        length = samples_for(frames, self.frame_rate)
-        sample = Sample(
-            audio=torch.nn.functional.pad(audio[:length], (0, max(0, length - len(audio)))),
-            motion=torch.zeros(frames, *template.shape),
-            template=template,
-            identity=assets.identity_index(subject),
-            reference=reference.motion.float(),
-            name="speech",
-            subject=subject,
-            sentence="",
-            reference_name=reference.clip,
-            style=chosen.vector if isinstance(chosen, Style) else None,
-        )
+        self.assets.template(subject)  # who is not known at all has no style either
+        sample = speech_sample(audio, self.assets, subject, style or self.default_style(subject))
         batch = collate([sample]).to(self.device)
         motion = self.generate(batch, seed=seed, progress=progress)
         identity = subject if sample.identity >= 0 else "unknown"
-        return Prediction(sample.name, identity, reference.clip, (motion + batch.template[:, None])[0].cpu())
+        return Prediction(sample.name, identity, sample.reference_name, (motion + batch.template[:, None])[0].cpu())
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """Sample in another way from now on; a system that does not sample has no choice.
