@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any
 from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from wandb_workspaces.workspaces import Workspace
 
 STEP = "trainer/global_step"
@@ -49,9 +51,8 @@ def build(entity: str, project: str, *, clips: Sequence[str] = (), terms: Sequen
         terms: terms of the loss beside ``loss``.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", DeprecationWarning
-        )  # wandb-workspaces uses an old form of pydantic's validators
+        # wandb-workspaces uses an old form of pydantic's validators.
+        warnings.simplefilter("ignore", DeprecationWarning)
         try:
             import wandb_workspaces.reports.v2 as panels
             import wandb_workspaces.workspaces as views
@@ -62,10 +63,32 @@ def build(entity: str, project: str, *, clips: Sequence[str] = (), terms: Sequen
                 f"pip install wandb wandb-workspaces"
             ) from error
 
+    sections = panels_by_section(panels, clips, terms)
+    return views.Workspace(
+        entity=entity,
+        project=project,
+        name="facediff",
+        sections=[views.Section(name=name, panels=content, is_open=True) for name, content in sections.items()],
+        settings=views.WorkspaceSettings(x_axis=STEP),
+        runset_settings=views.RunsetSettings(
+            groupby=[expr.Config("data/corpus"), expr.Config("protocol")], pinned_columns=list(COLUMNS)
+        ),
+    )
+
+
+def panels_by_section(panels: ModuleType, clips: Sequence[str], terms: Sequence[str]) -> dict[str, list[Any]]:
+    """The panels of the view by the name of their section.
+
+    Args:
+        panels: the module that has the kinds of panels.
+        clips: clips whose preview videos get a panel each.
+        terms: terms of the loss beside ``loss``.
+    """
+
     def line(title: str, *names: str, **options: Any) -> Any:  # noqa: ANN401
         return panels.LinePlot(title=title, x=STEP, y=list(names), **options)
 
-    sections = {
+    return {
         "Losses": [line(term, f"train/{term}", f"val/{term}", log_y=True) for term in ("loss", *terms)],
         "Metrics": [line(f"validation {metric}", f"val/{metric}") for metric in METRICS],
         "Optimisation": [
@@ -96,16 +119,6 @@ def build(entity: str, project: str, *, clips: Sequence[str] = (), terms: Sequen
             panels.WeavePanelSummaryTable(table_name="test/sequences"),
         ],
     }
-    return views.Workspace(
-        entity=entity,
-        project=project,
-        name="facediff",
-        sections=[views.Section(name=name, panels=content, is_open=True) for name, content in sections.items()],
-        settings=views.WorkspaceSettings(x_axis=STEP),
-        runset_settings=views.RunsetSettings(
-            groupby=[expr.Config("data/corpus"), expr.Config("protocol")], pinned_columns=list(COLUMNS)
-        ),
-    )
 
 
 def as_json(view: Workspace) -> str:

@@ -234,14 +234,14 @@ def _lips(args: argparse.Namespace) -> list[str]:
 
 def _training(args: argparse.Namespace) -> list[str]:
     from facediff.commands.figure_files import named_folders
-    from facediff.figures import choose_scalars, draw_training, find_metrics, read_curves
+    from facediff.figures import choose_scalars, draw_training, find_gaps, find_metrics, read_curves
 
     paper = _paper(args)
     folders = named_folders(args.runs, lambda path: "/".join(path.resolve().parts[-2:]).removeprefix("/"))
     runs = {name: read_curves(find_metrics(folder), args.x) for name, folder in folders.items()}
     scalars = choose_scalars(runs, args.scalar)
     draw_training(runs, scalars, args.output, paper=paper, axis=args.x, smoothing=args.smooth, log=args.log)
-    return []
+    return find_gaps(runs, scalars, log=args.log)
 
 
 FIGURES: dict[str, tuple[str, Callable[[Add], None], Callable[[argparse.Namespace], list[str]]]] = {

@@ -54,17 +54,19 @@ def gather(args: argparse.Namespace) -> Material:
     """
     from facediff.data.corpus import read_manifest, read_templates
     from facediff.evaluate import DEFAULT_PATTERNS, TRUTH_PATTERN
-    from facediff.evaluate.inputs import count_vertices, find_truths
+    from facediff.evaluate.inputs import find_truths
     from facediff.figures import Material, find_clips
 
     methods = named_folders([args.predictions, *args.method], lambda path: path.resolve().name)
     truth, corpus = find_truths(_truth_folder(args.truth))
+    if not truth.is_dir():
+        raise FaceDiffError(f"{args.truth}: no such folder; expected a corpus, a folder of .npy files, or puppet")
     manifest = read_manifest(corpus) if corpus else {}
     module = _recognise(args.topology, corpus or truth, manifest)
     templates_file = args.templates or (corpus / "templates.pkl" if corpus else None)
     if templates_file is not None and args.templates is None and not templates_file.is_file():
         templates_file = None
-    n_vertices = module.n_vertices if module else count_vertices(None, templates_file, truth)
+    n_vertices = module.n_vertices if module else _count_vertices(templates_file, truth)
     templates = {} if templates_file is None else read_templates(templates_file, n_vertices)
     mesh = _find_mesh(args.mesh, corpus or truth, module, n_vertices)
     rate, stride = _rates(args, manifest, module)
@@ -139,6 +141,15 @@ def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module
     return module if module is not None and module.n_vertices == folder.n_vertices() else None
 
 
+def _count_vertices(templates_file: Path | None, truth: Path) -> int:
+    """Vertices of the mesh, where no data module tells them: as the templates have it, else the first readable truth."""
+    from facediff.evaluate.inputs import count_vertices
+
+    if templates_file is None and not any(truth.glob("**/*.npy")):
+        raise FaceDiffError(f"{truth}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
+    return count_vertices(None, templates_file, truth)
+
+
 def _find_mesh(given: Path | None, root: Path, module: Module | None, n_vertices: int) -> Mesh | None:
     """The mesh given, else the one that lies in the corpus folder, else the built-in corpus's own; None without one."""
     from facediff.topology.mesh import SUFFIXES, read_mesh
@@ -167,7 +178,7 @@ def _rates(args: argparse.Namespace, manifest: dict[str, Any], module: Module | 
     """Frames a second of the predictions, and every how many-th frame of the truth belongs to them."""
     said = manifest.get("frame_rate") or (module and (module.stored_frame_rate or module.frame_rate))
     stored = float(said) if isinstance(said, int | float) else None
-    rate = args.frame_rate or (module.frame_rate if module else stored)
+    rate = args.frame_rate if args.frame_rate is not None else module.frame_rate if module else stored
     if rate is not None and not 0 < rate < 10_000:
         raise FaceDiffError(f"--frame-rate {rate:g}: expected frames a second, e.g. 25")
     if args.truth_stride is not None:

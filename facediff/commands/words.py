@@ -21,6 +21,9 @@ from facediff.systems.checkpoint import is_imported, read_checkpoint
 LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a system that the data module knows."""
 
+FREE = ("sampler", "sampling_space", "unseen_identity")
+"""Constructor arguments of a system that may differ from its checkpoint's; no weights depend on them."""
+
 
 def rewrite(name: str, words: list[str]) -> list[str]:
     """What LightningCLI gets for what was typed.
@@ -76,11 +79,11 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
     checkpoint = read_checkpoint(Path(str(path)))
     if name == "fit":
         return arguments
-    given = [word for word in arguments if re.match(r"--model(?!\.(init_args\.)?(sampler|unseen_identity)\b)\b", word)]
+    given = [word for word in arguments if re.match(rf"--model(?!\.(init_args\.)?({'|'.join(FREE)})\b)\b", word)]
     if given:
         raise FaceDiffError(
             f"{given[0]}: the checkpoint {path} decides the model, and its weights fit no other; leave the flag away "
-            f"(only --model.sampler… and --model.unseen_identity may change)"
+            f"(only --model.sampler…, --model.sampling_space and --model.unseen_identity may change)"
         )
     config = {"seed_everything": 0, "model": described(checkpoint["hyper_parameters"], drop=LINKS)}
     if option(arguments, "--data") is None:

@@ -12,7 +12,7 @@ from facediff.figures.maps import VertexMap, error_maps, motion_maps
 from facediff.figures.material import Material, find_clips
 from facediff.figures.page import COLUMN, PAGE, Paper
 from facediff.figures.phonemes import Phoneme, find_phoneme, read_phonemes
-from facediff.figures.runs import Curve, choose_scalars, find_metrics, read_curves, smooth
+from facediff.figures.runs import Curve, choose_scalars, find_gaps, find_metrics, read_curves, smooth
 
 __all__ = [
     "COLUMN",
@@ -33,6 +33,7 @@ __all__ = [
     "draw_training",
     "error_maps",
     "find_clips",
+    "find_gaps",
     "find_metrics",
     "find_phoneme",
     "frame_at",

@@ -52,7 +52,7 @@ def read_pairs(source: str | None, corpus: Path | None, n_vertices: int) -> LipP
         )
     try:
         if not Path(source).is_file() and all(c.isdecimal() or c in "-," for c in source):
-            pairs = LipPairs.from_pairs("lip pairs", [[int(i) for i in pair.split("-")] for pair in source.split(",")])
+            pairs = LipPairs.from_pairs("given", [[int(i) for i in pair.split("-")] for pair in source.split(",")])
         else:
             pairs = LipPairs.from_file(source)
         pairs.check(n_vertices)

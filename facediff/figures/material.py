@@ -100,7 +100,7 @@ class Material:
             for method, files in self.methods.items():
                 if clip not in files:
                     raise FaceDiffError(f'{method} has no prediction of clip "{clip}": {few(files, clip)}')
-        return list(clips)
+        return list(dict.fromkeys(clips))  # one that was named twice counts once
 
     def open(self, clip: str) -> dict[str, Tensor]:
         """Absolute vertices (T, V, 3) of the truth and of each method, memory-mapped, each in its own length.

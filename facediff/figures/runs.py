@@ -25,7 +25,7 @@ class Curve:
 
     Attributes:
         at: steps or epochs (N,).
-        values: the scalar (N,); NaN where the run logged it.
+        values: the scalar (N,), as logged: NaN or infinity where training diverged.
     """
 
     at: Array
@@ -110,6 +110,19 @@ def choose_scalars(runs: Mapping[str, Mapping[str, Curve]], wanted: Sequence[str
             if name not in curves:
                 raise FaceDiffError(f'{run}: logged no scalar "{name}": {choices(name, curves)}')
     return list(dict.fromkeys(wanted))
+
+
+def find_gaps(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[str], *, log: bool = False) -> list[str]:
+    """Notes on values that a drawing cannot show: NaN and infinity, and on a logarithmic axis what is not above 0."""
+    notes = []
+    for scalar in scalars:
+        for run, curves in runs.items():
+            values = curves[scalar].values
+            shown = np.isfinite(values) & ((values > 0) | (not log))
+            if not shown.all():
+                what = "NaN, infinity or not above 0" if log else "NaN or infinity"
+                notes.append(f"{run}: {(~shown).sum()} of {len(values)} values of {scalar} are {what} and not drawn")
+    return notes
 
 
 def smooth(values: Array, weight: float) -> Array:

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.files import atomic
 from facediff.render.rasteriser import Renderer
 from facediff.render.text import draw_text
 
@@ -158,13 +159,6 @@ def save_image(path: str | Path, image: Frame) -> None:
         raise FaceDiffError(f'picture file "{target}" must end in .png.')
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image must be uint8 (height, width, 3), got {image.dtype} {image.shape}")
-    partial = target.with_name(f".{target.stem}.partial.png")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            pillow("Image").fromarray(image).save(partial)
-            partial.replace(target)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise FaceDiffError(f'cannot write the picture "{target}" ({error.strerror}): choose another place.') from error
+    picture = pillow("Image").fromarray(image)
+    with atomic(target) as temporary:
+        picture.save(temporary)

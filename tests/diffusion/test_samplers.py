@@ -201,6 +201,71 @@ def test_dpm_solver_of_first_order_is_ddim() -> None:
     torch.testing.assert_close(*ends, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("steps", [1, 2, 3, 7, 14, 15, 20])
+def test_dpm_solver_is_the_librarys(order: int, steps: int) -> None:
+    """Against diffusers' DPMSolverMultistepScheduler with the same places."""
+    from diffusers import DPMSolverMultistepScheduler
+
+    process = NoiseProcess(1000)
+    sampler = make("dpm_solver", process, steps=steps, order=order)
+    start = torch.randn(3, 4, 5)
+    ours = sampler.run(lambda x, _: 0.5 * x.tanh(), start)
+    scheduler = DPMSolverMultistepScheduler(
+        **process.scheduler_config(), algorithm_type="dpmsolver++", solver_order=order, final_sigmas_type="zero"
+    )
+    scheduler.set_timesteps(timesteps=sampler.places())
+    theirs = start
+    for step in scheduler.timesteps:
+        theirs = scheduler.step(0.5 * theirs.tanh(), step, theirs, return_dict=False)[0]
+    torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4)
+
+
+LINEAR = [name for name in NAMES if registry.sampler.get(name).linear]
+VARIANTS = [(name, {}) for name in LINEAR] + [("ddim", {"eta": 0.6}), ("dpm_solver", {"order": 1})]
+VARIANTS += [("dpm_solver", {"order": 3})]
+
+
+def test_the_samplers_that_can_be_folded() -> None:
+    assert {"ddim", "ddpm", "dpm_solver"} <= set(LINEAR)
+
+
+@pytest.mark.parametrize(("name", "options"), VARIANTS)
+@pytest.mark.parametrize("steps", [1, 2, 7, 14, 15, 20])
+def test_a_linear_sampler_ends_at_its_last_prediction(name: str, options: dict[str, float], steps: int) -> None:
+    predictions: list[Tensor] = []
+
+    def predict(noisy: Tensor, step: int) -> Tensor:
+        predictions.append(noisy.tanh())
+        return predictions[-1]
+
+    _, motions = trace(make(name, NoiseProcess(20), steps=steps, **options), predict, torch.randn(3, 4, 5))
+    torch.testing.assert_close(motions[-1], predictions[-1], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(("name", "options"), VARIANTS)
+@pytest.mark.parametrize("steps", [2, 7, 20])
+def test_a_linear_sampler_commutes_with_linear_maps(name: str, options: dict[str, float], steps: int) -> None:
+    """Run on A x, with predictions A x̂₀ and noise A z, it gives A times what it gives on x."""
+    sampler = make(name, NoiseProcess(20), steps=steps, **options)
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    start, *rest = torch.randn(2 * steps + 1, 4, 5, generator=generator, dtype=torch.float64)
+    predictions, fresh = rest[:steps], rest[steps:]
+    runs = []
+    for through in (torch.eye(5, dtype=torch.float64), image):
+        clean, noise = iter(predictions), iter(fresh)
+        states = []
+
+        def predict(state: Tensor, _: int) -> Tensor:
+            states.append(state)  # noqa: B023
+            return next(clean) @ through  # noqa: B023
+
+        sampler.run(predict, start @ through, noise=lambda _: next(noise) @ through)  # noqa: B023
+        runs.append(torch.stack(states))
+    torch.testing.assert_close(runs[0] @ image, runs[1], rtol=0, atol=1e-10)
+
+
 @pytest.mark.parametrize("name", registry.sampler.names())
 @pytest.mark.parametrize("steps", [1, 7, 61, 103, 121, 122, 201, 206, 217, 999, 1000])
 def test_every_number_of_steps_visits_as_many_places_downwards(name: str, steps: int) -> None:

@@ -188,15 +188,24 @@ class TestObjectives:
         assert float(relative_distance(values, values, mask)) == 0
 
     def test_dynamics_compare_spreads(self) -> None:
-        motion = torch.randn(1, 200, 6, 3)
-        mask, chosen = masks(200), torch.tensor([True])
-        other = motion[:, torch.randperm(200)]
-        assert float(dynamics_distance(motion, other, mask, mask, chosen)) == pytest.approx(0, abs=1e-5)
-        spread = motion.square().sum(-1).sqrt().std(1, correction=0)[0]
-        want = (spread / (spread + 0.01 * spread.max())).mean()
-        got = dynamics_distance(2 * motion, motion, mask, mask, chosen)
-        assert float(got) == pytest.approx(float(want), rel=1e-3)
-        assert float(dynamics_distance(motion, 2 * motion, mask, mask, ~chosen)) == 0
+        """Against NumPy's own standard deviations; the order of frames does not count."""
+        motion, truth = torch.randn(3, 40, 6, 3), torch.randn(3, 40, 6, 3)
+        mask, truth_mask = masks(40, 30, 20), masks(40, 25, 35)
+        chosen, vertices = torch.tensor([True, False, True]), torch.tensor([1, 4])
+        spreads = []
+        for each, lengths in ((motion, (40, 20)), (truth, (40, 35))):
+            squared = (each.double().numpy() ** 2).sum(-1)[:, :, [1, 4]]
+            spreads.append(
+                np.stack([squared[clip, :frames].std(0) for clip, frames in zip((0, 2), lengths, strict=True)])
+            )
+        want = ((spreads[0] - spreads[1]) ** 2).mean() / (spreads[1].mean() ** 2 + 1e-6)
+        got = dynamics_distance(motion, truth, mask, truth_mask, chosen, vertices)
+        assert float(got) == pytest.approx(want, rel=1e-4)
+        other = motion[:, torch.randperm(40)]
+        everything = masks(40, 40, 40)
+        same = dynamics_distance(motion, other, everything, everything, chosen, vertices)
+        assert float(same) == pytest.approx(0, abs=1e-9)
+        assert float(dynamics_distance(motion, truth, mask, truth_mask, chosen & False, vertices)) == 0
 
 
 SMALL: dict[str, object] = {

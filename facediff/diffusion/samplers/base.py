@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from jaxtyping import Float
@@ -23,6 +23,12 @@ NoiseSource = Callable[[Tensor], Tensor]
 class Sampler(ABC):
     """Runs the reverse process from noise to clean motion (algorithm 2).
 
+    Class attributes:
+        linear: whether every update is a fixed linear combination, the same for all coordinates, of motions,
+            predictions and noise, and the last update returns the last prediction itself. Then the process may run
+            on any linear image of motion (:mod:`facediff.diffusion.folding`). A sampler that clips or
+            thresholds, or that ends anywhere else, is not; False is always safe.
+
     Args:
         process: the noise process to reverse.
         steps: denoising steps; at most the process's own number.
@@ -30,6 +36,8 @@ class Sampler(ABC):
     Raises:
         FaceDiffError: if the number of steps is impossible.
     """
+
+    linear: ClassVar[bool] = False
 
     def __init__(self, process: NoiseProcess, steps: int) -> None:
         if not 1 <= steps <= process.steps:

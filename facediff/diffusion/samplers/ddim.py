@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -51,6 +51,8 @@ class DdimSampler(Sampler):
     Raises:
         FaceDiffError: if the number of steps or eta is impossible.
     """
+
+    linear: ClassVar[bool] = True
 
     def __init__(self, *, process: NoiseProcess, steps: int = 25, eta: float = 0.0) -> None:
         super().__init__(process, steps)

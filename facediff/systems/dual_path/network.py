@@ -114,6 +114,7 @@ class DualPathNetwork(nn.Module):
         token_form: TokenForm,
     ) -> None:
         super().__init__()
+        self.coordinates = 3 * n_vertices
         self.audio_encoder = audio_encoder
         self.identity_encoder = identity_encoder
         self.style_encoder = style_encoder
@@ -169,10 +170,16 @@ class DualPathNetwork(nn.Module):
         conditions: Conditions,
     ) -> Float[Tensor, "batch frames coordinates"]:
         """Predict the clean scaled motion M̂⁰ from Mⁿ."""
-        hidden = self.core(self.embed(noisy), step, conditions)
-        # In mixed precision the last map stays in float32: differences over time of half-precision motion are noise.
-        with torch.autocast(hidden.device.type, enabled=False):
-            return self.unembed(hidden.float())
+        return self.leave(self.core(self.embed(noisy), step, conditions))
+
+    def leave(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames coordinates"]:
+        """F_dec to the clean scaled motion.
+
+        In mixed precision this map stays in the weights' own type: differences over time of half-precision motion are
+        noise.
+        """
+        with torch.autocast(features.device.type, enabled=False):
+            return self.unembed(features.to(next(self.unembed.parameters()).dtype))
 
     def core(
         self, motion: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions

@@ -24,11 +24,13 @@ from facediff.components.style_encoder import StyleEncoderFactory
 from facediff.components.style_encoder.tcn_gru_transformer import TcnGruTransformer
 from facediff.data import Batch
 from facediff.diffusion import NoiseProcess
+from facediff.diffusion.folding import FoldCache
 from facediff.diffusion.samplers import SamplerFactory
 from facediff.diffusion.samplers.ddim import DdimSampler
 from facediff.hparams import describe
 from facediff.systems.base import Progress, SpeechAnimator
 from facediff.systems.dual_path.network import Conditions, DualPathNetwork, TokenForm
+from facediff.systems.dual_path.spaces import SamplingSpace, choose_space
 from facediff.systems.identity_policy import IdentityPolicy
 
 
@@ -51,6 +53,9 @@ class DualPathDiffusion(SpeechAnimator):
         fusion: where speech meets noisy motion.
         decoder: to clean motion.
         sampler: runs the reverse process in validation, test, prediction and animation.
+        sampling_space: where it runs: ``folded`` into ``dim`` dimensions, with the same distribution of motion at a
+            cost per step that does not depend on the vertices, or on the ``vertices`` themselves, for comparison. A
+            sampler or a network that cannot be folded runs on the vertices anyway.
         diffusion_steps: noising steps N.
         noise_schedule: schedule of diffusers; ``squaredcos_cap_v2`` is the cosine schedule.
         motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
@@ -86,6 +91,7 @@ class DualPathDiffusion(SpeechAnimator):
         fusion: FusionFactory = BidirectionalCrossAttention,
         decoder: DecoderFactory = StyleTransformer,
         sampler: SamplerFactory = DdimSampler,
+        sampling_space: SamplingSpace = "folded",
         diffusion_steps: int = 1000,
         noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
         motion_scale: Literal["unit", "none"] = "unit",
@@ -123,6 +129,8 @@ class DualPathDiffusion(SpeechAnimator):
         }
         self.process = NoiseProcess(diffusion_steps, noise_schedule)
         self.sampler = sampler(process=self.process)
+        self.sampling_space: SamplingSpace = sampling_space
+        self._fold_cache = FoldCache()
         style = style_encoder(dim=dim)
         self.network = DualPathNetwork(
             n_vertices=n_vertices,
@@ -199,23 +207,28 @@ class DualPathDiffusion(SpeechAnimator):
         """F_dyn of reference motions (eq. 2 to 9); of width 0 if the dynamic path is left out."""
         return self.network.dynamic_style(reference * self.scale, mask)
 
+    @torch.no_grad()
     def generate(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
     ) -> Float[Tensor, "batch frames vertices 3"]:
-        """Algorithm 2 with the system's sampler; conditions are computed once.
+        """Algorithm 2 with the system's sampler, in its sampling space; conditions are computed once.
 
         All noise of a clip follows from the seed and its name: its motion does not depend on the clips beside it.
         """
         conditions = self._conditions(batch)
-        noise = ClipNoise(batch, seed)
+        space = choose_space(self.network, self.sampling_space, self.sampler, self._fold_cache)
+        unit = ClipNoise(batch, seed)
 
-        def denoise(noisy: Tensor, step: int) -> Tensor:
-            steps = torch.full((len(batch),), step, device=noisy.device)
-            return self.network(noisy, steps, conditions)
+        def noise(like: Tensor) -> Tensor:
+            return space.noise(unit(like))
 
-        start = noise(batch.motion.flatten(2))
-        motion = self.sampler.run(denoise, start, noise=noise, progress=progress) / self.scale
-        return motion.view(batch.motion.shape)
+        def denoise(state: Tensor, step: int) -> Tensor:
+            steps = torch.full((len(batch),), step, device=state.device)
+            return space.predict(state, steps, conditions)
+
+        start = noise(batch.motion.new_empty((*batch.motion.shape[:2], space.width)))
+        sample = self.sampler.run(denoise, start, noise=noise, progress=progress)
+        return (space.motion(sample) / self.scale).view(batch.motion.shape)
 
 
 class ClipNoise:
@@ -232,7 +245,7 @@ class ClipNoise:
             torch.Generator(batch.motion.device).manual_seed(zlib.crc32(name.encode()) + seed) for name in batch.names
         ]
 
-    def __call__(self, like: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames coordinates"]:
+    def __call__(self, like: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
         """The next noise of the shape of ``like``."""
         noise = torch.zeros_like(like)
         for i, (stream, frames) in enumerate(zip(self.streams, self.lengths, strict=True)):

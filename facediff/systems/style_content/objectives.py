@@ -191,13 +191,17 @@ def style_contrast(
 
 
 def dynamics_distance(
-    motion: Motion, truths: Motion, mask: Mask, truth_mask: Mask, chosen: Bool[Tensor, " batch"]
+    motion: Motion,
+    truths: Motion,
+    mask: Mask,
+    truth_mask: Mask,
+    chosen: Bool[Tensor, " batch"],
+    vertices: Int[Tensor, " region"],
 ) -> Float[Tensor, ""]:
-    """Mean over vertices of |σ − σ̂| / σ̄, σ the spread over time of the length of a vertex's displacement.
+    """Mean over vertices of (σ − σ̂)² / σ̄², σ the spread over time of a vertex's squared displacement, as in FDD.
 
-    Each vertex counts in proportion to σ̄, its own mean spread, so that brows count like lips; vertices that hardly
-    move are kept from counting by a hundredth of the largest spread. The motions need not be aligned, nor be of one
-    length.
+    σ̄ is the mean of σ̂ over vertices and clips. The motions need not be aligned, nor be of one length: two people who
+    say the same do not blink at the same time, but one may blink more.
 
     Args:
         motion: (B, T, V, 3).
@@ -205,10 +209,10 @@ def dynamics_distance(
         mask: valid frames of the motions.
         truth_mask: valid frames of the truths.
         chosen: which clips count.
+        vertices: vertices that count.
     """
     if not chosen.any():
         return motion.new_zeros(())
-    lengths = [(each[chosen].square().sum(-1) + EPSILON).sqrt() for each in (motion, truths)]
-    spread, wanted = masked_std(lengths[0], mask[chosen]), masked_std(lengths[1], truth_mask[chosen])
-    usual = wanted.mean(0)
-    return ((spread - wanted).abs() / (usual + 0.01 * usual.max() + EPSILON)).mean()
+    squared = [each[chosen][:, :, vertices].square().sum(-1) for each in (motion, truths)]
+    spread, wanted = masked_std(squared[0], mask[chosen]), masked_std(squared[1], truth_mask[chosen])
+    return (spread - wanted).square().mean() / (wanted.mean().square() + EPSILON)

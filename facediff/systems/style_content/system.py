@@ -75,7 +75,7 @@ class StyleContentDisentanglement(SpeechAnimator):
         reconstruction_weight: of motion from its own content and style.
         swap_weight: of motion from its own content and the partner's style.
         cycle_weight: of swapping twice.
-        swap_dynamics_weight: of the swapped motion's spread over time against the partner's.
+        swap_dynamics_weight: of the swapped upper face's spread over time against the partner's.
         speech_weight: factor of the same terms with content from speech.
         reading_content_weight: pulls the contents of two aligned readings of a sentence together.
         person_style_weight: pulls the styles of a person's clips together, and those of different people apart.
@@ -128,7 +128,7 @@ class StyleContentDisentanglement(SpeechAnimator):
         position_weight: float = 1.0,
         velocity_weight: float = 5.0,
         lip_gap_weight: float = 1.0,
-        upper_face_weight: float = 0.3,
+        upper_face_weight: float = 0.0,
         learning_rate: float = 1e-4,
         weight_decay: float = 0.0,
         lr_schedule: Schedule = "constant",
@@ -255,8 +255,9 @@ class StyleContentDisentanglement(SpeechAnimator):
         free = pairing.unaligned
         terms["swap"] = terms["swap"] + relative_distance(again, said.detach(), mask & free[:, None])
         terms["swap"] = terms["swap"] + relative_style_distance(style_again, style[partner].detach(), free)
+        upper = self.assets.regions["upper_face"].to(motion.device)
         apart = partner != torch.arange(len(partner), device=partner.device)
-        terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], mask, mask[partner], apart)
+        terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], mask, mask[partner], apart, upper)
         back = self._decode(again, style_again[partner], mask)
         terms["cycle"] = self._compare(batch, back, motion, mask)
         return terms
