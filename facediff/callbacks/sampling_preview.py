@@ -14,6 +14,7 @@ from lightning.pytorch.strategies import DDPStrategy, DeepSpeedStrategy
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities.seed import isolate_rng
 
+from facediff import registry
 from facediff.callbacks.sampling_preview_drawing import (
     ClipPreview,
     Drawing,
@@ -26,7 +27,8 @@ from facediff.callbacks.sampling_preview_drawing import (
 from facediff.callbacks.sampling_preview_loggers import Showcase, run_folder
 from facediff.callbacks.sampling_preview_weights import averaged_weights
 from facediff.data import Sample, SpeechMotionDataModule
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.render import VIEWS
 from facediff.systems import SpeechAnimator
 
 
@@ -81,6 +83,10 @@ class SamplingPreview(Callback):
         ):
             if value is not None and not value > 0:
                 raise FaceDiffError(f"SamplingPreview: {option} is {value}, expected a number above zero")
+        if view not in VIEWS:
+            raise FaceDiffError(f'SamplingPreview: there is no view "{view}": {choices(view, VIEWS)}')
+        if sampler is not None:
+            registry.sampler.get(sampler)  # a wrong name is told now, not after hours of training
         self.every_n_epochs = every_n_epochs
         self.at_end = at_end
         self.clips = clips

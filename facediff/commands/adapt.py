@@ -44,8 +44,8 @@ def parser() -> argparse.ArgumentParser:
         default="all",
         help="train all weights (default), or those of identity and style and freeze the rest",
     )
-    made.add_argument("--epochs", type=int, default=40, help="epochs over the training clips (default: 40)")
-    made.add_argument("--learning-rate", type=float, default=2e-4, help="falls to 0 as a cosine (default: 2e-4)")
+    made.add_argument("--epochs", type=int, default=60, help="epochs over the training clips (default: 60)")
+    made.add_argument("--learning-rate", type=float, default=5e-4, help="falls to 0 as a cosine (default: 5e-4)")
     made.add_argument("--data-root", type=Path, help="where the corpus is, if not where it was in training")
     made.add_argument("--seed", type=int, default=0, help="seed of all draws (default: 0)")
     made.add_argument("--accelerator", default="auto", help="Lightning's: auto (default), cpu, gpu …")

@@ -142,7 +142,7 @@ def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module
 
 
 def _count_vertices(templates_file: Path | None, truth: Path) -> int:
-    """Vertices of the mesh, where no data module tells them: as the templates have it, else the first readable truth."""
+    """Vertices of the mesh where no data module tells: as the templates have it, else the first readable truth."""
     from facediff.evaluate.inputs import count_vertices
 
     if templates_file is None and not any(truth.glob("**/*.npy")):

@@ -22,12 +22,13 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 
 from facediff.callbacks import SamplingPreview
-from facediff.callbacks.sampling_preview_drawing import default_error_scale, first_of_each_subject, length
+from facediff.callbacks.sampling_preview_drawing import borrowed, default_error_scale, first_of_each_subject, length
 from facediff.cli import main
 from facediff.data import collate
 from facediff.data.corpus import Clip
 from facediff.errors import FaceDiffError
 from facediff.render import Renderer
+from facediff.render.heat import heat_colours
 from facediff.systems import DualPathDiffusion, load_system
 from tests.fakes.tiny import Tiny
 from tests.fakes.wandb_run import OfflineRun
@@ -35,9 +36,9 @@ from tests.fakes.wandb_run import OfflineRun
 MakeSystem = Callable[..., DualPathDiffusion]
 MakeTrainer = Callable[..., pl.Trainer]
 
-SIZE = 64
+SIZE, SCALE = 64, 0.01
 CLIPS = ["A_e05", "B_e05"]
-SMALL = {"every_n_epochs": 1, "size": SIZE, "steps": 3, "sampler": "ddim", "error_scale": 0.01}
+SMALL = {"every_n_epochs": 1, "size": SIZE, "steps": 3, "sampler": "ddim", "error_scale": SCALE}
 
 
 class Weights(pl.Callback):
@@ -66,7 +67,7 @@ class Losses(pl.Callback):
 
 
 def shown(sheet: Path, system: DualPathDiffusion, clip: str, tiny: Tiny, seed: int = 0) -> bool:
-    """Whether the first picture of a sheet shows this system's motion, drawn here with the renderer alone."""
+    """Whether the first picture of a sheet shows this system's motion and error, drawn by the renderer alone."""
     dataset = tiny.dataset("val")
     sample = dataset[[found.name for found in dataset.clips].index(clip)]
     system.choose_sampler("ddim", 3)
@@ -77,12 +78,14 @@ def shown(sheet: Path, system: DualPathDiffusion, clip: str, tiny: Tiny, seed: i
     width = SIZE * 3 // 4
     renderer = Renderer(mesh.faces.numpy(), template=sample.template.numpy(), size=(SIZE, width), colours=mesh.colours)
     first = round(0.5 * (len(motion) - 1) / 6)
-    truth, made = (renderer.render((found + sample.template)[first].numpy()) for found in (sample.motion, motion))
+    true, moved = ((found + sample.template)[first].numpy() for found in (sample.motion, motion))
+    heat = heat_colours(np.linalg.norm(moved - true, axis=1), SCALE)
+    truth, made, wrong = renderer.render(true), renderer.render(moved), renderer.render(moved, colours=heat)
     with Image.open(sheet) as image:
         picture = np.asarray(image)
     for top in range(SIZE):
         if np.array_equal(picture[top : top + SIZE, :width], truth):
-            return np.array_equal(picture[top : top + SIZE, width : 2 * width], made)
+            return np.array_equal(picture[top : top + SIZE, width : 3 * width], np.hstack([made, wrong]))
     raise AssertionError("the truth is not on the sheet")
 
 
@@ -279,6 +282,10 @@ def test_a_corpus_without_a_mesh_is_told_once(
 def test_bad_options_are_refused_at_once(make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny) -> None:
     with pytest.raises(FaceDiffError, match="seconds is 0, expected a number above zero"):
         SamplingPreview(seconds=0)
+    with pytest.raises(FaceDiffError, match='no view "side_wise": did you mean "side"'):
+        SamplingPreview(view="side_wise")
+    with pytest.raises(FaceDiffError, match='no sampler "dim": did you mean "ddim"'):
+        SamplingPreview(sampler="dim")
     trainer = make_trainer(callbacks=[SamplingPreview(names=["A_e05", "A_e06"])])
     with pytest.raises(FaceDiffError, match="A_e06 is no validation clip"):
         trainer.fit(make_system(), datamodule=tiny)
@@ -339,6 +346,23 @@ def test_the_shipped_configs_draw_and_the_last_one_counts(tiny_root: Path, tmp_p
     assert sorted(path.stem for path in sheets) == CLIPS  # the trainer's config alone draws one
     with Image.open(sheets[0]) as image:
         assert image.size[0] == 2 * 3 * 288 + 6
+
+
+def test_a_system_is_given_back_as_it_was_lent(make_system: MakeSystem) -> None:
+    system = make_system().train()
+    next(system.children()).eval()  # as a frozen part is
+    modes, sampler = [module.training for module in system.modules()], system.sampler
+
+    def fail() -> NoReturn:
+        with borrowed(system, "dpm_solver", 3):
+            assert not any(module.training for module in system.modules())
+            assert system.sampler is not sampler
+            raise RuntimeError("in between")
+
+    with pytest.raises(RuntimeError, match="in between"):
+        fail()
+    assert [module.training for module in system.modules()] == modes
+    assert system.sampler is sampler
 
 
 def test_each_persons_first_clip_comes_before_any_second() -> None:

@@ -144,6 +144,17 @@ def test_lengths_that_differ_are_noted(corpus: Path, capsys: pytest.CaptureFixtu
     assert "ours lasts from 0 to 0.36 s" in capsys.readouterr().err
 
 
+def test_values_that_cannot_be_drawn_are_noted(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = corpus.parent / "run" / "metrics.csv"
+    table.write_text("epoch,step,train/loss\n0,0,nan\n0,1,inf\n0,2,-1\n0,3,2\n")
+    assert main(words("training", corpus)) == 0
+    told = capsys.readouterr().out
+    assert "note: one: 2 of 4 values of train/loss are NaN or infinity and not drawn\n" in told
+    assert main(words("training", corpus, "--log")) == 0
+    told = capsys.readouterr().out
+    assert "note: two: 3 of 4 values of train/loss are NaN, infinity or not above 0 and not drawn\n" in told
+
+
 WRONG = {
     "unknown figure": (["figure", "frame"], 'did you mean "frames"'),
     "unknown suffix": (["error", "-o", "a.jpg"], "expected one of .png, .pdf, .svg"),
@@ -165,9 +176,13 @@ WRONG = {
     "too many pixels": (["error", "--width", "30", "--dpi", "50"], "raise --width or --dpi"),
     "pairs": (["lips", "--lip-pairs", "3-900"], "--lip-pairs 3-900"),
     "span": (["lips", "--span", "3", "1"], "--span 3 1"),
+    "span without a frame": (["lips", "--span", "0.03", "0.05"], "the middle of no frame lies in it"),
     "audio": (["lips", "--audio", "gone.wav"], "gone.wav: no such sound file"),
     "phoneme file": (["lips", "--phoneme-file", "gone.csv"], "gone.csv: not readable as phonemes"),
     "rate": (["lips", "--frame-rate", "-3"], "--frame-rate -3"),
+    "rate of zero": (["error", "--frame-rate", "0"], "--frame-rate 0"),
+    "truth not there": (["figure", "error", "ours", "gone", "-o", "a.png"], "gone: no such folder"),
+    "truth without files": (["figure", "error", "ours", "run", "-o", "a.png"], "run: holds no .npy file"),
     "stride": (["lips", "--truth-stride", "0"], "--truth-stride 0"),
     "run": (["figure", "training", "gone", "-o", "a.png"], "metrics.csv: no such file"),
     "scalar": (["training", "--scalar", "train/los"], 'did you mean "train/loss"'),

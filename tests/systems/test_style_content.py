@@ -310,6 +310,8 @@ class TestLosses:
         inside = pairing.aligned[0]
         np.testing.assert_allclose(other[inside], 2 * mine[inside], atol=0.006)
         assert not pair_up(batch, None).aligned.any()
+        alone = pair_up(pairs(tiny, "A_e01", "A_e02"), Readings(25.0))
+        assert alone.partner.tolist() == [0, 1], "two sentences of one person: nothing to swap"
 
     def test_training_batches_are_pairs_of_one_sentence(self, tiny: Tiny, make_trainer: MakeTrainer) -> None:
         system, seen = make(), []

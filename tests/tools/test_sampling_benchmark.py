@@ -25,28 +25,30 @@ def output(tmp_path_factory: pytest.TempPathFactory) -> Output:
 def test_every_total_is_the_sum_of_its_parts(output: Output) -> None:
     _, numbers = output
     assert numbers["seconds"] == 1.0
-    assert len(numbers["rows"]) == 6
+    assert len(numbers["rows"]) == 12
     for row in numbers["rows"]:
         parts = row["audio_encoder"] + row["conditions"] + row["steps"] * row["per_step"] + row["rest"]
         assert row["total"] == pytest.approx(parts)
         assert row["real_time_factor"] == pytest.approx(row["total"] / numbers["seconds"])
+        assert row["per_step"] == numbers["costs"]["step"][row["space"]][row["sampler"]]
 
 
-def test_a_step_is_the_sum_of_its_parts(output: Output) -> None:
+def test_the_ratios_follow_from_the_parts(output: Output) -> None:
     _, numbers = output
-    costs = numbers["costs"]
-    for row in numbers["rows"]:
-        parts = costs["embed"] + costs["core"] + costs["unembed"] + costs["update"][row["sampler"]]
-        assert row["per_step"] == pytest.approx(parts)
-        assert row["all_steps"] == pytest.approx(row["steps"] * parts)
+    costs, ratios = numbers["costs"], numbers["ratios"]
+    assert ratios["step"] == pytest.approx(costs["step"]["vertices"]["ddpm"] / costs["step"]["folded"]["ddpm"])
+    peer = costs["conditions"] + 500 * (costs["audio_encoder"] + costs["step"]["vertices"]["ddpm"])
+    usual = next(r for r in numbers["rows"] if (r["space"], r["sampler"], r["steps"]) == ("folded", "ddim", 25))
+    assert ratios["peer_to_ddim_25"] == pytest.approx(peer / usual["total"])
+    assert ratios["vertices_5023"] > 0
 
 
 def test_the_printed_table_holds_the_same_numbers(output: Output) -> None:
     text, numbers = output
-    lines = text.split("a clip, in seconds", 1)[1].splitlines()[2:8]
+    lines = text.split("a clip, in seconds", 1)[1].splitlines()[2:14]
     for line, row in zip(lines, numbers["rows"], strict=True):
-        name, steps, *cells = line.split()
-        assert (name, int(steps)) == (row["sampler"], row["steps"])
+        space, name, steps, *cells = line.split()
+        assert (space, name, int(steps)) == (row["space"], row["sampler"], row["steps"])
         audio, conditions, all_steps, rest, total, factor = map(float, cells)
         assert total == pytest.approx(audio + conditions + all_steps + rest, abs=3e-4)
         assert total == pytest.approx(row["total"], abs=1e-4)
@@ -58,6 +60,6 @@ def test_machine_memory_and_the_full_run_are_named(output: Output) -> None:
     assert "machine: " in text
     assert "device cpu" in text
     assert "EXTRAPOLATED" in text
-    assert "peak memory: " in text
-    assert "ddim 3 in full: measured" in text
+    assert "peak memory of that: " in text
+    assert "ddim 3, folded, in full: " in text
     assert numbers["full"]["measured"] > 0

@@ -1,9 +1,9 @@
-"""How long sampling takes against the length of the speech: the real-time factor, by sampler and steps.
+"""How long sampling takes against the length of the speech, folded and on vertices, by sampler and steps.
 
 Run ``python tools/benchmarks/sampling.py``: 10 s of noise as speech, 23 370 vertices as in BIWI, HuBERT base and the
-dual-path network at width 512, all with random weights, so nothing is downloaded. A step's cost
-does not depend on its number, so a few steps are timed and multiplied; one configuration (``--full``) is also run
-from start to end, to compare.
+dual-path network at width 512, all with random weights, so nothing is downloaded. The default sampler is run from
+start to end. A step's cost does not depend on its number, so for the others a few steps are timed and multiplied;
+steps of the kinds that are compared take turns, so that whatever else the machine does meets them alike.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -32,13 +32,20 @@ from facediff.components.fusion.cross_attention import BidirectionalCrossAttenti
 from facediff.components.style_encoder.tcn_gru_transformer import TcnGruTransformer
 from facediff.data import Assets, Batch, Sample, collate
 from facediff.data.audio import SAMPLE_RATE, samples_for
+from facediff.diffusion.folding import fold
 from facediff.diffusion.samplers import Sampler
 from facediff.systems import DualPathDiffusion
 from facediff.systems.dual_path.network import Conditions
+from facediff.systems.dual_path.spaces import SamplingSpace, Space, choose_space
+from facediff.systems.dual_path.system import ClipNoise
 
 FRAME_RATE = 25.0
 REFERENCE_FRAMES = 100
 IDENTITIES = ["F2", "F3", "F4", "M3", "M4", "M5"]
+SPACES: tuple[SamplingSpace, ...] = ("folded", "vertices")
+PEER_STEPS = 500
+SAMPLERS = ("ddpm", "ddim", "dpm_solver")
+FLAME = 5023
 CONFIGURATIONS = (("ddpm", 1000), ("ddim", 50), ("ddim", 25), ("ddim", 10), ("dpm_solver", 20), ("dpm_solver", 10))
 
 
@@ -49,33 +56,37 @@ class Costs:
     Attributes:
         audio_encoder: speech to features, once a clip.
         conditions: identity and style, once a clip.
-        embed: noisy motion to C channels, once a step.
-        core: fusion and decoder, once a step.
-        unembed: C channels to clean motion, once a step.
-        update: the scheduler's step with the noise that it draws, once a step, by sampler.
-        rest: first noise, making the scheduler, undoing the motion scale; once a clip.
+        fold: the products of the linear ends, once a model.
+        look: whether the weights are those that were folded; once a clip.
+        core: fusion and decoder, in every step.
+        leave: features to vertices: once a clip where folded, in every step otherwise.
+        rest: undoing the motion scale; once a clip.
+        step: a whole step with the noise that it draws, by sampling space and sampler.
     """
 
     audio_encoder: float
     conditions: float
-    embed: float
+    fold: float
+    look: float
     core: float
-    unembed: float
+    leave: float
     rest: float
-    update: dict[str, float] = field(default_factory=dict)
+    step: dict[str, dict[str, float]] = field(default_factory=dict)
 
-    def row(self, sampler: str, steps: int, seconds: float) -> dict[str, Any]:
+    def row(self, space: str, sampler: str, steps: int, seconds: float) -> dict[str, Any]:
         """What one configuration costs: parts, total and real-time factor."""
-        step = self.embed + self.core + self.unembed + self.update[sampler]
-        total = self.audio_encoder + self.conditions + steps * step + self.rest
+        step = self.step[space][sampler]
+        rest = self.rest + (self.look + self.leave if space == "folded" else 0.0)
+        total = self.audio_encoder + self.conditions + steps * step + rest
         return {
+            "space": space,
             "sampler": sampler,
             "steps": steps,
             "audio_encoder": self.audio_encoder,
             "conditions": self.conditions,
             "per_step": step,
             "all_steps": steps * step,
-            "rest": self.rest,
+            "rest": rest,
             "total": total,
             "real_time_factor": total / seconds,
         }
@@ -115,9 +126,9 @@ class Bench:
     def conditions(self) -> Conditions:
         """Everything that is computed once a clip."""
         batch = self.batch
-        reference = batch.reference.flatten(2) * self.system.scale
+        style = self.system.encode_style(batch.reference, batch.reference_mask)
         return self.system.network.conditions(
-            batch.audio, batch.audio_lengths, batch.frame_lengths, batch.identity, reference, batch.reference_mask
+            batch.audio, batch.audio_lengths, batch.frame_lengths, batch.identity, style
         )
 
     def once_a_clip(self) -> tuple[float, float]:
@@ -136,41 +147,63 @@ class Bench:
         others = [total - part for total, part in zip(whole, audio, strict=True)]
         return statistics.median(audio[1:]), statistics.median(others[1:])
 
-    def start(self) -> torch.Tensor:
-        """The noise that sampling starts from."""
-        return torch.randn(self.batch.motion.flatten(2).shape, device=self.system.device)
+    def space(self, name: SamplingSpace, sampler: Sampler) -> Space:
+        """A sampling space, with the system's own cache."""
+        return choose_space(self.system.network, name, sampler, self.system._fold_cache)
+
+    def stepper(self, name: SamplingSpace, sampler: Sampler, conditions: Conditions) -> Callable[[], None]:
+        """A call that takes one step of the real loop: prediction, noise, update."""
+        space, unit = self.space(name, sampler), ClipNoise(self.batch, 0)
+        shape = (*self.batch.motion.shape[:2], space.width)
+        state = space.noise(unit(torch.empty(shape, device=self.system.device)))
+        scheduler = sampler.make_scheduler()
+        places = iter(scheduler.timesteps.tolist())
+
+        def step() -> None:
+            nonlocal state
+            place = next(places)
+            prediction = space.predict(state, torch.full((1,), place, device=state.device), conditions)
+            state = sampler.advance(scheduler, prediction, place, state, lambda like: space.noise(unit(like)))
+
+        return step
+
+    def in_turn(self, steppers: dict[str, Callable[[], None]]) -> dict[str, float]:
+        """Median seconds of a step of each, taken in turn, after two that warm up."""
+        spent: dict[str, list[float]] = {name: [] for name in steppers}
+        for _ in range(self.repeats + 2):
+            for name, step in steppers.items():
+                spent[name].append(self.clock(step))
+        return {name: statistics.median(times[2:]) for name, times in spent.items()}
 
     def measure(self, samplers: dict[str, Sampler]) -> Costs:
         """Time every part."""
         network, batch = self.system.network, self.batch
         audio_encoder, others = self.once_a_clip()
-        conditions, noisy = self.conditions(), self.start()
-        step = torch.full((len(batch),), self.system.process.steps // 2, device=noisy.device)
-        embedded = network.embed(noisy)
-        decoded = network.core(embedded, step, conditions)
+        conditions = self.conditions()
         first = next(iter(samplers.values()))
+        step = torch.full((len(batch),), self.system.process.steps // 2, device=self.system.device)
+        entered = torch.randn(*batch.motion.shape[:2], network.embed.out_features, device=self.system.device)
+        decoded = network.core(entered, step, conditions)
+        vertices = network.leave(decoded)
+        maps = network.embed.weight.detach(), network.unembed.weight.detach(), network.unembed.bias.detach()
         costs = Costs(
             audio_encoder=audio_encoder,
             conditions=others,
-            embed=self.median(lambda: network.embed(noisy)),
-            core=self.median(lambda: network.core(embedded, step, conditions)),
-            unembed=self.median(lambda: network.unembed(decoded)),
-            rest=self.median(lambda: (first.make_scheduler(), self.start() / self.system.scale)),
+            fold=self.clock(lambda: fold(*maps)),
+            look=self.median(lambda: self.space("folded", first)),
+            core=self.median(lambda: network.core(entered, step, conditions)),
+            leave=self.median(lambda: network.leave(decoded)),
+            rest=self.median(lambda: vertices / self.system.scale),
         )
-        clean = network.unembed(decoded)
-        costs.update = {name: self.update(sampler, noisy, clean) for name, sampler in samplers.items()}
+        costs.step = {space: {} for space in SPACES}
+        for name, sampler in samplers.items():
+            found = self.in_turn({space: self.stepper(space, sampler, conditions) for space in SPACES})
+            for space, seconds in found.items():
+                costs.step[space][name] = seconds
         return costs
 
-    def update(self, sampler: Sampler, noisy: torch.Tensor, clean: torch.Tensor) -> float:
-        """Median seconds of the scheduler's step, after two that warm up."""
-        scheduler, spent = sampler.make_scheduler(), []
-        for step in scheduler.timesteps[: self.repeats + 2].tolist():
-            work = partial(sampler.advance, scheduler, clean, step, noisy, torch.randn_like)
-            spent.append(self.clock(work))
-        return statistics.median(spent[2:] or spent)
 
-
-def build(args: argparse.Namespace) -> Bench:
+def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool) -> Bench:
     """The system with random weights, its assets, and one clip of noise as speech."""
     from transformers import HubertConfig
 
@@ -182,9 +215,9 @@ def build(args: argparse.Namespace) -> Bench:
         "intermediate_size": 64,
     }
     tiny |= {"conv_dim": (16,) * 7, "num_conv_pos_embeddings": 16, "num_conv_pos_embedding_groups": 2}
-    config = HubertConfig(**(tiny if args.tiny_encoder else {})).to_dict()
+    config = HubertConfig(**(tiny if tiny_encoder else {})).to_dict()
     system = DualPathDiffusion(
-        n_vertices=args.vertices,
+        n_vertices=vertices,
         identities=IDENTITIES,
         frame_rate=FRAME_RATE,
         dim=args.dim,
@@ -200,7 +233,7 @@ def build(args: argparse.Namespace) -> Bench:
             unit="m",
             frame_rate=FRAME_RATE,
             identities=IDENTITIES,
-            templates={name: torch.zeros(args.vertices, 3) for name in IDENTITIES},
+            templates={name: torch.zeros(vertices, 3) for name in IDENTITIES},
             faces=None,
             regions={name: torch.arange(3) for name in ("lips", "upper_face")},
             motion_scale=100.0,
@@ -209,10 +242,10 @@ def build(args: argparse.Namespace) -> Bench:
     frames = max(1, round(args.seconds * FRAME_RATE))
     sample = Sample(
         audio=torch.randn(samples_for(frames, FRAME_RATE)),
-        motion=torch.zeros(frames, args.vertices, 3),
-        template=torch.zeros(args.vertices, 3),
+        motion=torch.zeros(frames, vertices, 3),
+        template=torch.zeros(vertices, 3),
         identity=0,
-        reference=1e-2 * torch.randn(REFERENCE_FRAMES, args.vertices, 3),
+        reference=1e-2 * torch.randn(REFERENCE_FRAMES, vertices, 3),
         name="speech",
         subject=IDENTITIES[0],
         sentence="",
@@ -262,42 +295,70 @@ def heading(args: argparse.Namespace, bench: Bench) -> str:
 
 
 def tables(costs: Costs, rows: list[dict[str, Any]]) -> str:
-    """Both tables: a step's parts, and the configurations."""
-    lines = ["", "one step, in milliseconds", f"{'sampler':<12}{'embed':>10}{'core':>10}{'unembed':>10}"]
-    lines[-1] += f"{'noise+update':>14}{'step':>10}"
-    for name, update in costs.update.items():
-        parts = (costs.embed, costs.core, costs.unembed)
-        cells = "".join(f"{1e3 * part:>10.3f}" for part in parts)
-        lines.append(f"{name:<12}{cells}{1e3 * update:>14.3f}{1e3 * (sum(parts) + update):>10.3f}")
-    lines += ["", "a clip, in seconds; all steps = steps x one step (EXTRAPOLATED from a few timed steps)"]
-    lines.append(
-        f"{'sampler':<12}{'steps':>6}{'audio encoder':>15}{'conditions':>12}{'all steps':>12}{'rest':>10}{'total':>12}"
-        f"{'real-time factor':>18}"
-    )
-    for row in rows:
-        lines.append(
-            f"{row['sampler']:<12}{row['steps']:>6}{row['audio_encoder']:>15.4f}{row['conditions']:>12.4f}"
-            f"{row['all_steps']:>12.4f}{row['rest']:>10.4f}{row['total']:>12.4f}{row['real_time_factor']:>18.4f}"
-        )
+    """Both tables: a step, and the configurations."""
+    lines = ["", "one step with its noise and update, in milliseconds, and in vertices / folded"]
+    lines.append(f"{'sampler':<12}{'folded':>10}{'vertices':>10}{'ratio':>8}")
+    for name, folded in costs.step["folded"].items():
+        plain = costs.step["vertices"][name]
+        lines.append(f"{name:<12}{1e3 * folded:>10.3f}{1e3 * plain:>10.3f}{plain / folded:>8.2f}")
+    lines += [
+        f"of which fusion and decoder {1e3 * costs.core:.3f}; the map to vertices {1e3 * costs.leave:.3f}, once a clip "
+        f"where folded",
+        f"folding the ends: {costs.fold:.3f} s, once a model; looking whether the weights changed: "
+        f"{1e3 * costs.look:.3f} ms, once a clip",
+        "",
+        "a clip, in seconds; all steps = steps x one step (EXTRAPOLATED from a few timed steps)",
+        f"{'space':<10}{'sampler':<12}{'steps':>6}{'audio encoder':>15}{'conditions':>12}{'all steps':>12}{'rest':>10}"
+        f"{'total':>12}{'real-time factor':>18}",
+    ]
+    lines += [
+        f"{row['space']:<10}{row['sampler']:<12}{row['steps']:>6}{row['audio_encoder']:>15.4f}{row['conditions']:>12.4f}"
+        f"{row['all_steps']:>12.4f}{row['rest']:>10.4f}{row['total']:>12.4f}{row['real_time_factor']:>18.4f}"
+        for row in rows
+    ]
     return "\n".join(lines)
 
 
-def ratios(rows: list[dict[str, Any]]) -> str:
+def ratios(costs: Costs, rows: list[dict[str, Any]]) -> tuple[str, dict[str, float]]:
     """What one run says about the relations, which carry over to other machines better than seconds do."""
-    by = {(row["sampler"], row["steps"]): row for row in rows}
-    slow, usual, few = by["ddpm", 1000], by["ddim", 25], by["dpm_solver", 10]
-    again = usual["total"] + (usual["steps"] - 1) * usual["audio_encoder"]
-    return "\n".join(
-        [
-            "",
-            "ratios, from this run alone",
-            f"  ddpm 1000 takes {slow['total'] / usual['total']:.1f} times as long as ddim 25, "
-            f"{slow['total'] / few['total']:.1f} times as long as dpm_solver 10",
-            f"  share of the audio encoder: {usual['audio_encoder'] / usual['total']:.1%} with ddim 25, "
-            f"{few['audio_encoder'] / few['total']:.1%} with dpm_solver 10",
-            f"  encoding the speech anew in every step would make ddim 25 {again / usual['total']:.1f} times as slow",
-        ]
+    by = {(row["space"], row["sampler"], row["steps"]): row for row in rows}
+    peer_step = costs.audio_encoder + costs.step["vertices"]["ddpm"]
+    peer = costs.conditions + PEER_STEPS * peer_step
+    usual, few = by["folded", "ddim", 25], by["folded", "dpm_solver", 10]
+    found = {
+        "step": costs.step["vertices"]["ddpm"] / costs.step["folded"]["ddpm"],
+        "peer_seconds": peer,
+        "peer_to_ddim_25": peer / usual["total"],
+        "peer_to_dpm_solver_10": peer / few["total"],
+        "peer_to_folded_ddpm_500": peer
+        / (costs.audio_encoder + costs.conditions + PEER_STEPS * costs.step["folded"]["ddpm"] + usual["rest"]),
+    }
+    lines = [
+        "",
+        "ratios, from this run alone",
+        f"  (a) a step of ddpm on vertices takes {found['step']:.1f} times as long as folded",
+        f"  (c) encoding the speech and projecting in each of {PEER_STEPS} steps takes {peer:.1f} s (EXTRAPOLATED):",
+        f"      {found['peer_to_ddim_25']:.0f} times as long as folded ddim 25, "
+        f"{found['peer_to_dpm_solver_10']:.0f} times as long as folded dpm_solver 10,",
+        f"      {found['peer_to_folded_ddpm_500']:.1f} times as long as folded ddpm with as many steps",
+    ]
+    return "\n".join(lines), found
+
+
+def sizes(args: argparse.Namespace, bench: Bench) -> dict[str, float]:
+    """Milliseconds of a folded step at two sizes of mesh, taken in turn."""
+    steppers = {}
+    for vertices in (FLAME, args.vertices):
+        one = bench if vertices == args.vertices else build(args, vertices, tiny_encoder=True)
+        sampler = registry.sampler.get("ddpm")(process=one.system.process)
+        steppers[str(vertices)] = one.stepper("folded", sampler, one.conditions())
+    found = replace(bench, repeats=4 * bench.repeats).in_turn(steppers)
+    small, large = found[str(FLAME)], found[str(args.vertices)]
+    print(
+        f"  (d) a folded step at {FLAME} vertices takes {1e3 * small:.3f} ms, at {args.vertices} {1e3 * large:.3f} ms: "
+        f"ratio {large / small:.3f}"
     )
+    return found
 
 
 def options() -> argparse.Namespace:
@@ -313,12 +374,26 @@ def options() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, help="threads of PyTorch (default: its own choice)")
     parser.add_argument("--tiny-encoder", action="store_true", help="a tiny HuBERT instead of HuBERT base, for trials")
     parser.add_argument("--quick", action="store_true", help="one repetition of every part and no full run")
-    parser.add_argument("--full", type=int, default=10, help="steps of the ddim run in full (default: 10; 0: none)")
+    parser.add_argument("--full", type=int, default=25, help="steps of the ddim run in full (default: 25; 0: none)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers there too, unrounded")
     args = parser.parse_args()
     if args.quick:
         args.repeats, args.full = 1, 0
     return args
+
+
+def in_full(args: argparse.Namespace, bench: Bench, seconds: float) -> dict[str, float]:
+    """The default sampler from start to end, the first time with folding, and memory before anything else ran."""
+    bench.system.choose_sampler("ddim", args.full)
+    first = bench.clock(lambda: bench.system.generate(bench.batch))
+    again = statistics.median(bench.clock(lambda: bench.system.generate(bench.batch)) for _ in range(bench.repeats))
+    print(
+        f"\n(b) ddim {args.full}, folded, in full: {again:.4f} s, real-time factor {again / seconds:.4f}; "
+        f"the first time, with folding and warming up, {first:.4f} s\n"
+        f"(e) peak memory of that: {peak_memory(args.device)}",
+        flush=True,
+    )
+    return {"steps": args.full, "measured": again, "first": first, "real_time_factor": again / seconds}
 
 
 @torch.inference_mode()
@@ -327,25 +402,23 @@ def main() -> None:
     args = options()
     if args.threads:
         torch.set_num_threads(args.threads)
-    bench = build(args)
+    bench = build(args, args.vertices, tiny_encoder=args.tiny_encoder)
     print(heading(args, bench), flush=True)
     seconds = bench.batch.audio.shape[1] / SAMPLE_RATE
     process = bench.system.process
-    costs = bench.measure({name: registry.sampler.get(name)(process=process) for name, _ in CONFIGURATIONS})
-    rows = [costs.row(name, steps, seconds) for name, steps in CONFIGURATIONS]
+    # First, since the highest memory so far is all that a process can tell.
+    full = in_full(args, bench, seconds) if args.full else None
+    costs = bench.measure({name: registry.sampler.get(name)(process=process, steps=1000) for name in SAMPLERS})
+    rows = [costs.row(space, name, steps, seconds) for space in SPACES for name, steps in CONFIGURATIONS]
     print(tables(costs, rows))
-    print(ratios(rows), flush=True)
-    found: dict[str, Any] = {"seconds": seconds, "costs": asdict(costs), "rows": rows}
-    if args.full:
-        bench.system.choose_sampler("ddim", args.full)
-        measured = bench.clock(lambda: bench.system.generate(bench.batch))
-        expected = costs.row("ddim", args.full, seconds)["total"]
-        print(
-            f"\nddim {args.full} in full: measured {measured:.4f} s, extrapolated {expected:.4f} s, "
-            f"measured/extrapolated {measured / expected:.3f}"
-        )
-        found["full"] = {"steps": args.full, "measured": measured, "extrapolated": expected}
-    print(f"peak memory: {peak_memory(args.device)}")
+    text, relations = ratios(costs, rows)
+    print(text, flush=True)
+    relations |= {"vertices_" + name: value for name, value in sizes(args, bench).items()}
+    found = {"seconds": seconds, "costs": asdict(costs), "rows": rows, "ratios": relations, "full": full}
+    if full is not None:
+        expected = costs.row("folded", "ddim", args.full, seconds)["total"]
+        print(f"  ddim {args.full} in full: measured / extrapolated {full['measured'] / expected:.3f}")
+    print(f"peak memory with sampling on vertices: {peak_memory(args.device)}")
     if args.json:
         args.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 

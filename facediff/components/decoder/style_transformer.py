@@ -2,12 +2,43 @@
 
 from __future__ import annotations
 
+import math
+
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from facediff.components.decoder.base import Decoder
 from facediff.components.layers import Attention, FeedForward
 from facediff.registry import decoder
+
+
+class TokenAttention(Attention):
+    """Attention to a few tokens, with the query's map multiplied into the keys and the last map into the values.
+
+    The scores (W_q x + b_q)·k and the mixture Σ_k a_k W_o v_k are the same numbers in another order, and for fewer than
+    ``dim`` pairs of head and token two narrow products replace two of ``dim`` by ``dim`` per frame.
+    """
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch frames dim"],
+        context: Float[Tensor, "batch keys context_dim"],
+        context_mask: Bool[Tensor, "batch keys"] | None = None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Attend from ``x`` to all of ``context``."""
+        narrow = self.num_heads * context.shape[1] < x.shape[-1]
+        if context_mask is not None or self.rotary is not None or self.dropout or not narrow:
+            return super().forward(x, context, context_mask)
+        key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
+        key = key / math.sqrt(key.shape[-1])
+        # Weights by head: (heads, head_dim, dim).
+        into = self.query.weight.unflatten(0, (self.num_heads, -1))
+        out = self.out.weight.T.unflatten(0, (self.num_heads, -1))
+        scores = x @ (key @ into).flatten(1, 2).transpose(1, 2)
+        offset = key @ self.query.bias.view(self.num_heads, -1, 1)
+        scores = scores + offset.flatten(1)[:, None]
+        weights = scores.unflatten(-1, (self.num_heads, -1)).softmax(dim=-1).flatten(2)
+        return weights @ (value @ out).flatten(1, 2) + self.out.bias
 
 
 class Block(nn.Module):
@@ -18,7 +49,7 @@ class Block(nn.Module):
         self.time_norm = nn.LayerNorm(dim)
         self.time_attention = Attention(dim, dim, num_heads, rotary=True, dropout=dropout)
         self.style_norm = nn.LayerNorm(dim)
-        self.style_attention = Attention(dim, style_dim, num_heads)
+        self.style_attention = TokenAttention(dim, style_dim, num_heads)
         self.feed_forward_norm = nn.LayerNorm(dim)
         self.feed_forward = FeedForward(dim, hidden_dim, dropout)
         self.dropout = nn.Dropout(dropout)

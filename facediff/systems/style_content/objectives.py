@@ -47,14 +47,17 @@ class Pairing:
 def pair_up(batch: Batch, readings: Readings | None) -> Pairing:
     """Neighbours 2k and 2k + 1 are partners; those that say the same sentence are aligned in time.
 
+    There is nothing to swap between two sentences of one person: each clip is its own partner then.
+
     Args:
         batch: clips; one that is left over is its own partner.
         readings: aligns; None aligns nobody.
     """
     count, frames = batch.mask.shape
     partner = torch.arange(count)
-    paired = count // 2 * 2
-    partner[:paired] = partner[:paired] ^ 1
+    for clip in range(0, count - 1, 2):
+        if batch.subjects[clip] != batch.subjects[clip + 1] or batch.sentences[clip] == batch.sentences[clip + 1]:
+            partner[clip], partner[clip + 1] = clip + 1, clip
     places = torch.zeros(count, frames, dtype=torch.long)
     aligned = torch.zeros(count, frames, dtype=torch.bool)
     for clip, other in enumerate(partner.tolist()):

@@ -247,6 +247,9 @@ class StyleContentDisentanglement(SpeechAnimator):
         network, mask = self.network, batch.mask
         partner = pairing.partner
         terms = {"reconstruction": self._compare(batch, self._decode(said, own, mask), motion, mask)}
+        apart = partner != torch.arange(len(partner), device=partner.device)
+        if not apart.any():  # nobody to swap with: two thirds of the work saved where one person alone is learnt
+            return {**terms, **dict.fromkeys(("swap", "swap_dynamics", "cycle"), motion.new_zeros(()))}
         swapped = self._decode(said, style[partner], mask)
         again, style_again = network.content(swapped, mask), network.style(swapped, mask)
         terms["swap"] = self._compare(
@@ -256,7 +259,6 @@ class StyleContentDisentanglement(SpeechAnimator):
         terms["swap"] = terms["swap"] + relative_distance(again, said.detach(), mask & free[:, None])
         terms["swap"] = terms["swap"] + relative_style_distance(style_again, style[partner].detach(), free)
         upper = self.assets.regions["upper_face"].to(motion.device)
-        apart = partner != torch.arange(len(partner), device=partner.device)
         terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], mask, mask[partner], apart, upper)
         back = self._decode(again, style_again[partner], mask)
         terms["cycle"] = self._compare(batch, back, motion, mask)
