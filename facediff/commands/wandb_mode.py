@@ -82,7 +82,7 @@ def why_offline() -> str | None:
 
 
 def answers(address: str, patience: float = PATIENCE) -> bool:
-    """Whether a web server answers, with whatever; proxies of the environment are used.
+    """Whether a web server answers, with whatever but an error of its own; proxies of the environment are used.
 
     In a thread of its own, since looking up a name may take longer than any time limit of the connection.
     """
@@ -91,8 +91,9 @@ def answers(address: str, patience: float = PATIENCE) -> bool:
     def ask() -> None:
         try:
             urllib.request.urlopen(address, timeout=patience).close()  # noqa: S310 (the user's own setting)
-        except urllib.error.HTTPError:
-            pass  # "not found" is an answer
+        except urllib.error.HTTPError as error:
+            if error.code >= 500:  # a gateway whose server is down; "not found" is an answer
+                return
         except (OSError, ValueError):
             return
         heard.set()

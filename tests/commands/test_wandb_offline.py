@@ -8,8 +8,10 @@ import re
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import redirect_stderr
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -156,6 +158,20 @@ def test_a_server_that_says_nothing_does_not_answer() -> None:
         assert not answers(f"http://127.0.0.1:{silent.getsockname()[1]}", patience=0.3)
         assert time.monotonic() - start < 3
     assert not answers("http://host.invalid", patience=1.0)
+
+
+@pytest.mark.parametrize(("status", "answer"), [(404, True), (503, False)])
+def test_a_gateway_without_its_server_does_not_answer(status: int, answer: bool) -> None:
+    class Gateway(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_error(status)
+
+        def log_message(self, *words: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Gateway) as server:
+        threading.Thread(target=server.handle_request, daemon=True).start()
+        assert answers(f"http://127.0.0.1:{server.server_port}") is answer
 
 
 def trainer_with_wandb(**options: object) -> dict[str, object]:

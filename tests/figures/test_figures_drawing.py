@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from facediff.errors import FaceDiffError, MissingExtraError
@@ -28,6 +29,7 @@ from facediff.figures import (
     draw_lips,
     draw_training,
 )
+from facediff.figures import curves as curves_module
 from facediff.figures import page as page_module
 from facediff.figures.grid import Grid, Heading
 from facediff.figures.heat import scale_end
@@ -248,6 +250,23 @@ def test_options_of_curves_that_cannot_be(tmp_path: Path) -> None:
         with pytest.raises(FaceDiffError, match="--span"):
             draw_lips(LIPS, Sound(), path, span=span)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_lips_are_drawn_at_their_times_and_in_their_unit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    saved: list[Figure] = []
+    monkeypatch.setattr(curves_module, "save", lambda figure, path: saved.append(figure))
+    click = np.zeros(32_000, "f4")
+    click[16_000] = 1
+    sound = Sound(click, phonemes=PHONEMES)
+    draw_lips(LIPS, sound, tmp_path / "a.png", paper=SMALL, scale=(1000, "mm"), span=(0.1, 1.6))
+    opening, _, wave = saved[0].axes
+    assert opening.get_xlim() == wave.get_xlim() == (0.1, 1.6)
+    for line, values in zip(opening.lines, LIPS.openings.values(), strict=True):
+        np.testing.assert_allclose(line.get_xydata(), np.stack([TIMES, 1000 * values], 1))
+    (grey,) = opening.patches  # the only phoneme for which lips close
+    assert (grey.get_x(), grey.get_x() + grey.get_width()) == pytest.approx((0.2, 0.5))
+    outline = wave.collections[0].get_paths()[0].vertices
+    assert outline[outline[:, 1].argmax(), 0] == pytest.approx(1.0, abs=0.01)
 
 
 def test_without_sound_or_phonemes_there_is_the_curve_alone(tmp_path: Path) -> None:
