@@ -162,3 +162,16 @@ def test_a_region_index_out_of_range_names_the_file(broken: Path) -> None:
     (broken / "regions" / "lve.txt").write_text("1, 2, 24")
     with pytest.raises(FaceDiffError, match=r"lve\.txt.*24"):
         Tiny(root=str(broken)).assets()
+
+
+def test_newcomers_train_on_their_clips_of_no_split(tiny_root: Path) -> None:
+    data = Tiny(root=str(tiny_root), newcomers=["C"])
+    assert data.identities == ["C", "A", "B"]
+    assert {clip.name for clip in data.clips("train") if clip.subject == "C"} == {f"C_e0{n}" for n in range(1, 6)}
+    assert {clip.subject for clip in data.clips("test_b")} == {"C"}, "test clips stay test clips"
+    only = Tiny(root=str(tiny_root), newcomers=["C"], train_subjects=["C"])
+    assert {clip.subject for clip in only.clips("train")} == {"C"}
+    assert only.identities == data.identities
+    assert [clip.name for clip in only.clips("val")] == [clip.name for clip in data.clips("val")]
+    with pytest.raises(FaceDiffError, match="A is there more than once"):
+        Tiny(root=str(tiny_root), newcomers=["A"])

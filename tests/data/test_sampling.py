@@ -103,3 +103,42 @@ def test_the_number_of_batches_does_not_change_from_epoch_to_epoch() -> None:
 def test_evaluation_is_in_order() -> None:
     assert indices(batches([5] * 6, batch_size=4)) == [[0, 1, 2, 3], [4, 5]]
     assert {pick.seed for batch in batches([5] * 6) for pick in batch} == {0}
+
+
+GROUPS = [f"e{i % 7}" for i in range(23)] + ["alone", "lonely", "single"]
+
+
+@pytest.mark.parametrize("world", [1, 2])
+def test_training_batches_of_pairs(world: int) -> None:
+    """Neighbours share a group, every clip comes, the number of batches is the same in each epoch."""
+    counts = set()
+    for epoch in range(4):
+        seen: list[int] = []
+        for rank in range(world):
+            batches = ClipBatches(
+                [10] * len(GROUPS), batch_size=4, training=True, groups=GROUPS, rank=rank, world_size=world
+            )
+            batches.set_epoch(epoch)
+            made = [[pick.index for pick in batch] for batch in batches]
+            counts.add(len(made))
+            assert len(made) == len(batches)
+            for batch in made:
+                for one, other in zip(batch[::2], batch[1::2], strict=True):
+                    assert one != other
+                    together = {GROUPS[one], GROUPS[other]}
+                    assert len(together) == 1 or together <= {"alone", "lonely", "single"}
+            seen += [index for batch in made for index in batch]
+        assert set(seen) == set(range(len(GROUPS)))
+    assert len(counts) == 1
+
+
+def test_evaluation_knows_no_pairs() -> None:
+    batches = ClipBatches([10] * len(GROUPS), batch_size=4, groups=GROUPS)
+    assert [pick.index for batch in batches for pick in batch] == list(range(len(GROUPS)))
+
+
+def test_pairs_keep_to_a_frame_budget() -> None:
+    lengths = [10 + 3 * (i % 5) for i in range(len(GROUPS))]
+    for batch in ClipBatches(lengths, batch_size=1, max_frames=90, training=True, groups=GROUPS):
+        assert len(batch) % 2 == 0
+        assert max(lengths[pick.index] for pick in batch) * len(batch) <= 90
