@@ -7,6 +7,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import yaml
@@ -106,7 +107,17 @@ class FaceDiffCLI(LightningCLI):
 
 
 class RunConfig(SaveConfigCallback):
-    """Saves the config as ``config.yaml`` in the run's folder, and as ``config`` in a wandb run's config."""
+    """Saves the config as ``config.yaml`` in the run's folder, and as ``config`` in a wandb run's config.
+
+    A run without a logger has no folder of its own; a ``config.yaml`` in the working folder may be the user's and
+    is left alone.
+    """
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Save the config where the run's files lie, unless that is merely the working folder."""
+        if not trainer.loggers and Path(trainer.default_root_dir).resolve() == Path.cwd():
+            self.save_to_log_dir = False
+        super().setup(trainer, pl_module, stage)
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Give wandb the config; called on one process only."""

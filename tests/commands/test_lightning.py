@@ -55,6 +55,19 @@ def test_test_takes_everything_from_the_checkpoint(
     assert len(list(tmp_path.glob("runs/test/version_0/test_scores.csv"))) == 1
 
 
+def test_a_config_of_the_users_is_not_overwritten(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run without a logger has no folder of its own to write its config to."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.yaml").write_text("mine")
+    words = ["validate", f"--ckpt_path={checkpoint}", "--trainer.enable_progress_bar=false", "--trainer.logger=false"]
+    assert main(words) == 0
+    assert (tmp_path / "config.yaml").read_text() == "mine"
+    assert main([*words, "--trainer.default_root_dir=there"]) == 0
+    assert "seed_everything" in (tmp_path / "there" / "config.yaml").read_text()
+
+
 def test_predict_writes_files(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     words = ["predict", f"--ckpt_path={checkpoint}", "--trainer.enable_progress_bar=false", "--model.sampler.steps=1"]
@@ -280,5 +293,5 @@ def test_wandb_gets_the_sequences_and_the_protocol(
     words = ["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false", *logger]
     assert main(words) == 0
     wandb.finish()
-    columns = ["split", "method", "clip", "frames", "mve", "lve", "fdd", "audio", "error"]
+    columns = ["split", "method", "clip", "identity", "frames", "mve", "lve", "fdd", "audio", "error"]
     assert logged == {"columns": columns, "rows": 18}
