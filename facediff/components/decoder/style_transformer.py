@@ -32,12 +32,12 @@ class TokenAttention(Attention):
         key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
         key = key / math.sqrt(key.shape[-1])
         # Weights by head: (heads, head_dim, dim).
-        into = self.query.weight.unflatten(0, (self.num_heads, -1))
-        out = self.out.weight.T.unflatten(0, (self.num_heads, -1))
+        into = self.query.weight.view(self.num_heads, -1, x.shape[-1])
+        out = self.out.weight.T.reshape(self.num_heads, -1, x.shape[-1])
         scores = x @ (key @ into).flatten(1, 2).transpose(1, 2)
         offset = key @ self.query.bias.view(self.num_heads, -1, 1)
         scores = scores + offset.flatten(1)[:, None]
-        weights = scores.unflatten(-1, (self.num_heads, -1)).softmax(dim=-1).flatten(2)
+        weights = scores.view(*scores.shape[:2], self.num_heads, -1).softmax(dim=-1).flatten(2)
         return weights @ (value @ out).flatten(1, 2) + self.out.bias
 
 
