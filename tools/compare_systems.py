@@ -86,6 +86,7 @@ def measure(name: str, config: str, epochs: int, args: argparse.Namespace) -> Ro
 def scores(path: Path) -> Row:
     """The test's scores, with the still face's LVE beside."""
     words = ["--ckpt_path", str(path), "--trainer.accelerator=cpu", "--trainer.logger=false"]
+    words.append(f"--trainer.default_root_dir={path.parent}")
     metrics = run_cli("test", words).trainer.callback_metrics
     found: Row = {}
     for split in ("test_a", "test_b"):
