@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +14,8 @@ import torch
 
 from facediff.cli import main
 from facediff.data import collate
+from facediff.pickles import load_pickle
+from facediff.prepare.job import write_templates
 from facediff.systems import load_system
 from facediff.systems.adaptation import grow
 from facediff.systems.checkpoint import read_checkpoint
@@ -177,3 +181,38 @@ def test_a_vector_of_another_model_is_refused(
     words = ["--checkpoint", str(checkpoint), "--style", str(tmp_path / "other.npy"), "-o", str(tmp_path / "o.npy")]
     assert main(["animate", str(tmp_path / "speech.wav"), *words]) == 2
     assert "holds 7 numbers" in capsys.readouterr().err
+
+
+def person_folder(corpus: Path, root: Path, subject: str = "C", name: str = "Maria") -> Path:
+    """The clips of a subject of the miniature corpus, as `facediff data import-person` lays out a person's."""
+    for folder in ("wav", "vertices_npy"):
+        (root / folder).mkdir(parents=True)
+    rows = ["clip,subject,sentence,split"]
+    for number, source in enumerate(sorted((corpus / "vertices_npy").glob(f"{subject}_*.npy")), 1):
+        clip = f"{name}_s{number:02d}"
+        shutil.copy(source, root / "vertices_npy" / f"{clip}.npy")
+        shutil.copy(corpus / "wav" / f"{source.stem}.wav", root / "wav" / f"{clip}.wav")
+        rows.append(f"{clip},{name},s{number:02d},{'test' if number == 7 else 'train'}")
+    (root / "clips.csv").write_text("\n".join(rows) + "\n")
+    template = load_pickle(corpus / "templates.pkl")[subject]
+    write_templates(root / "templates.pkl", {name: template})
+    (root / "manifest.json").write_text(json.dumps({"corpus": "person", "person": name, "frame_rate": 25}))
+    return root
+
+
+def test_a_persons_folder_is_learnt_by_name(checkpoint: Path, tiny_root: Path, tmp_path: Path) -> None:
+    """And a second person after the first; the folders are named in the checkpoint, so that it is tested as ever."""
+    folder = person_folder(tiny_root, tmp_path / "maria")
+    first, second = tmp_path / "first.ckpt", tmp_path / "second.ckpt"
+    assert main(["adapt", "--checkpoint", str(checkpoint), "--person", str(folder), "-o", str(first), *FAST]) == 0
+    system = load_system(first)
+    assert system.identities == ["Maria", "A", "B"]
+    assert "Maria" in system.assets.templates
+    assert system.default_style("Maria").clip.startswith("Maria_")
+    words = ["--trainer.accelerator=cpu", f"--trainer.logger.save_dir={tmp_path}"]
+    assert main(["test", "--ckpt_path", str(first), *words]) == 0
+    (table,) = tmp_path.rglob("test_sequences.csv")
+    assert "Maria_s07" in table.read_text()
+    other = person_folder(tiny_root, tmp_path / "eve", name="Eve")
+    assert main(["adapt", "--checkpoint", str(first), "--person", str(other), "-o", str(second), *FAST]) == 0
+    assert load_system(second).identities == ["Eve", "Maria", "A", "B"]
