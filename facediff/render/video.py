@@ -36,7 +36,8 @@ def write_video(
     """Write an mp4 whose sound starts with its first frame.
 
     The file appears under its name only when it is complete: until then it is a hidden sibling, which is
-    removed if anything fails (so is every folder that had to be made). Same input, same bytes.
+    removed if anything fails (so is every folder that had to be made). Same input, same pictures bit by bit; the
+    sound may differ inaudibly, since FFmpeg's AAC encoder now and then chooses other bits for the same samples.
 
     Args:
         path: ends in ".mp4"; missing folders are made.
