@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import WandbLogger
 
 from facediff.callbacks.dashboard_media import measure_clips, wandb_media, worst_clips
-from facediff.files import atomic
+from facediff.files import write_rows
 from facediff.systems import SpeechAnimator
 
 METHOD_NAMES = {"model": "model", "still": "still face", "shuffled": "model, shuffled speech"}
@@ -122,11 +121,3 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
             line |= {f"{part}_vertices": region["count"], f"{part}_hash": region["hash"]}
         flat.append(line)
     write_rows(path, flat)
-
-
-def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Rows of equal keys as CSV, whole or not at all."""
-    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)

@@ -66,10 +66,6 @@ def run(name: str, arguments: Sequence[str]) -> int:
     started = time.monotonic()
     person, data = adaptation_data(args)
     system = load_system(args.checkpoint)
-    if person in system.identities:
-        raise FaceDiffError(
-            f"--person {args.person}: the checkpoint knows {person} already; train on with `facediff fit`"
-        )
     data.prepare_data()
     if person not in data.corpus.templates:
         known = ", ".join(sorted(data.corpus.templates))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import sys
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facediff.errors import FaceDiffError
-from facediff.files import atomic, check_writable
+from facediff.files import atomic, check_writable, write_rows
 
 if TYPE_CHECKING:
     from facediff.evaluate import Report
@@ -156,8 +155,4 @@ def _write_csv(path: Path, report: Report) -> None:
     regions = {
         f"{part}_{key}": region[key] for part, region in report.regions().items() for key in ("name", "count", "hash")
     }
-    rows = [row | regions for row in report.rows()]
-    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(path, [row | regions for row in report.rows()])

@@ -116,6 +116,10 @@ class SpeechAnimator(LightningModule, ABC):
             FaceDiffError: if the system was made without a style.
         """
 
+    def style_of(self, batch: Batch) -> Float[Tensor, "batch style_dim"]:
+        """A batch's own style vectors, or else those of its references."""
+        return self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
+
     @abstractmethod
     def personal_modules(self) -> list[nn.Module]:
         """The parts that hold who somebody is and how they move; the others may stay frozen when one is learnt."""

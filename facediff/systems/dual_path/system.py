@@ -197,7 +197,7 @@ class DualPathDiffusion(SpeechAnimator):
             batch.audio_lengths,
             batch.frame_lengths,
             identity,
-            self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style,
+            self.style_of(batch),
             batch.cached_features,
         )
 

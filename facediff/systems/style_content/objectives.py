@@ -159,11 +159,10 @@ def relative_distance(
 
 
 def relative_style_distance(
-    styles: Float[Tensor, "batch dim"], others: Float[Tensor, "batch dim"], chosen: Bool[Tensor, " batch"] | None = None
+    styles: Float[Tensor, "batch dim"], others: Float[Tensor, "batch dim"], chosen: Bool[Tensor, " batch"]
 ) -> Float[Tensor, ""]:
-    """The same for style vectors."""
-    mask = torch.ones(len(styles), dtype=torch.bool, device=styles.device) if chosen is None else chosen
-    return relative_distance(styles[:, None], others[:, None], mask[:, None])
+    """The same for the chosen clips' style vectors."""
+    return relative_distance(styles[:, None], others[:, None], chosen[:, None])
 
 
 def style_contrast(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Literal
 
 import torch
@@ -36,7 +35,8 @@ from facediff.systems.style_content.objectives import (
 from facediff.systems.style_content.readings import Readings
 from facediff.systems.style_content.speech import WindowedTransformer
 
-DefaultStyle = partial(LstmStyle, style_dim=32)
+SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
+"""Terms that the speech network has as well, by the name ``speech_<term>``."""
 
 
 class StyleContentDisentanglement(SpeechAnimator):
@@ -104,7 +104,7 @@ class StyleContentDisentanglement(SpeechAnimator):
         content_dim: int = 64,
         audio_encoder: AudioEncoderFactory = MelEncoder,
         mesh_encoder: MeshEncoderFactory = SpiralMeshEncoder,
-        style_encoder: StyleEncoderFactory = DefaultStyle,
+        style_encoder: StyleEncoderFactory = LstmStyle,
         window_seconds: float = 0.64,
         speech_layers: int = 3,
         speech_heads: int = 4,
@@ -152,7 +152,6 @@ class StyleContentDisentanglement(SpeechAnimator):
         self.basis_start = basis_start
         self.aligned_pairs = aligned_pairs
         self.swap_region = swap_region
-        self.speech_weight = speech_weight
         self.weights = {
             "reconstruction": reconstruction_weight,
             "swap": swap_weight,
@@ -162,6 +161,7 @@ class StyleContentDisentanglement(SpeechAnimator):
             "person_style": person_style_weight,
             "speech_content": speech_content_weight,
         }
+        self.weights |= {f"speech_{term}": speech_weight * self.weights[term] for term in SPOKEN}
         self.distance = MotionDistance(position_weight, velocity_weight, lip_gap_weight, upper_face_weight)
         self.readings = Readings(frame_rate)
         style = style_encoder(dim=dim)
@@ -231,13 +231,7 @@ class StyleContentDisentanglement(SpeechAnimator):
         for prefix, said, own in (("", content, style), ("speech_", heard, usual)):
             made = self._branch(batch, motion, pairing, said, own, style)
             terms |= {f"{prefix}{name}": term for name, term in made.items()}
-        weights = {
-            name: self.weights[name.removeprefix("speech_")] * self.speech_weight
-            if name.startswith("speech_") and name not in self.weights
-            else self.weights[name]
-            for name in terms
-        }
-        terms["loss"] = torch.stack([weights[name] * terms[name] for name in weights]).sum()
+        terms["loss"] = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
         return terms
 
     def _branch(
@@ -322,5 +316,4 @@ class StyleContentDisentanglement(SpeechAnimator):
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Content from the speech, style from the reference; one pass, nothing is drawn."""
         heard = self.network.hear(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.cached_features)
-        style = self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
-        return self.decode(heard, style, batch.mask)
+        return self.decode(heard, self.style_of(batch), batch.mask)
