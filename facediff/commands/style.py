@@ -37,7 +37,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     import numpy as np
     import torch
 
-    from facediff.commands.animate import read_style
+    from facediff.commands.style_files import read_style
     from facediff.files import atomic, check_writable
     from facediff.systems import Style, load_system
 

@@ -105,7 +105,7 @@ class BilabialClosureRate(OpeningMetric):
         if not clip.closures:
             return torch.full_like(true[0], torch.nan)
         low, high = true.aminmax()
-        limit = low + self.threshold * (high - low)
+        limit = low.lerp(high, self.threshold)  # exactly the widest opening at threshold 1
         bounds = torch.tensor(clip.closures, device=true.device)
 
         def rate(series: Tensor) -> Tensor:

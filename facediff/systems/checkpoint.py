@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import nn
 
-from facediff.data.assets import ASSETS_KEY
+from facediff.data.assets import ASSETS_KEY, Assets
 from facediff.diffusion.samplers import Sampler
 from facediff.errors import FaceDiffError
 from facediff.registry import KINDS
@@ -43,6 +43,15 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         )
     check_class_paths(path, checkpoint.get("hyper_parameters", {}))
     return checkpoint
+
+
+def read_assets(path: Path) -> Assets:
+    """The assets alone: templates, faces, frame rate …; the system is not built.
+
+    Raises:
+        FaceDiffError: as :func:`read_checkpoint`.
+    """
+    return Assets.from_state(read_checkpoint(path)[ASSETS_KEY])
 
 
 def check_class_paths(path: Path, hparams: dict[str, Any]) -> None:

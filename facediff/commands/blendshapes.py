@@ -1,0 +1,1 @@
+"""``facediff blendshapes``."""

@@ -1,0 +1,1 @@
+"""Takes carried over to other meshes."""

@@ -1,0 +1,108 @@
+"""The contract of a finished performance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.takes.units import metres_per_unit
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """One performance of one face.
+
+    Attributes:
+        name: what it is called in messages and in files.
+        vertices: (T, V, 3) absolute positions; float32, finite, possibly a memory map that is read frame by frame.
+            y points up and z towards the viewer.
+        template: (V, 3) the neutral face.
+        frame_rate: frames a second; frame t is shown from t / frame_rate on.
+        faces: (F, 3) triangles; None where the topology has no mesh, so that it can be neither drawn nor exported.
+        unit: unit of length, as :func:`facediff.takes.metres_per_unit` takes it.
+        speech: (S,) mono, full scale 1, starting with the first frame; None for a silent take.
+        sample_rate: of the speech, in Hz.
+        colours: (V, 3) vertex colours (sRGB, 0 to 255); None where there are none.
+        regions: vertex indices by region name (``lips``, ``upper_face``).
+        inner_lip_pairs: (P, 2) upper and lower vertices of the inner lips, for the mouth's opening; None if unknown.
+        metadata: plain words about how it was made: identity, style, what in it is procedural …
+
+    Raises:
+        FaceDiffError: if the arrays do not fit one another, or there is no frame.
+    """
+
+    name: str
+    vertices: npt.NDArray[np.float32]
+    template: npt.NDArray[np.float32]
+    frame_rate: float
+    faces: npt.NDArray[np.int32] | None = None
+    unit: str = "m"
+    speech: npt.NDArray[np.float32] | None = None
+    sample_rate: int = 16_000
+    colours: npt.NDArray[np.uint8] | None = None
+    regions: Mapping[str, npt.NDArray[np.int64]] = field(default_factory=dict)
+    inner_lip_pairs: npt.NDArray[np.int64] | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape = self.vertices.shape
+        if len(shape) != 3 or shape[2] != 3:
+            raise FaceDiffError(f"{self.name}: has shape {shape}; expected (frames, vertices, 3)")
+        if not shape[0]:
+            raise FaceDiffError(f"{self.name}: holds no frames; give a motion of at least one")
+        if self.template.shape != shape[1:]:
+            raise FaceDiffError(
+                f"{self.name}: has {shape[1]} vertices and its template {len(self.template)}; give the mesh that the "
+                f"motion was made for"
+            )
+        if self.faces is not None and len(self.faces) and not 0 <= self.faces.min() <= self.faces.max() < shape[1]:
+            raise FaceDiffError(
+                f"{self.name}: its triangles name vertex {int(self.faces.max())} of {shape[1]}; give the mesh that the "
+                f"motion was made for"
+            )
+        if not 0 < self.frame_rate <= 1000:
+            raise FaceDiffError(
+                f"{self.name}: frame rate {self.frame_rate:g} is impossible; expected e.g. 25, 30 or 60"
+            )
+        metres_per_unit(self.unit)
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts."""
+        return len(self.vertices) / self.frame_rate
+
+    @cached_property
+    def triangles(self) -> npt.NDArray[np.int32]:
+        """The triangles, where something cannot do without.
+
+        Raises:
+            FaceDiffError: if there are none.
+        """
+        if self.faces is None or not len(self.faces):
+            raise FaceDiffError(
+                f"{self.name}: comes without a mesh (triangles); give one with --mesh, or write .npy, .npz, .pc2 or "
+                f".mdd, which need none"
+            )
+        return self.faces
+
+    def refuse_not_finite(self) -> None:
+        """Look at every frame.
+
+        Raises:
+            FaceDiffError: naming the first frame that holds NaN or infinity.
+        """
+        for index, frame in enumerate(self.vertices):
+            if not np.isfinite(frame).all():
+                raise FaceDiffError(f"{self.name}: frame {index} holds NaN or infinity; make the motion anew")
+
+    def sound(self) -> npt.NDArray[np.float32] | None:
+        """The speech as long as the motion: cut, or followed by silence; None for a silent take."""
+        if self.speech is None:
+            return None
+        wanted = round(self.seconds * self.sample_rate)
+        return np.pad(self.speech[:wanted], (0, max(0, wanted - len(self.speech)))).astype(np.float32)

@@ -1,0 +1,121 @@
+"""A take survives its file; what does not fit together is refused with one sentence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.takes import Take, metres_per_unit, read_archive, read_take, write_archive
+from facediff.takes.reading import Surroundings
+
+
+@pytest.fixture
+def take() -> Take:
+    rng = np.random.default_rng(0)
+    template = rng.normal(size=(6, 3)).astype(np.float32)
+    return Take(
+        name="hello",
+        vertices=template + rng.normal(0, 0.1, (5, 6, 3)).astype(np.float32),
+        template=template,
+        frame_rate=25.0,
+        faces=np.array([[0, 1, 2], [3, 4, 5]], np.int32),
+        unit="mm",
+        speech=np.linspace(-1, 1, 3300, dtype=np.float32),
+        colours=rng.integers(0, 255, (6, 3)).astype(np.uint8),
+        regions={"lips": np.array([1, 2])},
+        inner_lip_pairs=np.array([[0, 1]]),
+        metadata={"identity": "Zoë"},
+    )
+
+
+def test_an_archive_gives_back_every_field_without_pickle(take: Take, tmp_path: Path) -> None:
+    write_archive(tmp_path / "a.npz", take)
+    back = read_archive(tmp_path / "a.npz")
+    for name, value in vars(take).items():
+        if name == "regions":
+            assert back.regions.keys() == value.keys()
+            assert np.array_equal(back.regions["lips"], value["lips"])
+        elif isinstance(value, np.ndarray):
+            assert np.array_equal(getattr(back, name), value)
+        else:
+            assert getattr(back, name) == value
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
+        assert set(archive.files) >= {"vertices", "template", "faces", "speech", "about", "region_lips"}
+
+
+def test_the_sound_is_as_long_as_the_picture(take: Take) -> None:
+    sound = take.sound()
+    assert sound is not None
+    assert len(sound) == 3200
+    assert np.array_equal(sound, take.speech[:3200])  # type: ignore[index]
+    longer = replace(take, speech=take.speech[:100]).sound()  # type: ignore[index]
+    assert longer is not None
+    assert len(longer) == 3200
+    assert not longer[100:].any()
+
+
+def test_a_bare_array_needs_a_frame_rate_and_may_be_flat(take: Take, tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", take.vertices.reshape(5, -1))
+    with pytest.raises(FaceDiffError, match="--frame-rate"):
+        read_take(tmp_path / "x.npy")
+    read = read_take(tmp_path / "x.npy", Surroundings(frame_rate=30, template=take.template))
+    assert np.array_equal(read.vertices, take.vertices)
+    assert np.array_equal(read_take(tmp_path / "x.npy", Surroundings(frame_rate=30)).template, take.vertices[0])
+
+
+def test_options_go_before_what_an_archive_says(take: Take, tmp_path: Path) -> None:
+    write_archive(tmp_path / "a.npz", take)
+    read = read_take(tmp_path / "a.npz", Surroundings(frame_rate=60, regions={"jaw": np.array([0])}))
+    assert read.frame_rate == 60
+    assert set(read.regions) == {"lips", "jaw"}
+    assert read.unit == "mm"
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"vertices": np.zeros((0, 6, 3), np.float32)}, "holds no frames"),
+        ({"vertices": np.zeros((5, 7, 3), np.float32)}, "has 7 vertices and its template 6"),
+        ({"vertices": np.zeros((5, 18), np.float32)}, "expected (frames, vertices, 3)"),
+        ({"faces": np.array([[0, 1, 6]], np.int32)}, "name vertex 6 of 6"),
+        ({"frame_rate": 0.0}, "frame rate 0 is impossible"),
+        ({"unit": "parsec"}, 'unit "parsec"'),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(take: Take, change: dict[str, object], sentence: str) -> None:
+    with pytest.raises(FaceDiffError) as caught:
+        replace(take, **change)  # type: ignore[arg-type]
+    assert sentence in str(caught.value)
+    assert "hello" in str(caught.value) or "unit" in change
+
+
+def test_motion_that_is_not_finite_is_never_written(take: Take, tmp_path: Path) -> None:
+    vertices = take.vertices.copy()
+    vertices[3, 2, 1] = np.nan
+    with pytest.raises(FaceDiffError, match="frame 3 holds NaN"):
+        write_archive(tmp_path / "a.npz", replace(take, vertices=vertices))
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_that_are_no_takes(tmp_path: Path) -> None:
+    (tmp_path / "a.npz").write_text("no")
+    with pytest.raises(FaceDiffError, match="not a readable .npz"):
+        read_archive(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", x=np.zeros(3))
+    with pytest.raises(FaceDiffError, match="has no vertices, template, about"):
+        read_archive(tmp_path / "b.npz")
+    np.save(tmp_path / "c.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    with pytest.raises(FaceDiffError, match="not a readable NumPy array"):
+        read_take(tmp_path / "c.npy")
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [("m", 1.0), ("mm", 0.001), ("0.5", 0.5), ("normalised (the root of its area is 1, about 185 mm)", 0.185)],
+)
+def test_units(unit: str, metres: float) -> None:
+    assert metres_per_unit(unit) == pytest.approx(metres)
