@@ -7,10 +7,18 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+Rotation = tuple[Tensor, Tensor]
+"""Cosines and signed sines of a rotary embedding, both (frames, head_dim)."""
+
 
 def frame_mask(lengths: Int[Tensor, " batch"], frames: int) -> Bool[Tensor, "batch frames"]:
     """True on valid frames, False on padding."""
     return torch.arange(frames, device=lengths.device)[None, :] < lengths[:, None]
+
+
+def needed_mask(mask: Bool[Tensor, "batch frames"]) -> Bool[Tensor, "batch frames"] | None:
+    """The mask, or None where nothing is padded; it looks at the values, so it waits for the device."""
+    return None if bool(mask.all()) else mask
 
 
 def interpolate_frames(
@@ -61,12 +69,26 @@ class RotaryEmbedding(nn.Module):
         exponent = torch.arange(0, head_dim, 2, dtype=torch.float32) / head_dim
         self.register_buffer("frequencies", base**-exponent, persistent=False)
 
-    def forward(self, x: Float[Tensor, "batch heads frames head_dim"]) -> Float[Tensor, "batch heads frames head_dim"]:
-        """Rotate channel pair (i, i + head_dim/2) of frame t by t·frequency_i."""
-        angle = torch.arange(x.shape[-2], device=x.device, dtype=torch.float32)[:, None] * self.frequencies
-        cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
+    def table(self, frames: int) -> Rotation:
+        """What :meth:`forward` needs for ``frames`` frames or fewer."""
+        places = torch.arange(frames, device=self.frequencies.device, dtype=torch.float32)
+        angle = places[:, None] * self.frequencies
+        cos, sin = angle.cos(), angle.sin()
+        return torch.cat([cos, cos], dim=-1), torch.cat([-sin, sin], dim=-1)
+
+    def forward(
+        self, x: Float[Tensor, "batch heads frames head_dim"], table: Rotation | None = None
+    ) -> Float[Tensor, "batch heads frames head_dim"]:
+        """Rotate channel pair (i, i + head_dim/2) of frame t by t·frequency_i.
+
+        Args:
+            x: queries or keys.
+            table: as :meth:`table` gives it, of a rotary embedding like this one; made anew if None.
+        """
+        frames = x.shape[-2]
+        cos, sin = (part[:frames].to(x.dtype) for part in (self.table(frames) if table is None else table))
         first, second = x.chunk(2, dim=-1)
-        return torch.cat([first * cos - second * sin, first * sin + second * cos], dim=-1)
+        return x * cos + torch.cat([second, first], dim=-1) * sin
 
 
 class Attention(nn.Module):
@@ -98,12 +120,40 @@ class Attention(nn.Module):
         x: Float[Tensor, "batch frames dim"],
         context: Float[Tensor, "batch keys context_dim"],
         context_mask: Bool[Tensor, "batch keys"] | None = None,
+        rotation: Rotation | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
-        """Attend from ``x`` to the valid positions of ``context``."""
+        """Attend from ``x`` to the valid positions of ``context``.
+
+        Args:
+            x: what asks.
+            context: what answers.
+            context_mask: True on valid positions; all are if None.
+            rotation: as :meth:`rotation` gives it; made anew if None.
+        """
+        return self.attend(self.queries(x, rotation), context, context_mask, rotation)
+
+    def rotation(self, frames: int) -> Rotation | None:
+        """The table of rotary positions for so many frames and keys; None without such positions."""
+        return None if self.rotary is None else self.rotary.table(frames)
+
+    def queries(
+        self, x: Float[Tensor, "batch frames dim"], rotation: Rotation | None = None
+    ) -> Float[Tensor, "batch heads frames head_dim"]:
+        """The first half of :meth:`forward`: all that ``x`` is needed for."""
         query = self._split(self.query(x))
+        return query if self.rotary is None else self.rotary(query, rotation)
+
+    def attend(
+        self,
+        query: Float[Tensor, "batch heads frames head_dim"],
+        context: Float[Tensor, "batch keys context_dim"],
+        context_mask: Bool[Tensor, "batch keys"] | None = None,
+        rotation: Rotation | None = None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """The second half of :meth:`forward`, from the queries that the first one gave."""
         key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
         if self.rotary is not None:
-            query, key = self.rotary(query), self.rotary(key)
+            key = self.rotary(key, rotation)
         mask = None if context_mask is None else context_mask[:, None, None, :]
         dropout = self.dropout if self.training else 0.0
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask, dropout_p=dropout)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 from jaxtyping import Float, Int
@@ -21,7 +23,30 @@ class AudioEncoder(nn.Module, ABC):
     An encoder whose first part is frozen may let it be computed once per clip and kept on disk: it then overrides
     :meth:`frozen_key` and :meth:`frozen_features`, and takes their result as ``features`` and ``feature_lengths``,
     two further arguments of its :meth:`forward` that no other encoder is given.
+
+    An encoder that looks at how loud the speech is takes it through :meth:`standardise`, so that a piece of a long
+    recording is heard as loud as it is in the whole.
     """
+
+    _level: tuple[float, float] | None = None
+
+    @contextmanager
+    def at_level(self, mean: float, deviation: float) -> Iterator[None]:
+        """Within it, speech is standardised by this mean and standard deviation and not by its own."""
+        before, self._level = self._level, (mean, deviation)
+        try:
+            yield
+        finally:
+            self._level = before
+
+    def standardise(
+        self, audio: Float[Tensor, "batch samples"], lengths: Int[Tensor, " batch"]
+    ) -> Float[Tensor, "batch samples"]:
+        """Speech of zero mean and unit variance, as :func:`standardise` makes it or by the level that is set."""
+        if self._level is None:
+            return standardise(audio, lengths)
+        mean, deviation = self._level
+        return (audio - mean) / deviation * frame_mask(lengths, audio.shape[1])
 
     def frozen_key(self) -> str | None:
         """A hash of all that decides :meth:`frozen_features`; None if nothing is frozen, or something is random."""

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.components.audio_encoder.base import AudioEncoder, standardise
+from facediff.components.audio_encoder.base import AudioEncoder
 from facediff.components.layers import interpolate_frames
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.registry import audio_encoder
@@ -118,7 +118,7 @@ class HubertEncoder(AudioEncoder):
         self, audio: Float[Tensor, "batch samples"], audio_lengths: Int[Tensor, " batch"]
     ) -> tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]]:
         """Hidden states below the first layer that is trained, at 50 steps a second."""
-        return by_length(standardise(audio, audio_lengths), audio_lengths, self._lower)
+        return by_length(self.standardise(audio, audio_lengths), audio_lengths, self._lower)
 
     def _lower(self, wave: Tensor) -> Tensor:
         """The frozen part: convolutions, projection and the frozen layers."""
@@ -152,7 +152,7 @@ class HubertEncoder(AudioEncoder):
     ) -> Float[Tensor, "batch frames dim"]:
         """Encode; see :class:`AudioEncoder`."""
         if self.hubert.config.apply_spec_augment:
-            hidden, steps = by_length(standardise(audio, audio_lengths), audio_lengths, self._whole)
+            hidden, steps = by_length(self.standardise(audio, audio_lengths), audio_lengths, self._whole)
         else:
             if features is None or feature_lengths is None:
                 features, feature_lengths = self.frozen_features(audio, audio_lengths)

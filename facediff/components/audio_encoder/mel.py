@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.components.audio_encoder.base import SAMPLE_RATE, AudioEncoder, standardise
+from facediff.components.audio_encoder.base import SAMPLE_RATE, AudioEncoder
 from facediff.components.layers import frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
 
@@ -85,7 +85,7 @@ class MelEncoder(AudioEncoder):
         frame_lengths: Int[Tensor, " batch"],
     ) -> Float[Tensor, "batch frames dim"]:
         """Encode; see :class:`AudioEncoder`."""
-        spectrum, lengths = self._log_mel(standardise(audio, audio_lengths), audio_lengths)
+        spectrum, lengths = self._log_mel(self.standardise(audio, audio_lengths), audio_lengths)
         x = self.stem(spectrum.transpose(1, 2)).transpose(1, 2)
         lengths = (lengths // 2).clamp_min(1)
         mask = frame_mask(lengths, x.shape[1])[..., None].to(x.dtype)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Protocol
+from typing import Any, Protocol
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -11,6 +11,16 @@ from torch import Tensor, nn
 
 class Decoder(nn.Module, ABC):
     """Fused features F_fused and style tokens F_s to features that one linear map turns into clean motion."""
+
+    def prepare(
+        self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Any:  # noqa: ANN401 - each decoder's own
+        """What stays the same over the denoising steps, computed once a clip; None if there is nothing.
+
+        A decoder that overrides this takes the result as a fourth, optional argument of ``forward`` and gives the same
+        with it as without, up to rounding. The arguments are those that ``forward`` will get.
+        """
+        return None
 
     @abstractmethod
     def forward(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -9,6 +11,20 @@ from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from facediff.components.decoder.base import Decoder
 from facediff.registry import decoder
+
+
+class GruConstants(NamedTuple):
+    """What the decoding of a clip does not compute in every step.
+
+    Attributes:
+        lengths: valid frames of each clip, on the CPU.
+        scale: factor on the result, (batch, 1, dim).
+        shift: what is added to it, (batch, 1, dim).
+    """
+
+    lengths: Tensor
+    scale: Tensor
+    shift: Tensor
 
 
 @decoder.register("gru")
@@ -51,10 +67,24 @@ class GruDecoder(Decoder):
         fused: Float[Tensor, "batch frames dim"],
         style: Float[Tensor, "batch tokens style_dim"],
         mask: Bool[Tensor, "batch frames"],
+        prepared: GruConstants | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
-        """F_dec of each frame."""
-        lengths = mask.sum(1).cpu()
+        """F_dec of each frame.
+
+        Args:
+            fused: F_fused.
+            style: style tokens.
+            mask: True on valid frames.
+            prepared: as :meth:`prepare` gives it.
+        """
+        lengths, scale, shift = self.prepare(style, mask) if prepared is None else prepared
         packed = pack_padded_sequence(fused, lengths, batch_first=True, enforce_sorted=False)
         hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])
+        return torch.addcmul(shift, self.norm(hidden + fused), scale)
+
+    def prepare(
+        self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> GruConstants:
+        """The lengths, for which the device must be waited for, and the modulation by the style."""
         scale, shift = self.modulation(style.mean(1, keepdim=True)).chunk(2, dim=-1)
-        return torch.addcmul(shift, self.norm(hidden + fused), 1 + scale)
+        return GruConstants(mask.sum(1).cpu(), 1 + scale, shift)

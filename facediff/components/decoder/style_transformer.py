@@ -3,13 +3,42 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from facediff.components.decoder.base import Decoder
-from facediff.components.layers import Attention, FeedForward
+from facediff.components.layers import Attention, FeedForward, Rotation, needed_mask
 from facediff.registry import decoder
+
+
+class TokenProducts(NamedTuple):
+    """Keys and values of a few tokens with the attention's outer maps multiplied in.
+
+    Attributes:
+        keys: from a frame's features to its scores, (batch, dim, heads * tokens).
+        offset: added to the scores, (batch, 1, heads * tokens).
+        values: from the scores' softmax to the result, (batch, heads * tokens, dim).
+    """
+
+    keys: Tensor
+    offset: Tensor
+    values: Tensor
+
+
+class DecoderConstants(NamedTuple):
+    """What the decoding of a clip does not compute in every step.
+
+    Attributes:
+        tokens: what each block attends to: the style tokens, or products of them.
+        mask: True on valid frames; None if nothing is padded.
+        rotation: rotary positions of all blocks.
+    """
+
+    tokens: list[Tensor | TokenProducts]
+    mask: Tensor | None
+    rotation: Rotation | None
 
 
 class TokenAttention(Attention):
@@ -22,23 +51,33 @@ class TokenAttention(Attention):
     def forward(
         self,
         x: Float[Tensor, "batch frames dim"],
-        context: Float[Tensor, "batch keys context_dim"],
+        context: Float[Tensor, "batch keys context_dim"] | TokenProducts,
         context_mask: Bool[Tensor, "batch keys"] | None = None,
+        rotation: Rotation | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
-        """Attend from ``x`` to all of ``context``."""
-        narrow = self.num_heads * context.shape[1] < x.shape[-1]
-        if context_mask is not None or self.rotary is not None or self.dropout or not narrow:
-            return super().forward(x, context, context_mask)
+        """Attend from ``x`` to all of ``context``, which may be what :meth:`prepare` made of it."""
+        if not isinstance(context, TokenProducts):
+            prepared = context if context_mask is not None else self.prepare(context)
+            if not isinstance(prepared, TokenProducts):
+                return super().forward(x, prepared, context_mask, rotation)
+            context = prepared
+        scores = x @ context.keys + context.offset
+        weights = scores.view(*scores.shape[:2], self.num_heads, -1).softmax(dim=-1).flatten(2)
+        return weights @ context.values + self.out.bias
+
+    def prepare(self, context: Float[Tensor, "batch keys context_dim"]) -> Tensor | TokenProducts:
+        """The products that do not depend on what asks; the tokens themselves where there are too many."""
+        dim = self.query.in_features
+        if self.rotary is not None or self.dropout or self.num_heads * context.shape[1] >= dim:
+            return context
         key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
         key = key / math.sqrt(key.shape[-1])
         # Weights by head: (heads, head_dim, dim).
-        into = self.query.weight.view(self.num_heads, -1, x.shape[-1])
-        out = self.out.weight.T.reshape(self.num_heads, -1, x.shape[-1])
-        scores = x @ (key @ into).flatten(1, 2).transpose(1, 2)
-        offset = key @ self.query.bias.view(self.num_heads, -1, 1)
-        scores = scores + offset.flatten(1)[:, None]
-        weights = scores.view(*scores.shape[:2], self.num_heads, -1).softmax(dim=-1).flatten(2)
-        return weights @ (value @ out).flatten(1, 2) + self.out.bias
+        into = self.query.weight.view(self.num_heads, -1, dim)
+        out = self.out.weight.T.reshape(self.num_heads, -1, dim)
+        keys = (key @ into).flatten(1, 2).transpose(1, 2)
+        offset = (key @ self.query.bias.view(self.num_heads, -1, 1)).flatten(1)[:, None]
+        return TokenProducts(keys, offset, (value @ out).flatten(1, 2))
 
 
 class Block(nn.Module):
@@ -54,10 +93,12 @@ class Block(nn.Module):
         self.feed_forward = FeedForward(dim, hidden_dim, dropout)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, x: Tensor, style: Tensor, mask: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, style: Tensor | TokenProducts, mask: Tensor | None, rotation: Rotation | None
+    ) -> Tensor:
         """``x`` (batch, frames, dim), ``style`` (batch, tokens, style_dim), ``mask`` (batch, frames)."""
         normed = self.time_norm(x)
-        x = x + self.dropout(self.time_attention(normed, normed, mask))
+        x = x + self.dropout(self.time_attention(normed, normed, mask, rotation))
         x = x + self.dropout(self.style_attention(self.style_norm(x), style))
         return x + self.dropout(self.feed_forward(self.feed_forward_norm(x)))
 
@@ -96,8 +137,28 @@ class StyleTransformer(Decoder):
         fused: Float[Tensor, "batch frames dim"],
         style: Float[Tensor, "batch tokens style_dim"],
         mask: Bool[Tensor, "batch frames"],
+        prepared: DecoderConstants | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
-        """F_dec of each frame."""
-        for block in self.blocks:
-            fused = block(fused, style, mask)
+        """F_dec of each frame.
+
+        Args:
+            fused: F_fused.
+            style: style tokens.
+            mask: True on valid frames.
+            prepared: as :meth:`prepare` gives it.
+        """
+        if prepared is None:
+            prepared = DecoderConstants([style] * len(self.blocks), mask, self._rotation(mask.shape[1]))
+        for block, tokens in zip(self.blocks, prepared.tokens, strict=True):
+            fused = block(fused, tokens, prepared.mask, prepared.rotation)
         return self.norm(fused)
+
+    def prepare(
+        self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> DecoderConstants:
+        """Each block's products of the style tokens, and the rotary positions that all blocks share."""
+        tokens = [block.style_attention.prepare(style) for block in self.blocks]
+        return DecoderConstants(tokens, needed_mask(mask), self._rotation(mask.shape[1]))
+
+    def _rotation(self, frames: int) -> Rotation | None:
+        return self.blocks[0].time_attention.rotation(frames) if len(self.blocks) else None

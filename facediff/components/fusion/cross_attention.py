@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from facediff.components.fusion.base import Fusion
-from facediff.components.layers import Attention
+from facediff.components.layers import Attention, Rotation, needed_mask
 from facediff.registry import fusion
+
+
+class FusionConstants(NamedTuple):
+    """What the fusion of a clip does not compute in every step.
+
+    Attributes:
+        query: of the speech, (batch, heads, frames, head_dim).
+        mask: True on valid frames; None if nothing is padded.
+        rotation: rotary positions, if there are any.
+    """
+
+    query: Tensor
+    mask: Tensor | None
+    rotation: Rotation | None
 
 
 @fusion.register("cross_attention")
@@ -39,10 +55,29 @@ class BidirectionalCrossAttention(Fusion):
         audio: Float[Tensor, "batch frames dim"],
         motion: Float[Tensor, "batch frames dim"],
         mask: Bool[Tensor, "batch frames"],
+        prepared: FusionConstants | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
-        """F_am = F'_a + F'_m."""
+        """F_am = F'_a + F'_m.
+
+        Args:
+            audio: F_a.
+            motion: F_m.
+            mask: True on valid frames.
+            prepared: as :meth:`prepare` gives it.
+        """
+        query, needed, rotation = self._constants(audio, mask) if prepared is None else prepared
         normed_motion = self.motion_norm(motion)
-        audio = audio + self.dropout(self.audio_from_motion(self.audio_norm(audio), normed_motion, mask))
+        audio = audio + self.dropout(self.audio_from_motion.attend(query, normed_motion, needed, rotation))
         enriched = self.enriched_norm(audio)
-        motion = motion + self.dropout(self.motion_from_audio(normed_motion, enriched, mask))
+        motion = motion + self.dropout(self.motion_from_audio(normed_motion, enriched, needed, rotation))
         return audio + motion
+
+    def prepare(
+        self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> FusionConstants:
+        """The speech asks the same in every step; what it is answered depends on the motion, and so does F'_a."""
+        return self._constants(audio, needed_mask(mask))
+
+    def _constants(self, audio: Tensor, mask: Tensor | None) -> FusionConstants:
+        rotation = self.audio_from_motion.rotation(audio.shape[1])
+        return FusionConstants(self.audio_from_motion.queries(self.audio_norm(audio), rotation), mask, rotation)

@@ -1,5 +1,5 @@
 """Samplers: how the reverse process is run, chosen by name."""
 
-from facediff.diffusion.samplers.base import Sampler, SamplerFactory
+from facediff.diffusion.samplers.base import NoiseSource, Sampler, SamplerFactory
 
-__all__ = ["Sampler", "SamplerFactory"]
+__all__ = ["NoiseSource", "Sampler", "SamplerFactory"]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,6 +16,7 @@ from facediff.components.identity_encoder import IdentityEncoder
 from facediff.components.layers import frame_mask
 from facediff.components.mesh_encoder import MeshEncoder
 from facediff.components.style_encoder import StyleEncoder
+from facediff.systems.dual_path.step_embedding import StepEmbedding
 
 TokenForm = Literal["levels", "single"]
 
@@ -35,23 +35,33 @@ class Conditions:
     style: Float[Tensor, "batch tokens dim"]
     mask: Bool[Tensor, "batch frames"]
 
+    def frames(self, start: int, end: int) -> Conditions:
+        """Those of some of the frames."""
+        return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end])
 
-class StepEmbedding(nn.Module):
-    """t_emb: sinusoids of the diffusion step, then an MLP."""
+    def repeated(self, times: int) -> Conditions:
+        """One clip's conditions for several takes of it; nothing is copied."""
+        if times == 1:
+            return self
+        audio, style = (value.expand(times, -1, -1) for value in (self.audio, self.style))
+        return Conditions(audio, style, self.mask.expand(times, -1))
 
-    frequencies: Tensor
 
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        half = dim // 2
-        frequencies = torch.exp(-math.log(10_000.0) * torch.arange(half) / half)
-        self.register_buffer("frequencies", frequencies, persistent=False)
-        self.mlp = nn.Sequential(nn.Linear(2 * half, dim), nn.SiLU(), nn.Linear(dim, dim))
+@dataclass(frozen=True)
+class PreparedConditions(Conditions):
+    """Conditions with everything else that does not change over the steps; whole, not to be sliced.
 
-    def forward(self, step: Int[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
-        """Embed step numbers counted from 0."""
-        angle = step[:, None].float() * self.frequencies
-        return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))
+    It holds for the weights and the precision in which it was made.
+
+    Attributes:
+        fusion: what the fusion prepared.
+        decoder: what the decoder prepared.
+        steps: the embedding of each step; None if steps are embedded as they come.
+    """
+
+    fusion: Any = None
+    decoder: Any = None
+    steps: Float[Tensor, "steps dim"] | None = None
 
 
 class StyleTokens(nn.Module):
@@ -150,6 +160,26 @@ class DualPathNetwork(nn.Module):
         style = torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1)
         return Conditions(encoded, self.style_tokens(style), frame_mask(frame_lengths, encoded.shape[1]))
 
+    def prepared(self, conditions: Conditions, steps: int | None = None) -> PreparedConditions:
+        """What :meth:`core` would compute anew in each of many steps, computed once.
+
+        To be called on conditions as they will be used, after any slicing, once a clip or window; :meth:`core` gives
+        the same with the result as with the conditions themselves, up to rounding.
+
+        Args:
+            conditions: as :meth:`conditions` gives them, or parts of them.
+            steps: the process's steps N, for a table of their embeddings; none is used if None.
+        """
+        audio, style, mask = conditions.audio, conditions.style, conditions.mask
+        return PreparedConditions(
+            audio,
+            style,
+            mask,
+            fusion=self.fusion.prepare(audio, mask),
+            decoder=self.decoder.prepare(style, mask),
+            steps=None if steps is None else self.step_embedding.table(steps),
+        )
+
     def dynamic_style(
         self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch dynamic_dim"]:
@@ -184,7 +214,17 @@ class DualPathNetwork(nn.Module):
     def core(
         self, motion: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions
     ) -> Float[Tensor, "batch frames dim"]:
-        """F_m to F_dec: everything between the two vertex-space maps."""
-        fused = self.fusion(conditions.audio, motion, conditions.mask)
-        fused = self.fused_norm(fused + self.step_embedding(step)[:, None])  # eq. 13
-        return self.decoder(fused, conditions.style, conditions.mask)
+        """F_m to F_dec: everything between the two vertex-space maps.
+
+        Args:
+            motion: F_m.
+            step: step numbers counted from 0.
+            conditions: as they are, or :meth:`prepared`.
+        """
+        ready = conditions if isinstance(conditions, PreparedConditions) else PreparedConditions(**vars(conditions))
+        # A component that prepares nothing need not know that others do.
+        known = [() if part is None else (part,) for part in (ready.fusion, ready.decoder)]
+        fused = self.fusion(ready.audio, motion, ready.mask, *known[0])
+        embedded = self.step_embedding(step) if ready.steps is None else ready.steps[step]
+        fused = self.fused_norm(fused + embedded[:, None])  # eq. 13
+        return self.decoder(fused, ready.style, ready.mask, *known[1])

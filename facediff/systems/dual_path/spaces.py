@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, Protocol
 
 import torch
@@ -12,8 +13,12 @@ from facediff.diffusion.folding import Fold, FoldCache
 from facediff.diffusion.samplers import Sampler
 from facediff.errors import FaceDiffError
 from facediff.systems.dual_path.network import Conditions, DualPathNetwork
+from facediff.systems.dual_path.seam import unchanged
 
 SamplingSpace = Literal["folded", "vertices"]
+
+Blend = Callable[[Tensor], Tensor]
+"""From the features that the network gave in a step to those that are used."""
 
 
 class Space(Protocol):
@@ -46,11 +51,13 @@ class VertexSpace:
     Args:
         network: the network.
         width: coordinates of a frame, 3V.
+        blend: changes the features of every step.
     """
 
-    def __init__(self, network: DualPathNetwork, width: int) -> None:
+    def __init__(self, network: DualPathNetwork, width: int, blend: Blend = unchanged) -> None:
         self.network = network
         self.width = width
+        self.blend = blend
 
     def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
         """Unit noise as it is."""
@@ -60,7 +67,7 @@ class VertexSpace:
         self, state: Float[Tensor, "batch frames width"], step: Int[Tensor, " batch"], conditions: Conditions
     ) -> Float[Tensor, "batch frames width"]:
         """M̂⁰."""
-        return self.network(state, step, conditions)
+        return self.network.leave(self.blend(self.network.core(self.network.embed(state), step, conditions)))
 
     def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
         """The sample as it is."""
@@ -76,11 +83,13 @@ class FoldedSpace:
     Args:
         network: a network whose ``embed`` and ``unembed`` are linear.
         fold: their products.
+        blend: changes the features of every step.
     """
 
-    def __init__(self, network: DualPathNetwork, fold: Fold) -> None:
+    def __init__(self, network: DualPathNetwork, fold: Fold, blend: Blend = unchanged) -> None:
         self.network = network
         self.fold = fold
+        self.blend = blend
         self.width = len(fold.offset)
         self._features: Tensor | None = None
         self._prediction: Tensor | None = None
@@ -95,7 +104,7 @@ class FoldedSpace:
     ) -> Float[Tensor, "batch frames width"]:
         """E M̂⁰ = E U h + E b."""
         bias = self.network.embed.bias
-        features = self.network.core(state if bias is None else state + bias, step, conditions)
+        features = self.blend(self.network.core(state if bias is None else state + bias, step, conditions))
         with torch.autocast(features.device.type, enabled=False):
             prediction = nn.functional.linear(features.to(state.dtype), self.fold.product, self.fold.offset)
         self._features, self._prediction = features, prediction
@@ -120,7 +129,9 @@ class FoldedSpace:
         return self.network.leave(features)
 
 
-def choose_space(network: DualPathNetwork, wanted: SamplingSpace, sampler: Sampler, cache: FoldCache) -> Space:
+def choose_space(
+    network: DualPathNetwork, wanted: SamplingSpace, sampler: Sampler, cache: FoldCache, blend: Blend = unchanged
+) -> Space:
     """The folded space where it is wanted and exact, else the vertices.
 
     Args:
@@ -128,8 +139,9 @@ def choose_space(network: DualPathNetwork, wanted: SamplingSpace, sampler: Sampl
         wanted: the space asked for.
         sampler: the sampler that will run; it can be folded if it is linear.
         cache: the network's fold from earlier.
+        blend: changes the features that the network gives in every step.
     """
     first, last = network.embed, network.unembed
     if wanted == "folded" and sampler.linear and isinstance(first, nn.Linear) and isinstance(last, nn.Linear):
-        return FoldedSpace(network, cache.get(first.weight, last.weight, last.bias))
-    return VertexSpace(network, network.coordinates)
+        return FoldedSpace(network, cache.get(first.weight, last.weight, last.bias), blend)
+    return VertexSpace(network, network.coordinates, blend)

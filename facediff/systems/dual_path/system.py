@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import zlib
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff import losses, registry
@@ -24,14 +24,18 @@ from facediff.components.style_encoder import StyleEncoderFactory
 from facediff.components.style_encoder.tcn_gru_transformer import TcnGruTransformer
 from facediff.data import Batch
 from facediff.diffusion import NoiseProcess
+from facediff.diffusion.draws import unit_noise
 from facediff.diffusion.folding import FoldCache
-from facediff.diffusion.samplers import SamplerFactory
+from facediff.diffusion.samplers import NoiseSource, SamplerFactory
 from facediff.diffusion.samplers.ddim import DdimSampler
 from facediff.hparams import describe
 from facediff.systems.base import Progress, SpeechAnimator
 from facediff.systems.dual_path.network import Conditions, DualPathNetwork, TokenForm
-from facediff.systems.dual_path.spaces import SamplingSpace, choose_space
+from facediff.systems.dual_path.noise import ClipNoise, WindowNoise
+from facediff.systems.dual_path.seam import Seam, unchanged
+from facediff.systems.dual_path.spaces import Blend, SamplingSpace, choose_space
 from facediff.systems.identity_policy import IdentityPolicy
+from facediff.systems.windows import Window
 
 
 class DualPathDiffusion(SpeechAnimator):
@@ -171,21 +175,36 @@ class DualPathDiffusion(SpeechAnimator):
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """One draw of step and noise per clip (algorithm 1), then the four losses (eq. 15 to 19)."""
-        clean = batch.motion.flatten(2) * self.scale
-        noise = torch.randn(clean.shape, device=clean.device, generator=generator)
-        step = self.process.draw_steps(len(batch), clean.device, generator)
-        noisy = self.process.add_noise(clean, noise, step)
-        predicted = self.network(noisy, step, self._conditions(batch)).view(batch.motion.shape)
-        truth, mask = clean.view(batch.motion.shape), batch.mask
-        upper = self.assets.regions["upper_face"].to(clean.device)
-        terms = {
-            "reconstruction": losses.reconstruction_loss(predicted, truth, mask),
-            "velocity": losses.velocity_loss(predicted, truth, mask),
-            "acceleration": losses.acceleration_loss(predicted, truth, mask),
-            "face": losses.face_dynamics_loss(predicted, truth, mask, upper),
-        }
-        terms["loss"] = sum((self.loss_weights[name] * term for name, term in terms.items()), clean.new_zeros(()))
-        return terms
+        motion = batch.motion.flatten(2)
+        step = self.process.draw_steps(len(batch), motion.device, generator)
+        return self.losses_at(batch, step, unit_noise(motion.shape, motion.device, generator))
+
+    def losses_at(
+        self, batch: Batch, step: Int[Tensor, " batch"], noise: Float[Tensor, "batch frames coordinates"]
+    ) -> dict[str, Tensor]:
+        """The losses at given steps with given noise, which is overwritten.
+
+        Args:
+            batch: clips with their true motion.
+            step: each clip's step, counted from 0.
+            noise: unit noise.
+        """
+        network = self.network
+        # As NoiseProcess.add_noise, without further tensors of the motion's size: on a processor, having a new one
+        # takes longer than what is done to it.
+        signal = self.process.signal.to(noise.device)[step][:, None, None]
+        noisy = noise.mul_((1 - signal).sqrt()).addcmul_(batch.motion.flatten(2), signal.sqrt() * self.scale)
+        decoded = network.core(network.embed(noisy), step, self._conditions(batch))
+        return losses.losses_of_linear(
+            decoded,
+            network.unembed.weight,
+            network.unembed.bias,
+            batch.motion,
+            batch.mask,
+            self.assets.regions["upper_face"],
+            self.loss_weights,
+            scale=self.scale,
+        )
 
     def _conditions(self, batch: Batch) -> Conditions:
         identity = batch.identity
@@ -208,48 +227,50 @@ class DualPathDiffusion(SpeechAnimator):
         return self.network.dynamic_style(reference * self.scale, mask)
 
     @torch.no_grad()
-    def generate(
+    def perform(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Algorithm 2 with the system's sampler, in its sampling space; conditions are computed once.
 
         All noise of a clip follows from the seed and its name: its motion does not depend on the clips beside it.
         """
-        conditions = self._conditions(batch)
-        space = choose_space(self.network, self.sampling_space, self.sampler, self._fold_cache)
-        unit = ClipNoise(batch, seed)
+        noise = ClipNoise(batch.names, batch.frame_lengths.tolist(), [seed] * len(batch), self.device)
+        return self._sample(self._conditions(batch), noise, progress=progress)
+
+    @torch.no_grad()
+    def perform_takes(
+        self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None
+    ) -> Float[Tensor, "takes frames vertices 3"]:
+        """The same for several seeds: speech and style are encoded once."""
+        lengths = clip.frame_lengths.tolist() * len(seeds)
+        noise = ClipNoise(clip.names * len(seeds), lengths, seeds, self.device)
+        return self._sample(self._conditions(clip).repeated(len(seeds)), noise, progress=progress)
+
+    @torch.no_grad()
+    def perform_window(
+        self, clip: Batch, window: Window, seeds: Sequence[int], before: list[Tensor] | None
+    ) -> tuple[Float[Tensor, "takes frames vertices 3"], list[Tensor]]:
+        """The same for a window, joined in every denoising step to the window before it."""
+        conditions = self._conditions(clip).frames(window.context, window.context + window.frames)
+        seam = Seam(before, window.kept)
+        noise = WindowNoise(clip.names[0], window, seeds, self.device)
+        return self._sample(conditions.repeated(len(seeds)), noise, blend=seam), seam.features
+
+    def _sample(
+        self, conditions: Conditions, unit: NoiseSource, *, blend: Blend = unchanged, progress: Progress | None = None
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """Run the sampler; ``unit`` gives unit noise, ``blend`` changes the features of every step."""
+        conditions = self.network.prepared(conditions, self.process.steps)
+        space = choose_space(self.network, self.sampling_space, self.sampler, self._fold_cache, blend)
+        rows, frames = conditions.mask.shape
 
         def noise(like: Tensor) -> Tensor:
             return space.noise(unit(like))
 
         def denoise(state: Tensor, step: int) -> Tensor:
-            steps = torch.full((len(batch),), step, device=state.device)
+            steps = torch.full((rows,), step, device=state.device)
             return space.predict(state, steps, conditions)
 
-        start = noise(batch.motion.new_empty((*batch.motion.shape[:2], space.width)))
+        start = noise(torch.empty(rows, frames, space.width, device=self.device, dtype=next(self.parameters()).dtype))
         sample = self.sampler.run(denoise, start, noise=noise, progress=progress)
-        return (space.motion(sample) / self.scale).view(batch.motion.shape)
-
-
-class ClipNoise:
-    """Unit Gaussian noise for the clips of a batch, zero on their padding; each clip has a stream of its own.
-
-    Args:
-        batch: the clips; their names and lengths are looked at.
-        seed: seed of all streams.
-    """
-
-    def __init__(self, batch: Batch, seed: int) -> None:
-        self.lengths = batch.frame_lengths.tolist()
-        self.streams = [
-            torch.Generator(batch.motion.device).manual_seed(zlib.crc32(name.encode()) + seed) for name in batch.names
-        ]
-
-    def __call__(self, like: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
-        """The next noise of the shape of ``like``."""
-        noise = torch.zeros_like(like)
-        for i, (stream, frames) in enumerate(zip(self.streams, self.lengths, strict=True)):
-            noise[i, :frames] = torch.randn(
-                (frames, like.shape[2]), device=like.device, dtype=like.dtype, generator=stream
-            )
-        return noise
+        return (space.motion(sample) / self.scale).view(rows, frames, self.n_vertices, 3)

@@ -311,7 +311,7 @@ class StyleContentDisentanglement(SpeechAnimator):
         """Offsets from the template, zero on padding, of content and style that may be of different people."""
         return self._decode(content, style, mask) / self.scale * mask[..., None, None]
 
-    def generate(
+    def perform(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Content from the speech, style from the reference; one pass, nothing is drawn."""
