@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,11 +34,11 @@ def parser() -> argparse.ArgumentParser:
 def run(name: str, arguments: Sequence[str]) -> int:
     """Run all steps, each with its time."""
     args = parser().parse_args(list(arguments))
-    from facediff.commands.animate import check_output
     from facediff.commands.lightning import run_cli
+    from facediff.export import ExportOptions, check_export
     from facediff.files import atomic
 
-    check_output(args.output / "truth_and_prediction.mp4")
+    check_export(args.output / "truth_and_prediction.mp4", ExportOptions())
     started = time.monotonic()
     data = [f"--data.root={args.data_root}"] if args.data_root else []
     epochs = [f"--trainer.max_epochs={args.epochs}"] if args.epochs else []
@@ -65,9 +66,12 @@ def write_videos(folder: Path, system: SpeechAnimator, data: SpeechMotionDataMod
     """
     import torch
 
-    from facediff.commands.animate import drawn_frames, write_animation
+    from facediff.commands.take_options import facts_of
     from facediff.data import collate
+    from facediff.export import ExportOptions, write_takes
+    from facediff.export.video import drawn_frames
     from facediff.render import contact_sheet, save_image
+    from facediff.takes import Take
 
     written = []
     for split in data.test_splits:
@@ -75,11 +79,17 @@ def write_videos(folder: Path, system: SpeechAnimator, data: SpeechMotionDataMod
         batch = collate([sample])
         with torch.inference_mode():
             motion = system.eval().generate(batch)[0]
-        panels = [(moved + sample.template).numpy() for moved in (sample.motion, motion)]
+        facts = facts_of(system.assets, sample.subject)
+        takes = [
+            Take(name=name, vertices=(moved + sample.template).numpy(), speech=sample.audio.numpy(), **facts)
+            for name, moved in (("truth", sample.motion), ("facediff", motion))
+        ]
         path = folder / f"truth_and_prediction_{split}.mp4"
-        write_animation(path, panels, ["truth", "facediff"], sample.audio.numpy(), system.assets)
+        footer = f"{system.assets.corpus}: synthetic corpus"
+        write_takes(path, takes, ExportOptions(footer=footer, quiet=False))
         picks = [round(i * (len(motion) - 1) / (SHEET + 1)) for i in range(1, SHEET + 1)]
-        frames = drawn_frames(path, [panel[picks] for panel in panels], ["truth", "facediff"], system.assets, size=224)
+        few = [replace(take, vertices=take.vertices[picks]) for take in takes]
+        frames = drawn_frames(few, ExportOptions(footer=footer, size=224))
         times = [f"{pick / system.frame_rate:.2f} s" for pick in picks]
         save_image(path.with_suffix(".png"), contact_sheet(list(frames), 4, labels=times))
         written += [path, path.with_suffix(".png")]

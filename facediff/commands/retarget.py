@@ -1,1 +1,112 @@
-"""``facediff retarget``."""
+"""``facediff retarget``: animations carried over to another mesh."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from facediff.commands.take_options import add_take_options, take_of
+
+if TYPE_CHECKING:
+    from facediff.retarget import Correspondence
+    from facediff.takes import Take
+
+TURNED = 0.7
+"""A cosine below this between both meshes' up axes is said."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Options of the command."""
+    made = argparse.ArgumentParser(
+        "facediff retarget",
+        description="Carry an animation over to another mesh. The suffix of OUT chooses the format, as in `facediff "
+        "export`.",
+    )
+    made.add_argument("take", type=Path, metavar="TAKE", help="motion: .npz of `facediff animate`, or .npy")
+    made.add_argument(
+        "--target-mesh", type=Path, required=True, metavar="FILE", help="the other face at rest: .obj, .ply, .glb …"
+    )
+    made.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file to write")
+    made.add_argument(
+        "--correspondence", type=Path, metavar="MAP", help=".npz to use if it is there, else to write for other takes"
+    )
+    made.add_argument(
+        "--landmarks",
+        type=Path,
+        metavar="CSV",
+        help="pairs of vertices that are one place, `source,target` a line, counted from 0: for meshes that show other "
+        "parts of the head",
+    )
+    made.add_argument("--show", type=Path, metavar="PNG", help="picture of both faces at the most open mouth")
+    add_take_options(made)
+    return made
+
+
+def run(name: str, arguments: Sequence[str]) -> int:
+    """Carry, show and write; every input is checked first."""
+    args = parser().parse_args(list(arguments))
+
+    from facediff.commands.check_picture import check_picture_path
+    from facediff.commands.target_mesh import carried_with
+    from facediff.export import ExportOptions, check_export, write_takes
+
+    check_export(args.output, ExportOptions())
+    check_picture_path(args.show)
+    take = take_of(args.take, args)
+    made, found = carried_with(take, args.target_mesh, args.correspondence, args.landmarks)
+    written = write_takes(args.output, [made], ExportOptions())
+    if args.show is not None:
+        show(args.show, take, made, found)
+        written.append(args.show)
+    for file in written:
+        print(file)
+    for line in told(take, made, found):
+        print(line)
+    return 0
+
+
+def told(take: Take, made: Take, found: Correspondence) -> list[str]:
+    """What a user should know of a correspondence, a sentence each."""
+    import numpy as np
+
+    from facediff.takes import metres_per_unit
+
+    millimetres = 1000 * metres_per_unit(made.unit)
+    still, unsure = np.count_nonzero(found.share == 0), np.count_nonzero(found.trust < 0.5)
+    lines = [
+        f"{len(take.template)} vertices to {len(made.template)}: the meshes lie {np.median(found.distances) * millimetres:.2g}"
+        f" mm apart (median), scale {found.similarity.scale:.4g}, unit {made.unit}",
+        f"{unsure} vertices lie where the source has no like surface and follow their neighbours; {still} lie far from "
+        f"it and stand still",
+    ]
+    if found.fits_badly:
+        lines.append("the meshes fit badly: look at the result with --show, and give --landmarks")
+    if found.similarity.rotation[1, 1] < TURNED:
+        lines.append("the target mesh is turned against the take, whose y axis points up: mind it in what is written")
+    return lines
+
+
+def show(path: Path, take: Take, made: Take, found: Correspondence) -> None:
+    """Draw the source, the target, how far each vertex of it moves, and how far the meshes lie apart."""
+    import numpy as np
+
+    from facediff.commands.check_picture import Panel, heat, widest_frame, write_panels
+    from facediff.takes import metres_per_unit
+
+    frame, millimetres = widest_frame(take), 1000 * metres_per_unit(made.unit)
+    # In the source's axes and unit, so that one camera shows both.
+    back = found.similarity.inverse()
+    posed = back.apply(made.vertices[frame])
+    moved, moves = heat(np.linalg.norm(made.vertices[frame] - made.template, axis=1) * millimetres, "carried motion")
+    apart, distances = heat(found.distances * millimetres, "distance of the meshes")
+    write_panels(
+        path,
+        [
+            Panel(f"{take.name}, frame {frame}", np.asarray(take.vertices[frame]), take.triangles, take.colours),
+            Panel("carried over", posed, made.triangles, made.colours),
+            Panel(moved, posed, made.triangles, moves),
+            Panel(apart, back.apply(made.template), made.triangles, distances),
+        ],
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from facediff.errors import FaceDiffError
 
@@ -47,7 +47,7 @@ def surroundings(args: argparse.Namespace) -> Surroundings:
     from facediff.takes.reading import Surroundings
     from facediff.topology import read_mesh
 
-    given: dict[str, object] = {}
+    given: dict[str, Any] = {}
     if args.checkpoint is not None:
         given |= facts_of(assets_of(args.checkpoint), args.identity)
     elif args.identity is not None:
@@ -64,7 +64,7 @@ def surroundings(args: argparse.Namespace) -> Surroundings:
         given["frame_rate"] = args.frame_rate
     if args.unit is not None:
         given["unit"] = args.unit
-    return Surroundings(**given)  # type: ignore[arg-type]
+    return Surroundings(**given)
 
 
 def assets_of(checkpoint: Path) -> Assets:
@@ -74,8 +74,8 @@ def assets_of(checkpoint: Path) -> Assets:
     return read_assets(checkpoint)
 
 
-def facts_of(assets: Assets, identity: str | None) -> dict[str, object]:
-    """Assets as :class:`facediff.takes.reading.Surroundings` takes them."""
+def facts_of(assets: Assets, identity: str | None) -> dict[str, Any]:
+    """Assets as :class:`facediff.takes.Take` and :class:`facediff.takes.reading.Surroundings` take them."""
     import numpy as np
 
     def array(value: object, kind: type) -> object:

@@ -1,1 +1,123 @@
-"""``facediff view``."""
+"""``facediff view``: one HTML file that plays animations with their speech in any browser."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from facediff.commands.take_options import add_take_options, surroundings
+from facediff.errors import FaceDiffError
+
+if TYPE_CHECKING:
+    from facediff.takes import Take
+    from facediff.takes.reading import Surroundings
+
+EPILOG = """\
+The page is one file that loads nothing from anywhere: mail it, put it on a share, open it by a double click. Takes next
+to each other need one frame rate and one length. A bare .npy borrows what it does not say from the first .npz given,
+if both have equally many vertices."""
+BORROWED = ("template", "faces", "colours", "inner_lip_pairs", "unit", "frame_rate")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Options of the command."""
+    made = argparse.ArgumentParser(
+        "facediff view",
+        description="Write one HTML file that plays animations with their speech in any browser.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument(
+        "takes", type=Path, nargs="+", metavar="TAKE", help="motions, shown side by side: .npz or .npy; four at most"
+    )
+    made.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the page (.html)")
+    made.add_argument(
+        "--truth", type=Path, metavar="FILE", help="what the takes are compared with: shown first, and in heat maps"
+    )
+    made.add_argument("--labels", nargs="+", metavar="NAME", help="names to show, in the order of the panels")
+    made.add_argument("--shortest", action="store_true", help="cut all to the shortest instead of refusing")
+    made.add_argument("--max-mb", type=float, default=30.0, metavar="MB", help="largest page written (default: 30)")
+    made.add_argument("--open", action="store_true", help="open the page in the browser")
+    add_take_options(made)
+    return made
+
+
+def run(name: str, arguments: Sequence[str]) -> int:
+    """Write a page.
+
+    Raises:
+        FaceDiffError: for anything that the user can put right; then nothing has been written.
+    """
+    args = parser().parse_args(list(arguments))
+    if args.output.suffix not in (".html", ".htm"):
+        raise FaceDiffError(f'--output {args.output}: unknown suffix "{args.output.suffix}"; expected .html')
+    if not args.max_mb > 0:
+        raise FaceDiffError(f"--max-mb {args.max_mb:g}: expected a number above 0")
+    from facediff.files import check_writable
+    from facediff.viewer import write_page
+
+    check_writable(args.output)
+    paths = [*([] if args.truth is None else [args.truth]), *args.takes]
+    takes = named(read_takes(paths, args), args.labels)
+    if args.shortest:
+        takes = shortest(takes)
+    write_page(args.output, takes, max_mb=args.max_mb, truth=None if args.truth is None else 0)
+    size = args.output.stat().st_size / 1e6
+    print(
+        f"{args.output}: {len(takes[0].vertices)} frames of {len(takes)} take(s), {size:.1f} MB; open it in a browser"
+    )
+    if args.open:
+        import webbrowser
+
+        webbrowser.open(args.output.resolve().as_uri())
+    return 0
+
+
+def read_takes(paths: Sequence[Path], args: argparse.Namespace) -> list[Take]:
+    """The takes of all files, archives lending to arrays what those do not say.
+
+    Raises:
+        FaceDiffError: if a file is unreadable, or something needed is not said.
+    """
+    from facediff.takes import read_take
+
+    given = surroundings(args)
+    whole = {path: read_take(path, given) for path in paths if path.suffix == ".npz"}
+    lender = next(iter(whole.values()), None)
+    return [whole[path] if path in whole else read_take(path, completed(path, given, lender)) for path in paths]
+
+
+def completed(path: Path, given: Surroundings, lender: Take | None) -> Surroundings:
+    """What is said of an array, the options going before the lender."""
+    if lender is None or path.suffix != ".npy":
+        return given
+    from facediff.takes.reading import read_vertices
+
+    if read_vertices(path).shape[1] != len(lender.template):
+        return given
+    lent = {name: getattr(lender, name) for name in BORROWED if getattr(given, name) is None}
+    return replace(given, **lent, regions={**lender.regions, **given.regions})
+
+
+def named(takes: Sequence[Take], labels: Sequence[str] | None) -> list[Take]:
+    """The takes under the names that are shown.
+
+    Raises:
+        FaceDiffError: if there are not as many names as takes.
+    """
+    if labels is None:
+        return list(takes)
+    if len(labels) != len(takes):
+        raise FaceDiffError(
+            f"--labels: {len(labels)} names for {len(takes)} panels; give one for each, the truth's first"
+        )
+    return [replace(take, name=label) for take, label in zip(takes, labels, strict=True)]
+
+
+def shortest(takes: Sequence[Take]) -> list[Take]:
+    """The takes, cut to the frames that all have."""
+    frames = min(len(take.vertices) for take in takes)
+    return [replace(take, vertices=take.vertices[:frames]) for take in takes]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,20 @@ def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.
     if rate != SAMPLE_RATE:
         mono = soxr.resample(mono, rate, SAMPLE_RATE, quality="HQ")
     return np.ascontiguousarray(mono, dtype=np.float32)
+
+
+def resampler(rate: int) -> Callable[[npt.NDArray[np.float32], bool], npt.NDArray[np.float32]]:
+    """Converts pieces of a stream (n,) at any rate to 16 kHz; the second argument says that no more will come.
+
+    Raises:
+        MissingExtraError: if soxr is not installed.
+    """
+    try:
+        import soxr
+    except ImportError as error:
+        raise MissingExtraError("soxr", "audio", "resampling speech") from error
+    stream = soxr.ResampleStream(rate, SAMPLE_RATE, 1, dtype="float32", quality="HQ")
+    return lambda piece, last: stream.resample_chunk(piece, last=last)
 
 
 def _decode(path: Path) -> tuple[npt.NDArray[np.float32], int]:

@@ -291,7 +291,7 @@ class SpeechAnimator(LightningModule, ABC):
         # Fused: one pass over all parameters instead of several operations for each.
         optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
         # It could undo a loss scale by itself, for which reason Lightning will not clip its gradients in mixed
-        # precision. Told that it does not, the scale, if there is one, is undone first and clipping sees true gradients.
+        # precision. Told that it does not, the scale, if there is one, is undone before gradients are clipped.
         optimizer._step_supports_amp_scaling = False
         if self.lr_schedule == "constant" and not self.warmup_steps:
             return optimizer

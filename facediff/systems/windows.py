@@ -35,6 +35,9 @@ class Window:
 class WindowPlan:
     """Lengths in seconds.
 
+    Models of this field learn from sentences of three to five seconds. Windows of that length are what they know; one
+    that learnt from longer clips may do better with longer windows, and must be at ease with speech up to ``above``.
+
     Attributes:
         seconds: length of a window.
         overlap: how much of it the next one has as well; at most half of it.
@@ -46,11 +49,11 @@ class WindowPlan:
         FaceDiffError: if a length is impossible.
     """
 
-    seconds: float = 8.0
+    seconds: float = 4.0
     overlap: float = 1.0
     before: float = 2.0
     after: float = 0.5
-    above: float = 30.0
+    above: float = 10.0
 
     def __post_init__(self) -> None:
         if not all(map(math.isfinite, vars(self).values())) or not 0 < self.seconds <= 600:

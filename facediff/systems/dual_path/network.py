@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -59,8 +59,8 @@ class PreparedConditions(Conditions):
         steps: the embedding of each step; None if steps are embedded as they come.
     """
 
-    fusion: Any = None
-    decoder: Any = None
+    fusion: object = None
+    decoder: object = None
     steps: Float[Tensor, "steps dim"] | None = None
 
 

@@ -1,0 +1,246 @@
+"""Batch mode of ``facediff animate``: many recordings, on all processors, resumable, past failures."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from facediff.commands.batch_records import Recipe, alone_in, difference, read_record, sweep, write_record
+from facediff.commands.folder_pool import run_tasks
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.files import check_writable
+from facediff.machine import processors
+
+Animate = Callable[[Path, Path], None]
+"""Animates a recording (first) and writes a file (second), whole or not at all."""
+MakeWorker = Callable[[list[str]], Animate]
+"""Gets the command's words and loads what all recordings have in common."""
+
+TABLE = 40
+"""Recordings that the table at the end shows; of more, only the failed ones."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A recording to animate.
+
+    Attributes:
+        speech: the recording.
+        output: the file to write.
+        recipe: what else decides it.
+    """
+
+    speech: Path
+    output: Path
+    recipe: Recipe
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a recording.
+
+    Attributes:
+        problem: the sentence that says why it failed; empty if it did not.
+        seconds: how long it took.
+        hopeless: the next one would fail for the same reason.
+    """
+
+    problem: str = ""
+    seconds: float = 0.0
+    hopeless: bool = False
+
+
+@dataclass
+class Work:
+    """What a worker process does: it loads the model once, and animates recording after recording.
+
+    Attributes:
+        make_worker: a function of a module.
+        command: its argument.
+    """
+
+    make_worker: MakeWorker
+    command: list[str]
+    _animate: Animate | None = field(default=None, init=False)
+
+    def __call__(self, task: Task) -> Outcome:
+        """Animate a recording and write down that it is done; whatever goes wrong becomes a sentence."""
+        started = time.monotonic()
+        if self._animate is None:
+            try:
+                self._animate = self.make_worker(self.command)
+            except FaceDiffError as error:
+                return Outcome(str(error), hopeless=True)
+        problem = ""
+        try:
+            self._animate(task.speech, task.output)
+        except FaceDiffError as error:
+            problem = str(error)
+            if isinstance(error, MissingExtraError) or _disk_full(error):
+                return Outcome(problem, hopeless=True)
+        except Exception as error:
+            traceback.print_exc()
+            problem = f"{task.speech}: {type(error).__name__}: {error} (see the traceback above)"
+        write_record(task.speech, task.output, task.recipe, problem)
+        return Outcome(problem, time.monotonic() - started)
+
+
+def _disk_full(error: FaceDiffError) -> bool:
+    from facediff.prepare.pool import NO_SPACE
+
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in NO_SPACE
+
+
+def recordings(paths: Sequence[Path]) -> list[Path]:
+    """Recordings, and those that lie in folders (not deeper), each once.
+
+    Raises:
+        FaceDiffError: if a folder has none. A file that is missing fails later, by itself.
+    """
+    from facediff.data.audio import SUFFIXES
+
+    found: dict[Path, Path] = {}
+    for path in paths:
+        files = [path]
+        if path.is_dir():
+            files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES and file.is_file()]
+            files = [file for file in files if not file.name.startswith(".")]
+            if not files:
+                raise FaceDiffError(f"{path}: holds no recording; expected {', '.join(SUFFIXES)}")
+        for file in files:
+            found.setdefault(file.resolve(), file)
+    return list(found.values())
+
+
+def output_names(speeches: Sequence[Path], suffix: str) -> list[str]:
+    """Names of the outputs: ``a.wav`` gives ``a.mp4``; where two would be equal, ``a.wav.mp4`` and ``a.flac.mp4``.
+
+    Letters' case does not tell names apart, as on many disks.
+
+    Raises:
+        FaceDiffError: if two recordings have the same name.
+    """
+    stems = Counter(speech.stem.lower() for speech in speeches)
+    names = [(speech.stem if stems[speech.stem.lower()] == 1 else speech.name) + suffix for speech in speeches]
+    first: dict[str, Path] = {}
+    for name, speech in zip(names, speeches, strict=True):
+        if (other := first.setdefault(name.lower(), speech)) is not speech:
+            raise FaceDiffError(f"{other} and {speech} would both give {name}; rename one, or animate them one by one")
+    return names
+
+
+def seed_of_recording(speech: Path, seed: int) -> int:
+    """The seed of a recording in a batch: it follows from the file's name, not from its place or its worker."""
+    digest = hashlib.sha256(f"{seed}/{speech.name}".encode()).digest()
+    return int.from_bytes(digest[:4], "big") >> 1
+
+
+def run_folder(
+    speeches: Sequence[Path],
+    output: Path,
+    suffix: str,
+    command: Sequence[str],
+    *,
+    make_worker: MakeWorker,
+    files: Sequence[Path] = (),
+    workers: int | None = None,
+    retry_failed: bool = False,
+) -> int:
+    """Animate recordings into a folder.
+
+    What an earlier run has made of the same recording, options and files is kept, and a recording that failed is not
+    tried again unless something has changed or it is wished. Each output appears whole or not at all. Ctrl-C waits for
+    the recordings at work; the same command goes on.
+
+    Args:
+        speeches: recordings.
+        output: folder for the outputs.
+        suffix: of the outputs (``.mp4``).
+        command: the options that decide the result, without recordings, output and workers.
+        make_worker: a function of a module; called once in each process with the command.
+        files: files that the command names and that decide the result (checkpoint, styles …).
+        workers: processes; as many as processors if None.
+        retry_failed: try failed recordings again.
+
+    Returns:
+        the exit status: 0 if all outputs are there, 1 if a recording failed.
+
+    Raises:
+        FaceDiffError: if nothing can be made at all: the folder, the options or the checkpoint are no good.
+    """
+    if workers is not None and workers < 1:
+        raise FaceDiffError(f"--workers {workers}: expected 1 or more")
+    if output.exists() and not output.is_dir():
+        raise FaceDiffError(f"--output {output}: is a file; expected a folder, since there are several recordings")
+    names = output_names(speeches, suffix)
+    recipe = Recipe.of(command, files)
+    check_writable(output / names[0])
+    results: dict[Path, tuple[str, str]] = {}
+    with alone_in(output):
+        tasks = []
+        for speech, name in zip(speeches, names, strict=True):
+            task = Task(speech, output / name, recipe)
+            known = known_result(task, retry_failed)
+            if known is None:
+                sweep(task.output)
+                tasks.append(task)
+            else:
+                results[speech] = known
+        try:
+            _carry_out(Work(make_worker, list(command)), tasks, workers or processors(), results)
+        finally:
+            _tell(speeches, results)
+    return int(any(state == "failed" for state, _ in results.values()))
+
+
+def known_result(task: Task, retry_failed: bool) -> tuple[str, str] | None:
+    """What an earlier run has left of a recording: its state and its problem; None if it is to be animated."""
+    record = read_record(task.output)
+    if record is None:
+        if task.output.exists():
+            print(f"note: {task.output}: is made anew, since it is not known how it was made")
+        return None
+    changed = difference(record, task.speech, task.output, task.recipe)
+    if changed:
+        print(f"note: {task.output}: is made anew, since {changed}")
+        return None
+    if not record.get("problem"):
+        return "up to date", ""
+    return None if retry_failed else ("failed", f"{record['problem']} (in an earlier run; --retry-failed tries again)")
+
+
+def _carry_out(work: Work, tasks: Sequence[Task], workers: int, results: dict[Path, tuple[str, str]]) -> None:
+    with closing(run_tasks(work, tasks, workers)) as outcomes:  # type: ignore[type-var]
+        for place, (task, outcome) in enumerate(outcomes, start=1):
+            if outcome is None:
+                outcome = Outcome(f"{task.speech}: killed its process, perhaps for want of memory; try --workers 1")
+                write_record(task.speech, task.output, task.recipe, outcome.problem)
+            if outcome.hopeless:
+                raise FaceDiffError(outcome.problem)
+            if outcome.problem:
+                stale = f" ({task.output} is of an earlier run)" if task.output.exists() else ""
+                results[task.speech] = "failed", outcome.problem + stale
+                print(f"[{place}/{len(tasks)}] failed: {outcome.problem}", flush=True)
+            else:
+                results[task.speech] = "made", f"{outcome.seconds:.1f} s"
+                print(f"[{place}/{len(tasks)}] {task.output}, {outcome.seconds:.1f} s", flush=True)
+
+
+def _tell(speeches: Sequence[Path], results: dict[Path, tuple[str, str]]) -> None:
+    """The table at the end."""
+    left = [(speech, *results.get(speech, ("left", ""))) for speech in speeches]
+    shown = left if len(left) <= TABLE else [row for row in left if row[1] == "failed"]
+    width = max((len(str(speech.name)) for speech, _, _ in shown), default=0)
+    for speech, state, words in shown:
+        print(f"{speech.name:<{width}}  {state:<10}  {words}".rstrip())
+    counts = Counter(state for _, state, _ in left)
+    told = ", ".join(f"{count} {state}" for state, count in counts.items())
+    print(f"{len(left)} recording{'s' * (len(left) != 1)}: {told}", flush=True)
+    if counts["left"]:
+        print("the same command goes on where this one stopped", flush=True)
