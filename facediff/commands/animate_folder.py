@@ -71,13 +71,12 @@ class Work:
 
     def __call__(self, task: Task) -> Outcome:
         """Animate a recording and write down that it is done; whatever goes wrong becomes a sentence."""
-        started = time.monotonic()
         if self._animate is None:
             try:
                 self._animate = self.make_worker(self.command)
             except FaceDiffError as error:
                 return Outcome(str(error), hopeless=True)
-        problem = ""
+        started, problem = time.monotonic(), ""
         try:
             self._animate(task.speech, task.output)
         except FaceDiffError as error:

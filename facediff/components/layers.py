@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -9,6 +11,13 @@ from torch import Tensor, nn
 
 Rotation = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary embedding, both (frames, head_dim)."""
+
+
+class KeysValues(NamedTuple):
+    """What an attention makes of its context, both (batch, heads, keys, head_dim)."""
+
+    key: Tensor
+    value: Tensor
 
 
 def frame_mask(lengths: Int[Tensor, " batch"], frames: int) -> Bool[Tensor, "batch frames"]:
@@ -130,7 +139,7 @@ class Attention(nn.Module):
             context_mask: True on valid positions; all are if None.
             rotation: as :meth:`rotation` gives it; made anew if None.
         """
-        return self.attend(self.queries(x, rotation), context, context_mask, rotation)
+        return self.attend(self.queries(x, rotation), self.keys_values(context, rotation), context_mask)
 
     def rotation(self, frames: int) -> Rotation | None:
         """The table of rotary positions for so many frames and keys; None without such positions."""
@@ -139,21 +148,25 @@ class Attention(nn.Module):
     def queries(
         self, x: Float[Tensor, "batch frames dim"], rotation: Rotation | None = None
     ) -> Float[Tensor, "batch heads frames head_dim"]:
-        """The first half of :meth:`forward`: all that ``x`` is needed for."""
+        """The first part of :meth:`forward`: all that ``x`` is needed for."""
         query = self._split(self.query(x))
         return query if self.rotary is None else self.rotary(query, rotation)
+
+    def keys_values(
+        self, context: Float[Tensor, "batch keys context_dim"], rotation: Rotation | None = None
+    ) -> KeysValues:
+        """The second part of :meth:`forward`: all that ``context`` is needed for."""
+        key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
+        return KeysValues(key if self.rotary is None else self.rotary(key, rotation), value)
 
     def attend(
         self,
         query: Float[Tensor, "batch heads frames head_dim"],
-        context: Float[Tensor, "batch keys context_dim"],
+        context: KeysValues,
         context_mask: Bool[Tensor, "batch keys"] | None = None,
-        rotation: Rotation | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
-        """The second half of :meth:`forward`, from the queries that the first one gave."""
-        key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
-        if self.rotary is not None:
-            key = self.rotary(key, rotation)
+        """The last part of :meth:`forward`, from what the two before gave."""
+        key, value = context
         mask = None if context_mask is None else context_mask[:, None, None, :]
         dropout = self.dropout if self.training else 0.0
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask, dropout_p=dropout)

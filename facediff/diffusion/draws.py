@@ -8,15 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 from torch import Tensor
 
-ROWS = 2**21
-"""Numbers that one stream draws on a processor."""
+PART = 2**21
+"""How many numbers one stream draws on a processor."""
 
 
 def unit_noise(shape: Sequence[int], device: torch.device, generator: torch.Generator | None = None) -> Tensor:
     """Noise, drawn by all threads of a processor.
 
-    PyTorch draws on a processor with one thread, which takes as long as many a network's step where there are 70 000
-    coordinates a frame. Here many streams, seeded by ``generator``, are drawn side by side. How many threads there are
+    PyTorch draws on a processor with one thread, which with 70 000 coordinates a frame is a good part of a training
+    step. Here many streams, seeded by ``generator``, are drawn side by side. How many threads there are
     does not change the numbers.
 
     Args:
@@ -27,11 +27,14 @@ def unit_noise(shape: Sequence[int], device: torch.device, generator: torch.Gene
     if device.type != "cpu":
         return torch.randn(*shape, device=device, generator=generator)
     noise = torch.empty(*shape)
-    parts = noise.view(-1).split(ROWS)
+    parts = torch.split(noise.view(-1), PART)
     seeds = torch.randint(2**63 - 1, (len(parts),), generator=generator).tolist()
 
+    mode = torch.is_inference_mode_enabled()  # a thread does not know its caller's
+
     def draw(part: Tensor, seed: int) -> None:
-        part.normal_(generator=torch.Generator().manual_seed(seed))
+        with torch.inference_mode(mode):
+            part.normal_(generator=torch.Generator().manual_seed(seed))
 
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
         list(threads.map(draw, parts, seeds))

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from facediff import registry
 from facediff.components.decoder.gru import GruDecoder
 from facediff.components.decoder.style_transformer import StyleTransformer
 from facediff.components.fusion.add import AddFusion
@@ -100,3 +101,22 @@ def test_motion_of_a_frame_can_hear_any_other_frame() -> None:
     other = torch.randn(1, FRAMES, DIM)
     assert reach(lambda x: fusion(x, other, MASK)).all()
     assert reach(lambda x: fusion(other, x, MASK)).all()
+
+
+@pytest.mark.parametrize("part", [(kind, n) for kind in ("fusion", "decoder") for n in registry.KINDS[kind].names()])
+@pytest.mark.parametrize("clips", [(0, 1, 2, 3), (3,)], ids=["padded", "whole"])
+def test_what_is_prepared_changes_nothing(
+    part: tuple[str, str],
+    clips: tuple[int, ...],
+    make: Callable[..., nn.Module],
+    call: Callable[..., tuple[Tensor, ...]],
+) -> None:
+    """Every registered fusion and decoder, over several steps with one preparation."""
+    module = make(*part).eval()
+    first, second, mask = call(part[0], clips)
+    constant, moving = (first, second) if part[0] == "fusion" else (second, first)
+    prepared = module.prepare(constant, mask)
+    for scale in (1.0, 3.0) if prepared is not None else ():
+        inputs = (first, scale * moving) if part[0] == "fusion" else (scale * moving, second)
+        out, expected = module(*inputs, mask, prepared), module(*inputs, mask)
+        torch.testing.assert_close(out[mask], expected[mask], rtol=0, atol=1e-5)

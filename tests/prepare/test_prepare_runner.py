@@ -277,7 +277,7 @@ import os, time
 def slow(work, out):
     (out.parent / f"pid-{os.getpid()}").touch()
     frames = work(out)
-    time.sleep(0.2)
+    time.sleep(0.6)  # so that the signal comes long before the end, however busy the machine is
     return frames
 """
 

@@ -54,8 +54,10 @@ def cast(batch: Batch, dtype: torch.dtype) -> Batch:
 
 
 def run(system: DualPathDiffusion, batch: Batch, space: Space, noise: Callable[[], Tensor]) -> Tensor:
-    """The sampler in a space, with its noise given."""
+    """The sampler in a space, with its noise given; on vertices, all is computed anew in every step."""
     conditions = system._conditions(batch)
+    if isinstance(space, FoldedSpace):
+        conditions = system.network.prepared(conditions, system.process.steps)
 
     def denoise(state: Tensor, step: int) -> Tensor:
         return space.predict(state, torch.full((len(state),), step), conditions)

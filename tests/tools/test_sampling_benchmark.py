@@ -40,6 +40,11 @@ def test_the_ratios_follow_from_the_parts(output: Output) -> None:
     peer = costs["conditions"] + 500 * (costs["audio_encoder"] + costs["step"]["vertices"]["ddpm"])
     usual = next(r for r in numbers["rows"] if (r["space"], r["sampler"], r["steps"]) == ("folded", "ddim", 25))
     assert ratios["peer_to_ddim_25"] == pytest.approx(peer / usual["total"])
+    # A step costs the same whatever the number of steps; the default sampler ran with three.
+    full = numbers["full"]
+    by_default = next(r for r in numbers["rows"] if (r["space"], r["sampler"]) == ("folded", full["sampler"]))
+    shorter = by_default["total"] - (by_default["steps"] - full["steps"]) * by_default["per_step"]
+    assert ratios["peer_to_default"] == pytest.approx(peer / shorter)
     assert ratios["vertices_5023"] > 0
 
 
@@ -61,5 +66,6 @@ def test_machine_memory_and_the_full_run_are_named(output: Output) -> None:
     assert "device cpu" in text
     assert "EXTRAPOLATED" in text
     assert "peak memory of that: " in text
-    assert "ddim 3, folded, in full: " in text
+    assert f"{numbers['full']['sampler']} 3, folded, in full: " in text
+    assert numbers["full"]["steps"] == 3
     assert numbers["full"]["measured"] > 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from typing import Protocol
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -12,9 +12,7 @@ from torch import Tensor, nn
 class Decoder(nn.Module, ABC):
     """Fused features F_fused and style tokens F_s to features that one linear map turns into clean motion."""
 
-    def prepare(
-        self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Any:  # noqa: ANN401 - each decoder's own
+    def prepare(self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]) -> object:
         """What stays the same over the denoising steps, computed once a clip; None if there is nothing.
 
         A decoder that overrides this takes the result as a fourth, optional argument of ``forward`` and gives the same

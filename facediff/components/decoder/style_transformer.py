@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, cast
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from facediff.components.decoder.base import Decoder
-from facediff.components.layers import Attention, FeedForward, Rotation, needed_mask
+from facediff.components.layers import Attention, FeedForward, KeysValues, Rotation, needed_mask
 from facediff.registry import decoder
 
 
@@ -27,16 +28,20 @@ class TokenProducts(NamedTuple):
     values: Tensor
 
 
+PreparedTokens = TokenProducts | KeysValues
+"""What an attention to a few tokens makes of them."""
+
+
 class DecoderConstants(NamedTuple):
     """What the decoding of a clip does not compute in every step.
 
     Attributes:
-        tokens: what each block attends to: the style tokens, or products of them.
+        tokens: what each block attends to: the style tokens, or what its attention makes of them.
         mask: True on valid frames; None if nothing is padded.
         rotation: rotary positions of all blocks.
     """
 
-    tokens: list[Tensor | TokenProducts]
+    tokens: Sequence[Tensor | PreparedTokens]
     mask: Tensor | None
     rotation: Rotation | None
 
@@ -51,26 +56,29 @@ class TokenAttention(Attention):
     def forward(
         self,
         x: Float[Tensor, "batch frames dim"],
-        context: Float[Tensor, "batch keys context_dim"] | TokenProducts,
+        context: Float[Tensor, "batch keys context_dim"] | PreparedTokens,
         context_mask: Bool[Tensor, "batch keys"] | None = None,
         rotation: Rotation | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
         """Attend from ``x`` to all of ``context``, which may be what :meth:`prepare` made of it."""
-        if not isinstance(context, TokenProducts):
-            prepared = context if context_mask is not None else self.prepare(context)
-            if not isinstance(prepared, TokenProducts):
-                return super().forward(x, prepared, context_mask, rotation)
-            context = prepared
+        if isinstance(context, Tensor):
+            if context_mask is not None:
+                return super().forward(x, context, context_mask, rotation)
+            context = self.prepare(context, rotation)
+        if isinstance(context, KeysValues):
+            return self.attend(self.queries(x, rotation), context)
         scores = x @ context.keys + context.offset
         weights = scores.view(*scores.shape[:2], self.num_heads, -1).softmax(dim=-1).flatten(2)
         return weights @ context.values + self.out.bias
 
-    def prepare(self, context: Float[Tensor, "batch keys context_dim"]) -> Tensor | TokenProducts:
-        """The products that do not depend on what asks; the tokens themselves where there are too many."""
+    def prepare(
+        self, context: Float[Tensor, "batch keys context_dim"], rotation: Rotation | None = None
+    ) -> PreparedTokens:
+        """What does not depend on what asks: the products, or keys and values where there are too many tokens."""
         dim = self.query.in_features
+        key, value = found = self.keys_values(context, rotation)
         if self.rotary is not None or self.dropout or self.num_heads * context.shape[1] >= dim:
-            return context
-        key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
+            return found
         key = key / math.sqrt(key.shape[-1])
         # Weights by head: (heads, head_dim, dim).
         into = self.query.weight.view(self.num_heads, -1, dim)
@@ -94,7 +102,7 @@ class Block(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(
-        self, x: Tensor, style: Tensor | TokenProducts, mask: Tensor | None, rotation: Rotation | None
+        self, x: Tensor, style: Tensor | PreparedTokens, mask: Tensor | None, rotation: Rotation | None
     ) -> Tensor:
         """``x`` (batch, frames, dim), ``style`` (batch, tokens, style_dim), ``mask`` (batch, frames)."""
         normed = self.time_norm(x)
@@ -157,8 +165,9 @@ class StyleTransformer(Decoder):
         self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]
     ) -> DecoderConstants:
         """Each block's products of the style tokens, and the rotary positions that all blocks share."""
-        tokens = [block.style_attention.prepare(style) for block in self.blocks]
+        tokens = [block.style_attention.prepare(style) for block in cast(Sequence[Block], self.blocks)]
         return DecoderConstants(tokens, needed_mask(mask), self._rotation(mask.shape[1]))
 
     def _rotation(self, frames: int) -> Rotation | None:
-        return self.blocks[0].time_attention.rotation(frames) if len(self.blocks) else None
+        blocks = cast(Sequence[Block], self.blocks)
+        return blocks[0].time_attention.rotation(frames) if len(blocks) else None

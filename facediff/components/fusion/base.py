@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from typing import Protocol
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -12,9 +12,7 @@ from torch import Tensor, nn
 class Fusion(nn.Module, ABC):
     """Speech features F_a and embedded noisy motion F_m to one sequence F_am."""
 
-    def prepare(
-        self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Any:  # noqa: ANN401 - each fusion's own
+    def prepare(self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]) -> object:
         """What stays the same over the denoising steps, computed once a clip; None if there is nothing.
 
         A fusion that overrides this takes the result as a fourth, optional argument of ``forward`` and gives the same

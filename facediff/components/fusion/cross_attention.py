@@ -67,14 +67,13 @@ class BidirectionalCrossAttention(Fusion):
         """
         query, needed, rotation = self._constants(audio, mask) if prepared is None else prepared
         normed_motion = self.motion_norm(motion)
-        audio = audio + self.dropout(self.audio_from_motion.attend(query, normed_motion, needed, rotation))
+        heard = self.audio_from_motion.keys_values(normed_motion, rotation)
+        audio = audio + self.dropout(self.audio_from_motion.attend(query, heard, needed))
         enriched = self.enriched_norm(audio)
         motion = motion + self.dropout(self.motion_from_audio(normed_motion, enriched, needed, rotation))
         return audio + motion
 
-    def prepare(
-        self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> FusionConstants:
+    def prepare(self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]) -> FusionConstants:
         """The speech asks the same in every step; what it is answered depends on the motion, and so does F'_a."""
         return self._constants(audio, needed_mask(mask))
 

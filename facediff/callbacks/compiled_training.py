@@ -1,0 +1,85 @@
+"""Training with parts of the network compiled by PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import nn
+
+from facediff.errors import FaceDiffError
+
+
+class CompiledTraining(Callback):
+    """Compiles parts of the network with ``torch.compile`` for the training steps.
+
+    Checkpoints are as without it: parts are compiled in place and keep their names. Validation, previews and whatever
+    comes after training run the parts as they are. Each part is compiled once for all lengths of clips; the first steps
+    wait for that, a minute or so. Losses are the same but for rounding and dropout's draws.
+
+    Args:
+        parts: names of submodules of the system's network, such as ``decoder`` or ``style_encoder``.
+        backend: what compiles, as ``torch.compile`` calls it. The usual one needs a C++ compiler on a processor, and
+            Triton and a C compiler on a GPU.
+    """
+
+    def __init__(self, parts: Sequence[str] = ("fusion", "decoder"), backend: str = "inductor") -> None:
+        self.parts = list(parts)
+        self.backend = backend
+        self._compiled: list[nn.Module] = []
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Look whether anything can be compiled here.
+
+        Raises:
+            FaceDiffError: if a part is not there, or nothing can be compiled on this machine.
+        """
+        known = dict(pl_module.network.named_modules()) if isinstance(pl_module.network, nn.Module) else {}
+        for name in self.parts:
+            if name not in known or not name:
+                there = ", ".join(child for child, _ in pl_module.network.named_children())  # type: ignore[union-attr]
+                raise FaceDiffError(
+                    f'CompiledTraining.parts: the network has no part "{name}"; choose among {there}, or parts of these'
+                )
+        try:
+            torch.compile(_probe, backend=self.backend)(torch.ones(8, device=pl_module.device))
+        except Exception as error:  # what it raises depends on what is missing
+            text = str(getattr(error, "inner_exception", error)).strip()
+            reason = text.splitlines()[0] if text else type(error).__name__
+            raise FaceDiffError(
+                f"CompiledTraining: torch.compile does not work on this machine ({reason}); install a C++ compiler "
+                f"such as g++, or leave the callback away"
+            ) from error
+        self._compiled = [known[name] for name in self.parts]
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Compile; nothing happens before a part is first used."""
+        for part in self._compiled:
+            part.compile(backend=self.backend, dynamic=True)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Sampling runs a part many times on shapes of its own, and would have it compiled for each."""
+        self._undo()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Go on with the compiled parts."""
+        if self._compiled and not trainer.sanity_checking:
+            self.on_train_start(trainer, pl_module)
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the system as it was."""
+        self._undo()
+        self._compiled = []
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Leave the system as it was, also after an interruption."""
+        self.on_fit_end(trainer, pl_module)
+
+    def _undo(self) -> None:
+        for part in self._compiled:
+            part._compiled_call_impl = None
+
+
+def _probe(values: torch.Tensor) -> torch.Tensor:
+    return (values.sin() * 2).sum()

@@ -1,0 +1,29 @@
+"""One page that plays takes with their speech in any browser."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from facediff.export.format import Format
+from facediff.export.options import ExportOptions
+from facediff.takes import Take
+
+
+def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+    """Write an .html file; several takes are shown next to each other."""
+    from facediff.viewer import write_page
+
+    write_page(path, [take if options.speech else replace(take, speech=None) for take in takes])
+
+
+FORMAT = Format(
+    help="a page that plays in any browser, without a server",
+    write=write,
+    then="open it in a browser; `facediff view` has more options",
+    several=True,
+    holds_sound=True,
+    unit="none",
+    ups=(),
+)

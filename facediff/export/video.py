@@ -1,0 +1,95 @@
+"""A video with the speech; several takes side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.export.format import Format
+from facediff.export.options import ExportOptions
+from facediff.takes import Take, metres_per_unit
+
+Frame = npt.NDArray[np.uint8]
+
+
+def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+    """Write an .mp4 with the speech of the first take that has one.
+
+    A take that ends before the longest stays on its last frame.
+
+    Raises:
+        FaceDiffError: if a take has no triangles, or the frame rates differ.
+        MissingExtraError: if what draws or encodes is not installed.
+    """
+    from facediff.render import write_video
+
+    frames = max(len(take.vertices) for take in takes)
+    shown: Iterable[Frame] = drawn_frames(takes, options)
+    if not options.quiet:
+        shown = _bar(shown, f"drawing {path.name}", frames)
+    speaker = next((take for take in takes if take.speech is not None), takes[0])
+    heard = speaker.sound() if options.speech else None
+    write_video(path, shown, speaker.frame_rate, heard, speaker.sample_rate)
+
+
+def drawn_frames(takes: Sequence[Take], options: ExportOptions) -> Iterator[Frame]:
+    """Pictures of takes side by side, one a frame; everything is checked before the first is drawn.
+
+    Faces of one unit are seen by one camera, so that their sizes compare.
+
+    Raises:
+        FaceDiffError: if a take has no triangles, or the frame rates differ.
+    """
+    from facediff.render import Camera, Renderer, side_by_side
+
+    if len({take.frame_rate for take in takes}) > 1:
+        told = ", ".join(f"{take.name} {take.frame_rate:g}" for take in takes)
+        raise FaceDiffError(f"the takes differ in frame rate ({told}); a video has one, so write a video for each")
+    metres = [metres_per_unit(take.unit) for take in takes]
+    camera = None
+    if len(set(metres)) == 1:
+        camera = Camera.framing([take.template for take in takes], view=options.view)
+    renderers = [
+        Renderer(
+            take.triangles,
+            template=take.template,
+            view=options.view,
+            size=options.size,
+            camera=camera,
+            colours=take.colours,
+        )
+        for take in takes
+    ]
+    frames = max(len(take.vertices) for take in takes)
+    motions = [held(take.vertices, frames) for take in takes]
+    return side_by_side(renderers, motions, [take.name for take in takes], footer=options.footer or None)
+
+
+def held(motion: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:
+    """A motion (T, V, 3) that stays on its last frame until there are so many."""
+    missing = frames - len(motion)
+    return motion if not missing else np.concatenate([motion, np.repeat(motion[-1:], missing, axis=0)])
+
+
+def _bar(items: Iterable[Frame], description: str, total: int) -> Iterable[Frame]:
+    try:
+        from tqdm import tqdm
+    except ImportError as error:
+        raise MissingExtraError("tqdm", "train", "a progress bar") from error
+    return tqdm(items, desc=description, total=total, leave=False)
+
+
+FORMAT = Format(
+    help="video with the speech; several takes side by side",
+    write=write,
+    then="any player shows it",
+    several=True,
+    holds_sound=True,
+    unit="none",
+    ups=(),
+    package=("av", "render"),
+)

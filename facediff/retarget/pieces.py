@@ -1,0 +1,101 @@
+"""Separate pieces of a mesh (teeth, eyes, skin), and which piece of another mesh each one is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.retarget.surface import Nearest, Surface, nearest
+from facediff.topology import face_size
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+MOST = 32
+"""As many of the largest pieces are looked at; hair may be thousands."""
+ALIKE = 1.5
+"""Two pieces differ in size by no more than this factor."""
+NEAR = 0.5
+"""Two pieces' centres lie no further apart than this share of the smaller one's size."""
+WELD = 1e-6
+"""Vertices nearer than this share of the mesh's size are one: seams of textures do not part a mesh."""
+
+
+@dataclass(frozen=True, eq=False)
+class Partners:
+    """Where to look for the nearest points of each target vertex.
+
+    Attributes:
+        parts: vertices of the target (N,) and the part of the source on which theirs lie; together all vertices.
+        size: of the source.
+    """
+
+    parts: list[tuple[Indices, Surface]]
+    size: float
+
+    def nearest(self, points: Array, normals: Array) -> Nearest:
+        """The nearest point of each target vertex (Vt, 3) on its part of the source."""
+        count = len(points)
+        corners = np.empty((count, 3), np.int64)
+        weights, where, facing = (np.empty((count, 3)) for _ in range(3))
+        away, cosines = np.empty(count), np.empty(count)
+        for some, surface in self.parts:
+            found = nearest(surface, points[some], normals[some], self.size)
+            corners[some], weights[some], where[some] = found.corners, found.weights, found.points
+            facing[some], away[some], cosines[some] = found.normals, found.distances, found.cosines
+        return Nearest(corners, weights, where, facing, away, cosines)
+
+
+def partners(source: Surface, laid: Surface) -> Partners:
+    """Pair the pieces of a target that lies on a source with the source's.
+
+    Two pieces are partners if each is the other's nearest, they are about as large, and lie about in one place: so
+    lower teeth are not taken for upper ones. What has no partner is looked for on all of the source.
+    """
+    labels = [pieces(surface) for surface in (source, laid)]
+    (centres, sizes, kept), (goals, extents, others) = (
+        _measured(surface, label) for surface, label in zip((source, laid), labels, strict=True)
+    )
+    away = np.linalg.norm(goals[:, None] - centres[None], axis=2)
+    alike = np.abs(np.log(extents[:, None] / sizes[None])) < np.log(ALIKE)
+    fit = np.where(alike & (away < NEAR * np.minimum(extents[:, None], sizes[None])), away, np.inf)
+    parts, left = [], np.ones(len(laid.vertices), bool)
+    for row in range(len(fit)):
+        column = int(fit[row].argmin())
+        if np.isfinite(fit[row, column]) and fit[:, column].argmin() == row:
+            some = np.flatnonzero(labels[1] == others[row])
+            parts.append((some, Surface(source.vertices, source.faces[labels[0][source.faces[:, 0]] == kept[column]])))
+            left[some] = False
+    if left.any():
+        parts.append((np.flatnonzero(left), source))
+    return Partners(parts, source.size)
+
+
+def pieces(surface: Surface) -> Indices:
+    """A label (V,) for each vertex, equal for those that triangles join or that lie in one place."""
+    extent = max(float(np.ptp(surface.vertices, axis=0).max()), np.finfo(float).tiny)
+    _, place = np.unique(np.rint(surface.vertices / (WELD * extent)), axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    faces = place[surface.faces]
+    labels = np.arange(place.max() + 1)
+    while True:
+        least = labels[faces].min(axis=1)
+        new = labels.copy()
+        for corner in range(3):
+            np.minimum.at(new, faces[:, corner], least)
+        new = new[new]
+        if np.array_equal(new, labels):
+            return labels[place]
+        labels = new
+
+
+def _measured(surface: Surface, labels: Indices) -> tuple[Array, Array, Indices]:
+    """Centres (P, 3), sizes (P,) and labels (P,) of the largest pieces that triangles make."""
+    names, counts = np.unique(labels[surface.faces[:, 0]], return_counts=True)
+    names = names[np.argsort(-counts, kind="stable")[:MOST]]
+    points = [surface.vertices[np.unique(surface.faces[labels[surface.faces[:, 0]] == name])] for name in names]
+    centres = np.stack([part.mean(axis=0) for part in points])
+    sizes = np.array([max(face_size(part), np.finfo(float).tiny) for part in points])
+    return centres, sizes, names

@@ -1,0 +1,56 @@
+// Words about the takes and about the page. Names come from files: they are set as text, never as markup.
+
+/** A new element with classes and text. */
+function make(tag, classes, text) {
+  const element = document.createElement(tag);
+  if (classes) element.className = classes;
+  if (text !== undefined) element.textContent = text;
+  return element;
+}
+
+const plain = (word) => word.replaceAll("_", " ");
+
+/** A list of terms and what is said of them. */
+function describe(rows) {
+  const list = make("dl");
+  for (const [term, words] of rows) list.append(make("dt", "", plain(term)), make("dd", "", words));
+  return list;
+}
+
+/** Fill the panel with what is known about each take, and how exact the page is. */
+function fillInformation(place, facts) {
+  for (const take of facts.takes) {
+    const rows = [
+      ["mesh", `${take.vertices} vertices, ${take.triangles} triangles`],
+      ["length", `${facts.frames} frames, ${facts.frameRate} a second`],
+      ...Object.entries(take.metadata),
+    ];
+    place.append(make("h3", "", take.name), describe(rows));
+  }
+  const largest = ((Math.sqrt(3) / 2) * facts.step).toFixed(3);
+  place.append(
+    make("p", "fine", `Positions are rounded to ${facts.step} mm on each axis: no vertex is off by more than ${largest} mm.` +
+      (facts.heat ? ` The heat map shows the distance of each vertex from the truth's, without any alignment.` : ""))
+  );
+}
+
+/** What is said of a take under its name; what was not learned is marked. */
+function captions(take) {
+  const { identity, style, corpus, procedural } = take.metadata;
+  const words = [];
+  if (identity) words.push(`identity ${identity}`);
+  if (style) words.push(`style of ${style}`);
+  const marks = [];
+  if (/synthetic/i.test(corpus ?? "")) marks.push(`corpus: ${corpus}`);
+  if (procedural) marks.push(`procedural: ${procedural}`);
+  return { words: words.join(", "), marks };
+}
+
+/** Buttons that open and close dialogs. */
+function connectDialogs() {
+  for (const button of document.querySelectorAll("[data-opens]")) {
+    const dialog = document.getElementById(button.dataset.opens);
+    button.addEventListener("click", () => dialog.showModal());
+    dialog.addEventListener("click", (event) => event.target === dialog && dialog.close());
+  }
+}

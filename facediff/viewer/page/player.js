@@ -1,0 +1,207 @@
+// Puts the parts together: reads the page's data, follows the clock, and listens to buttons and keys.
+
+const find = (id) => document.getElementById(id);
+const errors = [];
+
+/** Keep an error for scripts, and tell the reader about it. */
+function report(error) {
+  const words = error && error.message ? error.message : String(error);
+  errors.push(words);
+  find("message").textContent = words;
+  find("message").hidden = false;
+}
+
+addEventListener("error", (event) => report(event.error ?? event.message));
+addEventListener("unhandledrejection", (event) => report(event.reason));
+addEventListener("securitypolicyviolation", (event) => report(`refused by the page's policy: ${event.blockedURI}`));
+
+/** One take, ready to be drawn. */
+async function readFace(facts, take) {
+  const positions = new Float32Array(await readBlob(take.template));
+  return {
+    take,
+    template: positions.slice(),
+    positions,
+    normals: new Float32Array(positions.length),
+    faces: new Uint32Array(await readBlob(take.faces)),
+    colours: take.colours === null ? null : new Uint8Array(await readBlob(take.colours)),
+    opening: take.opening === null ? null : new Float32Array(await readBlob(take.opening)),
+    distances: take.compared ? new Float32Array(take.vertices) : null,
+    centre: take.centre,
+    motion: new Motion(facts, take, report),
+  };
+}
+
+class Player {
+  constructor(facts, faces, ramp) {
+    Object.assign(this, { facts, faces });
+    this.wanted = 0;
+    this.shown = -1;
+    this.dirty = true;
+    this.heat = false;
+    this.highest = facts.heat ? facts.heat.highest : 0;
+    this.waiting = [];
+    this.stats = { shown: 0, late: 0, workMs: 0 };
+    this.pace = new Pace(facts.frameRate);
+    this.extent = [0, 1, 2].map((axis) => Math.max(...facts.takes.map((take) => take.extent[axis])));
+    this.clock = new SilentClock(facts.frames / facts.frameRate);
+    this.scene = new Scene(find("view"), faces, ramp);
+    this.camera = new Camera(find("stage"), () => (this.dirty = true));
+    this.panels = new Panels(facts, () => (this.dirty = true));
+    const lines = faces.flatMap(({ opening }, number) => (opening ? [{ values: opening, number }] : []));
+    find("opening").hidden = !lines.length;
+    this.curve = lines.length ? new Curve(find("curve"), find("cursor"), lines, facts, (f) => this.seek(f)) : null;
+  }
+
+  /** Let an audio element be the clock; without it, or if it cannot be played, the machine's clock serves. */
+  async connectSound() {
+    if (this.facts.sound === null) return;
+    const audio = find("sound");
+    audio.addEventListener("error", () => {
+      report("this browser cannot play the page's sound; the picture goes on without");
+      this.clock = new SilentClock(this.facts.frames / this.facts.frameRate);
+    });
+    audio.addEventListener("ended", () => (this.wanted = this.facts.frames - 1));
+    audio.src = URL.createObjectURL(new Blob([await readBlob(this.facts.sound)], { type: "audio/wav" }));
+    this.clock = new SoundClock(audio, this.facts.frameRate);
+  }
+
+  get playing() {
+    return this.clock.playing;
+  }
+
+  async play() {
+    this.pace.start();
+    try {
+      await this.clock.play();
+    } catch (error) {
+      if (error.name !== "AbortError") report(error); // paused before it had begun
+    }
+  }
+
+  pause() {
+    this.wanted = frameAt(this.clock.time, this.facts.frameRate, this.facts.frames);
+    this.clock.pause();
+  }
+
+  toggle() {
+    return this.playing ? this.pause() : this.play();
+  }
+
+  /** Go to a frame; the promise is kept when it is on the screen. */
+  seek(frame) {
+    this.wanted = Math.max(0, Math.min(this.facts.frames - 1, Math.round(frame)));
+    this.clock.seek(this.wanted / this.facts.frameRate);
+    const { wanted } = this;
+    return new Promise((resolve) => this.waiting.push({ wanted, resolve }));
+  }
+
+  /** Steps are taken standing still. */
+  step(frames) {
+    if (this.playing) this.pause();
+    return this.seek(this.wanted + frames);
+  }
+
+  setHeat(on) {
+    this.heat = on && Boolean(this.facts.heat);
+    this.shown = -1; // distances are computed only while they are shown
+    this.panels.showHeat(this.heat, this.highest);
+  }
+
+  tick() {
+    requestAnimationFrame(() => this.tick());
+    const started = performance.now();
+    const { playing } = this;
+    if (playing) this.pace.beat(started);
+    else if (this.moved) this.dirty = true; // in full sharpness
+    this.moved = playing;
+    if (playing) this.wanted = frameAt(this.clock.time, this.facts.frameRate, this.facts.frames);
+    if (this.scene.fresh) this.shown = -1;
+    const changed = this.wanted !== this.shown && this.prepare(this.wanted);
+    if (changed || this.dirty) {
+      this.scene.resize(playing ? this.pace.sharpness : 1);
+      this.scene.draw(this.panels.rectangles(), this.camera, this.extent, this.heat ? this.highest : 0);
+      this.dirty = false;
+    }
+    if (changed) {
+      this.stats.shown += 1;
+      this.stats.workMs += (performance.now() - started - this.stats.workMs) / Math.min(this.stats.shown, 30);
+    }
+    this.panels.showState(this);
+    this.waiting = this.waiting.filter(({ wanted, resolve }) => {
+      const done = wanted === this.shown || this.wanted !== wanted;
+      if (done) resolve(this.shown);
+      return !done;
+    });
+  }
+
+  /** Bring a frame of every take to the graphics card; false while one is still being unpacked. */
+  prepare(frame) {
+    const steps = this.faces.map((face) => face.motion.at(frame));
+    if (steps.some((each) => !each)) {
+      this.stats.late += this.playing ? 1 : 0;
+      return false;
+    }
+    this.faces.forEach((face, number) => {
+      place(face.positions, face.template, steps[number], this.facts.step);
+      orient(face.normals, face.positions, face.faces);
+    });
+    this.faces.forEach((face, number) => {
+      if (this.heat && face.distances) {
+        const found = compare(face.distances, face.positions, this.faces[this.facts.truth].positions);
+        this.panels.showError(number, found);
+      }
+      this.scene.upload(number);
+    });
+    this.shown = frame;
+    this.scene.fresh = false;
+    if (this.curve) this.curve.point(frame);
+    return true;
+  }
+}
+
+async function start() {
+  const facts = JSON.parse(find("facts").textContent);
+  const began = performance.now();
+  const player = { current: null };
+  // What scripts and tests may use; frame, time (s) and positions (mm) are those of the picture that is drawn.
+  window.facediff = {
+    format: facts.format,
+    facts,
+    errors,
+    ready: false,
+    get frame() { return player.current ? player.current.shown : -1; },
+    get time() { return player.current ? player.current.shown / facts.frameRate : 0; },
+    get clock() { return player.current ? player.current.clock.time : 0; },
+    get playing() { return Boolean(player.current && player.current.playing); },
+    get stats() { return player.current ? { ...player.current.stats } : {}; },
+    play: () => player.current.play(),
+    pause: () => player.current.pause(),
+    seek: (frame) => player.current.seek(frame),
+    heat: (on) => player.current.setHeat(on),
+    turn: (yaw, pitch) => player.current.camera.turn(yaw, pitch),
+    positions: (take) => player.current.faces[take].positions,
+    distances: (take) => player.current.faces[take].distances,
+  };
+  fillInformation(find("about"), facts);
+  connectDialogs();
+  if (typeof DecompressionStream === "undefined") {
+    throw new Error("this browser is too old for this page: use Chrome or Edge 80, Firefox 113, Safari 16.4 or newer");
+  }
+  if (!document.createElement("canvas").getContext("webgl2")) {
+    throw new Error("this browser has no WebGL 2, or it is switched off: the faces cannot be drawn");
+  }
+  const faces = await Promise.all(facts.takes.map((take) => readFace(facts, take)));
+  const ramp = facts.heat ? new Uint8Array(await readBlob(facts.heat.ramp)) : null;
+  player.current = new Player(facts, faces, ramp);
+  player.current.panels.connect(player.current, ramp);
+  await player.current.connectSound();
+  const drawn = player.current.seek(0);
+  player.current.tick();
+  await drawn;
+  player.current.stats.readyMs = performance.now() - began;
+  window.facediff.ready = true;
+  document.body.classList.add("ready");
+}
+
+start().catch(report);

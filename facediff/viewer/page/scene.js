@@ -1,0 +1,211 @@
+// Drawing in WebGL 2: one canvas, one panel for each take. Lights are far away and fixed to the camera.
+
+const VERTEX_SHADER = `#version 300 es
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+layout(location = 2) in vec3 colour;
+layout(location = 3) in float distance;
+uniform mat4 view, project;
+uniform float highest; // of the heat map in mm; 0 for none
+centroid out vec3 facing, albedo; // at the edge of a triangle, values beyond it would show
+centroid out float heat;
+void main() {
+  facing = mat3(view) * normal;
+  albedo = colour * colour;
+  heat = clamp(distance / max(highest, 1e-6), 0.0, 1.0) * (255.0 / 256.0) + 0.5 / 256.0;
+  gl_Position = project * view * vec4(position, 1.0);
+}`;
+
+// Browsers without a graphics card run this on the processor, so powers are products here and a gamma of 2 serves.
+const FRAGMENT_SHADER = `#version 300 es
+precision highp float;
+centroid in vec3 facing, albedo;
+centroid in float heat;
+uniform float highest;
+uniform sampler2D ramp;
+out vec4 colour;
+
+// A lamp that reaches a little round the edge of the shadow, red light furthest, as it does under skin.
+vec3 lamp(float cosine, vec3 strength, vec3 wrap) {
+  vec3 lit = max((cosine + wrap) / (1.0 + wrap), 0.0);
+  return strength * lit * (1.0 - wrap + wrap * lit); // nearly lit to the power of 1 + wrap
+}
+
+void main() {
+  vec3 normal = normalize(gl_FrontFacing ? facing : -facing);
+  if (highest > 0.0) {
+    float shade = 0.6 + 0.4 * max(dot(normal, vec3(-0.199, 0.448, 0.871)), 0.0);
+    vec3 told = texture(ramp, vec2(heat, 0.5)).rgb;
+    colour = vec4(told * sqrt(shade * (gl_FrontFacing ? 1.0 : 0.4)), 1.0);
+    return;
+  }
+  vec3 light = mix(vec3(0.12, 0.09, 0.08), vec3(0.24, 0.26, 0.30), normal.y * 0.5 + 0.5);
+  light += lamp(dot(normal, vec3(-0.482, 0.525, 0.701)), vec3(0.80, 0.76, 0.70), vec3(0.37, 0.27, 0.25));
+  light += lamp(dot(normal, vec3(0.816, 0.048, 0.576)), vec3(0.14, 0.17, 0.22), vec3(0.62, 0.52, 0.5));
+  light += max(dot(normal, vec3(0.724, 0.434, -0.531)), 0.0) * vec3(0.22, 0.23, 0.26);
+  float shine = max(dot(normal, vec3(-0.261, 0.285, 0.922)), 0.0); // half way between key light and viewer
+  shine *= shine; // 2
+  float wide = shine * shine; // 4
+  wide *= wide; // 8
+  wide *= wide; // 16
+  float narrow = wide * wide; // 32
+  vec3 lit = albedo * light + 0.096 * wide * shine + 0.064 * narrow * narrow;
+  if (!gl_FrontFacing) lit = mix(vec3(0.10, 0.02, 0.015), lit, 0.18); // the hollow of the mouth is dark and warm
+  colour = vec4(sqrt(lit), 1.0);
+}`;
+
+const SKIN = [0.9, 0.745, 0.66];
+/** Pixels of the screen for one of the page, at most: more cannot be told apart in motion, and slows a laptop down. */
+const SHARPEST = 2;
+const COARSEST = 0.4;
+
+class Scene {
+  constructor(canvas, faces, ramp) {
+    this.canvas = canvas;
+    this.gl = canvas.getContext("webgl2", { alpha: true, antialias: true, powerPreference: "high-performance" });
+    if (!this.gl) throw new Error("WebGL 2 is missing");
+    this.faces = faces;
+    this.ramp = ramp;
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+    canvas.addEventListener("webglcontextrestored", () => this.build());
+    this.build();
+  }
+
+  /** Everything on the graphics card. */
+  build() {
+    const gl = this.gl;
+    this.program = link(gl);
+    this.places = {};
+    for (const name of ["view", "project", "ramp", "highest"]) {
+      this.places[name] = gl.getUniformLocation(this.program, name);
+    }
+    this.meshes = this.faces.map((face) => buildMesh(gl, face));
+    if (this.ramp) {
+      gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+      gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, this.ramp.length / 3, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, this.ramp);
+      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+      for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) {
+        gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+      }
+    }
+    this.fresh = true; // buffers are empty: upload before drawing
+  }
+
+  upload(number) {
+    const gl = this.gl;
+    const face = this.faces[number], mesh = this.meshes[number];
+    for (const name of ["positions", "normals", "distances"]) {
+      if (!face[name]) continue;
+      gl.bindBuffer(gl.ARRAY_BUFFER, mesh[name]);
+      gl.bufferSubData(gl.ARRAY_BUFFER, 0, face[name]);
+    }
+  }
+
+  /** Fit the canvas to its place on the page, in full sharpness or in the part of it that this machine manages. */
+  resize(sharpness) {
+    const scale = Math.min(devicePixelRatio || 1, SHARPEST) * sharpness;
+    const width = Math.max(1, Math.round(this.canvas.clientWidth * scale));
+    const height = Math.max(1, Math.round(this.canvas.clientHeight * scale));
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+  }
+
+  /**
+   * Draw all takes.
+   *
+   * Args: rectangles in shares of the canvas (left, top, width, height), one a take; the camera; the extent that all
+   * share, so that they appear at one scale; the heat map's end in mm, or 0 for none.
+   */
+  draw(rectangles, camera, extent, highest) {
+    const gl = this.gl;
+    if (gl.isContextLost()) return;
+    gl.useProgram(this.program);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.enable(gl.DEPTH_TEST);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.uniform1i(this.places.ramp, 0);
+    this.faces.forEach((face, number) => {
+      const [left, top, width, height] = rectangles[number];
+      const x = Math.round(left * this.canvas.width), w = Math.round(width * this.canvas.width);
+      const h = Math.round(height * this.canvas.height), y = this.canvas.height - Math.round(top * this.canvas.height) - h;
+      if (w < 1 || h < 1) return;
+      gl.viewport(x, y, w, h);
+      gl.scissor(x, y, w, h);
+      const { view, project } = camera.matrices(face.centre, extent, w / h);
+      gl.uniformMatrix4fv(this.places.view, false, view);
+      gl.uniformMatrix4fv(this.places.project, false, project);
+      gl.uniform1f(this.places.highest, face.distances ? highest : 0);
+      gl.bindVertexArray(this.meshes[number].array);
+      gl.vertexAttrib3f(2, ...SKIN);
+      gl.vertexAttrib1f(3, 0);
+      gl.drawElements(gl.TRIANGLES, face.faces.length, gl.UNSIGNED_INT, 0);
+    });
+    gl.disable(gl.SCISSOR_TEST);
+  }
+}
+
+/** Fewer pixels while a machine cannot keep up with the motion; a standing picture is always sharp. */
+class Pace {
+  constructor(rate) {
+    this.slow = 1.3 * Math.max(1000 / rate, 1000 / 60);
+    this.sharpness = 1;
+    this.start();
+  }
+
+  /** The next play may be quicker than the last. */
+  start() {
+    this.sharpness = Math.min(1, this.sharpness / 0.75);
+    this.last = this.mean = this.count = 0;
+  }
+
+  /** Take note of a moment at which a picture may be drawn. */
+  beat(now) {
+    if (this.last && now - this.last < 1000) { // longer: the page was hidden
+      this.count += 1;
+      this.mean += (now - this.last - this.mean) / Math.min(this.count, 10);
+    }
+    this.last = now;
+    if (this.count < 12 || this.mean < this.slow) return;
+    this.sharpness = Math.max(COARSEST, this.sharpness * 0.75);
+    this.count = this.mean = 0;
+  }
+}
+
+function link(gl) {
+  const program = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+    const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
+    throw new Error(`the shaders do not compile: ${logs.join(" ")}${gl.getProgramInfoLog(program)}`);
+  }
+  return program;
+}
+
+function buildMesh(gl, face) {
+  const mesh = { array: gl.createVertexArray() };
+  gl.bindVertexArray(mesh.array);
+  const attribute = (place, size, kind, normalised, data, usage) => {
+    const buffer = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, data, usage);
+    gl.enableVertexAttribArray(place);
+    gl.vertexAttribPointer(place, size, kind, normalised, 0, 0);
+    return buffer;
+  };
+  mesh.positions = attribute(0, 3, gl.FLOAT, false, face.positions, gl.DYNAMIC_DRAW);
+  mesh.normals = attribute(1, 3, gl.FLOAT, false, face.normals, gl.DYNAMIC_DRAW);
+  if (face.colours) attribute(2, 3, gl.UNSIGNED_BYTE, true, face.colours, gl.STATIC_DRAW);
+  if (face.distances) mesh.distances = attribute(3, 1, gl.FLOAT, false, face.distances, gl.DYNAMIC_DRAW);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.faces, gl.STATIC_DRAW);
+  gl.bindVertexArray(null);
+  return mesh;
+}

@@ -1,0 +1,91 @@
+"""Training with compiled parts is training without, and leaves no trace in checkpoints."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import lightning.pytorch as pl
+import pytest
+
+from facediff.callbacks import CompiledTraining
+from facediff.errors import FaceDiffError
+from facediff.systems import DualPathDiffusion
+from tests.fakes.tiny import Tiny
+
+MakeSystem = Callable[..., DualPathDiffusion]
+MakeTrainer = Callable[..., pl.Trainer]
+ROOT = Path(__file__).parents[2]
+
+
+PROGRAM = """
+import json, sys
+from functools import partial
+import lightning.pytorch as pl
+import torch
+from facediff import registry
+from facediff.callbacks import CompiledTraining
+from facediff.systems import DualPathDiffusion
+from tests.fakes.tiny import SEEN, VERTICES, Tiny
+
+torch.set_num_threads(1)
+calls = []
+
+def backend(graph, _):
+    calls.append(len(list(graph.graph.nodes)))
+    return graph.forward
+
+def train(*callbacks):
+    torch.manual_seed(0)
+    system = DualPathDiffusion(
+        n_vertices=VERTICES, identities=SEEN, frame_rate=25.0, dim=16, diffusion_steps=40,
+        audio_encoder=partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0),
+        style_encoder=partial(registry.style_encoder.tcn_gru_transformer, num_layers=1, dropout=0.0),
+        fusion=partial(registry.fusion.cross_attention, dropout=0.0),
+        decoder=partial(registry.decoder.style_transformer, num_layers=1, dropout=0.0),
+        sampler=partial(registry.sampler.ddim, steps=2),
+    )
+    trainer = pl.Trainer(accelerator="cpu", devices=1, max_epochs=1, logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False, callbacks=list(callbacks), log_every_n_steps=1)
+    trainer.fit(system, datamodule=Tiny(root=sys.argv[1], max_frames_per_batch=60))
+    left = [name for name, part in system.named_modules() if part._compiled_call_impl is not None]
+    weights = {name: value.double().sum().item() for name, value in system.state_dict().items()}
+    return float(trainer.callback_metrics["train/loss"]), weights, left
+
+plain = train()
+assert not calls
+found = train(CompiledTraining(backend=backend))
+print(json.dumps([plain, found, calls]))
+"""
+
+
+def test_losses_weights_and_names_are_those_without(tiny_root: Path) -> None:
+    # In a process of its own, without the checks of shapes, which cannot be traced.
+    command = [sys.executable, "-c", PROGRAM, tiny_root]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    plain, found, calls = json.loads(done.stdout.splitlines()[-1])
+    assert max(calls) > 20  # the decoder was compiled, not the probe alone
+    assert len(calls) <= 5  # once for all lengths
+    assert found[0] == pytest.approx(plain[0], rel=1e-4)
+    assert list(found[1]) == list(plain[1])
+    assert found[1] == pytest.approx(plain[1], rel=1e-3, abs=1e-2)
+    assert found[2] == []
+
+
+def test_a_machine_that_cannot_compile_is_told(make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny) -> None:
+    def backend(*_: object) -> Callable[..., object]:
+        raise RuntimeError("No working C++ compiler found")
+
+    trainer = make_trainer(callbacks=[CompiledTraining(backend=backend)])  # type: ignore[arg-type]
+    with pytest.raises(FaceDiffError, match=r"does not work on this machine \(.*C\+\+ compiler.*install a C\+\+ comp"):
+        trainer.fit(make_system(), datamodule=tiny)
+
+
+def test_a_part_that_is_not_there_is_named(make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny) -> None:
+    trainer = make_trainer(callbacks=[CompiledTraining(parts=["decoders"])])
+    with pytest.raises(FaceDiffError, match=r'no part "decoders"; choose among .*fusion, .*decoder'):
+        trainer.fit(make_system(), datamodule=tiny)

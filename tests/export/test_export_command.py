@@ -1,0 +1,70 @@
+"""``facediff export`` from words to files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import trimesh
+
+from facediff.cli import main
+from facediff.export import FORMATS
+from facediff.takes import Take, write_archive
+
+
+def test_an_archive_needs_no_further_options(take: Take, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_archive(tmp_path / "in.npz", take)
+    assert main(["export", str(tmp_path / "in.npz"), "-o", str(tmp_path / "out" / "a.glb")]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith(f"{tmp_path / 'out' / 'a.glb'}: ")
+    assert said[1].startswith(f"{tmp_path / 'out' / 'a.wav'}: ")
+    assert "Import > glTF" in said[2]
+    assert len(said) == 3
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"a.glb", "a.wav"}
+
+
+def test_a_bare_array_is_completed_by_options(take: Take, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "x.npy", take.vertices.reshape(40, -1))
+    trimesh.Trimesh(take.template, take.triangles, process=False).export(tmp_path / "face.ply")
+    soundfile.write(tmp_path / "x.wav", np.zeros(44_100), 44_100)
+    words = ["export", str(tmp_path / "x.npy"), "-o", str(tmp_path / "out.obj"), "--frame-rate", "30", "--unit", "m"]
+    words += ["--mesh", str(tmp_path / "face.ply"), "--speech", str(tmp_path / "x.wav")]
+    assert main([*words, "--output-unit", "cm", "--up", "z"]) == 0
+    assert "42 files" in capsys.readouterr().out
+    mesh = trimesh.load(tmp_path / "out_obj" / "out_0005.obj", process=False, maintain_order=True)
+    x, y, z = take.vertices[5].T
+    np.testing.assert_allclose(mesh.vertices, np.stack([x, -z, y], 1) * 100, atol=1e-5)
+    assert soundfile.info(tmp_path / "out_obj" / "out.wav").duration == pytest.approx(40 / 30, abs=1e-3)
+    assert main([*words, "--no-speech"]) == 0
+    assert not (tmp_path / "out_obj" / "out.wav").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["a.npz", "-o", "a.fbx"], 'there is no format ".fbx"'),
+        (["a.npz", "-o", "a.csv"], "give --shapes"),
+        (["a.npz", "-o", "a.glb", "--shapes", "."], "--shapes: is for weights; write .csv"),
+        (["a.npz", "-o", "a.npy"], "a.npz: no such file"),
+        (["a.npz", "-o", "a.mp4", "--up", "z"], ".mp4 holds no axes"),
+    ],
+)
+def test_refusals_are_one_sentence(
+    words: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", *words]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert sentence in said.err
+    assert len(said.err.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_help_lists_the_formats(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["export", "--help"])
+    said = capsys.readouterr().out
+    assert all(f"  {suffix} " in said and made.help in said for suffix, made in FORMATS.items())

@@ -1,0 +1,236 @@
+"""A .glb read back by pygltflib and trimesh, and held against the rules of the glTF 2.0 specification."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pygltflib
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from facediff.errors import FaceDiffError
+from facediff.export import ExportOptions, write_takes
+from facediff.export.morph import compress
+from facediff.takes import Take
+
+COMPONENTS = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3}
+
+
+class Reader:
+    """Values of accessors, and the animated vertices as the specification defines them."""
+
+    def __init__(self, path: Path) -> None:
+        self.gltf = pygltflib.GLTF2().load(str(path))
+        self.blob = self.gltf.binary_blob()
+        self.primitive = self.gltf.meshes[0].primitives[0]
+
+    def values(self, index: int) -> npt.NDArray[Any]:
+        accessor = self.gltf.accessors[index]
+        view = self.gltf.bufferViews[accessor.bufferView]
+        start = view.byteOffset + (accessor.byteOffset or 0)
+        width = WIDTHS[accessor.type]
+        flat = np.frombuffer(self.blob, COMPONENTS[accessor.componentType], accessor.count * width, start)
+        return flat.reshape(-1, width) if width > 1 else flat
+
+    @property
+    def sampler(self) -> pygltflib.AnimationSampler:
+        return self.gltf.animations[0].samplers[0]
+
+    @property
+    def times(self) -> npt.NDArray[np.float32]:
+        return self.values(self.sampler.input)
+
+    @property
+    def weights(self) -> npt.NDArray[np.float32]:
+        return self.values(self.sampler.output).reshape(len(self.times), -1)
+
+    def at(self, time: float, attribute: str = "POSITION") -> npt.NDArray[np.float64]:
+        """The attribute at a time, by the linear sampler of section 3.11 and the morphing of section 3.7.2.2."""
+        assert self.sampler.interpolation == "LINEAR"
+        after = min(int(np.searchsorted(self.times, time)), len(self.times) - 1)
+        before = max(after - 1, 0)
+        span = float(self.times[after]) - float(self.times[before])
+        share = np.clip((time - float(self.times[before])) / span, 0, 1) if span else 0.0
+        weights = (1 - share) * self.weights[before].astype(float) + share * self.weights[after].astype(float)
+        weights = np.clip(weights, 0, 1)  # as Blender does
+        made = self.values(getattr(self.primitive.attributes, attribute)).astype(float)
+        for weight, target in zip(weights, self.primitive.targets, strict=True):
+            index = target[attribute] if isinstance(target, dict) else getattr(target, attribute)
+            made = made + weight * self.values(index)
+        return made
+
+
+@pytest.mark.parametrize("unit", ["m", "mm", "normalised (about 185 mm)"])
+def test_every_vertex_of_every_frame_comes_back_at_its_time(
+    make_take: Callable[..., Take], tmp_path: Path, unit: str
+) -> None:
+    take = make_take(unit=unit)
+    metres = {"m": 1.0, "mm": 0.001}.get(unit, 0.185)
+    write_takes(tmp_path / "a.glb", [take])
+    reader = Reader(tmp_path / "a.glb")
+    np.testing.assert_array_equal(reader.times, (np.arange(40) / 30).astype(np.float32))
+    assert reader.weights.min() >= 0
+    assert reader.weights.max() <= 1
+    for index in range(40):
+        distance = np.linalg.norm(reader.at(float(reader.times[index])) - take.vertices[index] * metres, axis=-1)
+        assert distance.max() <= 0.05e-3
+    between = (take.vertices[6] + take.vertices[7]) / 2 * metres
+    assert np.linalg.norm(reader.at(6.5 / 30) - between, axis=-1).max() <= 0.05e-3
+
+
+def test_few_shapes_are_enough_for_a_motion_of_few_shapes(take: Take, tmp_path: Path) -> None:
+    write_takes(tmp_path / "a.glb", [take], ExportOptions(tolerance_mm=0.001))
+    reader = Reader(tmp_path / "a.glb")
+    assert len(reader.primitive.targets) == 10  # two halves of each of five components
+    assert reader.gltf.meshes[0].extras["targetNames"] == [f"shape_{index:04d}" for index in range(10)]
+    np.testing.assert_allclose(reader.values(reader.primitive.attributes.POSITION), take.template)
+
+
+def test_a_motion_that_cannot_be_compressed_gets_a_target_for_every_frame(
+    make_take: Callable[..., Take], tmp_path: Path
+) -> None:
+    noise = np.random.default_rng(1).normal(0, 0.01, (9, 162, 3))
+    template = make_take().template
+    take = make_take(vertices=(template + noise).astype(np.float32))
+    write_takes(tmp_path / "a.glb", [take])
+    reader = Reader(tmp_path / "a.glb")
+    assert len(reader.primitive.targets) == 9
+    np.testing.assert_array_equal(reader.weights, np.eye(9))
+    for index in range(9):
+        np.testing.assert_allclose(reader.at(index / 30), take.vertices[index], atol=1e-7)
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_short_and_still_takes(make_take: Callable[..., Take], tmp_path: Path, frames: int) -> None:
+    moving, still = make_take(), make_take().template
+    for name, vertices in {"moving": moving.vertices[:frames], "still": np.stack([still] * frames)}.items():
+        write_takes(tmp_path / f"{name}.glb", [make_take(vertices=vertices)])
+        reader = Reader(tmp_path / f"{name}.glb")
+        for index in range(frames):
+            np.testing.assert_allclose(reader.at(index / 30), vertices[index], atol=1e-7)
+
+
+def test_the_file_keeps_the_rules_of_the_specification(take: Take, tmp_path: Path) -> None:
+    write_takes(tmp_path / "a.glb", [take])
+    data = (tmp_path / "a.glb").read_bytes()
+    magic, version, length, json_length, json_kind = struct.unpack_from("<4sIII4s", data)
+    binary_length, binary_kind = struct.unpack_from("<I4s", data, 20 + json_length)
+    assert (magic, version, length, json_kind, binary_kind) == (b"glTF", 2, len(data), b"JSON", b"BIN\0")
+    assert json_length % 4 == binary_length % 4 == 0
+    document = json.loads(data[20 : 20 + json_length])
+    assert document["buffers"] == [{"byteLength": binary_length}]
+    assert 28 + json_length + binary_length == length
+    reader, end = Reader(tmp_path / "a.glb"), 0
+    for accessor, view in zip(document["accessors"], document["bufferViews"], strict=True):
+        size = np.dtype(COMPONENTS[accessor["componentType"]]).itemsize * WIDTHS[accessor["type"]] * accessor["count"]
+        assert view["byteOffset"] % 4 == 0
+        assert view["byteOffset"] >= end
+        assert view["byteLength"] == size
+        end = view["byteOffset"] + size
+        if "min" in accessor:
+            values = reader.values(accessor["bufferView"]).reshape(accessor["count"], -1)
+            assert accessor["min"] == values.min(0).tolist()
+            assert accessor["max"] == values.max(0).tolist()
+    assert end <= binary_length
+    (primitive,) = document["meshes"][0]["primitives"]
+    attributes = [*primitive["attributes"].values(), *(i for target in primitive["targets"] for i in target.values())]
+    views = document["bufferViews"]
+    assert {views[index]["target"] for index in attributes} == {34962}
+    assert views[primitive["indices"]]["target"] == 34963
+    animated = document["animations"][0]["samplers"][0]
+    assert "target" not in views[animated["input"]]
+    assert "target" not in views[animated["output"]]
+    assert "min" in document["accessors"][animated["input"]]
+    positions = [primitive["attributes"]["POSITION"], *(target["POSITION"] for target in primitive["targets"])]
+    assert all("min" in document["accessors"][index] for index in positions)
+    assert len(document["meshes"][0]["weights"]) == len(primitive["targets"])
+    assert document["accessors"][animated["output"]]["count"] == 40 * len(primitive["targets"])
+    assert document["asset"]["generator"] == "facediff"
+    assert document["nodes"][0]["extras"] == {
+        "name": "Hello Zoë",
+        "frame_rate": 30.0,
+        "frames": 40,
+        "unit": "m",
+        "metres_per_unit": 1.0,
+        "up": "y",
+        "metadata": {"identity": "Zoë", "style": "F1_e01"},
+        "tolerance_mm": 0.05,
+        "speech": "a.wav",
+    }
+
+
+def test_the_face_is_whole_and_its_colours_are_linear(take: Take, tmp_path: Path) -> None:
+    write_takes(tmp_path / "a.glb", [take])
+    mesh = trimesh.load(tmp_path / "a.glb", process=False, maintain_order=True, force="mesh")
+    np.testing.assert_allclose(mesh.vertices, take.template, atol=1e-8)
+    assert {tuple(sorted(face)) for face in mesh.faces} == {tuple(sorted(face)) for face in take.triangles}
+    share = take.colours / 255  # type: ignore[operator]
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    reader = Reader(tmp_path / "a.glb")
+    np.testing.assert_allclose(reader.values(reader.primitive.attributes.COLOR_0), linear, atol=1e-6)
+
+
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_faces_and_normals_look_outward(make_take: Callable[..., Take], tmp_path: Path, inside_out: bool) -> None:
+    faces = make_take().triangles
+    take = make_take(faces=np.ascontiguousarray(faces[:, ::-1]) if inside_out else faces)
+    write_takes(tmp_path / "a.glb", [take])
+    mesh = trimesh.load(tmp_path / "a.glb", process=False, maintain_order=True, force="mesh")
+    assert mesh.volume > 0
+    reader = Reader(tmp_path / "a.glb")
+    for index in (0, 13, 39):
+        corners = take.vertices[index].astype(float)[faces]
+        true = np.zeros((162, 3))  # area-weighted means of the faces around
+        for corner in range(3):
+            np.add.at(true, faces[:, corner], np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        true /= np.linalg.norm(true, axis=-1, keepdims=True)
+        made = reader.at(index / 30, "NORMAL")
+        made /= np.linalg.norm(made, axis=-1, keepdims=True)
+        angles = np.degrees(np.arccos(np.clip((made * true).sum(-1), -1, 1)))
+        assert np.median(angles) < 2
+    np.testing.assert_allclose(np.linalg.norm(reader.values(reader.primitive.attributes.NORMAL), axis=-1), 1, atol=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    frames=st.integers(1, 14),
+    rank=st.integers(0, 5),
+    noise=st.sampled_from([0.0, 1e-6, 1e-3]),
+    tolerance=st.sampled_from([1e-5, 1e-4]),
+    seed=st.integers(0, 99),
+)
+def test_any_motion_is_within_the_tolerance(frames: int, rank: int, noise: float, tolerance: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    motion = rng.normal(0, 1, (frames, rank)) @ rng.normal(0, 5e-3, (rank, 60)) + rng.normal(0, noise, (frames, 60))
+    offsets = motion.reshape(frames, 20, 3).astype(np.float32)
+    morphs = compress(offsets, tolerance)
+    assert morphs.weights.min() >= 0
+    assert morphs.weights.max() <= 1
+    made = np.tensordot(morphs.weights.astype(float), morphs.shapes.astype(float), axes=1)
+    assert np.linalg.norm(made - offsets, axis=-1).max() <= tolerance * (1 + 1e-3)
+    assert len(morphs.shapes) <= max(frames, 1)
+
+
+def test_more_vertices_than_short_indices_can_count(make_take: Callable[..., Take], tmp_path: Path) -> None:
+    template = np.random.default_rng(0).normal(0, 0.1, (65_600, 3)).astype(np.float32)
+    faces = np.array([[65_599, 0, 65_535]], np.int32)
+    take = make_take(vertices=template[None], template=template, faces=faces, colours=None, speech=None)
+    assert write_takes(tmp_path / "a.glb", [take]) == [tmp_path / "a.glb"]
+    reader = Reader(tmp_path / "a.glb")
+    assert set(reader.values(reader.primitive.indices).tolist()) == {65_599, 0, 65_535}
+    assert reader.primitive.attributes.COLOR_0 is None
+
+
+def test_a_mesh_without_faces_is_refused(make_take: Callable[..., Take], tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="comes without a mesh"):
+        write_takes(tmp_path / "a.glb", [make_take(faces=None)])
+    assert not list(tmp_path.iterdir())

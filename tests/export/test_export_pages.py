@@ -1,0 +1,57 @@
+"""The pages about exporting name what there is, and their commands are understood."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+from facediff.commands.export import parser
+from facediff.export import FORMATS, write_takes
+from facediff.takes import Take
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "docs" / "export.md", *sorted((ROOT / "docs" / "tools").glob("*.md"))]
+COMMANDS = {
+    line
+    for page in PAGES
+    for line in re.findall(r"`(facediff export [^`]*)`|^\$ (facediff export .*)$", page.read_text(), re.MULTILINE)
+    for line in line
+    if line and "-o" in line
+}
+
+
+def test_the_table_of_formats_is_complete() -> None:
+    rows = re.findall(r"^\| `(\.\w+)` \|(.*)\|$", PAGES[0].read_text(), re.MULTILINE)
+    assert [suffix for suffix, _ in rows] == list(FORMATS)
+    for suffix, row in rows:
+        speech = row.split("|")[4]
+        assert ("in it" in speech) == FORMATS[suffix].holds_sound
+        assert ("beside" in speech or "in the folder" in speech) == FORMATS[suffix].sound_beside
+        assert ("y up" in row and "any" not in row) == (FORMATS[suffix].unit == "m")
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_commands_are_understood(command: str) -> None:
+    words = shlex.split(command.partition("#")[0])[2:]
+    args = parser().parse_args(words)
+    assert args.output.suffix in FORMATS or "$" in command
+
+
+def test_links_lead_somewhere() -> None:
+    for page in PAGES:
+        for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+            assert (page.parent / link).exists(), f"{page.name}: {link}"
+
+
+def test_the_picture_is_drawn_from_the_file_alone(take: Take, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_takes(tmp_path / "a.glb", [take])
+    words = [str(tmp_path / "a.glb"), str(tmp_path / "a.png"), "--times", "0", "0.5", "--size", "64"]
+    monkeypatch.setattr(sys, "argv", ["glb_sheet.py", *words])
+    runpy.run_path(str(ROOT / "tools" / "glb_sheet.py"), run_name="__main__")
+    assert cv2.imread(str(tmp_path / "a.png")).shape[1] == 2 * 64 + 6

@@ -1,0 +1,69 @@
+"""Videos read back by PyAV: what is seen and heard, of one take and of several."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.export import ExportOptions, write_takes
+from facediff.takes import Take
+
+SMALL = ExportOptions(size=64)
+
+
+def pictures(path: Path) -> npt.NDArray[np.uint8]:
+    with av.open(str(path)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+
+def test_one_frame_for_every_frame_with_the_speech(take: Take, tmp_path: Path) -> None:
+    assert write_takes(tmp_path / "a.mp4", [take], SMALL) == [tmp_path / "a.mp4"]
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].average_rate == 30
+        sound = container.streams.audio[0]
+        assert float(sound.duration * sound.time_base) == pytest.approx(40 / 30, abs=0.07)
+    seen = pictures(tmp_path / "a.mp4")
+    assert len(seen) == 40
+    assert seen.shape[2] == 64
+    face = seen[0, -64:].astype(int)
+    assert np.abs(face - face[0, 0]).max() > 40, "there is something on the background"
+
+
+def test_no_speech_is_a_silent_video(take: Take, tmp_path: Path) -> None:
+    write_takes(tmp_path / "a.mp4", [take], ExportOptions(size=64, speech=False, footer="synthetic corpus"))
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert not container.streams.audio
+
+
+def test_several_takes_stand_side_by_side_and_wait_for_the_longest(
+    make_take: Callable[..., Take], tmp_path: Path
+) -> None:
+    long, short = make_take(), make_take(vertices=make_take().vertices[:5], name="short")
+    assert write_takes(tmp_path / "a.mp4", [short, long], SMALL) == [tmp_path / "a.mp4"]
+    seen = pictures(tmp_path / "a.mp4").astype(int)
+    assert len(seen) == 40
+    assert seen.shape[2] == 128
+    left, right = seen[:, -64:, :64], seen[:, -64:, 64:]
+    assert np.abs(left[20:] - left[6]).mean() < 1, "the short take stays on its last frame"
+    assert np.abs(right[20:] - right[6]).mean() > np.abs(left[20:] - left[6]).mean()
+
+
+def test_faces_of_one_unit_compare_in_size(make_take: Callable[..., Take], tmp_path: Path) -> None:
+    big = make_take(colours=None)
+    small = make_take(colours=None, vertices=big.vertices / 2, template=big.template / 2)
+    write_takes(tmp_path / "a.mp4", [big, small], SMALL)
+    picture = pictures(tmp_path / "a.mp4")[0, -64:].astype(int)
+    covered = (np.abs(picture - picture[:1, :1]).sum(-1) > 60).reshape(64, 2, 64).sum((0, 2))
+    assert covered[1] < 0.5 * covered[0]
+
+
+def test_takes_of_different_frame_rates_are_refused(make_take: Callable[..., Take], tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match=r"differ in frame rate \(Hello Zoë 30, b 25\)"):
+        write_takes(tmp_path / "a.mp4", [make_take(), make_take(name="b", frame_rate=25.0)], SMALL)
+    assert not list(tmp_path.iterdir())

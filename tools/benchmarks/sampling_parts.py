@@ -1,0 +1,250 @@
+"""A system and a clip to sample for it, and the clocks that time the parts of sampling; used by ``sampling.py``."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import torch
+
+from facediff.components.audio_encoder.hubert import HubertEncoder
+from facediff.components.decoder.style_transformer import StyleTransformer
+from facediff.components.fusion.cross_attention import BidirectionalCrossAttention
+from facediff.components.style_encoder.tcn_gru_transformer import TcnGruTransformer
+from facediff.data import Assets, Batch, Sample, collate
+from facediff.data.audio import samples_for
+from facediff.diffusion.folding import fold
+from facediff.diffusion.samplers import Sampler
+from facediff.systems import DualPathDiffusion
+from facediff.systems.dual_path.network import Conditions, PreparedConditions
+from facediff.systems.dual_path.noise import ClipNoise
+from facediff.systems.dual_path.spaces import SamplingSpace, Space, choose_space
+
+FRAME_RATE = 25.0
+REFERENCE_FRAMES = 100
+IDENTITIES = ["F2", "F3", "F4", "M3", "M4", "M5"]
+SPACES: tuple[SamplingSpace, ...] = ("folded", "vertices")
+
+
+@dataclass
+class Costs:
+    """Seconds that the parts of sampling take; each is the quickest of the repeats.
+
+    Attributes:
+        audio_encoder: speech to features, once a clip.
+        conditions: identity, style and what is prepared of all conditions, once a clip.
+        fold: the products of the linear ends, once a model.
+        look: whether the weights are those that were folded; once a clip.
+        core: fusion and decoder, in every step.
+        core_unprepared: the same without what is prepared once a clip.
+        leave: features to vertices: once a clip where folded, in every step otherwise.
+        rest: undoing the motion scale; once a clip.
+        step: a whole step with the noise that it draws, by sampling space and sampler.
+    """
+
+    audio_encoder: float
+    conditions: float
+    fold: float
+    look: float
+    core: float
+    core_unprepared: float
+    leave: float
+    rest: float
+    step: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def row(self, space: str, sampler: str, steps: int, seconds: float) -> dict[str, Any]:
+        """What one configuration costs: parts, total and real-time factor."""
+        step = self.step[space][sampler]
+        rest = self.rest + (self.look + self.leave if space == "folded" else 0.0)
+        total = self.audio_encoder + self.conditions + steps * step + rest
+        return {
+            "space": space,
+            "sampler": sampler,
+            "steps": steps,
+            "audio_encoder": self.audio_encoder,
+            "conditions": self.conditions,
+            "per_step": step,
+            "all_steps": steps * step,
+            "rest": rest,
+            "total": total,
+            "real_time_factor": total / seconds,
+        }
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A system and one clip to sample for it.
+
+    Attributes:
+        system: the system, in evaluation mode.
+        batch: one clip.
+        repeats: timed repetitions of every part; one more before them warms up.
+    """
+
+    system: DualPathDiffusion
+    batch: Batch
+    repeats: int
+
+    def now(self) -> float:
+        """The time in seconds, once the device has finished what it was given."""
+        if self.system.device.type == "cuda":
+            torch.cuda.synchronize(self.system.device)
+        return time.perf_counter()
+
+    def clock(self, work: Callable[[], object]) -> float:
+        """Seconds that a call takes, with everything that it started on the device."""
+        start = self.now()
+        work()
+        return self.now() - start
+
+    def quickest(self, work: Callable[[], object]) -> float:
+        """Seconds of the quickest of several calls, after one to warm up."""
+        work()
+        return min(self.clock(work) for _ in range(self.repeats))
+
+    def conditions(self) -> PreparedConditions:
+        """Everything that is computed once a clip."""
+        batch, network = self.batch, self.system.network
+        style = self.system.encode_style(batch.reference, batch.reference_mask)
+        found = network.conditions(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.identity, style)
+        return network.prepared(found, self.system.process.steps)
+
+    def once_a_clip(self) -> tuple[float, float]:
+        """Seconds of the audio encoder, and of all other conditions."""
+        encoder = self.system.network.audio_encoder
+        entered: list[float] = []
+        left: list[float] = []
+        hooks = [
+            encoder.register_forward_pre_hook(lambda *_: entered.append(self.now())),
+            encoder.register_forward_hook(lambda *_: left.append(self.now())),
+        ]
+        whole = [self.clock(self.conditions) for _ in range(self.repeats + 1)]
+        for hook in hooks:
+            hook.remove()
+        audio = [end - start for start, end in zip(entered, left, strict=True)]
+        others = [total - part for total, part in zip(whole, audio, strict=True)]
+        return min(audio[1:]), min(others[1:])
+
+    def usual(self) -> tuple[str, int]:
+        """Name and steps of the system's sampler."""
+        return self.system.hparams["sampler"]["class_path"].rpartition(".")[2], self.system.sampler.steps
+
+    def space(self, name: SamplingSpace, sampler: Sampler) -> Space:
+        """A sampling space, with the system's own cache."""
+        return choose_space(self.system.network, name, sampler, self.system._fold_cache)
+
+    def stepper(self, name: SamplingSpace, sampler: Sampler, conditions: Conditions) -> Callable[[], None]:
+        """A call that takes one step of the real loop: prediction, noise, update."""
+        space, batch = self.space(name, sampler), self.batch
+        unit = ClipNoise(batch.names, batch.frame_lengths.tolist(), [0] * len(batch), self.system.device)
+        shape = (*batch.motion.shape[:2], space.width)
+        state = space.noise(unit(torch.empty(shape, device=self.system.device)))
+        scheduler = sampler.make_scheduler()
+        places = iter(scheduler.timesteps.tolist())
+
+        def step() -> None:
+            nonlocal state
+            place = next(places)
+            prediction = space.predict(state, torch.full((1,), place, device=state.device), conditions)
+            state = sampler.advance(scheduler, prediction, place, state, lambda like: space.noise(unit(like)))
+
+        return step
+
+    def in_turn(self, steppers: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+        """Seconds of the quickest step of each, taken in turn after two that warm up."""
+        spent: dict[str, list[float]] = {name: [] for name in steppers}
+        for _ in range(repeats + 2):
+            for name, step in steppers.items():
+                spent[name].append(self.clock(step))
+        return {name: min(times[2:]) for name, times in spent.items()}
+
+    def measure(self, samplers: dict[str, Sampler]) -> Costs:
+        """Time every part."""
+        network, batch = self.system.network, self.batch
+        audio_encoder, others = self.once_a_clip()
+        conditions = self.conditions()
+        bare = Conditions(conditions.audio, conditions.style, conditions.mask)
+        first = next(iter(samplers.values()))
+        step = torch.full((len(batch),), self.system.process.steps // 2, device=self.system.device)
+        entered = torch.randn(*batch.motion.shape[:2], network.embed.out_features, device=self.system.device)
+        decoded = network.core(entered, step, conditions)
+        vertices = network.leave(decoded)
+        maps = network.embed.weight.detach(), network.unembed.weight.detach(), network.unembed.bias.detach()
+        cores = self.in_turn(
+            {
+                "kept": lambda: network.core(entered, step, conditions),
+                "anew": lambda: network.core(entered, step, bare),
+            },
+            self.repeats,
+        )
+        costs = Costs(
+            audio_encoder=audio_encoder,
+            conditions=others,
+            fold=self.clock(lambda: fold(*maps)),
+            look=self.quickest(lambda: self.space("folded", first)),
+            core=cores["kept"],
+            core_unprepared=cores["anew"],
+            leave=self.quickest(lambda: network.leave(decoded)),
+            rest=self.quickest(lambda: vertices / self.system.scale),
+        )
+        costs.step = {space: {} for space in SPACES}
+        for name, sampler in samplers.items():
+            found = self.in_turn({s: self.stepper(s, sampler, conditions) for s in SPACES}, self.repeats)
+            for space, seconds in found.items():
+                costs.step[space][name] = seconds
+        return costs
+
+
+def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool) -> Bench:
+    """The system with random weights, its assets, and one clip of noise as speech."""
+    from transformers import HubertConfig
+
+    torch.manual_seed(0)
+    tiny: dict[str, Any] = {
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+        "hidden_size": 32,
+        "intermediate_size": 64,
+    }
+    tiny |= {"conv_dim": (16,) * 7, "num_conv_pos_embeddings": 16, "num_conv_pos_embedding_groups": 2}
+    config = HubertConfig(**(tiny if tiny_encoder else {})).to_dict()
+    system = DualPathDiffusion(
+        n_vertices=vertices,
+        identities=IDENTITIES,
+        frame_rate=FRAME_RATE,
+        dim=args.dim,
+        audio_encoder=partial(HubertEncoder, config=config),
+        style_encoder=partial(TcnGruTransformer, num_heads=args.heads),
+        fusion=partial(BidirectionalCrossAttention, num_heads=args.heads),
+        decoder=partial(StyleTransformer, num_layers=args.layers, num_heads=args.heads),
+    )
+    system.adopt(
+        Assets(
+            corpus="random weights",
+            synthetic=True,
+            unit="m",
+            frame_rate=FRAME_RATE,
+            identities=IDENTITIES,
+            templates={name: torch.zeros(vertices, 3) for name in IDENTITIES},
+            faces=None,
+            regions={name: torch.arange(3) for name in ("lips", "upper_face")},
+            motion_scale=100.0,
+        )
+    )
+    frames = max(1, round(args.seconds * FRAME_RATE))
+    sample = Sample(
+        audio=torch.randn(samples_for(frames, FRAME_RATE)),
+        motion=torch.zeros(frames, vertices, 3),
+        template=torch.zeros(vertices, 3),
+        identity=0,
+        reference=1e-2 * torch.randn(REFERENCE_FRAMES, vertices, 3),
+        name="speech",
+        subject=IDENTITIES[0],
+        sentence="",
+        reference_name="reference",
+    )
+    return Bench(system.eval().to(args.device), collate([sample]).to(args.device), args.repeats)
