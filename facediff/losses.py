@@ -173,9 +173,10 @@ class _LossesOfLinear(torch.autograd.Function):
         blocks = _Blocks(task, weight, step)
         low = task.low or weight.dtype
         entered, terms = frames.to(low), features.new_zeros(4, dtype=exact_type(features.device))
-        into = torch.zeros_like(frames) if ctx.needs_input_grad[0] else None
-        of_weight = torch.empty_like(weight) if ctx.needs_input_grad[1] else None
-        of_bias = torch.empty_like(bias) if bias is not None and ctx.needs_input_grad[2] else None
+        needed = [task.wanted and each for each in ctx.needs_input_grad]
+        into = torch.zeros_like(frames) if needed[0] else None
+        of_weight = torch.empty_like(weight) if needed[1] else None
+        of_bias = torch.empty_like(bias) if bias is not None and needed[2] else None
         for place, start in enumerate(range(0, len(weight), 3 * step)):
             rows = slice(start, start + 3 * step)
             guess = frames @ weight[rows].T if bias is None else torch.addmm(bias[rows], frames, weight[rows].T)

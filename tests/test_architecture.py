@@ -36,7 +36,7 @@ ALLOWED: dict[str, set[str]] = {
     "render": COMMON,
     "takes": COMMON,
     "export": {"takes", "viewer", "blendshapes", "render", "topology", *COMMON},
-    "viewer": {"takes", *COMMON},
+    "viewer": {"takes", "render", *COMMON},
     "blendshapes": {"takes", "topology", *COMMON},
     "retarget": {"takes", "topology", *COMMON},
     "directing": {"takes", "topology", *COMMON},

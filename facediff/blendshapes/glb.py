@@ -21,7 +21,7 @@ Array = npt.NDArray[np.float64]
 
 MAGIC, JSON_CHUNK, BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 FLOAT = 5126
-INDICES = {5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4")}
+INDICES: dict[int, np.dtype[Any]] = {5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4")}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
 TRIANGLES = 4
 
@@ -124,9 +124,9 @@ class _Glb:
             count: how many there must be; needed where the file need not hold them all (sparse accessors).
         """
         accessor = self.get("accessors", index)
-        kind = np.dtype("<f4") if form == "VEC3" else INDICES.get(accessor["componentType"])
-        told = accessor["count"]
-        if kind is None or accessor["type"] != form or (form == "VEC3" and accessor["componentType"] != FLOAT):
+        kinds: dict[int, np.dtype[Any]] = {FLOAT: np.dtype("<f4")} if form == "VEC3" else INDICES
+        kind, told = kinds.get(accessor["componentType"]), accessor["count"]
+        if kind is None or accessor["type"] != form:
             raise _BadFileError("holds positions or indices of an unknown type; export it without compression")
         if not isinstance(told, int) or told < 0 or (count is not None and told != count):
             raise _BadFileError(f"has a target of {told} vertices where the mesh has {count}; export it anew")

@@ -122,7 +122,8 @@ def _newton(problem: Problem, right: Tensor, free: Tensor) -> Tensor:
     if not problem.coupling:
         return torch.linalg.solve(blocks, right[..., None])[..., 0] * free
     beside = problem.coupling * (free[1:] & free[:-1]).to(right.dtype)
-    solved, factors = torch.empty_like(right), []
+    solved = torch.empty_like(right)
+    factors: list[Tensor] = []
     for t in range(frames):
         block, goal = blocks[t], right[t]
         if t:

@@ -102,7 +102,8 @@ def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integ
     """A third of the area of every triangle around each vertex, (V,)."""
     a, b, c = (np.asarray(vertices, np.float64)[faces[:, corner]] for corner in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
-    return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
+    total: Array = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices)).astype(np.float64)
+    return total
 
 
 def _moving(take: Take, shapes: ShapeSet, options: SolveOptions) -> _Moving:

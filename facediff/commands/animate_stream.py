@@ -37,7 +37,7 @@ def check_stream(args: argparse.Namespace) -> None:
             f"--output {args.output}: a stream is written as .npy, or as raw float32 to standard output with -o -; "
             f"`facediff export` turns the .npy into other formats"
         )
-    whole = ("expressiveness", "blinks", "gaze", "sway", "target_mesh", "unit", "up")
+    whole = ("expressiveness", "blinks", "gaze", "sway", "target_mesh", "output_unit", "up")
     given = next((name for name in whole if getattr(args, name) is not None), None)
     if given is not None or args.takes != 1:
         raise FaceDiffError(

@@ -28,8 +28,8 @@ def parser() -> argparse.ArgumentParser:
         "--shapes",
         type=Path,
         metavar="SHAPES",
-        help="folder of .obj or .ply files named jawOpen, mouthFunnel … with the face at rest as neutral, or a .glb with "
-        "named targets",
+        help="folder of .obj or .ply files named jawOpen, mouthFunnel … with the face at rest as neutral, or a .glb "
+        "with named targets",
     )
     made.add_argument(
         "--carry", action="store_true", help="the shapes are of another topology: carry them over to the take's mesh"
@@ -122,7 +122,8 @@ def shapes_for(take: Take, path: Path, *, carry: bool) -> ShapeSet:
     files = read_shape_files(path)
     if files.neutral is None or files.faces is None:
         raise FaceDiffError(
-            f"{path}: carrying shapes over needs their face at rest with triangles; add it as neutral{files.first.suffix}"
+            f"{path}: carrying shapes over needs their face at rest with triangles; add it as "
+            f"neutral{files.first.suffix}"
         )
     found = correspond(files.neutral, files.faces, take.template, take.triangles)
     deltas = carry_displacements(found, files.shapes - files.neutral)
@@ -150,8 +151,8 @@ def told(weights: Weights, *, plain: bool) -> list[str]:
 
     share, rms = weights.residual_share, weights.residual_rms_mm
     lines = [
-        f"residual: median {np.median(rms):.3g} mm, {np.median(share):.1%} of the motion's {weights.amplitude_mm:.3g} mm; "
-        f"worst frame {int(rms.argmax())} with {rms.max():.3g} mm, {share.max():.1%}"
+        f"residual: median {np.median(rms):.3g} mm, {np.median(share):.1%} of the motion's "
+        f"{weights.amplitude_mm:.3g} mm; worst frame {int(rms.argmax())} with {rms.max():.3g} mm, {share.max():.1%}"
     ]
     if weights.metadata["solve converged"] != "yes":
         lines.append(f"the solve did not converge ({weights.metadata['solve converged']}): look at the residual")

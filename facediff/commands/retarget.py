@@ -76,8 +76,9 @@ def told(take: Take, made: Take, found: Correspondence) -> list[str]:
     millimetres = 1000 * metres_per_unit(made.unit)
     still, unsure = np.count_nonzero(found.share == 0), np.count_nonzero(found.trust < 0.5)
     lines = [
-        f"{len(take.template)} vertices to {len(made.template)}: the meshes lie {np.median(found.distances) * millimetres:.2g}"
-        f" mm apart (median), scale {found.similarity.scale:.4g}, unit {made.unit}",
+        f"{len(take.template)} vertices to {len(made.template)}: the meshes lie "
+        f"{np.median(found.distances) * millimetres:.2g} mm apart (median), scale "
+        f"{found.similarity.scale:.4g}, unit {made.unit}",
         f"{unsure} vertices lie where the source has no like surface and follow their neighbours; {still} lie far from "
         f"it and stand still",
     ]

@@ -41,7 +41,9 @@ def is_free(path: Path) -> bool:
         return True
     try:
         if path.is_dir():
-            return (path / RECORD).is_file() and all(file.is_file() and is_free(file) for file in path.iterdir())
+            files = list(path.iterdir())
+            recorded = not files or (path / RECORD) in files
+            return recorded and all(file.is_file() and is_free(file) for file in files)
         with path.open("rb") as stream:
             return MARK in stream.read(200)
     except OSError as error:

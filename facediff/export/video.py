@@ -66,7 +66,10 @@ def drawn_frames(takes: Sequence[Take], options: ExportOptions) -> Iterator[Fram
     ]
     frames = max(len(take.vertices) for take in takes)
     motions = [held(take.vertices, frames) for take in takes]
-    return side_by_side(renderers, motions, [take.name for take in takes], footer=options.footer or None)
+    # Where nothing else is to be said, the corpora: that one is synthetic must not get lost on the way to a video.
+    corpora = dict.fromkeys(take.metadata["corpus"] for take in takes if "corpus" in take.metadata)
+    footer = options.footer or ", ".join(corpora)
+    return side_by_side(renderers, motions, [take.name for take in takes], footer=footer or None)
 
 
 def held(motion: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:

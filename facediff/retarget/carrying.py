@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from facediff.errors import FaceDiffError
 from facediff.retarget.correspondence import Correspondence
 from facediff.retarget.order import refuse_other_mesh
 from facediff.retarget.smoothing import averaging

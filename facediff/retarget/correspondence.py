@@ -11,7 +11,7 @@ from facediff.errors import FaceDiffError
 from facediff.retarget.pieces import Partners, partners
 from facediff.retarget.placing import place
 from facediff.retarget.smoothing import edges_of, smooth_field
-from facediff.retarget.surface import Nearest, Surface
+from facediff.retarget.surface import Surface
 from facediff.topology import Similarity, align, robust_align
 
 Array = npt.NDArray[np.float64]

@@ -146,7 +146,8 @@ class _Search:
             away = torch.cdist(torch.from_numpy(points[some]), torch.from_numpy(self.centres)).numpy()
             # A centre is on the surface, so the surface is no further away; a triangle is no nearer than its ball.
             limit = away.min(axis=1, keepdims=True) + slack + rounding
-            pairs = np.nonzero(away - self.radii <= limit)
+            point, face = np.nonzero(away - self.radii <= limit)
+            pairs = point.astype(np.int64, copy=False), face.astype(np.int64, copy=False)
             faces[some], weights[some], cosines[some] = self._best_of(points[some], normals[some], pairs, slack)
         return faces, weights, cosines
 

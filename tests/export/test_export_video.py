@@ -12,6 +12,7 @@ import pytest
 
 from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, write_takes
+from facediff.export.video import drawn_frames
 from facediff.takes import Take
 
 SMALL = ExportOptions(size=64)
@@ -39,6 +40,15 @@ def test_no_speech_is_a_silent_video(take: Take, tmp_path: Path) -> None:
     write_takes(tmp_path / "a.mp4", [take], ExportOptions(size=64, speech=False, footer="synthetic corpus"))
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert not container.streams.audio
+
+
+def test_the_corpus_is_named_below(make_take: Callable[..., Take]) -> None:
+    def height(take: Take, footer: str = "") -> int:
+        return len(next(drawn_frames([take], ExportOptions(size=64, footer=footer))))
+
+    bare = height(make_take(metadata={}))
+    assert height(make_take(metadata={"corpus": "puppet (synthetic)"})) > bare
+    assert height(make_take(metadata={}), "synthetic corpus") > bare
 
 
 def test_several_takes_stand_side_by_side_and_wait_for_the_longest(

@@ -59,6 +59,7 @@ def test_refused_before_any_work(tmp_path: Path, name: str, options: dict[str, o
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "folder.glb").mkdir()
     (tmp_path / "foreign_obj").mkdir()
+    (tmp_path / "foreign_obj" / "own.txt").write_text("mine")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(FaceDiffError) as caught:
         check_export(tmp_path / name, ExportOptions(**options))  # type: ignore[arg-type]

@@ -33,7 +33,7 @@ def glb_with_targets(
         binary += data
         return len(gltf["bufferViews"]) - 1
 
-    def accessor(component: int, kind: str, count: int, **more: Any) -> int:
+    def accessor(component: int, kind: str, count: int, **more: object) -> int:
         gltf["accessors"].append({"componentType": component, "type": kind, "count": count, **more})
         return len(gltf["accessors"]) - 1
 

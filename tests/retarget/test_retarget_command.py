@@ -1,4 +1,4 @@
-"""``facediff retarget``: a take on another mesh, the map kept and used again, and what it says when something is wrong."""
+"""``facediff retarget``: a take on another mesh, the map kept and used again, and what is refused."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import trimesh
 from facediff.cli import main
 from facediff.commands.target_mesh import carried
 from facediff.takes import Take, read_archive, write_archive
+
+TARGET = ("--target-mesh", "face.obj")
 
 
 @pytest.fixture
@@ -93,7 +95,7 @@ def test_a_reordered_mesh_is_told(
         (["nan.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "frame 0 holds NaN"),
         (["bare.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "without a mesh"),
         (
-            [*"take.npz --target-mesh face.obj -o o.npz --landmarks l.csv --correspondence take.npz".split()],
+            ["take.npz", *TARGET, "-o", "o.npz", "--landmarks", "l.csv", "--correspondence", "take.npz"],
             "would be used without them",
         ),
     ],

@@ -230,7 +230,8 @@ def test_the_heat_map_is_the_distance_from_the_truth(show: Show) -> None:
 
 @pytest.mark.parametrize(("width", "height", "dark"), [(1280, 800, True), (390, 844, False), (900, 420, False)])
 def test_wide_and_narrow_windows_light_and_dark(show: Show, width: int, height: int, dark: bool) -> None:
-    page = show([clicks(), clicks(name="other")], width=width, height=height, dark=dark)
+    page = show([clicks(), clicks(name="other")], truth=0, width=width, height=height, dark=dark)
+    page.evaluate("(facediff.heat(true), facediff.seek(0))")
     facts = page.evaluate(
         """({
           over: document.documentElement.scrollWidth - innerWidth,

@@ -104,4 +104,4 @@ class Motion {
 }
 
 /** Bytes of unpacked motion that are kept for one take. */
-Motion.MEMORY = 1;
+Motion.MEMORY = 24e6;

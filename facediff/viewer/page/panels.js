@@ -32,7 +32,9 @@ class Panels {
     if (number === this.facts.truth && take.name.toLowerCase() !== "truth") head.append(make("span", "mark", "truth"));
     const { words, marks } = captions(take);
     const error = make("p", "error");
-    box.append(head, make("p", "words", words), ...marks.map((mark) => make("p", "mark", mark)), error);
+    const foot = make("div", "marks"); // below the face: what is procedural or synthetic is said, but hides nothing
+    foot.append(...marks.map((mark) => make("p", "mark", mark)));
+    box.append(head, make("p", "words", words), error, foot);
     const opening = make("span", "value");
     return { box, error, opening };
   }
