@@ -109,6 +109,8 @@ def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integ
 def _moving(take: Take, shapes: ShapeSet, options: SolveOptions) -> _Moving:
     used = np.arange(len(take.template))
     if options.region is not None:
+        if not take.regions:
+            raise FaceDiffError(f"{take.name}: has no regions; give --checkpoint, or leave the region away")
         if options.region not in take.regions:
             raise FaceDiffError(
                 f'{take.name}: has no region "{options.region}"; {choices(options.region, take.regions)}'

@@ -53,9 +53,12 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
             f"--suffix {args.suffix}: a batch writes one file for each recording; choose a suffix that holds it all, "
             f"such as .glb, or .html for several takes"
         )
+    style_template = None if args.style_template is None else Path(args.style_template)
     files = [args.checkpoint, *style_paths(args.style)]
     files += [
-        path for path in (args.target_mesh, args.eyes, args.correspondence) if path is not None and path.is_file()
+        path
+        for path in (args.target_mesh, args.eyes, args.correspondence, style_template)
+        if path is not None and path.is_file()
     ]
     return run_folder(
         recordings(args.speech),
@@ -64,7 +67,7 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
         deciding(words),
         make_worker=make_worker,
         files=files,
-        workers=args.workers,
+        workers=args.workers or (None if args.device == "cpu" else 1),  # one accelerator holds one model
         retry_failed=args.retry_failed,
     )
 

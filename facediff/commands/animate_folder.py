@@ -177,6 +177,8 @@ def run_folder(
         raise FaceDiffError(f"--workers {workers}: expected 1 or more")
     if output.exists() and not output.is_dir():
         raise FaceDiffError(f"--output {output}: is a file; expected a folder, since there are several recordings")
+    if not speeches:
+        raise FaceDiffError("speech: no recording; give some, or a folder of them")
     names = output_names(speeches, suffix)
     recipe = Recipe.of(command, files)
     check_writable(output / names[0])

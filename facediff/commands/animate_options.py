@@ -83,7 +83,9 @@ def add_output_options(made: argparse.ArgumentParser) -> None:
         help="with --target-mesh: .npz to use if it is there, else to write",
     )
     group.add_argument("--shapes", type=Path, metavar="SHAPES", help="for .csv: folder of meshes, or .glb with targets")
-    group.add_argument("--output-unit", metavar="U", help="unit of length of the file: m, cm, mm, in, or metres as a number")
+    group.add_argument(
+        "--output-unit", metavar="U", help="unit of length of the file: m, cm, mm, in, or metres as a number"
+    )
     group.add_argument("--up", choices=["y", "z"], help="axis that points up in the file (default: y)")
     group.add_argument("--no-speech", action="store_true", help="leave the sound away")
     group.add_argument("--view", default="front", choices=VIEWS, help="camera of the video")

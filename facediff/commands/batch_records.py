@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -100,11 +101,11 @@ def difference(record: Mapping[str, Any], speech: Path, output: Path, recipe: Re
 
 
 def _same_speech(known: Mapping[str, Any], speech: Path) -> bool:
-    """By place, size and time; where only the time differs, by the bytes."""
+    """By place, size and time; where place or time differ, by the bytes."""
     facts = _facts(speech)
-    if known.get("path") != facts["path"] or known.get("bytes") != facts.get("bytes"):
-        return False
-    return known.get("modified_ns") == facts.get("modified_ns") or known.get("sha256") == sha256(speech)
+    if all(known.get(name) == value for name, value in facts.items()):
+        return True
+    return speech.is_file() and known.get("bytes") == facts.get("bytes") and known.get("sha256") == sha256(speech)
 
 
 @contextmanager
@@ -137,4 +138,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 def sweep(output: Path) -> None:
     """Remove what a killed run left half-written of an output."""
     for leftover in output.parent.glob(f".{glob.escape(output.stem)}.partial-*"):
-        leftover.unlink(missing_ok=True)
+        if leftover.is_dir():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink(missing_ok=True)

@@ -20,7 +20,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         "facediff blendshapes",
         description="Solve for the weights of blendshapes (ARKit's 52 names) that come nearest to an animation, and "
-        "write them as a table for Live Link's importers; what the table cannot say is in a .json beside it.",
+        "write them as the table that Live Link Face records; what the table cannot say is in a .json beside it.",
     )
     made.add_argument("take", type=Path, nargs="?", metavar="TAKE", help="motion: .npz of `facediff animate`, or .npy")
     made.add_argument("-o", "--output", type=Path, metavar="CSV", help="table to write")

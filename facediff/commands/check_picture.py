@@ -48,7 +48,7 @@ def check_picture_path(path: Path | None) -> None:
     check_writable(path)
 
 
-def write_panels(path: Path, panels: Sequence[Panel], size: int = 288) -> None:
+def write_panels(path: Path, panels: Sequence[Panel], size: int = 272) -> None:
     """Draw faces of one unit beside one another at one scale."""
     from facediff.render import Camera, Renderer, contact_sheet, save_image
 

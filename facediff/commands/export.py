@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from facediff.commands.directing_options import add_directing_options, check_directing, directed
 from facediff.commands.take_options import add_take_options, assets_of, take_of
 from facediff.errors import FaceDiffError
 
@@ -39,6 +40,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--size", type=int, default=512, help="for .mp4: height and width in pixels (default: 512)")
     made.add_argument("--quiet", action="store_true", help="no progress bars")
     add_take_options(made)
+    add_directing_options(made)
     return made
 
 
@@ -60,9 +62,10 @@ def run(name: str, arguments: Sequence[str]) -> int:
         quiet=args.quiet,
     )
     check_export(args.output, options, len(args.takes))
+    check_directing(args)
     if args.shapes is not None and args.output.suffix != ".csv":
         raise FaceDiffError(f"--shapes: is for weights; write .csv instead of {args.output.suffix}, or leave it away")
-    takes = [take_of(path, args) for path in args.takes]
+    takes = [directed(take_of(path, args), args) for path in args.takes]
     for written in write_takes(args.output, takes, options):
         print(f"{written}: {size_of(written)}")
     print(FORMATS[args.output.suffix].then)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facediff.commands.take_options import add_take_options, take_of
+from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
     from facediff.retarget import Correspondence
@@ -52,6 +53,10 @@ def run(name: str, arguments: Sequence[str]) -> int:
     from facediff.commands.target_mesh import carried_with
     from facediff.export import ExportOptions, check_export, write_takes
 
+    if args.output.suffix == ".csv":
+        raise FaceDiffError(
+            f"--output {args.output}: weights need shapes; write .npz, and then use `facediff blendshapes`"
+        )
     check_export(args.output, ExportOptions())
     check_picture_path(args.show)
     take = take_of(args.take, args)

@@ -97,10 +97,8 @@ def closing_of_lids(
             bottom = bottom[::-1]
             lower = lower[::-1]
         width = max(float(np.linalg.norm(np.ptp(edge, axis=0))) for edge in (top, bottom))
-        edge, way = (
-            np.concatenate([upper, lower]),
-            np.concatenate([_ways(top, bottom, width), _ways(bottom, top, width)]),
-        )
+        edge = np.concatenate([upper, lower])
+        way = np.concatenate([_ways(top, bottom, width), _ways(bottom, top, width)])
         way[len(upper) :] *= MEET
         way[: len(upper)] *= 1.0 - MEET
         way[: len(upper), 2] += AHEAD * width * _arch(top)

@@ -135,7 +135,7 @@ def test_shapes_of_another_topology_are_carried(
         (["small.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "1008 vertices and the take's"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--bounds", "1", "0"], "bounds 1 to 0"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--show", "a.jpg"], "expected a picture .png"),
-        (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--region", "lips"], 'no region "lips"'),
+        (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--region", "lips"], "has no regions"),
         (["take.npz", "--write-puppet-shapes", "new"], "leave the take away"),
         (["--write-puppet-shapes", "shapes"], "is there already"),
         (["--write-puppet-shapes", "new", "--identity", "F9"], 'no speaker "F9"; known are'),

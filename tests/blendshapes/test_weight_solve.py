@@ -236,6 +236,8 @@ def test_dependent_and_still_shapes_do_no_harm() -> None:
     assert found.residual_share.max() < 1e-4
     assert found.still == ("tongueOut",)
     assert not found.values[:, -1].any()
+    without = solve(take_of(made, known), more, SolveOptions(smoothness=1e-3, ridge=0))
+    assert without.metadata["solve converged"] == "yes"
     # The ridge chooses the smallest weights: the twins share.
     assert found.values[:, 0] == pytest.approx(found.values[:, 5], abs=1e-3)
 

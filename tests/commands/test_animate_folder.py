@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,12 +12,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from facediff.cli import main
 from facediff.commands.animate_folder import output_names, recordings, run_folder, seed_of_recording
 from facediff.commands.batch_records import alone_in
 from facediff.errors import FaceDiffError
 from facediff.files import atomic
+from facediff.takes import read_archive
 
 ROOT = Path(__file__).parents[2]
 
@@ -139,19 +143,26 @@ def test_only_what_has_changed_is_made_anew(folder: Path, capsys: pytest.Capture
     assert again("--seed", "1")[0] == set()
     os.utime(folder / "a.wav")  # touched, not changed
     assert again("--seed", "1")[0] == set()
+    folder.rename(folder.parent / "elsewhere")
+    shutil.copytree(folder.parent / "elsewhere", folder)  # other times, the same bytes
+    assert again("--seed", "1")[0] == set()
     (folder / "a.wav").write_text("hallo a")  # as long as before
     assert again("--seed", "1")[0] == {"a.npy"}
-    (folder.parent / "out" / "b.npy").write_text("cut")
-    changed, out = again("--seed", "1")
+    out = folder.parent / "out"
+    (out / "b.npy").write_text("cut")
+    (out / ".b.partial-12-ab.npy").write_text("left by a killed run")
+    (out / ".b.partial-folder").mkdir()
+    changed, told = again("--seed", "1")
     assert changed == {"b.npy"}
-    assert "b.npy: is made anew, since the output is gone or damaged" in out
+    assert "b.npy: is made anew, since the output is gone or damaged" in told
+    assert not list(out.glob(".b.*"))
     (folder.parent / "C.ckpt").write_text("other weights")
-    changed, out = again("--seed", "1")
+    changed, told = again("--seed", "1")
     assert changed == set(first)
-    assert "C.ckpt has changed" in out
-    changed, out = again("--seed", "2")
+    assert "C.ckpt has changed" in told
+    changed, told = again("--seed", "2")
     assert changed == set(first)
-    assert "the options have changed" in out
+    assert "the options have changed" in told
 
 
 def test_a_checkpoint_that_is_no_good_stops_at_once(folder: Path) -> None:
@@ -252,3 +263,29 @@ def test_workers_end_with_a_parent_that_is_killed(folder: Path, tmp_path: Path) 
     assert of_the_group() == []
     assert run(folder) == 0
     assert len(outputs(folder)) == 4
+
+
+def test_animate_takes_a_folder(
+    checkpoint: Path, tmp_path: Path, tiny_root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command itself, with a trained system: a recording in a batch is what it is alone with the batch's seed."""
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    for name in ("A_e01", "B_e02"):
+        shutil.copy(tiny_root / "wav" / f"{name}.wav", folder)
+    (folder / "broken.wav").write_text("no sound")
+    words = ["--checkpoint", str(checkpoint), "--sway", "3", "--style", "A_e02:1,B_e02:1", "--seed", "3", "--quiet"]
+    command = ["animate", str(folder), *words, "--suffix", ".npz", "--workers", "1", "-o", str(out)]
+    assert main(command) == 1
+    assert "3 recordings: 2 made, 1 failed" in capsys.readouterr().out
+    seed = seed_of_recording(folder / "A_e01.wav", 3)
+    alone = ["animate", str(folder / "A_e01.wav"), *words, "--seed", str(seed), "-o", str(tmp_path / "alone.npz")]
+    assert main(alone) == 0
+    one, other = read_archive(out / "A_e01.npz"), read_archive(tmp_path / "alone.npz")
+    assert np.array_equal(one.vertices, other.vertices)
+    assert one.metadata == other.metadata
+    assert one.metadata["procedural"] == f"head sway (3 degrees, seed {seed})"
+    assert one.metadata["style"] == "0.5 A_e02 + 0.5 B_e02"
+    capsys.readouterr()
+    assert main(command) == 1
+    assert "3 recordings: 2 up to date, 1 failed" in capsys.readouterr().out

@@ -88,6 +88,7 @@ def test_a_reordered_mesh_is_told(
         (["take.npz", "--target-mesh", "absent.obj", "-o", "o.npz"], "absent.obj"),
         (["take.npz", "--target-mesh", "flat.obj", "-o", "o.npz"], "flat.obj: target mesh: 3 vertices"),
         (["take.npz", "--target-mesh", "face.obj", "-o", "o.xyz"], 'no format ".xyz"'),
+        (["take.npz", "--target-mesh", "face.obj", "-o", "o.csv"], "weights need shapes; write .npz"),
         (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--correspondence", "m.txt"], "ends in .npz"),
         (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--correspondence", "take.npz"], "no correspondence"),
         (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--landmarks", "absent.csv"], "absent.csv"),
