@@ -87,7 +87,7 @@ class Space:
 
     def frames(self, take: Take) -> Iterator[npt.NDArray[np.float32]]:
         """Frame after frame (V, 3), so that a memory map is never read as a whole."""
-        return (self.place(np.asarray(frame)) for frame in take.vertices)
+        return (self.place(np.asarray(frame)) for frame in take.frames())
 
 
 def facts(take: Take, space: Space) -> dict[str, object]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import mmap
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -11,6 +12,9 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.takes.units import metres_per_unit
+
+MAPPED_BYTES = 1 << 26
+"""How much of a memory map is read before its pages are let go."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +94,22 @@ class Take:
             )
         return self.faces
 
+    def frames(self) -> Iterator[npt.NDArray[np.float32]]:
+        """Frame after frame (V, 3); what has been read of a memory map is let go, so that memory stays small."""
+        mapped = self.vertices if isinstance(self.vertices, np.memmap) else None
+        step = max(1, MAPPED_BYTES // max(1, self.vertices[0].nbytes))
+        for start in range(0, len(self.vertices), step):
+            yield from self.vertices[start : start + step]
+            if mapped is not None and mapped.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
+                mapped._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+
     def refuse_not_finite(self) -> None:
         """Look at every frame.
 
         Raises:
             FaceDiffError: naming the first frame that holds NaN or infinity.
         """
-        for index, frame in enumerate(self.vertices):
+        for index, frame in enumerate(self.frames()):
             if not np.isfinite(frame).all():
                 raise FaceDiffError(f"{self.name}: frame {index} holds NaN or infinity; make the motion anew")
 

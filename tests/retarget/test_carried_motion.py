@@ -156,7 +156,7 @@ def test_a_coarser_copy_with_vertices_of_its_own(rig: Rig, faces: np.ndarray) ->
 
     vertices, triangles, _ = finer(rig.neutral, faces, np.zeros((1, len(rig.neutral), 3)))
     vertices, triangles, _ = finer(vertices, triangles, np.zeros((1, len(vertices), 3)))
-    coarse, cut = fast_simplification.simplify(vertices, triangles.astype(np.int32), 0.85)
+    coarse, cut = fast_simplification.simplify(vertices, triangles.astype(np.int32), 0.92)
     coarse = coarse.astype(np.float64)
     source, corners, _ = finer(rig.neutral, faces, np.zeros((1, len(rig.neutral), 3)))
     found = correspond(source, corners, coarse, cut)

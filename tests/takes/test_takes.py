@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,3 +121,23 @@ def test_files_that_are_no_takes(tmp_path: Path) -> None:
 )
 def test_units(unit: str, metres: float) -> None:
     assert metres_per_unit(unit) == pytest.approx(metres)
+
+
+def test_a_motion_larger_than_memory_is_read_without_holding_it(tmp_path: Path) -> None:
+    """In a process of its own, since memory is counted per process: 600 MB are looked at twice."""
+    made = np.lib.format.open_memmap(tmp_path / "large.npy", "w+", np.float32, (2500, 20_000, 3))
+    made[2499, 0, 0] = 1
+    del made
+    program = f"""
+import resource, numpy as np
+from facediff.takes import Take
+from facediff.takes.reading import read_vertices
+vertices = read_vertices(__import__("pathlib").Path({str(tmp_path / "large.npy")!r}))
+take = Take("large", vertices, np.zeros((20_000, 3), np.float32), 25.0)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+take.refuse_not_finite()
+assert sum(float(frame[0, 0]) for frame in take.frames()) == 1
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 200

@@ -32,6 +32,9 @@ async function readFace(facts, take) {
   };
 }
 
+/** A picture stands still when the camera has not moved for so long. */
+const STILL_MS = 200;
+
 class Player {
   constructor(facts, faces, ramp) {
     Object.assign(this, { facts, faces });
@@ -46,7 +49,10 @@ class Player {
     this.extent = [0, 1, 2].map((axis) => Math.max(...facts.takes.map((take) => take.extent[axis])));
     this.clock = new SilentClock(facts.frames / facts.frameRate);
     this.scene = new Scene(find("view"), faces, ramp);
-    this.camera = new Camera(find("stage"), () => (this.dirty = true));
+    this.camera = new Camera(find("stage"), () => {
+      this.dirty = true;
+      this.movedAt = performance.now();
+    });
     this.panels = new Panels(facts, () => (this.dirty = true));
     const lines = faces.flatMap(({ opening }, number) => (opening ? [{ values: opening, number }] : []));
     find("opening").hidden = !lines.length;
@@ -113,13 +119,14 @@ class Player {
     const started = performance.now();
     const { playing } = this;
     if (playing) this.pace.beat(started);
-    else if (this.moved) this.dirty = true; // in full sharpness
-    this.moved = playing;
+    const still = !playing && !(started - this.movedAt < STILL_MS);
+    if (still !== this.still) this.dirty = true; // in another sharpness
+    this.still = still;
     if (playing) this.wanted = frameAt(this.clock.time, this.facts.frameRate, this.facts.frames);
     if (this.scene.fresh) this.shown = -1;
     const changed = this.wanted !== this.shown && this.prepare(this.wanted);
     if (changed || this.dirty) {
-      this.scene.resize(playing ? this.pace.sharpness : 1);
+      this.scene.resize(still ? this.scene.finest : playing ? this.pace.sharpness : 1);
       this.scene.draw(this.panels.rectangles(), this.camera, this.extent, this.heat ? this.highest : 0);
       this.dirty = false;
     }
@@ -187,9 +194,6 @@ async function start() {
   connectDialogs();
   if (typeof DecompressionStream === "undefined") {
     throw new Error("this browser is too old for this page: use Chrome or Edge 80, Firefox 113, Safari 16.4 or newer");
-  }
-  if (!document.createElement("canvas").getContext("webgl2")) {
-    throw new Error("this browser has no WebGL 2, or it is switched off: the faces cannot be drawn");
   }
   const faces = await Promise.all(facts.takes.map((take) => readFace(facts, take)));
   const ramp = facts.heat ? new Uint8Array(await readBlob(facts.heat.ramp)) : null;

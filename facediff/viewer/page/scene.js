@@ -59,11 +59,26 @@ const SKIN = [0.9, 0.745, 0.66];
 const SHARPEST = 2;
 const COARSEST = 0.4;
 
+/** Whether there is WebGL 2, and whether the processor does its work. */
+function graphics() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return { available: false, software: false };
+  const told = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = String(gl.getParameter(told ? told.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return { available: true, software: /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name) };
+}
+
 class Scene {
   constructor(canvas, faces, ramp) {
     this.canvas = canvas;
-    this.gl = canvas.getContext("webgl2", { alpha: true, antialias: true, powerPreference: "high-performance" });
-    if (!this.gl) throw new Error("WebGL 2 is missing");
+    const { available, software } = graphics();
+    if (!available) {
+      throw new Error("this browser has no WebGL 2, or it is switched off: the faces cannot be drawn");
+    }
+    // Without a graphics card soft edges cost as much as all the rest: they are for the picture that stands still.
+    this.finest = software ? 2 : 1;
+    this.gl = canvas.getContext("webgl2", { antialias: !software, powerPreference: "high-performance" });
     this.faces = faces;
     this.ramp = ramp;
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
@@ -102,7 +117,7 @@ class Scene {
     }
   }
 
-  /** Fit the canvas to its place on the page, in full sharpness or in the part of it that this machine manages. */
+  /** Fit the canvas to its place on the page, with so many times the pixels of the screen on each axis. */
   resize(sharpness) {
     const scale = Math.min(devicePixelRatio || 1, SHARPEST) * sharpness;
     const width = Math.max(1, Math.round(this.canvas.clientWidth * scale));
