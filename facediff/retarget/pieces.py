@@ -17,8 +17,8 @@ MOST = 32
 """As many of the largest pieces are looked at; hair may be thousands."""
 ALIKE = 1.5
 """Two pieces differ in size by no more than this factor."""
-NEAR = 0.5
-"""Two pieces' centres lie no further apart than this share of the smaller one's size."""
+NEAR = 1.0
+"""Partners' centres lie no further apart than this share of the smaller one's size."""
 WELD = 1e-6
 """Vertices nearer than this share of the mesh's size are one: seams of textures do not part a mesh."""
 
@@ -51,8 +51,8 @@ class Partners:
 def partners(source: Surface, laid: Surface) -> Partners:
     """Pair the pieces of a target that lies on a source with the source's.
 
-    Two pieces are partners if each is the other's nearest, they are about as large, and lie about in one place: so
-    lower teeth are not taken for upper ones. What has no partner is looked for on all of the source.
+    Partners are about as large and lie about in one place; of all ways to pair, the one with the least distances
+    counts, so that lower teeth are not taken for upper ones. What has no partner is looked for on all of the source.
     """
     labels = [pieces(surface) for surface in (source, laid)]
     (centres, sizes, kept), (goals, extents, others) = (
@@ -60,17 +60,49 @@ def partners(source: Surface, laid: Surface) -> Partners:
     )
     away = np.linalg.norm(goals[:, None] - centres[None], axis=2)
     alike = np.abs(np.log(extents[:, None] / sizes[None])) < np.log(ALIKE)
-    fit = np.where(alike & (away < NEAR * np.minimum(extents[:, None], sizes[None])), away, np.inf)
+    limit = NEAR * np.minimum(extents[:, None], sizes[None])
+    # A place of its own for every piece that finds no partner: relative to the limit, it costs one.
+    cost = np.concatenate([np.where(alike & (away < limit), away / limit, 1e6), np.ones((len(goals),) * 2)], axis=1)
     parts, left = [], np.ones(len(laid.vertices), bool)
-    for row in range(len(fit)):
-        column = int(fit[row].argmin())
-        if np.isfinite(fit[row, column]) and fit[:, column].argmin() == row:
+    for row, column in enumerate(least_pairing(cost)):
+        if column < len(kept):
             some = np.flatnonzero(labels[1] == others[row])
             parts.append((some, Surface(source.vertices, source.faces[labels[0][source.faces[:, 0]] == kept[column]])))
             left[some] = False
     if left.any():
         parts.append((np.flatnonzero(left), source))
     return Partners(parts, source.size)
+
+
+def least_pairing(cost: Array) -> list[int]:
+    """The column of each row, all different, with the least total cost (N, M), N ≤ M.
+
+    Kuhn, "The Hungarian method for the assignment problem", Naval Research Logistics 1955, with shortest augmenting
+    paths: rows come in one by one, and each may move those before it.
+    """
+    rows, columns = cost.shape
+    row_price, column_price = np.zeros(rows), np.zeros(columns)
+    owner = np.full(columns, -1)
+    for new in range(rows):
+        least, before = np.full(columns, np.inf), np.full(columns, -1)
+        done = np.zeros(columns, bool)
+        row, column = new, -1
+        while row >= 0:
+            reach = (least[column] if column >= 0 else 0.0) + cost[row] - row_price[row] - column_price
+            better = ~done & (reach < least)
+            least[better], before[better] = reach[better], column
+            column = int(np.where(done, np.inf, least).argmin())
+            row = int(owner[column])
+            done[column] = True
+        found = least[column]
+        reached = done & (least < found)
+        row_price[new] += found
+        row_price[owner[reached]] += found - least[reached]
+        column_price[reached] -= found - least[reached]
+        while column >= 0:
+            owner[column] = owner[before[column]] if before[column] >= 0 else new
+            column = int(before[column])
+    return [int(np.flatnonzero(owner == row)[0]) for row in range(rows)]
 
 
 def pieces(surface: Surface) -> Indices:

@@ -12,7 +12,7 @@ import torch
 from facediff.topology import face_size
 
 # The exact nearest point of a triangle is the mesh hierarchy's own, and not written a second time.
-from facediff.topology.projection import _closest as closest_on_triangles
+from facediff.topology.projection import closest_on_triangles
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -52,7 +52,8 @@ def read_archive(path: Path) -> Take:
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected a take that `facediff animate … -o take.npz` wrote")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened here, since NumPy leaves a file that it opened itself open where the archive is cut off.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             held = {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise FaceDiffError(f"{path}: not a readable .npz file ({error}); write it anew") from error

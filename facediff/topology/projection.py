@@ -33,7 +33,7 @@ def project(points: Array, coarse: Array, faces: Indices, clusters: Indices) -> 
     point = np.repeat(np.arange(len(points)), count)
     first = np.repeat(np.cumsum(count) - count, count)
     face = around[np.repeat(starts[clusters], count) + np.arange(len(point)) - first]
-    share, square = _closest(points[point], coarse[faces[face]])
+    share, square = closest_on_triangles(points[point], coarse[faces[face]])
     order = np.lexsort((face, square, point))
     found, best = np.unique(point[order], return_index=True)
     best = order[best]
@@ -56,7 +56,7 @@ def _faces_around(faces: Indices, n_vertices: int) -> tuple[Indices, Indices]:
     return np.searchsorted(pairs // len(faces), np.arange(n_vertices + 1)), pairs % len(faces)
 
 
-def _closest(points: Array, triangles: Array) -> tuple[Array, Array]:
+def closest_on_triangles(points: Array, triangles: Array) -> tuple[Array, Array]:
     """The point of each triangle (N, 3, 3) nearest to each point (N, 3): weights (N, 3) and squared distances (N,).
 
     The nearest point lies inside or on an edge: of the foot of the perpendicular, where it is inside, and the nearest

@@ -42,7 +42,7 @@ def write_page(path: Path, takes: Sequence[Take], *, max_mb: float = 30.0, truth
     """Write one self-contained HTML file that plays takes side by side with their speech.
 
     It loads nothing: no script, font or picture from elsewhere; its content security policy forbids it. Positions are
-    rounded by at most 0.0433 mm. It needs a browser with WebGL 2 and ``DecompressionStream``: Chrome or Edge 80,
+    rounded by at most 0.0433 mm. It needs a browser with WebGL 2 and ``DecompressionStream``: Chrome or Edge 111,
     Firefox 113, Safari 16.4 or newer.
 
     Args:
@@ -166,4 +166,4 @@ def safe_json(value: object) -> str:
 
 def read_text(name: str) -> str:
     """A file of the page."""
-    return resources.files("facediff.viewer").joinpath("page", name).read_text(encoding="utf-8")
+    return resources.files("facediff.viewer").joinpath("assets", name).read_text(encoding="utf-8")

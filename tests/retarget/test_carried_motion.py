@@ -217,6 +217,9 @@ def test_a_carried_take_says_what_it_is(take: Take, far_copy: Arrays, found: Cor
     assert made.colours is colours
     assert made.metadata["identity"] == "X"
     assert "1008 vertices" in made.metadata["carried"]
+    # The map serves another identity's take as well.
+    wide = replace(take, template=take.template * [1.1, 1, 1], vertices=take.vertices * [1.1, 1, 1])
+    assert carry(wide, found, Mesh(far_copy[0], far_copy[1].astype(np.int32))).unit == "mm"
     # Lips open as far as those of the source do.
     assert made.inner_lip_pairs is not None
     gaps = [

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
 
-from facediff.retarget.pieces import partners, pieces
+from facediff.retarget.pieces import least_pairing, partners, pieces
 from facediff.retarget.smoothing import averaging, edges_of, smooth_field
 from facediff.retarget.surface import Surface, nearest, vertex_normals
 
@@ -117,3 +119,26 @@ def test_averaging_is_the_mean_of_neighbours_where_trust_is_little() -> None:
         expected = np.zeros(len(trust))
         expected[list(near)] = (1 - trust[vertex]) / len(near)
         assert rows[vertex] == pytest.approx(expected)
+
+
+def test_the_pairing_has_the_least_cost() -> None:
+    """Against every way to pair."""
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        rows = int(rng.integers(1, 5))
+        columns = rows + int(rng.integers(0, 3))
+        cost = rng.integers(0, 6, (rows, columns)) * rng.choice([1.0, 0.37])
+        ways = [cost[np.arange(rows), list(way)].sum() for way in itertools.permutations(range(columns), rows)]
+        found = least_pairing(cost)
+        assert len(set(found)) == rows
+        assert cost[np.arange(rows), found].sum() == pytest.approx(min(ways))
+
+
+def test_pieces_that_moved_towards_one_anothers_places_keep_their_partners() -> None:
+    """The lower of two balls lies nearer to where the upper one was than to its own place."""
+    upper, lower = ball(1, (0, 0.12, 0.5), 0.2), ball(1, (0, -0.03, 0.5), 0.2)
+    source = together(ball(2), upper, lower)
+    laid = Surface(source.vertices + [0, 0.1, 0], source.faces)
+    found = partners(source, laid).nearest(laid.vertices, laid.normals)
+    count = len(lower.vertices)
+    assert (found.corners[-count:] >= len(source.vertices) - count).all()

@@ -168,7 +168,7 @@ def test_other_steps_keep_the_samplers_other_options(make_system: Make) -> None:
     system.choose_sampler(steps=9)
     assert (system.sampler.steps, system.sampler.eta) == (9, 0.7)
     system.choose_sampler("dpm_solver")
-    assert (type(system.sampler).__name__, system.sampler.steps) == ("dpm_solver", 10)
+    assert (type(system.sampler).__name__, system.sampler.steps) == ("dpm_solver", 5)
 
 
 def test_sizes_that_do_not_fit_are_named(make_system: Make, tiny: Tiny) -> None:

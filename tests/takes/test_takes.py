@@ -108,6 +108,9 @@ def test_files_that_are_no_takes(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="not a readable .npz"):
         read_archive(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", x=np.zeros(3))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "b.npz").read_bytes()[:-30])
+    with pytest.raises(FaceDiffError, match="not a readable .npz"):
+        read_archive(tmp_path / "cut.npz")
     with pytest.raises(FaceDiffError, match="has no vertices, template, about"):
         read_archive(tmp_path / "b.npz")
     np.save(tmp_path / "c.npy", np.array([{"a": 1}], object), allow_pickle=True)

@@ -21,6 +21,7 @@ from facediff.render.heat import heat_ramp
 from facediff.takes import Take
 from facediff.viewer import write_page
 from tests.fakes.clicks import FRAMES, OPEN_FRAMES, OPENING, RATE, SAMPLE_RATE, clicks
+from tools.benchmarks.viewer import minute
 
 HOSTILE = '</script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 1">{{facts}}&amp;\u2028'
 
@@ -219,3 +220,10 @@ def test_a_page_above_the_limit_is_refused_with_its_size_and_the_old_one_stays(t
     write_page(tmp_path / "b.html", [random_take(1, frames=900, vertices=99)], max_mb=30)
     told = float(str(error.value).split("would have ")[1].split(" MB")[0])
     assert (tmp_path / "b.html").stat().st_size / 1e6 == pytest.approx(told, abs=0.05)
+
+
+def test_a_minute_of_flames_size_stays_below_the_limit(tmp_path: Path) -> None:
+    take = minute(5023, seconds=6, noise=0.1)  # on every coordinate of every frame: more than models and scans have
+    assert len(take.vertices) == 180
+    write_page(tmp_path / "a.html", [take])
+    assert 10 * (tmp_path / "a.html").stat().st_size < 30e6

@@ -65,7 +65,7 @@ class DpmSolverScheduler:
 
 @sampler.register("dpm_solver")
 class DpmSolverSampler(Sampler):
-    """DPM-Solver++ multistep solver; good results in 10 to 20 steps (Lu et al. 2022).
+    """DPM-Solver++ multistep solver; good results in few steps (Lu et al. 2022).
 
     Args:
         process: the noise process; given by the system.
@@ -78,7 +78,7 @@ class DpmSolverSampler(Sampler):
 
     linear: ClassVar[bool] = True
 
-    def __init__(self, *, process: NoiseProcess, steps: int = 10, order: int = 2) -> None:
+    def __init__(self, *, process: NoiseProcess, steps: int = 5, order: int = 2) -> None:
         super().__init__(process, steps)
         if order not in (1, 2, 3):
             raise FaceDiffError(f"sampler.order: {order} is impossible; choose 1, 2 or 3")

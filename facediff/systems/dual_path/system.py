@@ -27,7 +27,7 @@ from facediff.diffusion import NoiseProcess
 from facediff.diffusion.draws import unit_noise
 from facediff.diffusion.folding import FoldCache
 from facediff.diffusion.samplers import NoiseSource, SamplerFactory
-from facediff.diffusion.samplers.ddim import DdimSampler
+from facediff.diffusion.samplers.dpm_solver import DpmSolverSampler
 from facediff.hparams import describe
 from facediff.systems.base import Progress, SpeechAnimator
 from facediff.systems.dual_path.network import Conditions, DualPathNetwork, TokenForm
@@ -94,7 +94,7 @@ class DualPathDiffusion(SpeechAnimator):
         style_encoder: StyleEncoderFactory = TcnGruTransformer,
         fusion: FusionFactory = BidirectionalCrossAttention,
         decoder: DecoderFactory = StyleTransformer,
-        sampler: SamplerFactory = DdimSampler,
+        sampler: SamplerFactory = DpmSolverSampler,
         sampling_space: SamplingSpace = "folded",
         diffusion_steps: int = 1000,
         noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",

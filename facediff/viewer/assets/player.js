@@ -193,7 +193,7 @@ async function start() {
   fillInformation(find("about"), facts);
   connectDialogs();
   if (typeof DecompressionStream === "undefined") {
-    throw new Error("this browser is too old for this page: use Chrome or Edge 80, Firefox 113, Safari 16.4 or newer");
+    throw new Error("this browser is too old for this page: use Chrome or Edge 111, Firefox 113, Safari 16.4 or newer");
   }
   const faces = await Promise.all(facts.takes.map((take) => readFace(facts, take)));
   const ramp = facts.heat ? new Uint8Array(await readBlob(facts.heat.ramp)) : null;
