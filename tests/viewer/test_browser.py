@@ -273,6 +273,21 @@ def test_names_from_files_cannot_become_scripts_and_nothing_foreign_runs(show: S
     assert page.evaluate("facediff.errors.splice(0).length") == 1
 
 
+def test_one_frame_without_sound_lips_or_colours_outlives_a_lost_graphics_card(show: Show) -> None:
+    take = clicks(speech=False)
+    bare = replace(take, vertices=take.vertices[:1], inner_lip_pairs=None, colours=None, frame_rate=23.976)
+    page = show([bare])
+    assert page.evaluate("document.getElementById('opening').hidden")
+    page.evaluate("window.card = view.getContext('webgl2').getExtension('WEBGL_lose_context'), card.loseContext()")
+    page.wait_for("view.getContext('webgl2').isContextLost()")
+    page.evaluate("card.restoreContext()")
+    page.wait_for("!view.getContext('webgl2').isContextLost()")
+    assert frame_after(page, "facediff.play()") == 0
+    colour = page.evaluate("(facediff.turn(0, 0), new Promise(requestAnimationFrame).then(pixel))")
+    assert colour[3] == 255
+    assert colour[0] > colour[2] > 50  # skin again
+
+
 def test_without_webgl_it_says_so(program: Path, tmp_path: Path) -> None:
     write_page(tmp_path / "a.html", [clicks()])
     with Chromium(program, ["--disable-3d-apis"]) as browser:

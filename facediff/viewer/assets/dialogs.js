@@ -43,7 +43,7 @@ function captions(take) {
   const marks = [];
   if (/synthetic/i.test(corpus ?? "")) marks.push(`corpus: ${corpus}`);
   if (procedural) marks.push(`procedural: ${procedural}`);
-  return { words: words.join(", "), marks };
+  return { words: words.join("\n"), marks };
 }
 
 /** Buttons that open and close dialogs. */
