@@ -229,7 +229,7 @@ class Page:
         end = time.monotonic() + timeout
         while not self.evaluate(f"Boolean({condition})"):
             if time.monotonic() > end:
-                raise BrowserError(f"not in {timeout:g} s: {condition}; {self.problems}")
+                raise BrowserError(f"not in {timeout:g} s: {condition}; {self.problems[:3]}")
             time.sleep(0.03)
 
     def press(self, key: str) -> None:

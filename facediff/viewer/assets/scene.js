@@ -13,7 +13,7 @@ void main() {
   facing = mat3(view) * normal;
   albedo = colour * colour;
   heat = clamp(distance / max(highest, 1e-6), 0.0, 1.0) * (255.0 / 256.0) + 0.5 / 256.0;
-  gl_Position = project * view * vec4(position, 1.0);
+  gl_Position = project * (view * vec4(position, 1.0));
 }`;
 
 // Browsers without a graphics card run this on the processor, so powers are products here and a gamma of 2 serves.
