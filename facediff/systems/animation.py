@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,9 @@ from torch import Tensor
 from facediff.data import Assets, Reference, Sample
 from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
+
+Progress = Callable[[Iterable[int]], Iterable[int]]
+"""Wraps an iteration, e.g. in a progress bar."""
 
 
 @dataclass(frozen=True)

@@ -5,22 +5,47 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from facediff.components.audio_encoder import AudioEncoder
 from facediff.data import Batch
 from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
+from facediff.systems.animation import Progress
 from facediff.systems.windows import Window, WindowPlan
-
-if TYPE_CHECKING:
-    from facediff.systems.base import Progress, SpeechAnimator
 
 QUIETEST = 0.003
 """Standard deviation below which speech is not taken to be louder than it is: noise of a microphone, not speech."""
+
+
+class WindowedSystem(Protocol):
+    """What a system must have to animate long speech; :class:`facediff.systems.performing.Performing` has it."""
+
+    frame_rate: float
+    windows: WindowPlan
+
+    @property
+    def speech_encoder(self) -> AudioEncoder:
+        """The part that hears."""
+        ...
+
+    def style_of(self, batch: Batch) -> Tensor:
+        """Style vectors (batch, style_dim)."""
+        ...
+
+    def perform(self, batch: Batch, *, seed: int = 0) -> Tensor:
+        """Motion (batch, frames, vertices, 3) of whole clips."""
+        ...
+
+    def perform_window(
+        self, clip: Batch, window: Window, seeds: Sequence[int], before: list[Tensor] | None
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Motion (takes, frames, vertices, 3) of a window, and what the next one is handed."""
+        ...
 
 
 class SpeechStream:
@@ -44,7 +69,7 @@ class SpeechStream:
     """
 
     def __init__(
-        self, system: SpeechAnimator, clip: Batch, *, seeds: Sequence[int] = (0,), plan: WindowPlan | None = None
+        self, system: WindowedSystem, clip: Batch, *, seeds: Sequence[int] = (0,), plan: WindowPlan | None = None
     ) -> None:
         self.system = system
         self.seeds = list(seeds)
@@ -202,7 +227,7 @@ def with_speech(clip: Batch, speech: Float[Tensor, " samples"], frames: int) -> 
     )
 
 
-def windowed(system: SpeechAnimator, batch: Batch, seed: int, progress: Progress | None) -> Tensor:
+def windowed(system: WindowedSystem, batch: Batch, seed: int, progress: Progress | None) -> Tensor:
     """Motion of a batch in which some clips are too long to be made at once; the others are made as ever."""
     motion = torch.zeros_like(batch.motion)
     limit = system.windows.above * system.frame_rate
@@ -240,6 +265,3 @@ def ramp(frames: int, like: Tensor) -> Float[Tensor, " frames"]:
     """Share of the new window in each shared frame: 0 at the first, 1 behind the last, smooth at both."""
     share = torch.arange(frames, device=like.device, dtype=like.dtype) / frames
     return share * share * (3 - 2 * share)
-
-
-__all__ = ["Level", "SpeechStream", "Window", "crossfaded", "ramp", "windowed", "with_speech"]

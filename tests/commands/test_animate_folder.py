@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from facediff.cli import main
-from facediff.commands.animate_folder import output_names, recordings, run_folder, seed_of_recording
-from facediff.commands.batch_records import alone_in
+from facediff.commands.animate.folder import output_names, recordings, run_folder, seed_of_recording
+from facediff.commands.animate.records import alone_in
 from facediff.errors import FaceDiffError
 from facediff.files import atomic
 from facediff.takes import read_archive

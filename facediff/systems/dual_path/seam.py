@@ -39,6 +39,3 @@ class Seam:
 def unchanged(features: Tensor) -> Tensor:
     """In place of a seam where there is none."""
     return features
-
-
-__all__ = ["Seam", "unchanged"]

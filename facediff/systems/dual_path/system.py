@@ -29,7 +29,8 @@ from facediff.diffusion.folding import FoldCache
 from facediff.diffusion.samplers import NoiseSource, SamplerFactory
 from facediff.diffusion.samplers.dpm_solver import DpmSolverSampler
 from facediff.hparams import describe
-from facediff.systems.base import Progress, SpeechAnimator
+from facediff.systems.animation import Progress
+from facediff.systems.base import SpeechAnimator
 from facediff.systems.dual_path.network import Conditions, DualPathNetwork, TokenForm
 from facediff.systems.dual_path.noise import ClipNoise, WindowNoise
 from facediff.systems.dual_path.seam import Seam, unchanged

@@ -18,7 +18,8 @@ from facediff.components.style_encoder.lstm import LstmStyle
 from facediff.data import Batch, SpeechMotionDataModule
 from facediff.errors import FaceDiffError
 from facediff.hparams import describe
-from facediff.systems.base import Progress, SpeechAnimator
+from facediff.systems.animation import Progress
+from facediff.systems.base import SpeechAnimator
 from facediff.systems.identity_policy import IdentityPolicy
 from facediff.systems.schedule import Schedule
 from facediff.systems.style_content.decoder import MotionDecoder

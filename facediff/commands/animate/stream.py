@@ -60,7 +60,7 @@ def run_stream(args: argparse.Namespace) -> int:
 
     import torch
 
-    from facediff.commands.performer import Performer
+    from facediff.commands.animate.performer import Performer
 
     performer = Performer(args)
     system = performer.system
@@ -124,7 +124,7 @@ def pcm(source: IO[bytes], rate: int) -> Iterator[npt.NDArray[np.float32]]:
 @contextmanager
 def sink(output: Path, frame: tuple[int, ...]) -> Iterator[Callable[[npt.NDArray[np.float32]], None]]:
     """Where frames (n, V, 3) go: a .npy file that appears when it is whole, or standard output at once."""
-    from facediff.commands.motion_files import MotionWriter
+    from facediff.commands.animate.motion_files import MotionWriter
 
     if str(output) == "-":
 

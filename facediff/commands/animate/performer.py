@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from facediff.commands.animate_options import export_options
+from facediff.commands.animate.options import export_options
 from facediff.commands.directing_options import check_directing, directed
 from facediff.errors import FaceDiffError
 
@@ -62,7 +62,7 @@ class Performer:
         Raises:
             FaceDiffError: if the recording is no good, or a file cannot be written.
         """
-        from facediff.commands.recordings import read_checked
+        from facediff.commands.animate.recordings import read_checked
         from facediff.export import write_takes
 
         speech = read_checked(recording, self.args.max_seconds)
@@ -125,7 +125,7 @@ class Performer:
         import numpy as np
         import torch
 
-        from facediff.commands.motion_files import MotionWriter
+        from facediff.commands.animate.motion_files import MotionWriter
 
         stream = self.system.stream(subject=self.identity, style=self.style, seeds=seeds)
         progress = None if self.args.quiet else partial(bar, description="seconds of speech")

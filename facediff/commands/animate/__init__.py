@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from facediff.commands.animate_options import check, parser
+from facediff.commands.animate.options import check, parser
 from facediff.errors import FaceDiffError
 
 
@@ -14,7 +14,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     """Animate; every input is checked before the model is loaded, and every output appears whole or not at all."""
     args = parser().parse_args(list(arguments))
     if args.stream or [str(path) for path in args.speech] == ["-"]:
-        from facediff.commands.animate_stream import run_stream
+        from facediff.commands.animate.stream import run_stream
 
         if not args.stream:
             raise FaceDiffError("speech: - is standard input; add --stream, and send samples rather than a file")
@@ -23,8 +23,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
         return run_batch(args, list(arguments))
     check(args, args.output)
 
-    from facediff.commands.performer import Performer
-    from facediff.commands.recordings import read_checked
+    from facediff.commands.animate.performer import Performer
+    from facediff.commands.animate.recordings import read_checked
 
     read_checked(args.speech[0], args.max_seconds)  # before the model, which takes longer to load
     written, take = Performer(args).write(args.speech[0], args.output, seed=args.seed)
@@ -42,7 +42,7 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
     Raises:
         FaceDiffError: if nothing can be made at all.
     """
-    from facediff.commands.animate_folder import recordings, run_folder
+    from facediff.commands.animate.folder import recordings, run_folder
     from facediff.commands.style_files import style_paths
     from facediff.export import FORMATS
 
@@ -87,8 +87,8 @@ def deciding(words: Sequence[str]) -> list[str]:
 
 def make_worker(command: list[str]) -> Callable[[Path, Path], None]:
     """What a process of a batch does with each recording; the model is loaded once."""
-    from facediff.commands.animate_folder import seed_of_recording
-    from facediff.commands.performer import Performer
+    from facediff.commands.animate.folder import seed_of_recording
+    from facediff.commands.animate.performer import Performer
 
     args = parser().parse_args(["-", "-o", "-", *command, "--quiet"])
     performer = Performer(args)

@@ -11,8 +11,8 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from facediff.commands.batch_records import Recipe, alone_in, difference, read_record, sweep, write_record
-from facediff.commands.folder_pool import run_tasks
+from facediff.commands.animate.pool import run_tasks
+from facediff.commands.animate.records import Recipe, alone_in, difference, read_record, sweep, write_record
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.files import check_writable
 from facediff.machine import processors
