@@ -208,6 +208,22 @@ def test_a_take_says_how_it_was_made(speech: Path, checkpoint: Path, tmp_path: P
     assert len(take.speech) == 16000
 
 
+def test_half_precision_is_near_and_its_vertices_are_not_rounded(
+    speech: Path, checkpoint: Path, tmp_path: Path
+) -> None:
+    made = []
+    for precision in ("32", "bf16"):
+        path = tmp_path / f"{precision}.npz"
+        assert animate(speech, "--checkpoint", checkpoint, "-o", path, "--precision", precision) == 0
+        made.append(read_archive(path))
+    full, half = (take.vertices - take.template for take in made)
+    assert 0 < np.abs(full - half).max() < 0.1 * np.abs(full).max()
+    assert half.dtype == np.float32
+    # Numbers of bfloat16 have 16 bits of nought at their end.
+    assert (half.view(np.uint32) & 0xFFFF).any()
+    assert made[1].metadata["precision"] == "bfloat16 and float32"
+
+
 def test_long_speech_goes_to_disk_window_by_window(checkpoint: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     speech = write(tmp_path / "long.wav", 0.1 * rng.normal(size=16000 * 13))

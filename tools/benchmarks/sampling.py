@@ -88,6 +88,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--heads", type=int, default=8, help="attention heads (default: 8)")
     parser.add_argument("--repeats", type=int, default=10, help="timed repetitions of every part (default: 10)")
     parser.add_argument("--device", default="cpu", help="cpu (default), cuda …")
+    parser.add_argument("--precision", default="32", choices=["32", "bf16"], help="of the network (default: 32)")
     parser.add_argument("--threads", type=int, help="threads of PyTorch (default: its own choice)")
     parser.add_argument("--tiny-encoder", action="store_true", help="a tiny HuBERT instead of HuBERT base, for trials")
     parser.add_argument("--quick", action="store_true", help="one repetition of every part and no full run")
@@ -115,9 +116,8 @@ def in_full(args: argparse.Namespace, bench: Bench, seconds: float) -> dict[str,
 
 
 @torch.inference_mode()
-def main() -> None:
+def main(args: argparse.Namespace) -> None:
     """Measure and print."""
-    args = options()
     if args.threads:
         torch.set_num_threads(args.threads)
     bench = build(args, args.vertices, tiny_encoder=args.tiny_encoder)
@@ -142,4 +142,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    args = options()
+    with torch.autocast(args.device.partition(":")[0], torch.bfloat16, enabled=args.precision == "bf16"):
+        main(args)

@@ -48,7 +48,8 @@ def heading(args: argparse.Namespace, bench: Bench) -> str:
             f"{torch.get_num_threads()} threads; device {args.device}",
             f"software: Python {platform.python_version()}, {packages}",
             f"model: {args.vertices} vertices, width {args.dim}, {args.layers} blocks, {args.heads} heads, {encoder}; "
-            f"{millions:.1f} million weights, {speech:.1f} of them in the audio encoder; random, float32",
+            f"{millions:.1f} million weights, {speech:.1f} of them in the audio encoder; random, "
+            f"{'bfloat16 between float32 ends' if args.precision == 'bf16' else 'float32'}",
             f"speech: {bench.batch.motion.shape[1] / FRAME_RATE:g} s, {bench.batch.motion.shape[1]} frames; "
             f"the quickest of {args.repeats} after a warm-up",
         ]

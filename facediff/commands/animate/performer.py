@@ -79,10 +79,11 @@ class Performer:
         # On the disk that the result goes to, which is the one that has room for it.
         spool: AbstractContextManager[str | None] = nullcontext() if short else self._folder(output)
         with spool as folder:
-            if folder is None:
-                motions, style = self._at_once(speech, seeds)
-            else:
-                motions, style = self._by_windows(speech, seeds, Path(folder))
+            with self.precision():
+                if folder is None:
+                    motions, style = self._at_once(speech, seeds)
+                else:
+                    motions, style = self._by_windows(speech, seeds, Path(folder))
             yield [
                 self._take(motion, speech, name if len(seeds) == 1 else f"{name}, take {i + 1}", take_seed, style)
                 for i, (motion, take_seed) in enumerate(zip(motions, seeds, strict=True))
@@ -96,6 +97,12 @@ class Performer:
         if self.args.target_mesh is not None:
             take = carried(take, self.args.target_mesh, self.args.correspondence)
         return take
+
+    def precision(self) -> AbstractContextManager[object]:
+        """Within it the network multiplies in the precision asked for; noise and vertices stay as they are."""
+        import torch
+
+        return torch.autocast(self.system.device.type, torch.bfloat16, enabled=self.args.precision == "bf16")
 
     @property
     def footer(self) -> str:
@@ -179,6 +186,7 @@ class Performer:
             else f"{self.identity} (not trained on)",
             "style": style,
             "seed": str(seed),
+            "precision": "bfloat16 and float32" if self.args.precision == "bf16" else "float32",
         }
         return told if sampler is None else {**told, "sampler": f"{type(sampler).__name__}, {sampler.steps} steps"}
 

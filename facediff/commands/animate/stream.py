@@ -72,7 +72,7 @@ def run_stream(args: argparse.Namespace) -> int:
     )
     stream = system.stream(subject=performer.identity, style=performer.style, seeds=[args.seed])
     busy, heard = 0.0, 0
-    with sink(args.output, tuple(template.shape)) as write:
+    with sink(args.output, tuple(template.shape)) as write, performer.precision():
         for samples in pcm(sys.stdin.buffer, args.rate):
             started = time.perf_counter()
             part = stream.feed(torch.from_numpy(samples))
