@@ -100,7 +100,7 @@ def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m
     if files.shapes.shape[1] != len(template):
         raise FaceDiffError(
             f"{files.first}: has {files.shapes.shape[1]} vertices and the take's template {len(template)}; give "
-            f"shapes of that mesh, or carry these over with --carry"
+            f"shapes of that mesh, or carry these over with `facediff blendshapes --carry`"
         )
     goal = np.asarray(template, np.float64)
     size = face_size(goal)

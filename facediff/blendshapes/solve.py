@@ -63,7 +63,7 @@ def solve(take: Take, shapes: ShapeSet, options: SolveOptions | None = None) -> 
     if shapes.deltas.shape[1] != len(take.template):
         raise FaceDiffError(
             f"{take.name}: has {len(take.template)} vertices and the shapes {shapes.deltas.shape[1]}; give shapes of "
-            f"the same mesh, or carry them over with --carry"
+            f"the same mesh, or carry them over with `facediff blendshapes --carry`"
         )
     moving = _moving(take, shapes, options)
     scale = np.sqrt(moving.energy)

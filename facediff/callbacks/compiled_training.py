@@ -35,10 +35,16 @@ class CompiledTraining(Callback):
         Raises:
             FaceDiffError: if a part is not there, or nothing can be compiled on this machine.
         """
-        known = dict(pl_module.network.named_modules()) if isinstance(pl_module.network, nn.Module) else {}
+        network = getattr(pl_module, "network", None)
+        if not isinstance(network, nn.Module):
+            raise FaceDiffError(
+                f"CompiledTraining: {type(pl_module).__name__} has no network whose parts could be compiled; leave the "
+                f"callback away"
+            )
+        known = dict(network.named_modules())
         for name in self.parts:
             if name not in known or not name:
-                there = ", ".join(child for child, _ in pl_module.network.named_children())  # type: ignore[union-attr]
+                there = ", ".join(child for child, _ in network.named_children())
                 raise FaceDiffError(
                     f'CompiledTraining.parts: the network has no part "{name}"; choose among {there}, or parts of these'
                 )

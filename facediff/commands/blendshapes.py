@@ -76,12 +76,14 @@ def solved(args: argparse.Namespace) -> int:
     """Solve for weights and write them."""
     from facediff.blendshapes import ARKIT, SolveOptions, solve, write_live_link, write_weights
     from facediff.commands.check_picture import check_picture_path
+    from facediff.export.place import check_free
     from facediff.files import check_writable
 
     if args.output.suffix.lower() != ".csv":
         raise FaceDiffError(f'--output {args.output}: unknown suffix "{args.output.suffix}"; expected a table .csv')
     for path in (args.output, args.output.with_suffix(".json")):
         check_writable(path)
+    check_free(args.output.with_suffix(".json"))
     check_picture_path(args.show)
     lower, upper = args.bounds or (0.0, 1.0)
     usual = SolveOptions()
@@ -93,6 +95,8 @@ def solved(args: argparse.Namespace) -> int:
         region=args.region,
     )
     take = take_of(args.take, args)
+    if args.show is not None:
+        _ = take.triangles  # refuses before anything is written
     shapes = shapes_for(take, args.shapes, carry=args.carry)
     if args.only_arkit:
         shapes = shapes.only(ARKIT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,8 +103,10 @@ def open_style(path: Path) -> StyleFile:
         return StyleFile(path, take.vertices, take.template, take.frame_rate, take.unit)
     try:
         array: npt.NDArray[np.generic] = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise FaceDiffError(f"--style {path}: not a readable NumPy array ({error})") from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise FaceDiffError(f"--style {path}: holds no array of numbers; expected a motion or a style vector")
     return StyleFile(path, array)
 
 

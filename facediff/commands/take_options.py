@@ -18,7 +18,7 @@ def add_take_options(parser: argparse.ArgumentParser) -> None:
     """Add what completes a motion file; the file's own argument is the command's."""
     group = parser.add_argument_group("what a bare .npy does not say (an .npz of `facediff animate` says it all)")
     group.add_argument("--mesh", type=Path, metavar="FILE", help="neutral face with triangles: .ply, .obj, .glb …")
-    group.add_argument("--checkpoint", type=Path, metavar="C", help="mesh, frame rate and unit from a checkpoint")
+    group.add_argument("--checkpoint", type=Path, metavar="C", help="what is still missing, from a checkpoint")
     group.add_argument(
         "--identity", metavar="NAME", help="whose face in the checkpoint; the first trained on if absent"
     )
@@ -35,21 +35,24 @@ def take_of(path: Path, args: argparse.Namespace) -> Take:
     """
     from facediff.takes import read_take
 
-    take = read_take(path, surroundings(args))
+    take = read_take(path, *surroundings(args))
     take.refuse_not_finite()
     return take
 
 
-def surroundings(args: argparse.Namespace) -> Surroundings:
-    """What the options say."""
+def surroundings(args: argparse.Namespace) -> tuple[Surroundings, Surroundings | None]:
+    """What the options say, which goes before a file; and what a checkpoint lends where nothing else says it."""
     import numpy as np
 
     from facediff.takes.reading import Surroundings
     from facediff.topology import read_mesh
 
     given: dict[str, Any] = {}
+    lent = None
     if args.checkpoint is not None:
-        given |= facts_of(assets_of(args.checkpoint), args.identity)
+        lent = Surroundings(**facts_of(assets_of(args.checkpoint), args.identity))
+        if args.identity is not None:
+            given["template"] = lent.template
     elif args.identity is not None:
         raise FaceDiffError("--identity: names a face of a checkpoint; give --checkpoint as well")
     if args.mesh is not None:
@@ -64,7 +67,7 @@ def surroundings(args: argparse.Namespace) -> Surroundings:
         given["frame_rate"] = args.frame_rate
     if args.unit is not None:
         given["unit"] = args.unit
-    return Surroundings(**given)
+    return Surroundings(**given), lent
 
 
 def assets_of(checkpoint: Path) -> Assets:

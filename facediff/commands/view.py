@@ -19,7 +19,6 @@ EPILOG = """\
 The page is one file that loads nothing from anywhere: mail it, put it on a share, open it by a double click. Takes next
 to each other need one frame rate and one length. A bare .npy borrows what it does not say from the first .npz given,
 if both have equally many vertices."""
-BORROWED = ("template", "faces", "colours", "inner_lip_pairs", "unit", "frame_rate")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -84,22 +83,21 @@ def read_takes(paths: Sequence[Path], args: argparse.Namespace) -> list[Take]:
     """
     from facediff.takes import read_take
 
-    given = surroundings(args)
-    whole = {path: read_take(path, given) for path in paths if path.suffix == ".npz"}
+    given, lent = surroundings(args)
+    whole = {path: read_take(path, given, lent) for path in paths if path.suffix == ".npz"}
     lender = next(iter(whole.values()), None)
-    return [whole[path] if path in whole else read_take(path, completed(path, given, lender)) for path in paths]
+    return [whole[path] if path in whole else read_take(path, given, lent_to(path, lent, lender)) for path in paths]
 
 
-def completed(path: Path, given: Surroundings, lender: Take | None) -> Surroundings:
-    """What is said of an array, the options going before the lender."""
+def lent_to(path: Path, lent: Surroundings | None, lender: Take | None) -> Surroundings | None:
+    """What completes an array: the checkpoint's facts before those of the lender."""
     if lender is None or path.suffix != ".npy":
-        return given
-    from facediff.takes.reading import read_vertices
+        return lent
+    from facediff.takes.reading import Surroundings, read_vertices
 
     if read_vertices(path).shape[1] != len(lender.template):
-        return given
-    lent = {name: getattr(lender, name) for name in BORROWED if getattr(given, name) is None}
-    return replace(given, **lent, regions={**lender.regions, **given.regions})
+        return lent
+    return (lent or Surroundings()).completed(Surroundings.of(lender))
 
 
 def named(takes: Sequence[Take], labels: Sequence[str] | None) -> list[Take]:

@@ -126,6 +126,8 @@ def region_factors(
 def _distances(places: Array, region: npt.NDArray[np.integer], limit: float) -> Array:
     """Distance of every vertex (V,) from the nearest one of a region; beyond ``limit`` it may be infinite."""
     found = np.full(len(places), np.inf)
+    if not len(region):  # as of a face that was carried to a mesh without it
+        return found
     chosen = places[region]
     near = np.flatnonzero(((places > chosen.min(0) - limit) & (places < chosen.max(0) + limit)).all(axis=1))
     for first in range(0, len(near), CHUNK):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.files import atomic
 from facediff.retarget.correspondence import Correspondence
+from facediff.takes.archive import read_entries
 from facediff.topology import Similarity
 
 FORMAT = "facediff correspondence 1"
@@ -26,6 +26,7 @@ ARRAYS = {
     "target_vertices": ("f", 2),
     "target_faces": ("i", 2),
 }
+SIMILARITY = {"rotation": ("f", 2), "translation": ("f", 1), "scale": ("f", 0)}
 
 
 def save_correspondence(path: Path, correspondence: Correspondence) -> None:
@@ -57,14 +58,12 @@ def load_correspondence(path: Path) -> Correspondence:
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected a correspondence that `facediff retarget` wrote")
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            if "format" not in archive.files or str(archive["format"]) != FORMAT:
-                raise FaceDiffError(f"{path}: is no correspondence; expected one that `facediff retarget` wrote")
-            held = {name: archive[name] for name in (*ARRAYS, "rotation", "translation", "scale")}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise FaceDiffError(f"{path}: not a readable correspondence ({error}); make it anew") from error
-    for name, (kind, axes) in ARRAYS.items():
+    held = read_entries(path)
+    if "format" not in held or str(held["format"]) != FORMAT:
+        raise FaceDiffError(f"{path}: is no correspondence; expected one that `facediff retarget` wrote")
+    for name, (kind, axes) in {**ARRAYS, **SIMILARITY}.items():
+        if name not in held:
+            raise FaceDiffError(f"{path}: has no {name}; make it anew")
         if held[name].dtype.kind != kind or held[name].ndim != axes or not np.isfinite(held[name]).all():
             raise FaceDiffError(f"{path}: its {name} are damaged; make it anew")
     made = Correspondence(
@@ -108,6 +107,9 @@ def _consistent(made: Correspondence) -> bool:
         and made.distances.shape == made.trust.shape == made.share.shape == (targets,)
         and made.similarity.rotation.shape == (3, 3)
         and made.similarity.translation.shape == (3,)
+        and made.similarity.scale > 0
+        and made.source_vertices.shape == (sources, 3)
+        and made.target_vertices.shape == (targets, 3)
         and all(
             faces.shape[1] == 3 and faces.size > 0 and faces.min() >= 0 and faces.max() < count
             for faces, count in ((made.source_faces, sources), (made.corners, sources), (made.target_faces, targets))

@@ -64,6 +64,9 @@ class SpeechStream:
         seeds: one for each take.
         plan: the windows; the system's own if None.
 
+    Attributes:
+        frames: how many have been given out so far.
+
     Raises:
         FaceDiffError: if the plan does not fit the frame rate.
     """
@@ -84,11 +87,7 @@ class SpeechStream:
         self._held: Tensor | None = None  # frames that the next window will make certain
         self._level = Level()
         self._finished = False
-
-    @property
-    def frames(self) -> int:
-        """Frames that have been given out so far."""
-        return self._index * self.plan.hop
+        self.frames = 0
 
     @torch.inference_mode()
     def feed(self, samples: Float[Tensor, " samples"]) -> Float[Tensor, "takes frames vertices 3"]:
@@ -97,8 +96,7 @@ class SpeechStream:
         Raises:
             FaceDiffError: if the stream was finished.
         """
-        if self._finished:
-            raise FaceDiffError("the stream is finished; start another one for more speech")
+        self._refuse_finished()
         self._speech = torch.cat([self._speech, samples.to(self._speech)])
         made = []
         while self._dropped + len(self._speech) >= self._sample(self._end + self.plan.after):
@@ -115,13 +113,17 @@ class SpeechStream:
             frames: how many frames the speech lasts in all; as many as fit its length if None.
 
         Raises:
-            FaceDiffError: if the speech was shorter than a frame.
+            FaceDiffError: if the speech was shorter than a frame, more frames than wanted were given out already, or
+                the stream was finished.
         """
+        self._refuse_finished()
         self._finished = True
         heard = self._dropped + len(self._speech)
         total = round(heard * self.system.frame_rate / SAMPLE_RATE) if frames is None else frames
         if total < 1:
             raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.system.frame_rate:.3f} s)")
+        if total < self.frames:
+            raise FaceDiffError(f"frames: {total} are fewer than the {self.frames} that have been given out already")
         missing = self._sample(total) - heard
         self._speech = torch.nn.functional.pad(self._speech, (0, max(0, missing)))
         made = []
@@ -186,7 +188,12 @@ class SpeechStream:
     def _together(self, parts: list[Tensor]) -> Tensor:
         if not parts:
             return self.clip.motion.new_zeros(len(self.seeds), 0, *self.clip.template.shape[1:])
+        self.frames += sum(part.shape[1] for part in parts)
         return torch.cat(parts, 1)
+
+    def _refuse_finished(self) -> None:
+        if self._finished:
+            raise FaceDiffError("the stream is finished; start another one for more speech")
 
 
 class Level:
@@ -199,7 +206,7 @@ class Level:
 
     def hear(self, samples: Float[Tensor, " samples"]) -> None:
         """Count more samples in."""
-        wide = samples.double()
+        wide = samples.cpu().double()  # not every accelerator knows float64
         self.count += len(samples)
         self._sum += float(wide.sum())
         self._squares += float(wide.square().sum())

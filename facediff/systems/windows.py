@@ -72,9 +72,10 @@ class WindowPlan:
         Raises:
             FaceDiffError: if windows are too short for frames.
         """
-        overlap = max(1, round(self.overlap * frame_rate))
         frames = round(self.seconds * frame_rate)
-        if frames < 2 * overlap or frames < 4:
+        # Half of a window may be rounded up where the window is rounded down.
+        overlap = max(1, min(round(self.overlap * frame_rate), frames // 2))
+        if frames < 4:
             raise FaceDiffError(
                 f"window: {self.seconds:g} s with an overlap of {self.overlap:g} s are too few frames at "
                 f"{frame_rate:g} a second; choose longer windows"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +15,8 @@ from facediff.takes.archive import read_archive
 from facediff.takes.take import Take
 
 SUFFIXES = (".npz", ".npy")
+OF_VERTICES = ("template", "faces", "colours", "inner_lip_pairs")
+"""Facts that hold for one topology only."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +45,23 @@ class Surroundings:
     speech: npt.NDArray[np.float32] | None = None
     sample_rate: int = 16_000
 
+    @classmethod
+    def of(cls, take: Take) -> Surroundings:
+        """What a take knows beside its motion and its speech."""
+        facts: dict[str, Any] = {name: getattr(take, name) for name in (*OF_VERTICES, "frame_rate", "unit")}
+        return cls(**facts, regions=dict(take.regions))
 
-def read_take(path: Path, given: Surroundings | None = None) -> Take:
+    def completed(self, other: Surroundings | None) -> Surroundings:
+        """These facts, and from others what these do not say: of another topology the frame rate and unit only."""
+        if other is None:
+            return self
+        alike = self.template is None or other.template is None or self.template.shape == other.template.shape
+        names = (*(OF_VERTICES if alike else ()), "frame_rate", "unit")
+        missing: dict[str, Any] = {name: getattr(other, name) for name in names if getattr(self, name) is None}
+        return replace(self, **missing, regions={**(other.regions if alike else {}), **self.regions})
+
+
+def read_take(path: Path, given: Surroundings | None = None, lent: Surroundings | None = None) -> Take:
     """Read a motion file.
 
     Args:
@@ -50,6 +69,7 @@ def read_take(path: Path, given: Surroundings | None = None) -> Take:
             (T, 3V).
         given: goes before what an archive says, and completes an array. Without a template a bare array's first
             frame is taken for the neutral face.
+        lent: completes what neither the file nor ``given`` says.
 
     Raises:
         FaceDiffError: if the file is unreadable, an array lacks a frame rate, or the parts do not fit one another.
@@ -57,17 +77,15 @@ def read_take(path: Path, given: Surroundings | None = None) -> Take:
     given = given or Surroundings()
     if path.suffix == ".npz":
         take = read_archive(path)
-        told = {
-            name: value
-            for name in ("template", "faces", "frame_rate", "unit", "colours", "inner_lip_pairs")
-            if (value := getattr(given, name)) is not None
-        }
+        said = given.completed(Surroundings.of(take)).completed(lent)
+        told: dict[str, Any] = {name: getattr(said, name) for name in (*OF_VERTICES, "frame_rate", "unit")}
         if given.speech is not None:
             told |= {"speech": given.speech, "sample_rate": given.sample_rate}
-        return replace(take, **told, regions={**take.regions, **given.regions})
+        return replace(take, **told, regions=said.regions)
     if path.suffix != ".npy":
         raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a motion in {" or ".join(SUFFIXES)}')
     vertices = read_vertices(path)
+    given = given.completed(lent)
     if given.frame_rate is None:
         raise FaceDiffError(f"{path}: an array does not say its frame rate; give --frame-rate or --checkpoint")
     return Take(
@@ -95,14 +113,17 @@ def read_vertices(path: Path) -> npt.NDArray[np.float32]:
         raise FaceDiffError(f"{path}: no such file; expected a motion (frames, vertices, 3)")
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise FaceDiffError(f"{path}: not a readable NumPy array ({error})") from error
+    if not isinstance(array, np.ndarray):
+        array.close()
+        raise FaceDiffError(f"{path}: not a NumPy array but an archive of several; name it .npz")
     flat = array.ndim == 2 and array.shape[1] % 3 == 0
     if not np.issubdtype(array.dtype, np.floating) or not (flat or (array.ndim == 3 and array.shape[2] == 3)):
         raise FaceDiffError(
             f"{path}: holds {array.dtype} of shape {array.shape}; expected absolute vertices as floating point, "
             f"(frames, vertices, 3) or (frames, 3 * vertices)"
         )
-    if not len(array):
-        raise FaceDiffError(f"{path}: holds no frames; give a motion of at least one")
+    if not array.size:
+        raise FaceDiffError(f"{path}: holds no {'vertices' if len(array) else 'frames'}; give a motion of at least one")
     return array.reshape(len(array), -1, 3).astype(np.float32, copy=False)

@@ -73,6 +73,8 @@ class Take:
             raise FaceDiffError(
                 f"{self.name}: frame rate {self.frame_rate:g} is impossible; expected e.g. 25, 30 or 60"
             )
+        if self.sample_rate < 1:
+            raise FaceDiffError(f"{self.name}: sample rate {self.sample_rate} is impossible; expected e.g. 16000")
         metres_per_unit(self.unit)
 
     @property

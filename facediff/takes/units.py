@@ -21,12 +21,8 @@ def metres_per_unit(unit: str) -> float:
         FaceDiffError: if it is none of these.
     """
     about = _ABOUT.search(unit)
-    if about:
-        return float(about[1]) / 1000
-    if unit in METRES:
-        return METRES[unit]
     try:
-        value = float(unit)
+        value = float(about[1]) / 1000 if about else METRES.get(unit) or float(unit)
     except ValueError:
         value = 0.0
     if not 0 < value < float("inf"):

@@ -67,7 +67,7 @@ def write_page(path: Path, takes: Sequence[Take], *, max_mb: float = 30.0, truth
     if size > max_mb:
         raise FaceDiffError(
             f"{path}: would have {size:.1f} MB, more than the limit of {max_mb:g} MB; show fewer or shorter takes, or "
-            f"raise the limit (--max-mb)"
+            f"raise the limit (`facediff view --max-mb`)"
         )
     with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
         stream.writelines(parts)
@@ -103,6 +103,10 @@ def heat_facts(truth: Take, others: Sequence[Take], blobs: Blobs) -> dict[str, A
 
 def take_facts(take: Take, compared: bool, blobs: Blobs) -> dict[str, Any]:
     """One take: its arrays in mm among the blobs, and words about it."""
+    from facediff.render.geometry import face_outward
+
+    # The script takes what is wound clockwise for the hollow of the mouth.
+    outside = face_outward(take.triangles.astype(np.int32), np.asarray(take.template, np.float64))
     centre, extent = bounds(take)
     curve = opening(take)
     template = np.asarray(take.template, np.float64) * millimetres(take)
@@ -111,7 +115,7 @@ def take_facts(take: Take, compared: bool, blobs: Blobs) -> dict[str, Any]:
         "vertices": len(take.template),
         "triangles": len(take.triangles),
         "template": blobs.add(template.astype("<f4").tobytes()),
-        "faces": blobs.add(take.triangles.astype("<u4").tobytes()),
+        "faces": blobs.add(outside.astype("<u4").tobytes()),
         "colours": None if take.colours is None else blobs.add(take.colours.astype(np.uint8).tobytes()),
         "opening": None if curve is None else blobs.add(curve.astype("<f4").tobytes()),
         "chunks": pack_motion(take, blobs),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from facediff.commands.animate.options import check, parser
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, choices
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
@@ -24,8 +24,9 @@ def run(name: str, arguments: Sequence[str]) -> int:
     check(args, args.output)
 
     from facediff.commands.animate.performer import Performer
-    from facediff.commands.animate.recordings import read_checked
+    from facediff.commands.animate.recordings import read_checked, refuse_replacing
 
+    refuse_replacing(args.speech, [args.output])
     read_checked(args.speech[0], args.max_seconds)  # before the model, which takes longer to load
     written, take = Performer(args).write(args.speech[0], args.output, seed=args.seed)
     told = f"{len(take.vertices)} frames, identity {take.metadata['identity']}, style of {take.metadata['style']}"
@@ -46,6 +47,13 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
     from facediff.commands.style_files import style_paths
     from facediff.export import FORMATS
 
+    if args.suffix not in FORMATS:
+        raise FaceDiffError(f"--suffix {args.suffix}: there is no such format: {choices(args.suffix, FORMATS)}")
+    if args.output.suffix in FORMATS and not args.output.is_dir():
+        raise FaceDiffError(
+            f"--output {args.output}: several recordings go into a folder; give its name, and --suffix "
+            f"{args.output.suffix}"
+        )
     check(args, args.output / f"recording{args.suffix}")
     kind = FORMATS[args.suffix]
     if kind.folder or (args.takes > 1 and not kind.several):
@@ -53,6 +61,9 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
             f"--suffix {args.suffix}: a batch writes one file for each recording; choose a suffix that holds it all, "
             f"such as .glb, or .html for several takes"
         )
+    speeches = recordings(args.speech)
+    if args.correspondence is not None and not args.correspondence.exists():
+        write_correspondence(args)
     style_template = None if args.style_template is None else Path(args.style_template)
     files = [args.checkpoint, *style_paths(args.style)]
     files += [
@@ -60,8 +71,11 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
         for path in (args.target_mesh, args.eyes, args.correspondence, style_template)
         if path is not None and path.is_file()
     ]
+    if args.shapes is not None:
+        inside = sorted(args.shapes.iterdir()) if args.shapes.is_dir() else [args.shapes]
+        files += [path for path in inside if path.is_file()]
     return run_folder(
-        recordings(args.speech),
+        speeches,
         args.output,
         args.suffix,
         deciding(words),
@@ -70,6 +84,24 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
         workers=args.workers or (None if args.device == "cpu" else 1),  # one accelerator holds one model
         retry_failed=args.retry_failed,
     )
+
+
+def write_correspondence(args: argparse.Namespace) -> None:
+    """Fit the target mesh, once and before a batch.
+
+    Otherwise every process would fit it, and a second run would find a file that decides the outputs and that the
+    records of the first one do not know.
+
+    Raises:
+        FaceDiffError: if a file is unreadable, or the meshes do not fit.
+    """
+    from facediff.commands.take_options import assets_of, facts_of
+    from facediff.commands.target_mesh import carried
+    from facediff.takes import Take
+
+    facts = facts_of(assets_of(args.checkpoint), args.identity)
+    neutral = Take(name=str(args.checkpoint), vertices=facts["template"][None], **facts)
+    carried(neutral, args.target_mesh, args.correspondence)
 
 
 def deciding(words: Sequence[str]) -> list[str]:

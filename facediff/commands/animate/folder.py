@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from facediff.commands.animate.pool import run_tasks
+from facediff.commands.animate.recordings import refuse_replacing
 from facediff.commands.animate.records import Recipe, alone_in, difference, read_record, sweep, write_record
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.files import check_writable
@@ -180,6 +181,7 @@ def run_folder(
     if not speeches:
         raise FaceDiffError("speech: no recording; give some, or a folder of them")
     names = output_names(speeches, suffix)
+    refuse_replacing(speeches, [output / name for name in names])
     recipe = Recipe.of(command, files)
     check_writable(output / names[0])
     results: dict[Path, tuple[str, str]] = {}

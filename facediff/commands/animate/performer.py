@@ -74,8 +74,12 @@ class Performer:
     @contextmanager
     def takes(self, speech: npt.NDArray[np.float32], name: str, seed: int, output: Path) -> Iterator[list[Take]]:
         """Takes of some speech, as they come from the system; long ones lie on disk as long as the context lasts."""
+        from facediff.data.audio import SAMPLE_RATE
+
         seeds = [seed + i for i in range(self.args.takes)]
-        short = len(speech) / 16_000 <= self.system.windows.above
+        # In whole frames, as the system counts: else speech of just about the limit would be made in another way here.
+        rate, above = self.system.frame_rate, self.system.windows.above
+        short = round(len(speech) * rate / SAMPLE_RATE) <= above * rate
         # On the disk that the result goes to, which is the one that has room for it.
         spool: AbstractContextManager[str | None] = nullcontext() if short else self._folder(output)
         with spool as folder:

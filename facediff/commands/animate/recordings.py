@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,18 @@ if TYPE_CHECKING:
 
 MIN_SECONDS = 0.2
 SILENCE = 1e-4
+
+
+def refuse_replacing(recordings: Sequence[Path], outputs: Sequence[Path]) -> None:
+    """Refuse to write an animation over a recording: a video whose speech is taken may have the animation's suffix.
+
+    Raises:
+        FaceDiffError: naming the output.
+    """
+    heard = {recording.resolve() for recording in recordings}
+    for output in outputs:
+        if output.resolve() in heard:
+            raise FaceDiffError(f"--output: {output} is itself a recording and would be replaced; choose another place")
 
 
 def read_checked(path: Path, max_seconds: float | None = None) -> npt.NDArray[np.float32]:

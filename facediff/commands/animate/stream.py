@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -44,6 +46,8 @@ def check_stream(args: argparse.Namespace) -> None:
             f"--{'takes' if given is None else given.replace('_', '-')}: needs the whole performance; stream to .npy, "
             f"then use `facediff export`"
         )
+    if sys.stdin is None:
+        raise FaceDiffError("--stream: standard input is closed; send samples to it")
     if not 1000 <= args.rate <= 384_000:
         raise FaceDiffError(f"--rate {args.rate}: expected samples a second, such as 16000 or 48000")
     if str(args.output) != "-":
@@ -51,10 +55,10 @@ def check_stream(args: argparse.Namespace) -> None:
 
 
 def run_stream(args: argparse.Namespace) -> int:
-    """Animate speech as it comes.
+    """Animate speech as it comes, until it ends or Ctrl-C ends it.
 
     Raises:
-        FaceDiffError: if an option is no good, or the speech ends before a frame.
+        FaceDiffError: if an option is no good, the speech ends before a frame, or nobody reads the frames any more.
     """
     check_stream(args)
 
@@ -70,15 +74,18 @@ def run_stream(args: argparse.Namespace) -> int:
         f"look-ahead {plan.look_ahead:.2f} s and the time that a window takes; {plan.in_frames(system.frame_rate).hop} "
         f"frames at a time, {system.frame_rate:g} a second, {len(template)} vertices; reading {args.rate} Hz, 16 bit"
     )
-    stream = system.stream(subject=performer.identity, style=performer.style, seeds=[args.seed])
     busy, heard = 0.0, 0
-    with sink(args.output, tuple(template.shape)) as write, performer.precision():
-        for samples in pcm(sys.stdin.buffer, args.rate):
+    with sink(args.output, tuple(template.shape)) as write, performer.precision(), ended_by_interrupt() as read:
+        # In the precision asked for from the style on, as a file is animated.
+        stream = system.stream(subject=performer.identity, style=performer.style, seeds=[args.seed])
+        for samples in pcm(sys.stdin.buffer, args.rate, read):
             started = time.perf_counter()
             part = stream.feed(torch.from_numpy(samples))
             busy += time.perf_counter() - started
             heard += len(samples)
             write((part[0].cpu() + template).numpy())
+        if not heard:
+            raise FaceDiffError("standard input: ended before any sample came; send 16-bit mono PCM to it")
         started = time.perf_counter()
         part = stream.finish()
         busy += time.perf_counter() - started
@@ -92,8 +99,56 @@ def tell(sentence: str) -> None:
     print(f"facediff animate: {sentence}", file=sys.stderr, flush=True)
 
 
-def pcm(source: IO[bytes], rate: int) -> Iterator[npt.NDArray[np.float32]]:
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C while the command waits for samples."""
+
+
+@contextmanager
+def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
+    """An ``os.read`` that is at its end after Ctrl-C, which ends most microphones; a second Ctrl-C stops at once.
+
+    Where Ctrl-C is ignored or somebody else's, it stays so.
+    """
+    stopped = reading = False
+
+    def hear(*_: object) -> None:
+        nonlocal stopped
+        if stopped:
+            raise KeyboardInterrupt
+        stopped = True
+        if reading:
+            raise Interrupted
+
+    def read(descriptor: int, size: int) -> bytes:
+        nonlocal reading
+        try:
+            reading = True
+            return b"" if stopped else os.read(descriptor, size)
+        except Interrupted:
+            return b""
+        finally:
+            reading = False
+
+    mine = threading.current_thread() is threading.main_thread()
+    if not mine or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield os.read
+        return
+    signal.signal(signal.SIGINT, hear)
+    try:
+        yield read
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pcm(
+    source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.read
+) -> Iterator[npt.NDArray[np.float32]]:
     """Pieces (n,) of speech at 16 kHz as they come.
+
+    Args:
+        source: 16-bit mono samples, little endian; half a sample at the end is left away.
+        rate: their sample rate.
+        read: as ``os.read``.
 
     Raises:
         FaceDiffError: if the input looks like a file and not like samples.
@@ -106,7 +161,7 @@ def pcm(source: IO[bytes], rate: int) -> Iterator[npt.NDArray[np.float32]]:
     convert = resampler(rate) if rate != SAMPLE_RATE else None
     rest, first = b"", True
     # A read of a pipe gives what is there, at least one byte, and nothing at its end.
-    while data := os.read(source.fileno(), max(2, round(CHUNK * rate) * 2)):
+    while data := read(source.fileno(), max(2, round(CHUNK * rate) * 2)):
         if first and data[:4] in (b"RIFF", b"fLaC", b"OggS"):
             raise FaceDiffError(
                 "standard input holds a sound file, not samples; give the file by name without --stream, or only its "
@@ -123,14 +178,23 @@ def pcm(source: IO[bytes], rate: int) -> Iterator[npt.NDArray[np.float32]]:
 
 @contextmanager
 def sink(output: Path, frame: tuple[int, ...]) -> Iterator[Callable[[npt.NDArray[np.float32]], None]]:
-    """Where frames (n, V, 3) go: a .npy file that appears when it is whole, or standard output at once."""
+    """Where frames (n, V, 3) go: a .npy file that appears when it is whole, or standard output at once.
+
+    Raises:
+        FaceDiffError: if the file cannot be written, or standard output has no reader any more.
+    """
     from facediff.commands.animate.motion_files import MotionWriter
 
     if str(output) == "-":
 
         def write(vertices: npt.NDArray[np.float32]) -> None:
-            sys.stdout.buffer.write(vertices.astype("<f4").tobytes())
-            sys.stdout.buffer.flush()
+            try:
+                sys.stdout.buffer.write(vertices.astype("<f4").tobytes())
+                sys.stdout.buffer.flush()
+            except BrokenPipeError as error:
+                # Python would try to write what is left once more at its end, and complain.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                raise FaceDiffError("standard output: whoever read the frames has ended, so the stream ends") from error
 
         yield write
         return

@@ -73,7 +73,10 @@ class SilentClock {
     if (!this.playing) return this.base;
     const time = this.base + ((performance.now() - this.since) / 1000) * this.rate;
     if (time < this.seconds) return time;
-    if (this.loop) return time % this.seconds;
+    if (this.loop) { // counted anew in every round, so that without the loop this one is played to its end
+      this.seek(time % this.seconds);
+      return this.base;
+    }
     this.base = this.seconds;
     this.playing = false;
     return this.base;
