@@ -62,7 +62,16 @@ class CompiledTraining(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Compile; nothing happens before a part is first used."""
         for part in self._compiled:
-            part.compile(backend=self.backend, dynamic=True)
+            if part._compiled_call_impl is None:
+                part.compile(backend=self.backend, dynamic=True)
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Go on with the compiled parts; a run that is resumed within an epoch has no such moment at first."""
+        self.on_train_start(trainer, pl_module)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """What other callbacks do when training has ended, such as a last preview, runs the parts as they are."""
+        self._undo()
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Sampling runs a part many times on shapes of its own, and would have it compiled for each."""

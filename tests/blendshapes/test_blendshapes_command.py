@@ -136,6 +136,8 @@ def test_shapes_of_another_topology_are_carried(
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--bounds", "1", "0"], "bounds 1 to 0"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--show", "a.jpg"], "expected a picture .png"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--region", "lips"], "has no regions"),
+        (["take.npz", "-o", "mine.csv", "--shapes", "shapes"], "mine.json: is a file that facediff did not write"),
+        (["bare.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25", "--show", "a.png"], "without a mesh"),
         (["take.npz", "--write-puppet-shapes", "new"], "leave the take away"),
         (["--write-puppet-shapes", "shapes"], "is there already"),
         (["--write-puppet-shapes", "new", "--identity", "F9"], 'no speaker "F9"; known are'),
@@ -154,8 +156,9 @@ def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
     (tmp_path / "shapes").symlink_to(folder)
     spoilt = take.vertices[:3].copy()
     spoilt[1, 2] = np.nan
-    for name, array in (("nan", spoilt), ("empty", take.vertices[:0]), ("small", take.vertices[:, :99])):
+    for name, array in (("nan", spoilt), ("empty", take.vertices[:0]), ("small", take.vertices[:, :99]), ("bare", take.vertices)):
         np.save(tmp_path / f"{name}.npy", array)
+    (tmp_path / "mine.json").write_text("{}")
     before = sorted(tmp_path.iterdir())
     monkeypatch.chdir(tmp_path)
     assert main(["blendshapes", *words]) == 2
@@ -163,6 +166,7 @@ def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
     assert says in said
     assert said.count("\n") == 1
     assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / "mine.json").read_text() == "{}"
 
 
 def test_the_command_runs_as_a_program(folder: Path, archive: Path, tmp_path: Path) -> None:

@@ -32,7 +32,12 @@ from facediff.systems import DualPathDiffusion
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
 torch.set_num_threads(1)
-calls = []
+calls, late = [], []
+
+class Last(pl.Callback):
+    # As a preview at the end of training; it is before the other callback in the list.
+    def on_train_end(self, trainer, system):
+        late.append([name for name, part in system.named_modules() if part._compiled_call_impl is not None])
 
 def backend(graph, _):
     calls.append(len(list(graph.graph.nodes)))
@@ -48,7 +53,7 @@ def train(*callbacks):
         decoder=partial(registry.decoder.style_transformer, num_layers=1, dropout=0.0),
         sampler=partial(registry.sampler.ddim, steps=2),
     )
-    trainer = pl.Trainer(accelerator="cpu", devices=1, max_epochs=1, logger=False, enable_checkpointing=False,
+    trainer = pl.Trainer(accelerator="cpu", devices=1, max_epochs=2, logger=False, enable_checkpointing=False,
         enable_progress_bar=False, enable_model_summary=False, callbacks=list(callbacks), log_every_n_steps=1)
     trainer.fit(system, datamodule=Tiny(root=sys.argv[1], max_frames_per_batch=60))
     left = [name for name, part in system.named_modules() if part._compiled_call_impl is not None]
@@ -57,8 +62,8 @@ def train(*callbacks):
 
 plain = train()
 assert not calls
-found = train(CompiledTraining(backend=backend))
-print(json.dumps([plain, found, calls]))
+found = train(Last(), CompiledTraining(backend=backend))
+print(json.dumps([plain, found, calls, late]))
 """
 
 
@@ -67,13 +72,14 @@ def test_losses_weights_and_names_are_those_without(tiny_root: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, tiny_root]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200, cwd=ROOT)
     assert done.returncode == 0, done.stderr
-    plain, found, calls = json.loads(done.stdout.splitlines()[-1])
+    plain, found, calls, late = json.loads(done.stdout.splitlines()[-1])
     assert max(calls) > 20  # the decoder was compiled, not the probe alone
     assert len(calls) <= 5  # once for all lengths
     assert found[0] == pytest.approx(plain[0], rel=1e-4)
     assert list(found[1]) == list(plain[1])
     assert found[1] == pytest.approx(plain[1], rel=1e-3, abs=1e-2)
     assert found[2] == []
+    assert late == [[]]
 
 
 def test_a_machine_that_cannot_compile_is_told(make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny) -> None:
@@ -83,6 +89,11 @@ def test_a_machine_that_cannot_compile_is_told(make_system: MakeSystem, make_tra
     trainer = make_trainer(callbacks=[CompiledTraining(backend=backend)])  # type: ignore[arg-type]
     with pytest.raises(FaceDiffError, match=r"does not work on this machine \(.*C\+\+ compiler.*install a C\+\+ comp"):
         trainer.fit(make_system(), datamodule=tiny)
+
+
+def test_a_system_without_a_network_is_told(make_trainer: MakeTrainer) -> None:
+    with pytest.raises(FaceDiffError, match="LightningModule has no network whose parts could be compiled"):
+        CompiledTraining().on_fit_start(make_trainer(), pl.LightningModule())
 
 
 def test_a_part_that_is_not_there_is_named(make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny) -> None:

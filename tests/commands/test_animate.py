@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import av
@@ -106,6 +109,8 @@ def bad_reference(folder: Path) -> Path:
         (["--style", "other.npy"], "has shape (9, 31, 3); the checkpoint's faces have 24 vertices"),
         (["--style", "A_e99"], "no clip of that name"),
         (["--style", "none.npy"], "no such file"),
+        (["--style", "archive.npy"], "holds no array of numbers"),
+        (["--style", "words.npy"], "holds no array of numbers"),
         (["--style", "far.npy"], "so it must be another person's"),
         (["--sampler", "dim"], 'there is no sampler "dim": did you mean "ddim"?'),
         (["--steps", "0"], "sampler.steps: 0 is impossible"),
@@ -134,6 +139,9 @@ def test_bad_options(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     bad_reference(tmp_path)
+    np.savez(tmp_path / "archive", a=np.zeros(3))
+    (tmp_path / "archive.npz").rename(tmp_path / "archive.npy")
+    np.save(tmp_path / "words.npy", np.array(["a", "b"]))
     np.save(tmp_path / "far.npy", np.full((9, 24, 3), 0.5, np.float32))
     (tmp_path / "text.ckpt").write_text("no checkpoint")
     before = sorted(tmp_path.rglob("*"))
@@ -234,6 +242,92 @@ def test_long_speech_goes_to_disk_window_by_window(checkpoint: Path, tmp_path: P
     assert made.shape == (325, 24, 3)
     np.testing.assert_array_equal(made, expected)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["long.npy"]
+
+
+def test_speech_of_just_about_ten_seconds_is_made_as_the_system_makes_it(checkpoint: Path, tmp_path: Path) -> None:
+    speech = write(tmp_path / "s.wav", 0.1 * np.random.default_rng(0).normal(size=160_100))  # 250 frames and a bit
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "s.npy") == 0
+    expected = load_system(checkpoint).animate(torch.from_numpy(read_speech(speech)), subject="A").vertices.numpy()
+    np.testing.assert_array_equal(np.load(tmp_path / "s.npy"), expected)
+
+
+def test_a_recording_is_not_replaced(
+    checkpoint: Path, speech: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A video is a recording too, and has the suffix of an animation."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    videos = [folder / "a.mp4", folder / "b.mp4"]
+    assert animate(speech, "--checkpoint", checkpoint, "-o", videos[0], "--size", 32) == 0
+    videos[1].write_bytes(videos[0].read_bytes())
+    before = [path.read_bytes() for path in videos]
+    capsys.readouterr()
+    for words in ([videos[0], "-o", videos[0]], [*videos, "-o", folder]):
+        assert animate(*words, "--checkpoint", checkpoint) == 2
+        assert "a.mp4 is itself a recording and would be replaced" in capsys.readouterr().err
+    assert [path.read_bytes() for path in videos] == before
+    assert sorted(folder.iterdir()) == videos
+
+
+def pcm(seconds: float) -> bytes:
+    samples = 3000 * np.random.default_rng(0).normal(size=round(16000 * seconds))
+    return samples.clip(-32767, 32767).astype("<i2").tobytes()
+
+
+def stream_words(checkpoint: Path, output: object) -> list[str]:
+    words = ["animate", "-", "--stream", "--checkpoint", str(checkpoint), "-o", str(output)]
+    return [sys.executable, "-m", "facediff", *words]
+
+
+def test_half_precision_is_the_same_for_a_stream(checkpoint: Path, tmp_path: Path) -> None:
+    """The style is encoded in it as well."""
+    speech = tmp_path / "s.wav"
+    soundfile.write(speech, np.frombuffer(pcm(10.5), "<i2"), 16000)
+    half = ["--precision", "bf16"]
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "file.npy", *half) == 0
+    words = [*stream_words(checkpoint, tmp_path / "stream.npy"), *half]
+    done = subprocess.run(words, input=pcm(10.5), capture_output=True)
+    assert done.returncode == 0, done.stderr
+    np.testing.assert_array_equal(np.load(tmp_path / "stream.npy"), np.load(tmp_path / "file.npy"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_ctrl_c_ends_the_speech_and_what_was_said_is_kept(checkpoint: Path, tmp_path: Path) -> None:
+    """A microphone has no other end."""
+    words = stream_words(checkpoint, tmp_path / "live.npy")
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        assert b"look-ahead" in process.stderr.readline()
+        process.stdin.write(pcm(2))
+        process.stdin.flush()
+        time.sleep(1)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+        assert b"2.00 s of speech" in process.stderr.read()
+    assert np.load(tmp_path / "live.npy").shape == (50, 24, 3)
+    assert [path.name for path in tmp_path.iterdir()] == ["live.npy"]
+
+
+def test_a_reader_that_ends_gets_a_sentence(checkpoint: Path) -> None:
+    with subprocess.Popen(
+        stream_words(checkpoint, "-"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        process.stdout = None
+        _, told = process.communicate(pcm(6))
+    assert process.returncode == 2
+    assert told.decode().splitlines()[-1].startswith("facediff: error: standard output: whoever read the frames has")
+    assert b"Traceback" not in told
+    assert b"ignored" not in told
+
+
+def test_a_stream_of_nothing(checkpoint: Path, tmp_path: Path) -> None:
+    done = subprocess.run(stream_words(checkpoint, tmp_path / "x.npy"), input=b"", capture_output=True)
+    assert done.returncode == 2
+    assert b"ended before any sample came" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_microphone_gives_what_the_file_gives(checkpoint: Path, tmp_path: Path) -> None:

@@ -20,9 +20,11 @@ from facediff.commands.animate.folder import output_names, recordings, run_folde
 from facediff.commands.animate.records import alone_in
 from facediff.errors import FaceDiffError
 from facediff.files import atomic
+from facediff.systems import load_system
 from facediff.takes import read_archive
 
 ROOT = Path(__file__).parents[2]
+FACES = "".join(f"f {r * 6 + c + 1} {r * 6 + c + 2} {r * 6 + c + 7}\n" for r in range(3) for c in range(5))
 
 
 def worker(command: list[str]) -> Callable[[Path, Path], None]:
@@ -263,6 +265,48 @@ def test_workers_end_with_a_parent_that_is_killed(folder: Path, tmp_path: Path) 
     assert of_the_group() == []
     assert run(folder) == 0
     assert len(outputs(folder)) == 4
+
+
+def test_where_a_batch_goes_and_what_it_writes(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["animate", str(folder), "--checkpoint", str(tmp_path / "C.ckpt"), "-o"]
+    before = sorted(tmp_path.rglob("*"))
+    for more, sentence in (
+        ([str(tmp_path / "all.mp4")], "several recordings go into a folder; give its name, and --suffix .mp4"),
+        ([str(tmp_path / "out"), "--suffix", "x.glb"], "--suffix x.glb: there is no such format"),
+        ([str(tmp_path / "out"), "--suffix", "glb"], 'did you mean ".glb"?'),
+    ):
+        assert main([*words, *more]) == 2
+        assert sentence in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_second_batch_knows_the_map_and_the_shapes_of_the_first(
+    checkpoint: Path, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The map to a mesh is written on the way; blendshapes decide a table as a checkpoint does."""
+    for name in ("A_e01", "B_e02"):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        shutil.copy(tiny_root / "wav" / f"{name}.wav", tmp_path / "in")
+    common = ["animate", str(tmp_path / "in"), "--checkpoint", str(checkpoint), "--workers", "1", "--quiet"]
+    mesh = ["--target-mesh", str(tiny_root / "tiny.ply"), "--correspondence", str(tmp_path / "map.npz")]
+    for state in ("made", "up to date"):
+        assert main([*common, *mesh, "--suffix", ".npz", "-o", str(tmp_path / "meshes")]) == 0
+        assert f"2 recordings: 2 {state}" in capsys.readouterr().out
+    shapes = tmp_path / "shapes"
+    shapes.mkdir()
+    neutral = load_system(checkpoint).assets.templates["A"].numpy()
+    for name, way in (("neutral", 0.0), ("jawOpen", 0.01)):
+        moved = neutral + np.array([0, -way, 0]) * (np.arange(24) < 12)[:, None]
+        (shapes / f"{name}.obj").write_text("".join(f"v {x:.8f} {y:.8f} {z:.8f}\n" for x, y, z in moved) + FACES)
+    tables = [*common, "--shapes", str(shapes), "--suffix", ".csv", "-o", str(tmp_path / "tables")]
+    for state in ("made", "up to date"):
+        assert main(tables) == 0
+        assert f"2 recordings: 2 {state}" in capsys.readouterr().out
+    (shapes / "jawOpen.obj").write_text((shapes / "jawOpen.obj").read_text().replace("v 0.0", "v 0.00", 1))
+    assert main(tables) == 0
+    assert "jawOpen.obj has changed" in capsys.readouterr().out
 
 
 def test_animate_takes_a_folder(

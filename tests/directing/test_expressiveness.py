@@ -38,6 +38,12 @@ def test_a_region_gets_its_own_factor_and_what_is_far_the_rest(make_take: Callab
     np.testing.assert_allclose(after[far], 1.1 * before[far], atol=1e-7)
 
 
+def test_a_region_without_vertices_changes_nothing(make_take: Callable[..., Take]) -> None:
+    take = make_take(2, jaw_open=0.7)
+    bare = replace(take, regions={**take.regions, "upper_face": np.zeros(0, np.int64)})
+    np.testing.assert_allclose(scale_regions(bare, {"upper_face": 3.0}).vertices, take.vertices, atol=1e-7)
+
+
 @pytest.mark.parametrize("factors", [{"lips": 4.0}, {"upper_face": 3.0, "lips": 0.0}, {"upper_face": 2.0, "all": 0.5}])
 def test_neighbours_differ_by_no_more_than_the_bound(factors: dict[str, float], make_take: Callable[..., Take]) -> None:
     """1.5 |f − g| |x − y| / width between two vertices, wherever one region meets the rest."""

@@ -119,8 +119,17 @@ def test_every_frame_is_there_whatever_the_length(ready: Ready, frames: int) -> 
     motion = torch.cat(parts, 1)
     assert motion.shape[1] == frames
     assert torch.isfinite(motion).all()
-    with pytest.raises(FaceDiffError, match="finished"):
-        stream.feed(torch.zeros(5))
+    assert stream.frames == frames
+    for more in (lambda: stream.feed(torch.zeros(5)), stream.finish):
+        with pytest.raises(FaceDiffError, match="finished"):
+            more()
+
+
+def test_a_stream_cannot_take_frames_back(ready: Ready) -> None:
+    stream = ready().stream(subject="A")
+    given = stream.feed(speech(4)).shape[1]
+    with pytest.raises(FaceDiffError, match=f"frames: 5 are fewer than the {given} that have been given out"):
+        stream.finish(5)
 
 
 def test_memory_does_not_grow_with_the_speech(ready: Ready) -> None:
@@ -219,6 +228,25 @@ def test_the_level_is_that_of_all_that_was_heard() -> None:
     np.testing.assert_allclose(level.deviation, whole.numpy().std(), rtol=1e-9)
 
 
+def test_the_level_needs_no_float64_where_the_speech_is() -> None:
+    class Narrow(Tensor):
+        """As on Apple's accelerators."""
+
+        @classmethod
+        def __torch_function__(
+            cls, func: object, types: object, args: tuple[Tensor, ...] = (), kwargs: object = None
+        ) -> object:
+            if func is Tensor.cpu:
+                return args[0].as_subclass(Tensor)
+            if func is Tensor.double:
+                raise TypeError("float64 is not known here")
+            return super().__torch_function__(func, types, args, kwargs or {})  # type: ignore[arg-type]
+
+    level = Level()
+    level.hear(torch.tensor([1.0, 3.0]).as_subclass(Narrow))
+    assert (level.mean, level.deviation) == (2.0, 1.0)
+
+
 def test_an_encoder_hears_a_piece_as_loud_as_in_the_whole(ready: Ready) -> None:
     encoder = ready().speech_encoder
     whole = speech(3)
@@ -247,6 +275,16 @@ def test_an_encoder_hears_a_piece_as_loud_as_in_the_whole(ready: Ready) -> None:
 def test_impossible_windows(change: dict[str, float], sentence: str) -> None:
     with pytest.raises(FaceDiffError, match=sentence.replace(".", r"\.")):
         WindowPlan(**change)
+
+
+@pytest.mark.parametrize("rate", [24.0, 25.0, 30.0, 60.0])
+def test_any_window_may_share_half_of_itself(rate: float) -> None:
+    """Also where half of it is rounded up and all of it down."""
+    for hundredths in range(20, 300):
+        plan = WindowPlan(seconds=hundredths / 100, overlap=hundredths / 200).in_frames(rate)
+        assert abs(plan.frames - hundredths / 100 * rate) <= 0.5
+        assert abs(plan.overlap - hundredths / 200 * rate) < 1
+        assert 0 < 2 * plan.overlap <= plan.frames
 
 
 def test_windows_of_too_few_frames(ready: Ready) -> None:

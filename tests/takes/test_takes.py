@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,6 +78,33 @@ def test_options_go_before_what_an_archive_says(take: Take, tmp_path: Path) -> N
     assert read.unit == "mm"
 
 
+def test_what_is_lent_never_goes_before_a_file(take: Take, tmp_path: Path) -> None:
+    lent = Surroundings(
+        template=take.template + 1,
+        faces=take.triangles[:1],
+        frame_rate=60,
+        unit="m",
+        regions={"lips": np.array([5]), "jaw": np.array([0])},
+        inner_lip_pairs=np.array([[3, 4]]),
+    )
+    write_archive(tmp_path / "a.npz", replace(take, inner_lip_pairs=None))
+    read = read_take(tmp_path / "a.npz", None, lent)
+    assert np.array_equal(read.template, take.template)
+    assert np.array_equal(read.triangles, take.triangles)
+    assert (read.frame_rate, read.unit) == (25, "mm")
+    assert read.inner_lip_pairs is not None
+    assert read.inner_lip_pairs.tolist() == [[3, 4]]
+    assert {name: indices.tolist() for name, indices in read.regions.items()} == {"lips": [1, 2], "jaw": [0]}
+    np.save(tmp_path / "x.npy", take.vertices)
+    bare = read_take(tmp_path / "x.npy", Surroundings(unit="cm"), lent)
+    assert np.array_equal(bare.template, take.template + 1)
+    assert (bare.frame_rate, bare.unit) == (60, "cm")
+    other = replace(lent, template=np.zeros((9, 3), np.float32), inner_lip_pairs=np.array([[7, 8]]))
+    assert read_take(tmp_path / "a.npz", None, other).inner_lip_pairs is None  # of another topology
+    told = read_take(tmp_path / "x.npy", Surroundings(template=take.template), other)
+    assert (told.faces, told.frame_rate, told.regions) == (None, 60, {})
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -86,6 +114,9 @@ def test_options_go_before_what_an_archive_says(take: Take, tmp_path: Path) -> N
         ({"faces": np.array([[0, 1, 6]], np.int32)}, "name vertex 6 of 6"),
         ({"frame_rate": 0.0}, "frame rate 0 is impossible"),
         ({"unit": "parsec"}, 'unit "parsec"'),
+        ({"unit": "normalised (about 0 mm)"}, "above 0"),
+        ({"unit": "about 1.2.3 mm"}, "above 0"),
+        ({"sample_rate": 0}, "sample rate 0 is impossible"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(take: Take, change: dict[str, object], sentence: str) -> None:
@@ -116,6 +147,54 @@ def test_files_that_are_no_takes(tmp_path: Path) -> None:
     np.save(tmp_path / "c.npy", np.array([{"a": 1}], object), allow_pickle=True)
     with pytest.raises(FaceDiffError, match="not a readable NumPy array"):
         read_take(tmp_path / "c.npy")
+    np.save(tmp_path / "plain.npy", np.zeros((2, 6, 3), np.float32))
+    (tmp_path / "plain.npy").rename(tmp_path / "plain.npz")
+    with pytest.raises(FaceDiffError, match="not a readable .npz"):
+        read_archive(tmp_path / "plain.npz")
+    (tmp_path / "b.npz").rename(tmp_path / "b.npy")
+    with pytest.raises(FaceDiffError, match="name it .npz"):
+        read_take(tmp_path / "b.npy")
+    for name, shape in (("flat", (4, 0)), ("deep", (4, 0, 3))):
+        np.save(tmp_path / f"{name}.npy", np.zeros(shape, np.float32))
+        with pytest.raises(FaceDiffError, match="holds no vertices"):
+            read_take(tmp_path / f"{name}.npy")
+    with zipfile.ZipFile(tmp_path / "words.npz", "w") as archive:
+        archive.writestr("vertices", "no numbers")
+    with pytest.raises(FaceDiffError, match="vertices is no array"):
+        read_archive(tmp_path / "words.npz")
+    np.savez_compressed(tmp_path / "spoilt.npz", vertices=np.arange(3000.0).reshape(10, 100, 3))
+    spoilt = bytearray((tmp_path / "spoilt.npz").read_bytes())
+    spoilt[100:200] = bytes(100)
+    (tmp_path / "spoilt.npz").write_bytes(spoilt)
+    with pytest.raises(FaceDiffError, match="not a readable .npz"):
+        read_archive(tmp_path / "spoilt.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "sentence"),
+    [
+        ("vertices", np.zeros((5, 6, 3), int), "its vertices are int64 of shape (5, 6, 3); expected floating point"),
+        ("template", np.float32(1), "its template are float32 of shape (); expected"),
+        ("faces", np.zeros((2, 4), np.int32), "expected whole numbers (triangles, 3)"),
+        ("faces", np.zeros((2, 3)), "expected whole numbers (triangles, 3)"),
+        ("speech", np.zeros((9, 2), np.float32), "expected floating point (samples,)"),
+        ("colours", np.zeros((6, 3)), "expected bytes (vertices, 3)"),
+        ("inner_lip_pairs", np.array([[0, 6]]), "its inner_lip_pairs names vertices other than 0 to 5"),
+        ("region_lips", np.array([-1]), "its lips names vertices other than 0 to 5"),
+        ("region_lips", np.array([0.5]), "its lips names vertices other than 0 to 5"),
+    ],
+)
+def test_an_archive_that_others_made_is_looked_at(
+    take: Take, tmp_path: Path, name: str, wrong: np.ndarray, sentence: str
+) -> None:
+    write_archive(tmp_path / "a.npz", take)
+    with np.load(tmp_path / "a.npz") as archive:
+        held = dict(archive)
+    np.savez(tmp_path / "a.npz", **{**held, name: wrong})
+    with pytest.raises(FaceDiffError) as caught:
+        read_archive(tmp_path / "a.npz")
+    assert sentence in str(caught.value)
+    assert "a.npz" in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,15 @@ def test_positions_come_back_within_the_bound_that_is_stated(
     assert off.max() <= 0.05 * 3**0.5 / 2 + 1e-4 < 0.05
 
 
+def test_a_mesh_that_is_wound_inside_out_is_turned(tmp_path: Path) -> None:
+    """The picture's script takes what is wound clockwise for the dark hollow of the mouth."""
+    take = clicks()
+    write_page(tmp_path / "a.html", [take, replace(take, faces=take.triangles[:, ::-1])])
+    page = Written(tmp_path / "a.html")
+    for facts in page.facts["takes"]:
+        assert np.array_equal(np.frombuffer(page.blob(facts["faces"]), "<u4").reshape(-1, 3), take.triangles)
+
+
 def test_a_page_of_several_takes_keeps_each_mesh_and_equal_parts_once(tmp_path: Path) -> None:
     first, second = random_take(0), random_take(1, vertices=12)
     write_page(tmp_path / "a.html", [first, second, replace(first, name="again")])
@@ -116,7 +125,7 @@ def test_a_page_of_several_takes_keeps_each_mesh_and_equal_parts_once(tmp_path: 
         facts = page.facts["takes"][number]
         assert np.allclose(page.motion(number), take.vertices * 1000.0, atol=0.05)
         faces = np.frombuffer(page.blob(facts["faces"]), "<u4").reshape(-1, 3)
-        assert np.array_equal(faces, take.triangles)
+        assert any(np.array_equal(faces, wound) for wound in (take.triangles, take.triangles[:, ::-1]))
         low, high = take.template.min(0) * 1000, take.template.max(0) * 1000
         assert np.allclose(facts["centre"], (low + high) / 2, atol=1e-2)
         assert np.allclose(facts["extent"], (high - low) / 2, atol=1e-2)

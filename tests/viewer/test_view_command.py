@@ -7,10 +7,12 @@ import re
 import webbrowser
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from facediff.cli import main
 from facediff.takes import write_archive
@@ -42,6 +44,34 @@ def test_a_bare_truth_borrows_the_mesh_and_stands_first(files: Path, capsys: pyt
     assert read["takes"][0]["opening"] is not None
     assert read["sound"] is not None
     assert re.search(r"page.html: 75 frames of 2 take\(s\), 0\.\d MB", capsys.readouterr().out)
+
+
+def test_a_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
+    files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The checkpoint's first face is not the archive's; whoever names an identity wants that one's."""
+    own = clicks()
+    faces = {"first": own.template + 50, "second": own.template + 100}
+    assets = SimpleNamespace(
+        template=lambda name: torch.from_numpy(faces[name]),
+        identities=("first", "second"),
+        faces=own.triangles,
+        frame_rate=50.0,
+        unit="cm",
+        colours=None,
+        regions={},
+        inner_lip_pairs=None,
+    )
+    monkeypatch.setattr("facediff.commands.take_options.assets_of", lambda path: assets)
+    page, words = files / "page.html", ["--checkpoint", "c.ckpt", "-o", str(files / "page.html")]
+    assert main(["view", str(files / "guess.npz"), *words]) == 0
+    assert facts(page)["frameRate"] == 25
+    assert facts(page)["takes"][0]["centre"] == [0, 0, -2.5]
+    assert main(["view", str(files / "true.npy"), *words]) == 0
+    assert facts(page)["frameRate"] == 50
+    assert facts(page)["takes"][0]["centre"] == [500, 500, 475]
+    assert main(["view", str(files / "guess.npz"), "--identity", "second", *words]) == 0
+    assert facts(page)["takes"][0]["centre"] == [100, 100, 97.5]
 
 
 def test_labels_the_shortest_and_the_browser(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -140,9 +140,7 @@ def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def pcm(
-    source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.read
-) -> Iterator[npt.NDArray[np.float32]]:
+def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.read) -> Iterator[npt.NDArray[np.float32]]:
     """Pieces (n,) of speech at 16 kHz as they come.
 
     Args:
