@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -12,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 from facediff.errors import MissingExtraError
+from facediff.processes import start_worker, unheard
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -60,7 +60,8 @@ def run_all(
         return
     left = dict(enumerate(tasks))
     with _pool(work, workers) as pool:
-        running = {pool.submit(_do, task): index for index, task in left.items()}
+        with unheard():
+            running = {pool.submit(_do, task): index for index, task in left.items()}
         try:
             for future in as_completed(running):
                 result = future.result()
@@ -92,7 +93,9 @@ def _one_by_one(work: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterat
             while waiting:
                 task = waiting.pop()
                 try:
-                    yield task, pool.submit(_do, task).result()
+                    with unheard():
+                        future = pool.submit(_do, task)
+                    yield task, future.result()
                 except BrokenProcessPool:
                     yield task, Died(task)
                     break
@@ -112,7 +115,7 @@ def _drop(futures: dict[Future[Any], int]) -> None:
 
 def _start(work: Callable[[Any], Any]) -> None:
     global _work
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
+    start_worker()
     _work = work
 
 

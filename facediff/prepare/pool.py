@@ -5,26 +5,22 @@ from __future__ import annotations
 import errno
 import multiprocessing
 import os
-import signal
-import sys
-import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import wait as wait_for
 from multiprocessing.context import BaseContext
 from pathlib import Path
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.prepare.job import Job
+from facediff.processes import THREAD_VARIABLES, start_worker, unheard
 
 AHEAD = 2
 """Clips handed out per worker at a time: none waits for work, and few are lost when the run is stopped."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -68,7 +64,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, workers: int) -> Generator[Outcome]
             yield attempt(job, out)
         return
     with _single_threaded():
-        pool = ProcessPoolExecutor(min(workers, len(jobs)), mp_context=_context(jobs), initializer=_start_worker)
+        pool = ProcessPoolExecutor(min(workers, len(jobs)), mp_context=_context(jobs), initializer=start_worker)
         try:
             yield from _hand_out(pool, jobs, out, AHEAD * workers)
         except BrokenProcessPool as error:
@@ -87,7 +83,8 @@ def _hand_out(pool: ProcessPoolExecutor, jobs: Sequence[Job], out: Path, ahead: 
     running: set[Future[Outcome]] = set()
     while True:
         while len(running) < ahead and (job := next(waiting, None)) is not None:
-            running.add(pool.submit(partial(attempt, job, out)))
+            with unheard():
+                running.add(pool.submit(partial(attempt, job, out)))
         if not running:
             return
         done, running = wait(running, return_when=FIRST_COMPLETED)
@@ -121,18 +118,3 @@ def _single_threaded() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-
-
-def _start_worker() -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone, however it went."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent.sentinel, os._exit), daemon=True).start()
-
-
-def _end_with(sentinel: int, end: Callable[[int], None]) -> None:
-    wait_for([sentinel])
-    end(1)
