@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -84,10 +85,15 @@ def main(args: Sequence[str] | None = None) -> int:
         return fail(f'there is no command "{name}": {choices(name, COMMANDS)}')
     try:
         status: int = importlib.import_module(COMMANDS[name].module).run(name, rest)
+        sys.stdout.flush()
     except FaceDiffError as error:
         return fail(str(error))
     except KeyboardInterrupt:
         return fail("interrupted", 130)
+    except BrokenPipeError:
+        # Whoever read our output (`| head`) has had enough; Python would say so once more when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] == "facediff":
             raise

@@ -51,3 +51,13 @@ def test_components_lists_what_can_be_chosen(capsys: pytest.CaptureFixture[str])
     text = capsys.readouterr().out
     assert "gru" in text
     assert "ddim" not in text
+
+
+def test_a_reader_that_has_had_enough_is_no_error() -> None:
+    command = [sys.executable, "-m", "facediff", "components"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()  # before a word of it has been written
+        assert process.stderr.read() == ""
+        assert process.wait(60) == 141
