@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facediff.commands.directing_options import add_directing_options, check_directing, directed
-from facediff.commands.take_options import add_take_options, assets_of, take_of
+from facediff.commands.take_options import add_take_options, assets_of, take_of, told_apart
 from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     check_directing(args)
     if args.shapes is not None and args.output.suffix != ".csv":
         raise FaceDiffError(f"--shapes: is for weights; write .csv instead of {args.output.suffix}, or leave it away")
-    takes = [directed(take_of(path, args), args) for path in args.takes]
+    takes = told_apart([directed(take_of(path, args), args) for path in args.takes], args.takes)
     for written in write_takes(args.output, takes, options):
         print(f"{written}: {size_of(written)}")
     print(FORMATS[args.output.suffix].then)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -68,6 +70,12 @@ def surroundings(args: argparse.Namespace) -> tuple[Surroundings, Surroundings |
     if args.unit is not None:
         given["unit"] = args.unit
     return Surroundings(**given), lent
+
+
+def told_apart(takes: Sequence[Take], paths: Sequence[Path]) -> list[Take]:
+    """The takes under their own names; where those are alike, as of one recording, under their files' names."""
+    alike = len({take.name for take in takes}) < len(takes)
+    return [replace(take, name=path.stem if alike else take.name) for take, path in zip(takes, paths, strict=True)]
 
 
 def assets_of(checkpoint: Path) -> Assets:

@@ -49,6 +49,7 @@ def carried_with(
     )
     from facediff.topology import read_mesh
 
+    triangles = take.triangles  # what it lacks is not the other mesh's fault
     mesh = read_mesh(mesh_path)
     if correspondence_path is not None and correspondence_path.exists():
         if landmarks_path is not None:
@@ -65,7 +66,7 @@ def carried_with(
         check_writable(correspondence_path)
     landmarks = None if landmarks_path is None else read_landmarks(landmarks_path)
     try:
-        found = correspond(take.template, take.triangles, mesh.vertices, mesh.faces, landmarks=landmarks)
+        found = correspond(take.template, triangles, mesh.vertices, mesh.faces, landmarks=landmarks)
     except FaceDiffError as error:
         raise FaceDiffError(f"{mesh_path}: {error}") from error
     made = carry(take, found, mesh)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facediff.commands.take_options import add_take_options, surroundings
+from facediff.commands.take_options import add_take_options, surroundings, told_apart
 from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
 
     check_writable(args.output)
     paths = [*([] if args.truth is None else [args.truth]), *args.takes]
-    takes = named(read_takes(paths, args), args.labels)
+    takes = named(read_takes(paths, args), paths, args.labels)
     if args.shortest:
         takes = shortest(takes)
     write_page(args.output, takes, max_mb=args.max_mb, truth=None if args.truth is None else 0)
@@ -100,14 +100,14 @@ def lent_to(path: Path, lent: Surroundings | None, lender: Take | None) -> Surro
     return (lent or Surroundings()).completed(Surroundings.of(lender))
 
 
-def named(takes: Sequence[Take], labels: Sequence[str] | None) -> list[Take]:
-    """The takes under the names that are shown.
+def named(takes: Sequence[Take], paths: Sequence[Path], labels: Sequence[str] | None) -> list[Take]:
+    """The takes under the names that are shown: the labels, else their own, else, where those are alike, the files'.
 
     Raises:
         FaceDiffError: if there are not as many names as takes.
     """
     if labels is None:
-        return list(takes)
+        return told_apart(takes, paths)
     if len(labels) != len(takes):
         raise FaceDiffError(
             f"--labels: {len(labels)} names for {len(takes)} panels; give one for each, the truth's first"

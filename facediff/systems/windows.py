@@ -43,7 +43,8 @@ class WindowPlan:
         overlap: how much of it the next one has as well; at most half of it.
         before: speech before the window that is heard with it.
         after: speech after the window that is heard with it.
-        above: speech that lasts longer than this is animated by windows; shorter speech at once.
+        above: speech that lasts longer than this is animated by windows; shorter speech at once. Infinite: always at
+            once.
 
     Raises:
         FaceDiffError: if a length is impossible.
@@ -56,15 +57,15 @@ class WindowPlan:
     above: float = 10.0
 
     def __post_init__(self) -> None:
-        if not all(map(math.isfinite, vars(self).values())) or not 0 < self.seconds <= 600:
-            raise FaceDiffError(f"window: {self.seconds:g} s is impossible; choose e.g. 8")
+        if not 0 < self.seconds <= 600:
+            raise FaceDiffError(f"window: {self.seconds:g} s is impossible; choose e.g. 4")
         if not 0 < self.overlap <= self.seconds / 2:
             raise FaceDiffError(
                 f"overlap: {self.overlap:g} s is impossible with windows of {self.seconds:g} s; choose more than 0, at "
                 f"most half of a window"
             )
-        if min(self.before, self.after, self.above) < 0:
-            raise FaceDiffError("window: the speech before and after a window cannot last less than 0 s")
+        if not (0 <= self.before < math.inf and 0 <= self.after < math.inf and self.above >= 0):
+            raise FaceDiffError("window: the speech before and after a window cannot last less than 0 s, nor for ever")
 
     def in_frames(self, frame_rate: float) -> FramePlan:
         """The same in whole frames.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -18,6 +19,8 @@ from facediff.takes.take import Take
 FORMAT = "facediff take 1"
 ARRAYS = ("vertices", "template", "faces", "speech", "colours", "inner_lip_pairs")
 NEEDED = ("vertices", "template", "about")
+BROKEN = (OSError, ValueError, EOFError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile)
+"""What NumPy raises for a damaged file; its headers are Python literals."""
 SHAPES: dict[str, tuple[str, str, tuple[int | None, ...]]] = {
     "vertices": ("f", "floating point (frames, vertices, 3)", (None, None, 3)),
     "template": ("f", "floating point (vertices, 3)", (None, 3)),
@@ -62,7 +65,7 @@ def read_archive(path: Path) -> Take:
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected a take that `facediff animate … -o take.npz` wrote")
-    held = read_entries(path)
+    held: dict[str, Any] = {**read_entries(path)}
     missing = [name for name in NEEDED if name not in held]
     if missing:
         raise FaceDiffError(
@@ -107,8 +110,8 @@ def read_entries(path: Path) -> dict[str, npt.NDArray[Any]]:
         strange = [name for name, value in held.items() if not isinstance(value, np.ndarray)]
         if strange:
             raise ValueError(f"{strange[0]} is no array")
-    except (OSError, ValueError, EOFError, LookupError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as e:
-        raise FaceDiffError(f"{path}: not a readable .npz file ({e}); write it anew") from e
+    except (*BROKEN, LookupError, RuntimeError, MemoryError, zlib.error) as error:
+        raise FaceDiffError(f"{path}: not a readable .npz file ({error}); write it anew") from error
     return held
 
 

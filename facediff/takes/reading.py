@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.takes.archive import read_archive
+from facediff.takes.archive import BROKEN, read_archive
 from facediff.takes.take import Take
 
 SUFFIXES = (".npz", ".npy")
@@ -113,7 +112,7 @@ def read_vertices(path: Path) -> npt.NDArray[np.float32]:
         raise FaceDiffError(f"{path}: no such file; expected a motion (frames, vertices, 3)")
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except BROKEN as error:
         raise FaceDiffError(f"{path}: not a readable NumPy array ({error})") from error
     if not isinstance(array, np.ndarray):
         array.close()

@@ -156,7 +156,12 @@ def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
     (tmp_path / "shapes").symlink_to(folder)
     spoilt = take.vertices[:3].copy()
     spoilt[1, 2] = np.nan
-    for name, array in (("nan", spoilt), ("empty", take.vertices[:0]), ("small", take.vertices[:, :99]), ("bare", take.vertices)):
+    for name, array in (
+        ("nan", spoilt),
+        ("empty", take.vertices[:0]),
+        ("small", take.vertices[:, :99]),
+        ("bare", take.vertices),
+    ):
         np.save(tmp_path / f"{name}.npy", array)
     (tmp_path / "mine.json").write_text("{}")
     before = sorted(tmp_path.iterdir())

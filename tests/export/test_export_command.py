@@ -41,6 +41,14 @@ def test_a_bare_array_is_completed_by_options(take: Take, tmp_path: Path, capsys
     assert not (tmp_path / "out_obj" / "out.wav").exists()
 
 
+def test_takes_of_one_recording_are_told_apart_by_their_files(take: Take, tmp_path: Path) -> None:
+    for name in ("mine", "theirs"):
+        write_archive(tmp_path / f"{name}.npz", take)
+    page = tmp_path / "page.html"
+    assert main(["export", str(tmp_path / "mine.npz"), str(tmp_path / "theirs.npz"), "-o", str(page)]) == 0
+    assert "<title>mine · theirs – facediff</title>" in page.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

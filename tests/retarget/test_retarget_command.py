@@ -94,7 +94,7 @@ def test_a_reordered_mesh_is_told(
         (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--landmarks", "absent.csv"], "absent.csv"),
         (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--show", "p.gif"], "expected a picture .png"),
         (["nan.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "frame 0 holds NaN"),
-        (["bare.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "without a mesh"),
+        (["bare.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "error: bare: comes without"),
         (
             ["take.npz", *TARGET, "-o", "o.npz", "--landmarks", "l.csv", "--correspondence", "take.npz"],
             "would be used without them",

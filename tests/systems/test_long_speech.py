@@ -125,6 +125,14 @@ def test_every_frame_is_there_whatever_the_length(ready: Ready, frames: int) -> 
             more()
 
 
+def test_without_a_limit_all_speech_is_made_at_once(ready: Ready) -> None:
+    system = ready()
+    system.windows = replace(PLAN, above=float("inf"))
+    vertices = system.animate(speech(3), subject="A").vertices
+    clip = system.clip_of(speech(3), "A", None)
+    assert torch.equal(vertices, system.perform(clip)[0] + clip.template[0])
+
+
 def test_a_stream_cannot_take_frames_back(ready: Ready) -> None:
     stream = ready().stream(subject="A")
     given = stream.feed(speech(4)).shape[1]
@@ -268,6 +276,9 @@ def test_an_encoder_hears_a_piece_as_loud_as_in_the_whole(ready: Ready) -> None:
         ({"seconds": 0.0}, "window: 0 s is impossible"),
         ({"seconds": 1.0, "overlap": 0.6}, "overlap: 0.6 s is impossible"),
         ({"overlap": 0.0}, "overlap: 0 s is impossible"),
+        ({"overlap": float("nan")}, "overlap: nan s is impossible"),
+        ({"before": float("inf")}, "nor for ever"),
+        ({"above": float("nan")}, "cannot last less than 0 s"),
         ({"after": -1.0}, "cannot last less than 0 s"),
         ({"seconds": float("nan")}, "window: nan s is impossible"),
     ],

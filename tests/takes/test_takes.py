@@ -148,6 +148,11 @@ def test_files_that_are_no_takes(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="not a readable NumPy array"):
         read_take(tmp_path / "c.npy")
     np.save(tmp_path / "plain.npy", np.zeros((2, 6, 3), np.float32))
+    whole = (tmp_path / "plain.npy").read_bytes()
+    for header in (whole.replace(b"}", b"{"), whole.replace(b"(2,", b"(02")):  # a NumPy header is Python
+        (tmp_path / "d.npy").write_bytes(header)
+        with pytest.raises(FaceDiffError, match="not a readable NumPy array"):
+            read_take(tmp_path / "d.npy")
     (tmp_path / "plain.npy").rename(tmp_path / "plain.npz")
     with pytest.raises(FaceDiffError, match="not a readable .npz"):
         read_archive(tmp_path / "plain.npz")

@@ -74,6 +74,13 @@ def test_a_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
     assert facts(page)["takes"][0]["centre"] == [100, 100, 97.5]
 
 
+def test_takes_of_one_recording_are_told_apart_by_their_files(files: Path) -> None:
+    write_archive(files / "other.npz", clicks(name="guess", lower=5))
+    page = files / "page.html"
+    assert main(["view", str(files / "guess.npz"), str(files / "other.npz"), "-o", str(page)]) == 0
+    assert [take["name"] for take in facts(page)["takes"]] == ["guess", "other"]
+
+
 def test_labels_the_shortest_and_the_browser(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)

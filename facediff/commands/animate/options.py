@@ -12,6 +12,7 @@ from facediff.errors import FaceDiffError
 if TYPE_CHECKING:
     from facediff.export import ExportOptions
 
+SEEDS = 2**62
 VIEWS = ("front", "three_quarter", "side")
 EPILOG = """examples:
   facediff animate speech.wav --checkpoint demo/puppet.ckpt -o speech.mp4
@@ -134,6 +135,16 @@ def export_options(args: argparse.Namespace, footer: str = "") -> ExportOptions:
     )
 
 
+def check_seed(seed: int) -> None:
+    """Refuse what the generators of random numbers do not take, clips' and takes' own numbers added.
+
+    Raises:
+        FaceDiffError: if it is too small or too large.
+    """
+    if not 0 <= seed < SEEDS:
+        raise FaceDiffError(f"--seed {seed}: expected 0 or more, and less than {SEEDS}")
+
+
 def check(args: argparse.Namespace, output: Path) -> None:
     """Refuse what can be refused before a model is loaded.
 
@@ -145,8 +156,7 @@ def check(args: argparse.Namespace, output: Path) -> None:
 
     if args.takes < 1:
         raise FaceDiffError(f"--takes {args.takes}: expected 1 or more")
-    if args.seed < 0:
-        raise FaceDiffError(f"--seed {args.seed}: expected 0 or more")
+    check_seed(args.seed)
     if args.size < 16:
         raise FaceDiffError(f"--size {args.size}: expected at least 16 pixels")
     if args.correspondence is not None and args.target_mesh is None:

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
-import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import resource_tracker
-from multiprocessing.connection import wait as wait_for
 from typing import Any, TypeVar
+
+from facediff.processes import start_worker, unheard
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _work: Callable[[Any], Any] | None = None
 
@@ -62,7 +55,7 @@ def _together(
     try:
         while waiting or running:
             while waiting and len(running) < workers:
-                with _unheard():
+                with unheard():
                     running[pool.submit(_do, waiting[0])] = waiting[0]
                 waiting.popleft()
             done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -80,7 +73,7 @@ def _together(
 def _alone(work: Callable[[Task], Result], task: Task) -> Iterator[tuple[Task, Result | None]]:
     with _pool(work, 1) as pool:
         try:
-            with _unheard():
+            with unheard():
                 future = pool.submit(_do, task)
             result = future.result()
         except BrokenProcessPool:
@@ -94,39 +87,10 @@ def _pool(work: Callable[[Any], Any], workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(work,))
 
 
-@contextmanager
-def _unheard() -> Iterator[None]:
-    """Processes that are started inside never hear Ctrl-C, not even while they start; this one hears it afterwards.
-
-    A worker that Ctrl-C ends would take all others along, in the middle of their work.
-    """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # its start, later, would undo the mask
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def _start(work: Callable[[Any], Any]) -> None:
     global _work
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # There are as many processes as processors; more threads than these get into each other's way.
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    start_worker()
     _work = work
-
-
-def _end_with(sentinel: int) -> None:
-    wait_for([sentinel])
-    os._exit(1)
 
 
 def _do(task: Any) -> Any:  # noqa: ANN401

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
+from facediff.commands.animate.options import check_seed
 from facediff.errors import FaceDiffError
 from facediff.files import atomic, check_writable
 
@@ -46,6 +47,7 @@ def check_stream(args: argparse.Namespace) -> None:
             f"--{'takes' if given is None else given.replace('_', '-')}: needs the whole performance; stream to .npy, "
             f"then use `facediff export`"
         )
+    check_seed(args.seed)
     if sys.stdin is None:
         raise FaceDiffError("--stream: standard input is closed; send samples to it")
     if not 1000 <= args.rate <= 384_000:
@@ -58,7 +60,7 @@ def run_stream(args: argparse.Namespace) -> int:
     """Animate speech as it comes, until it ends or Ctrl-C ends it.
 
     Raises:
-        FaceDiffError: if an option is no good, the speech ends before a frame, or nobody reads the frames any more.
+        FaceDiffError: if an option is no good, or the speech ends before a frame.
     """
     check_stream(args)
 
@@ -179,20 +181,15 @@ def sink(output: Path, frame: tuple[int, ...]) -> Iterator[Callable[[npt.NDArray
     """Where frames (n, V, 3) go: a .npy file that appears when it is whole, or standard output at once.
 
     Raises:
-        FaceDiffError: if the file cannot be written, or standard output has no reader any more.
+        FaceDiffError: if the file cannot be written.
     """
     from facediff.commands.animate.motion_files import MotionWriter
 
     if str(output) == "-":
 
         def write(vertices: npt.NDArray[np.float32]) -> None:
-            try:
-                sys.stdout.buffer.write(vertices.astype("<f4").tobytes())
-                sys.stdout.buffer.flush()
-            except BrokenPipeError as error:
-                # Python would try to write what is left once more at its end, and complain.
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-                raise FaceDiffError("standard output: whoever read the frames has ended, so the stream ends") from error
+            sys.stdout.buffer.write(vertices.astype("<f4").tobytes())
+            sys.stdout.buffer.flush()
 
         yield write
         return
