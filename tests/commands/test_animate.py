@@ -20,6 +20,7 @@ from facediff.cli import main
 from facediff.data.audio import read_speech
 from facediff.systems import load_system
 from facediff.takes import read_archive
+from facediff.topology import read_mesh
 
 
 @pytest.fixture
@@ -423,3 +424,25 @@ def test_a_folder_of_recordings(checkpoint: Path, tmp_path: Path, capsys: pytest
     assert (tmp_path / "out" / "c.npz").is_file()
     assert animate(*words[:-4], "--suffix", ".obj") == 2
     assert "a batch writes one file for each recording" in capsys.readouterr().err
+
+
+def test_takes_are_carried_to_another_mesh_by_one_correspondence(
+    speech: Path, checkpoint: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import facediff.retarget
+
+    found = []
+    correspond = facediff.retarget.correspond
+    monkeypatch.setattr(facediff.retarget, "correspond", lambda *a, **k: found.append(1) or correspond(*a, **k))
+    words = ["--takes", 2, "--target-mesh", tiny_root / "tiny.ply"]
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "t.npy", *words) == 0
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "own.npy", "--takes", 2) == 0
+    assert len(found) == 1
+    template = load_system(checkpoint).assets.templates["A"].numpy()
+    rest = read_mesh(tiny_root / "tiny.ply").vertices
+    for take in (1, 2):
+        carried, own = np.load(tmp_path / f"t_take{take}.npy"), np.load(tmp_path / f"own_take{take}.npy")
+        moved, wanted = carried - rest, own - template
+        # The same topology of nearly the same face: nearly the same motion, and another one for each take.
+        assert np.abs(moved - wanted).max() < 0.25 * np.abs(wanted).max()
+    assert not np.array_equal(np.load(tmp_path / "t_take1.npy"), np.load(tmp_path / "t_take2.npy"))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from facediff.data import Reference
+    from facediff.retarget import Correspondence
     from facediff.systems import Style
     from facediff.systems.windows import WindowPlan
     from facediff.takes import Take
@@ -52,6 +53,7 @@ class Performer:
         self.identity = args.identity or self.system.identities[0]
         self.system.assets.template(self.identity)
         check_directing(args, self.system.assets)
+        self._correspondence: Correspondence | None = None
         self.style: Reference | Style | None = None
         if args.style:
             self.style = read_styles(args.style, self.identity, self.system, template=args.style_template)
@@ -95,12 +97,21 @@ class Performer:
 
     def finished(self, take: Take, seed: int) -> Take:
         """A take with everything done to it that the options ask for after the system."""
-        from facediff.commands.target_mesh import carried
-
         take = directed(take, self.args, seed=None if self.args.directing_seed is not None else seed)
         if self.args.target_mesh is not None:
-            take = carried(take, self.args.target_mesh, self.args.correspondence)
+            take = self._carried(take)
         return take
+
+    def _carried(self, take: Take) -> Take:
+        """The take on the other mesh; the correspondence is found once for all takes, since all have one face."""
+        from facediff.commands.target_mesh import carried_with
+        from facediff.retarget import carry
+        from facediff.topology import read_mesh
+
+        if self._correspondence is None:
+            made, self._correspondence = carried_with(take, self.args.target_mesh, self.args.correspondence)
+            return made
+        return carry(take, self._correspondence, read_mesh(self.args.target_mesh))
 
     def precision(self) -> AbstractContextManager[object]:
         """Within it the network multiplies in the precision asked for; noise and vertices stay as they are."""
