@@ -11,6 +11,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["WANDB_MODE"] = "offline"
 os.environ["WANDB_SILENT"] = "true"
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +22,9 @@ import torch
 from facediff import registry
 from facediff.systems import DualPathDiffusion
 from tests.fakes.tiny import SEEN, VERTICES, Tiny, write_tiny
+
+# A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C, which some test.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Tiny tensors are faster on one thread, and much faster where something else keeps the other cores busy.
 torch.set_num_threads(1)

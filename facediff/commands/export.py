@@ -77,7 +77,7 @@ def footer(checkpoint: Path | None) -> str:
     if checkpoint is None:
         return ""
     assets = assets_of(checkpoint)
-    return f"{assets.corpus}: synthetic corpus" if assets.synthetic else assets.corpus
+    return f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
 
 
 def format_table(formats: Mapping[str, Format]) -> str:

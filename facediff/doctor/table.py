@@ -122,6 +122,8 @@ def _remark(group: Sequence[Finding]) -> list[str]:
 def _verdict(report: Report) -> str:
     counts = {s: sum(f.severity == s for f in report.findings) for s in ("error", "warning")}
     told = ", ".join(counted(count, severity) for severity, count in counts.items() if count)
+    if report.sound and not told:
+        return "sound: nothing is wrong with this copy"
     return f"{'sound' if report.sound else 'not sound'}{f': {told}' if told else ''}"
 
 

@@ -17,7 +17,12 @@ def find_truths(folder: Path) -> tuple[Path, Path | None]:
 
     Args:
         folder: a corpus folder, its ``vertices_npy``, or any other folder of files.
+
+    Raises:
+        FaceDiffError: if there is no such folder.
     """
+    if not folder.is_dir():
+        raise FaceDiffError(f"{folder}: no such folder; expected the truth's motion files, or a corpus folder")
     for name in MOTION_FOLDERS:
         if (folder / name).is_dir():
             return folder / name, folder

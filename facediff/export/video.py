@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -68,8 +69,15 @@ def drawn_frames(takes: Sequence[Take], options: ExportOptions) -> Iterator[Fram
     motions = [held(take.vertices, frames) for take in takes]
     # Where nothing else is to be said, the corpora: that one is synthetic must not get lost on the way to a video.
     corpora = dict.fromkeys(take.metadata["corpus"] for take in takes if "corpus" in take.metadata)
-    footer = options.footer or ", ".join(corpora)
+    footer = " – ".join(part for part in (options.footer or ", ".join(corpora), procedural(takes)) if part)
     return side_by_side(renderers, motions, [take.name for take in takes], footer=footer or None)
+
+
+def procedural(takes: Sequence[Take]) -> str:
+    """What in the takes was made by rules and not learnt, in short: it must be told wherever it is seen."""
+    told = dict.fromkeys(re.sub(r" \([^)]*\)", "", take.metadata.get("procedural", "")) for take in takes)
+    words = ", ".join(text.replace(";", ",") for text in told if text)
+    return f"procedural: {words}" if words else ""
 
 
 def held(motion: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:

@@ -46,6 +46,8 @@ def check_export(path: Path, options: ExportOptions, n_takes: int = 1) -> None:
             the place cannot be written.
         MissingExtraError: if a package is missing.
     """
+    if not path.suffix:
+        raise FaceDiffError(f"{path}: has no suffix, which names the format; give one, such as {path.name}.glb")
     if path.suffix not in FORMATS:
         raise FaceDiffError(f'{path}: there is no format "{path.suffix}": {choices(path.suffix.lower(), FORMATS)}')
     if n_takes < 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -11,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from facediff.errors import FaceDiffError
-from facediff.export import ExportOptions, write_takes
+from facediff.export import ExportOptions, video, write_takes
 from facediff.export.video import drawn_frames
 from facediff.takes import Take
 
@@ -77,3 +78,12 @@ def test_takes_of_different_frame_rates_are_refused(make_take: Callable[..., Tak
     with pytest.raises(FaceDiffError, match=r"differ in frame rate \(Hello Zoë 30, b 25\)"):
         write_takes(tmp_path / "a.mp4", [make_take(), make_take(name="b", frame_rate=25.0)], SMALL)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_procedural_is_told_under_the_video(take: Take) -> None:
+    told = {"corpus": "puppet (synthetic)", "procedural": "blinks (17 a minute, seed 0); head sway (2 degrees, seed 0)"}
+    assert video.procedural([replace(take, metadata=told), take]) == "procedural: blinks, head sway"
+    assert video.procedural([take]) == ""
+    plain = next(drawn_frames([replace(take, metadata={"corpus": "puppet (synthetic)"})], ExportOptions(size=128)))
+    marked = next(drawn_frames([replace(take, metadata=told)], ExportOptions(size=128)))
+    assert not np.array_equal(plain, marked)

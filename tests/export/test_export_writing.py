@@ -40,7 +40,7 @@ def test_the_formats_are_as_promised() -> None:
     [
         ("a.gltf", {}, 'there is no format ".gltf": did you mean ".glb"? known are .glb, .usdc'),
         ("a.GLB", {}, 'there is no format ".GLB": did you mean ".glb"?'),
-        ("a", {}, 'there is no format ""'),
+        ("a", {}, "has no suffix, which names the format"),
         ("a.glb", {"unit": "cm"}, ".glb is in metres by its standard"),
         ("a.glb", {"up": "z"}, ".glb has y up by definition"),
         ("a.npz", {"up": "z"}, ".npz has y up by definition"),

@@ -13,12 +13,20 @@ from facediff.errors import FaceDiffError, choices
 def run(name: str, arguments: Sequence[str]) -> int:
     """Animate; every input is checked before the model is loaded, and every output appears whole or not at all."""
     args = parser().parse_args(list(arguments))
+    # What can be told at once is told before anything heavy is imported.
+    if not args.checkpoint.is_file():
+        raise FaceDiffError(
+            f"{args.checkpoint}: no such checkpoint; expected a .ckpt file that `facediff fit` has written, or "
+            f"demo/puppet.ckpt of `facediff demo`"
+        )
     if args.stream or [str(path) for path in args.speech] == ["-"]:
         from facediff.commands.animate.stream import run_stream
 
         if not args.stream:
             raise FaceDiffError("speech: - is standard input; add --stream, and send samples rather than a file")
         return run_stream(args)
+    if len(args.speech) == 1 and not args.speech[0].exists():
+        raise FaceDiffError(f"{args.speech[0]}: no such sound file, nor a folder of recordings")
     if len(args.speech) > 1 or args.speech[0].is_dir():
         return run_batch(args, list(arguments))
     check(args, args.output)
@@ -30,7 +38,9 @@ def run(name: str, arguments: Sequence[str]) -> int:
     read_checked(args.speech[0], args.max_seconds)  # before the model, which takes longer to load
     written, take = Performer(args).write(args.speech[0], args.output, seed=args.seed)
     told = f"{len(take.vertices)} frames, identity {take.metadata['identity']}, style of {take.metadata['style']}"
-    procedural = f", procedural: {take.metadata['procedural']}" if "procedural" in take.metadata else ""
+    procedural = "".join(
+        f", {name}: {take.metadata[name]}" for name in ("directed", "procedural") if name in take.metadata
+    )
     for path in written:
         print(f"{path}: {told}{procedural}")
         told, procedural = "beside it", ""
@@ -57,10 +67,8 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
     check(args, args.output / f"recording{args.suffix}")
     kind = FORMATS[args.suffix]
     if kind.folder or (args.takes > 1 and not kind.several):
-        raise FaceDiffError(
-            f"--suffix {args.suffix}: a batch writes one file for each recording; choose a suffix that holds it all, "
-            f"such as .glb, or .html for several takes"
-        )
+        fit = ".html or .mp4, which hold several takes" if args.takes > 1 else "a format of one file, such as .glb"
+        raise FaceDiffError(f"--suffix {args.suffix}: a batch writes one file for each recording; choose {fit}")
     speeches = recordings(args.speech)
     if args.correspondence is not None and not args.correspondence.exists():
         write_correspondence(args)

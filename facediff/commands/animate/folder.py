@@ -103,16 +103,19 @@ def recordings(paths: Sequence[Path]) -> list[Path]:
     Raises:
         FaceDiffError: if a folder has none. A file that is missing fails later, by itself.
     """
-    from facediff.data.audio import SUFFIXES
+    from facediff.data.audio import CONTAINERS, SUFFIXES
 
+    known = SUFFIXES + CONTAINERS
     found: dict[Path, Path] = {}
     for path in paths:
         files = [path]
         if path.is_dir():
-            files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES and file.is_file()]
+            files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in known and file.is_file()]
             files = [file for file in files if not file.name.startswith(".")]
             if not files:
-                raise FaceDiffError(f"{path}: holds no recording; expected {', '.join(SUFFIXES)}")
+                raise FaceDiffError(f"{path}: holds no recording; expected {', '.join(known)}")
+        if not path.exists():
+            raise FaceDiffError(f"{path}: no such file or folder of recordings")
         for file in files:
             found.setdefault(file.resolve(), file)
     return list(found.values())

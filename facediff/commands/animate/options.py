@@ -119,7 +119,7 @@ def add_batch_options(made: argparse.ArgumentParser) -> None:
     group.add_argument("--retry-failed", action="store_true", help="try recordings again that failed before")
 
 
-def export_options(args: argparse.Namespace, footer: str = "") -> ExportOptions:
+def export_options(args: argparse.Namespace) -> ExportOptions:
     """How the takes are written."""
     from facediff.export import ExportOptions
 
@@ -130,7 +130,6 @@ def export_options(args: argparse.Namespace, footer: str = "") -> ExportOptions:
         view=args.view,
         size=args.size,
         shapes=args.shapes,
-        footer=footer,
         quiet=args.quiet,
     )
 

@@ -70,8 +70,7 @@ class Performer:
         speech = read_checked(recording, self.args.max_seconds)
         with self.takes(speech, recording.stem, seed, output) as takes:
             finished = [self.finished(take, seed + i) for i, take in enumerate(takes)]
-            options = export_options(self.args, self.footer if output.suffix == ".mp4" else "")
-            return write_takes(output, finished, options), finished[0]
+            return write_takes(output, finished, export_options(self.args)), finished[0]
 
     @contextmanager
     def takes(self, speech: npt.NDArray[np.float32], name: str, seed: int, output: Path) -> Iterator[list[Take]]:
@@ -118,12 +117,6 @@ class Performer:
         import torch
 
         return torch.autocast(self.system.device.type, torch.bfloat16, enabled=self.args.precision == "bf16")
-
-    @property
-    def footer(self) -> str:
-        """What stands under a video: the corpus, and whether a program made it."""
-        assets = self.system.assets
-        return f"{assets.corpus}: synthetic corpus" if assets.synthetic else assets.corpus
 
     def _at_once(
         self, speech: npt.NDArray[np.float32], seeds: Sequence[int]
