@@ -7,6 +7,7 @@ them are those of the CSV files that Epic's app Live Link Face records, as publi
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import lru_cache
 
 _EYE = ("eyeBlink", "eyeLookDown", "eyeLookIn", "eyeLookOut", "eyeLookUp", "eyeSquint", "eyeWide")
@@ -102,3 +103,13 @@ def _spellings() -> dict[str, str]:
             if name.endswith(side):
                 known[plain(name.removesuffix(side)) + side[0].lower()] = name
     return known
+
+
+def absent_from(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of ARKit's that are not among ``names``, in ARKit's order."""
+    return tuple(name for name in ARKIT if name not in names)
+
+
+def beyond_arkit(names: Sequence[str]) -> tuple[str, ...]:
+    """Those of ``names`` that are not ARKit's."""
+    return tuple(name for name in names if name not in ARKIT)

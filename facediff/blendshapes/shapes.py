@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.blendshapes.arkit import ARKIT, arkit_name
+from facediff.blendshapes.arkit import absent_from, arkit_name, beyond_arkit
 from facediff.blendshapes.files import ShapeFiles, read_shape_files
 from facediff.errors import FaceDiffError
 from facediff.takes import metres_per_unit
@@ -48,12 +48,12 @@ class ShapeSet:
     @property
     def absent(self) -> tuple[str, ...]:
         """Names of ARKit's that are not in the set."""
-        return tuple(name for name in ARKIT if name not in self.names)
+        return absent_from(self.names)
 
     @property
     def extra(self) -> tuple[str, ...]:
         """Names that are not ARKit's."""
-        return tuple(name for name in self.names if name not in ARKIT)
+        return beyond_arkit(self.names)
 
     @property
     def still(self) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from facediff.blendshapes.arkit import ARKIT
+from facediff.blendshapes.arkit import absent_from, beyond_arkit
 
 Array = npt.NDArray[np.float64]
 
@@ -40,12 +40,12 @@ class Weights:
     @property
     def absent(self) -> tuple[str, ...]:
         """Names of ARKit's that had no shape, in ARKit's order."""
-        return tuple(name for name in ARKIT if name not in self.names)
+        return absent_from(self.names)
 
     @property
     def extra(self) -> tuple[str, ...]:
         """Names that are not ARKit's."""
-        return tuple(name for name in self.names if name not in ARKIT)
+        return beyond_arkit(self.names)
 
     @property
     def residual_share(self) -> Array:

@@ -11,16 +11,18 @@ import numpy as np
 from facediff.export.format import Format, Space
 from facediff.export.options import ExportOptions
 from facediff.takes import Take, write_archive
+from facediff.takes.motion_files import MotionWriter
 
 
 def write_vertices(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
     """Absolute vertices (T, V, 3), float32; written frame by frame."""
     (take,) = takes
-    with path.open("wb") as stream:
-        header = {"descr": "<f4", "fortran_order": False, "shape": take.vertices.shape}
-        np.lib.format.write_array_header_1_0(stream, header)
+    writer = MotionWriter(path, take.template.shape)
+    try:
         for frame in Space.of(take, options).frames(take):
-            stream.write(np.ascontiguousarray(frame, "<f4").tobytes())
+            writer.write(frame[None])
+    finally:
+        writer.close()
 
 
 def write_take(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:

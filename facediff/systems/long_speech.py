@@ -237,14 +237,13 @@ def with_speech(clip: Batch, speech: Float[Tensor, " samples"], frames: int) -> 
 def windowed(system: WindowedSystem, batch: Batch, seed: int, progress: Progress | None) -> Tensor:
     """Motion of a batch in which some clips are too long to be made at once; the others are made as ever."""
     motion = torch.zeros_like(batch.motion)
-    limit = system.windows.above * system.frame_rate
     lengths = batch.frame_lengths.tolist()
-    short = [i for i, frames in enumerate(lengths) if frames <= limit]
+    short = [i for i, frames in enumerate(lengths) if system.windows.at_once(frames, system.frame_rate)]
     if short:
         made = system.perform(batch.select(short), seed=seed)
         motion[short, : made.shape[1]] = made
     for i, frames in enumerate(lengths):
-        if frames > limit:
+        if i not in short:
             clip = batch.select([i])
             start = 0
             for part in SpeechStream(system, clip, seeds=[seed]).over(

@@ -124,7 +124,7 @@ class Performing(ABC):
             seed: seed of the noise; a clip's noise depends on it and on the clip's name, not on the clips beside it.
             progress: wraps the iteration over steps, or over the seconds of long speech, e.g. in a progress bar.
         """
-        if int(batch.frame_lengths.max()) <= self.windows.above * self.frame_rate:
+        if self.windows.at_once(int(batch.frame_lengths.max()), self.frame_rate):
             return self.perform(batch, seed=seed, progress=progress)
         with torch.no_grad():
             return windowed(self, batch, seed, progress)
@@ -177,7 +177,7 @@ class Performing(ABC):
             FaceDiffError: as :meth:`animate`.
         """
         clip = self.clip_of(audio, subject, style)
-        if clip.motion.shape[1] <= self.windows.above * self.frame_rate:
+        if self.windows.at_once(clip.motion.shape[1], self.frame_rate):
             takes = self.perform_takes(clip, seeds, progress=progress)
         else:
             takes = torch.cat(list(SpeechStream(self, clip, seeds=seeds).over(clip.audio[0], progress=progress)), 1)

@@ -83,6 +83,10 @@ class WindowPlan:
             )
         return FramePlan(frames, overlap, round(self.before * frame_rate), round(self.after * frame_rate))
 
+    def at_once(self, frames: int, frame_rate: float) -> bool:
+        """Whether so many frames are short enough to be animated at once."""
+        return frames <= self.above * frame_rate
+
     @property
     def look_ahead(self) -> float:
         """Seconds of speech, at most, that must be heard after an instant before its frame is certain.

@@ -35,8 +35,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
     from facediff.commands.animate.recordings import read_checked, refuse_replacing
 
     refuse_replacing(args.speech, [args.output])
-    read_checked(args.speech[0], args.max_seconds)  # before the model, which takes longer to load
-    written, take = Performer(args).write(args.speech[0], args.output, seed=args.seed)
+    speech = read_checked(args.speech[0], args.max_seconds)  # before the model, which takes longer to load
+    written, take = Performer(args).write(speech, args.speech[0].stem, args.output, seed=args.seed)
     told = f"{len(take.vertices)} frames, identity {take.metadata['identity']}, style of {take.metadata['style']}"
     procedural = "".join(
         f", {name}: {take.metadata[name]}" for name in ("directed", "procedural") if name in take.metadata
@@ -114,11 +114,12 @@ def write_correspondence(args: argparse.Namespace) -> None:
 
 def deciding(words: Sequence[str]) -> list[str]:
     """The command without what decides nothing of a single output."""
-    args = parser().parse_args(list(words))
+    options = parser()
+    args = options.parse_args(list(words))
+    aside = ("speech", "output", "workers", "retry_failed", "quiet", "help", "stream", "suffix")
     kept = []
-    for action in parser()._actions:
+    for action in options._actions:
         value = getattr(args, action.dest, None)
-        aside = ("speech", "output", "workers", "retry_failed", "quiet", "help", "stream", "suffix")
         if action.dest in aside or value is None or value is False or not action.option_strings:
             continue
         kept += [action.option_strings[-1]] if value is True else [f"{action.option_strings[-1]}={value}"]
@@ -129,11 +130,13 @@ def make_worker(command: list[str]) -> Callable[[Path, Path], None]:
     """What a process of a batch does with each recording; the model is loaded once."""
     from facediff.commands.animate.folder import seed_of_recording
     from facediff.commands.animate.performer import Performer
+    from facediff.commands.animate.recordings import read_checked
 
     args = parser().parse_args(["-", "-o", "-", *command, "--quiet"])
     performer = Performer(args)
 
     def animate(recording: Path, output: Path) -> None:
-        performer.write(recording, output, seed=seed_of_recording(recording, args.seed))
+        speech = read_checked(recording, args.max_seconds)
+        performer.write(speech, recording.stem, output, seed=seed_of_recording(recording, args.seed))
 
     return animate

@@ -58,17 +58,15 @@ class Performer:
         if args.style:
             self.style = read_styles(args.style, self.identity, self.system, template=args.style_template)
 
-    def write(self, recording: Path, output: Path, *, seed: int) -> tuple[list[Path], Take]:
-        """Animate a recording and write it; the files, and the first take.
+    def write(self, speech: npt.NDArray[np.float32], name: str, output: Path, *, seed: int) -> tuple[list[Path], Take]:
+        """Animate speech (S,) at 16 kHz and write it under a name; the files, and the first take.
 
         Raises:
-            FaceDiffError: if the recording is no good, or a file cannot be written.
+            FaceDiffError: if a file cannot be written.
         """
-        from facediff.commands.animate.recordings import read_checked
         from facediff.export import write_takes
 
-        speech = read_checked(recording, self.args.max_seconds)
-        with self.takes(speech, recording.stem, seed, output) as takes:
+        with self.takes(speech, name, seed, output) as takes:
             finished = [self.finished(take, seed + i) for i, take in enumerate(takes)]
             return write_takes(output, finished, export_options(self.args)), finished[0]
 
@@ -79,8 +77,8 @@ class Performer:
 
         seeds = [seed + i for i in range(self.args.takes)]
         # In whole frames, as the system counts: else speech of just about the limit would be made in another way here.
-        rate, above = self.system.frame_rate, self.system.windows.above
-        short = round(len(speech) * rate / SAMPLE_RATE) <= above * rate
+        rate = self.system.frame_rate
+        short = self.system.windows.at_once(round(len(speech) * rate / SAMPLE_RATE), rate)
         # On the disk that the result goes to, which is the one that has room for it.
         spool: AbstractContextManager[str | None] = nullcontext() if short else self._folder(output)
         with spool as folder:
@@ -140,7 +138,7 @@ class Performer:
         import numpy as np
         import torch
 
-        from facediff.commands.animate.motion_files import MotionWriter
+        from facediff.takes.motion_files import MotionWriter
 
         stream = self.system.stream(subject=self.identity, style=self.style, seeds=seeds)
         progress = None if self.args.quiet else partial(bar, description="seconds of speech")
@@ -222,8 +220,8 @@ def device(name: str) -> str:
     return name
 
 
-def bar(items: Iterable[T], *, description: str, total: int | None = None) -> Iterable[T]:
+def bar(items: Iterable[T], *, description: str) -> Iterable[T]:
     """The items, with a progress bar."""
     from tqdm import tqdm
 
-    return tqdm(items, desc=description, total=total, leave=False)
+    return tqdm(items, desc=description, leave=False)

@@ -183,7 +183,7 @@ def sink(output: Path, frame: tuple[int, ...]) -> Iterator[Callable[[npt.NDArray
     Raises:
         FaceDiffError: if the file cannot be written.
     """
-    from facediff.commands.animate.motion_files import MotionWriter
+    from facediff.takes.motion_files import MotionWriter
 
     if str(output) == "-":
 
