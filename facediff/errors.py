@@ -1,5 +1,7 @@
 """The one error that facediff shows to people as a plain sentence instead of a traceback."""
 
+from __future__ import annotations
+
 import difflib
 from collections.abc import Iterable
 

@@ -1,10 +1,11 @@
-"""Names for the replaceable parts of a system: the one place where a word becomes a class.
+"""Everything that can be chosen by name: components, models, corpora, metrics and export formats.
 
-Each *kind* (``decoder``, ``fusion`` …) is an object of this module; each registered name is an importable class
-below it. ``facediff.registry.decoder.gru`` is therefore a path that configs and checkpoints can store and that
-survives moving files, and ``--model.decoder=gru`` works on the command line because the path ends in the name.
+Each *kind* (``decoder``, ``model``, ``metric`` …) is an object of this module. A component is registered under a lower
+snake case name and becomes an importable class below its kind: ``facediff.registry.decoder.gru`` is a path that configs
+and checkpoints can store and that survives moving files, and ``--model.decoder=gru`` works on the command line because
+the path ends in the name. Models and corpora are registered under their class names.
 
-Third parties add a component by installing a package with an entry point in the group ``facediff.<kind>``::
+Third parties add an entry of any kind by installing a package with an entry point in the group ``facediff.<kind>``::
 
     [project.entry-points."facediff.decoder"]
     my_decoder = "my_package.my_module:MyDecoder"
@@ -17,12 +18,14 @@ from __future__ import annotations
 import importlib
 import inspect
 import keyword
-import pkgutil
 import types
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
+from enum import Enum
+from functools import partial
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, TypeVar
 
 from facediff.errors import FaceDiffError, choices
@@ -69,14 +72,16 @@ class Kind:
 
     Args:
         name: the word for the kind.
-        package: import path of the package whose modules register the built-in components.
-        title: what a component of this kind does, in a few words.
+        modules: import paths of the modules that register the built-in ones, separated by spaces.
+        title: what an entry of this kind does, in a few words.
+        aliases: whether each entry is also an importable class below the kind, as components are.
     """
 
-    def __init__(self, name: str, package: str, title: str) -> None:
+    def __init__(self, name: str, modules: str, title: str, *, aliases: bool = True) -> None:
         self.kind = name
         self.title = title
-        self._package = package
+        self._aliases = aliases
+        self._modules = modules.split()
         self._entries: dict[str, Entry] = {}
         self._loaded = False
 
@@ -96,7 +101,8 @@ class Kind:
 
     def _add(self, name: str, implementation: type) -> None:
         """Register ``implementation`` under ``name``; see :meth:`register`."""
-        malformed = not name.isidentifier() or keyword.iskeyword(name) or name != name.lower() or name.startswith("_")
+        malformed = not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_")
+        malformed = malformed or (self._aliases and name != name.lower())
         if malformed or name in dir(self):
             raise RegistrationError(
                 f'{self.kind} name "{name}" cannot be registered: use a lower snake case identifier that is none '
@@ -108,7 +114,8 @@ class Kind:
             raise RegistrationError(
                 f'{self.kind} name "{name}" is wanted by {owner} but belongs to {taken.owner}: rename one of them'
             )
-        self._entries[name] = Entry(name, implementation, self._make_alias(name, implementation))
+        alias = self._make_alias(name, implementation) if self._aliases else implementation
+        self._entries[name] = Entry(name, implementation, alias)
 
     def _make_alias(self, name: str, implementation: type) -> type:
         """Make the empty subclass whose import path ends in the registered name."""
@@ -123,9 +130,8 @@ class Kind:
         if self._loaded:
             return
         self._loaded = True
-        package = importlib.import_module(self._package)
-        for module in pkgutil.iter_modules(package.__path__):
-            importlib.import_module(f"{self._package}.{module.name}")
+        for module in self._modules:
+            importlib.import_module(module)
         for point in entry_points(group=f"facediff.{self.kind}"):
             try:
                 self._add(point.name, point.load())
@@ -172,19 +178,35 @@ class Kind:
         return iter(self.entries())
 
 
-audio_encoder = Kind("audio_encoder", "facediff.components.audio_encoder", "speech to one feature per frame")
-identity_encoder = Kind("identity_encoder", "facediff.components.identity_encoder", "who the face is, from a label")
-mesh_encoder = Kind("mesh_encoder", "facediff.components.mesh_encoder", "a mesh's motion to one feature per frame")
-style_encoder = Kind(
-    "style_encoder", "facediff.components.style_encoder", "how the person moves, from a reference motion"
+audio_encoder = Kind("audio_encoder", "facediff.models.audio_encoders", "speech to one feature per frame")
+identity_encoder = Kind("identity_encoder", "facediff.models.identity_encoders", "a speaker's label to a vector")
+mesh_encoder = Kind("mesh_encoder", "facediff.models.mesh_encoders", "a mesh's motion to one feature per frame")
+style_encoder = Kind("style_encoder", "facediff.models.style_encoders", "a reference motion to its speaking style")
+fusion = Kind("fusion", "facediff.models.fusions", "speech features meet the noisy motion")
+decoder = Kind("decoder", "facediff.models.decoders", "fused features and style to clean motion")
+sampler = Kind("sampler", "facediff.models.samplers", "runs the reverse diffusion process")
+model = Kind(
+    "model",
+    "facediff.models.dual_path facediff.models.style_content",
+    "a method, as a LightningModule",
+    aliases=False,  # Lightning refuses to reload a module that is named by a nested alias
 )
-fusion = Kind("fusion", "facediff.components.fusion", "speech features meet the noisy motion")
-decoder = Kind("decoder", "facediff.components.decoder", "fused features and style to clean motion")
-sampler = Kind("sampler", "facediff.diffusion.samplers", "runs the reverse diffusion process")
+corpus = Kind(
+    "corpus",
+    "facediff.data.puppet facediff.data.biwi facediff.data.vocaset facediff.data.mead3d",
+    "a data set, as a LightningDataModule",
+    aliases=False,
+)
+metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class", aliases=False)
+export_format = Kind("export_format", "facediff.export", "a file format that animations are written in", aliases=False)
 
-KINDS: dict[str, Kind] = {
+COMPONENTS: dict[str, Kind] = {
     kind.kind: kind for kind in (audio_encoder, identity_encoder, mesh_encoder, style_encoder, fusion, decoder, sampler)
 }
+"""The kinds of which models are made; a model's option of the kind's name chooses one."""
+
+KINDS: dict[str, Kind] = {**COMPONENTS, **{kind.kind: kind for kind in (model, corpus, metric, export_format)}}
+"""Everything that can be chosen by name."""
 
 
 def alias_path(component: type) -> str:
@@ -193,8 +215,90 @@ def alias_path(component: type) -> str:
     Args:
         component: a registered alias, an implementation that is registered, or any other class.
     """
-    for kind in KINDS.values():
+    for kind in COMPONENTS.values():
         for entry in kind._entries.values():  # noqa: SLF001 - same module; loading everything is not wanted here
             if component in (entry.implementation, entry.alias):
                 return f"{__name__}.{kind.kind}.{entry.name}"
     return f"{component.__module__}.{component.__qualname__}"
+
+
+# Hyper-parameters as plain data, so that a checkpoint loads with ``weights_only=True`` however it was made.
+
+
+def plain(value: Any) -> Any:  # noqa: ANN401
+    """Describe a constructor argument by numbers, strings, lists and dicts.
+
+    A component class, or a ``functools.partial`` of one (which is also what the command line hands over), becomes
+    Lightning's form ``{"class_path": …, "init_args": {…}}``.
+
+    Raises:
+        TypeError: if the value has no plain description; the message says which forms have one.
+    """
+    if isinstance(value, Enum):  # before the numbers and strings, which members of some enumerations are too
+        return plain(value.value)
+    if value is None or isinstance(value, bool | int | float | str):
+        # Subclasses such as numpy.float64 would not load again with weights_only=True.
+        return value if value is None or type(value) in (bool, int, float, str) else _exact(value)
+    if isinstance(value, type):
+        return {"class_path": alias_path(value), "init_args": {}}
+    if isinstance(value, partial):
+        return {"class_path": alias_path(component_class(value)), "init_args": plain(value.keywords)}
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Sequence | Set) and not isinstance(value, bytes | bytearray | memoryview):
+        return [plain(item) for item in value]
+    if hasattr(value, "items"):
+        return {str(key): plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    raise TypeError(
+        f"a {type(value).__name__} cannot be kept in a checkpoint; give a component as its class or as "
+        f"functools.partial(class, option=value), and everything else as numbers, strings, lists and dicts"
+    )
+
+
+def _exact(value: bool | int | float | str) -> bool | int | float | str:
+    for kind in (bool, int, float, str):
+        if isinstance(value, kind):
+            return kind(value)
+    return value
+
+
+def component_class(factory: Any) -> type:  # noqa: ANN401
+    """The class that a factory makes an instance of.
+
+    Args:
+        factory: a class, a ``functools.partial`` of one, or jsonargparse's partial, which holds the class among its
+            arguments.
+    """
+    if isinstance(factory, type):
+        return factory
+    if isinstance(factory, partial):
+        for candidate in (factory.func, *factory.args):
+            if isinstance(candidate, type):
+                return candidate
+    raise TypeError(f"{factory!r} is no component; give its class or functools.partial(class, option=value)")
+
+
+def defaults(component: type) -> dict[str, Any]:
+    """A component's own options with their defaults, as plain data; what a model gives it has no default."""
+    parameters = inspect.signature(component).parameters.values()
+    return {p.name: plain(p.default) for p in parameters if p.default is not inspect.Parameter.empty}
+
+
+def describe(factory: Any, component: object) -> dict[str, Any]:  # noqa: ANN401
+    """A component's plain description for the checkpoint, with every option that it was made with.
+
+    Options left at their defaults are written down too: whoever rebuilds the component may fill what is missing from
+    the component that usually stands in its place. A component may have a method ``checkpoint_init_args`` that returns
+    constructor arguments which let it be built without the files that it was first built from (a pretrained network,
+    say).
+    """
+    description: dict[str, Any] = plain(factory)
+    description["init_args"] = {**defaults(component_class(factory)), **description["init_args"]}
+    extra = getattr(component, "checkpoint_init_args", None)
+    if extra is not None:
+        description["init_args"] = {**description["init_args"], **plain(extra())}
+    return description

@@ -5,7 +5,9 @@ import os
 # The shapes in the signatures of the mathematics are checked in tests only; the hook must come before the imports.
 from jaxtyping import install_import_hook
 
-install_import_hook(["facediff.components", "facediff.losses", "facediff.diffusion"], "beartype.beartype")
+install_import_hook(
+    ["facediff.models.layers", "facediff.models.losses", "facediff.models.samplers"], "beartype.beartype"
+)
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["WANDB_MODE"] = "offline"
@@ -20,7 +22,7 @@ import pytest
 import torch
 
 from facediff import registry
-from facediff.systems import DualPathDiffusion
+from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import SEEN, VERTICES, Tiny, write_tiny
 
 # A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C, which some test.
@@ -41,8 +43,8 @@ def tiny(tiny_root: Path) -> Tiny:
 
 
 @pytest.fixture
-def make_system() -> Callable[..., DualPathDiffusion]:
-    """A system small enough to train in a test; keyword arguments override."""
+def make_model() -> Callable[..., DualPathDiffusion]:
+    """A model small enough to train in a test; keyword arguments override."""
 
     def make(**options: object) -> DualPathDiffusion:
         from functools import partial

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from facediff.cli import COMMANDS, main
+from facediff.cli.app import COMMANDS, main
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -33,7 +33,7 @@ def test_fit_commands_parse(words: list[str], capsys: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit) as stop:
         main([*words[1:], "--print_config"])
     assert stop.value.code == 0
-    assert "class_path: facediff.systems.DualPathDiffusion" in capsys.readouterr().out
+    assert "class_path: facediff.models.DualPathDiffusion" in capsys.readouterr().out
 
 
 def test_links_lead_somewhere() -> None:

@@ -19,9 +19,8 @@ import torch
 from jsonargparse import ArgumentParser
 
 from facediff import registry
-from facediff.components.decoder import Decoder
-from facediff.components.decoder.gru import GruDecoder
 from facediff.errors import FaceDiffError
+from facediff.models.decoders import Decoder, GruDecoder
 from facediff.registry import Kind, RegistrationError, UnknownComponentError, alias_path
 
 ROOT = Path(__file__).parents[1]
@@ -53,10 +52,10 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., No
     return put
 
 
-@pytest.mark.parametrize("kind", registry.KINDS)
+@pytest.mark.parametrize("kind", registry.COMPONENTS)
 def test_every_name_is_an_importable_picklable_class(kind: str) -> None:
-    assert registry.KINDS[kind].names()
-    for entry in registry.KINDS[kind]:
+    assert registry.COMPONENTS[kind].names()
+    for entry in registry.COMPONENTS[kind]:
         alias = getattr(getattr(registry, kind), entry.name)
         assert f"{alias.__module__}.{alias.__qualname__}" == f"facediff.registry.{kind}.{entry.name}"
         assert issubclass(alias, entry.implementation)
@@ -120,7 +119,7 @@ def test_a_clash_names_both_owners(shelf: Kind) -> None:
 
 def test_register_hands_the_class_back_untouched(shelf: Kind) -> None:
     assert shelf.register("thing")(GruDecoder) is GruDecoder
-    assert GruDecoder.__module__ == "facediff.components.decoder.gru"
+    assert GruDecoder.__module__ == "facediff.models.decoders"
 
 
 def test_a_plug_in_is_found(shelf: Kind, install: Callable[..., None]) -> None:
@@ -139,7 +138,7 @@ def test_a_plug_in_is_found(shelf: Kind, install: Callable[..., None]) -> None:
         ("spinner", "", "has no attribute 'Spinner'"),
         ("spinner", "Spinner = 3\n", "Error"),
         ("Spinner-3", "class Spinner: ...\n", "lower snake case"),
-        ("taken", "class Spinner: ...\n", "facediff.components.decoder.gru.GruDecoder"),
+        ("taken", "class Spinner: ...\n", "facediff.models.decoders.GruDecoder"),
     ],
 )
 def test_a_broken_plug_in_is_a_warning_that_names_it(
@@ -201,7 +200,7 @@ def test_an_installed_package_is_listed(plugin_site: Path) -> None:
     rows = json.loads(facediff(plugin_site, "components", "--json"))
     ours = {(row["kind"], row["name"]) for row in rows}
     assert ("decoder", "moving_average") in ours
-    assert {(kind, name) for kind in registry.KINDS for name in registry.KINDS[kind].names()} <= ours
+    assert {(kind, name) for kind in registry.COMPONENTS for name in registry.COMPONENTS[kind].names()} <= ours
     [row] = [row for row in rows if row["name"] == "moving_average"]
     assert row["class"] == "facediff_moving_average.MovingAverageDecoder"
     assert row["summary"] == "Averages each frame with its neighbours and adds the mean style token."

@@ -135,7 +135,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--frames", type=int, nargs="+", default=[0, 15, 23, 31], help="of the picture")
     args = parser.parse_args()
-    with np.load(args.take, allow_pickle=False) as archive:
+    with np.load(args.animation, allow_pickle=False) as archive:
         about = json.loads(str(archive["about"]))
         vertices = archive["vertices"]
     truth = np.stack([vertices[..., 0], -vertices[..., 2], vertices[..., 1]], -1)  # z up

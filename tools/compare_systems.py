@@ -1,6 +1,6 @@
-"""Trains both systems on the built-in corpus and prints what they can do, side by side.
+"""Trains both models on the built-in corpus and prints what they can do, side by side.
 
-    python tools/compare_systems.py -o comparison
+    python tools/compare_models.py -o comparison
 
 About 20 minutes on two CPU cores. Figures on the built-in corpus are synthetic: they say nothing about real people.
 Checkpoints that exist already in the output folder are not trained again.
@@ -19,12 +19,12 @@ from typing import Any
 
 import torch
 
-from facediff.commands.adapt import run as adapt
-from facediff.commands.lightning import run_cli
+from facediff.cli.adapt import run as adapt
+from facediff.cli.lightning import run_cli
 from facediff.data import Puppet, collate
 from facediff.data.audio import SAMPLE_RATE
-from facediff.puppet import SEEN_SUBJECTS, UNSEEN_SUBJECTS
-from facediff.systems import SpeechAnimator, StyleContentDisentanglement, load_system
+from facediff.models import AnimationModel, StyleContentDisentanglement, load_model
+from facediff.synthetic import SEEN_IDENTITIES, UNSEEN_IDENTITIES
 
 SYSTEMS = {
     "dual-path diffusion": ("configs/experiment/puppet.yaml", 60),
@@ -41,7 +41,7 @@ def main(words: Sequence[str] | None = None) -> int:
     made.add_argument("-o", "--output", type=Path, default=Path("comparison"), help="folder of checkpoints and results")
     made.add_argument("--epochs", type=int, help="training epochs (default: 60 and 40)")
     made.add_argument("--adapt-epochs", type=int, default=60, help="epochs of adapting (default: 60)")
-    made.add_argument("--only", choices=list(SYSTEMS), help="one system")
+    made.add_argument("--only", choices=list(SYSTEMS), help="one model")
     args = made.parse_args(words)
     args.output.mkdir(parents=True, exist_ok=True)
     started, rows = time.monotonic(), []
@@ -55,29 +55,29 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def measure(name: str, config: str, epochs: int, args: argparse.Namespace) -> Row:
-    """All figures of one system."""
+    """All figures of one model."""
     path = args.output / f"{name.replace(' ', '_')}.ckpt"
     started = time.monotonic()
     if not path.is_file():
         options = [f"--trainer.max_epochs={epochs}"]
         options += [f"--trainer.logger.save_dir={args.output}", "--trainer.logger.name=training"]
         run_cli("fit", ["--config", config, *options]).trainer.save_checkpoint(path)
-    row: Row = {"system": name, "training seconds": round(time.monotonic() - started)}
-    system, data = load_system(path), Puppet()
+    row: Row = {"model": name, "training seconds": round(time.monotonic() - started)}
+    model, data = load_model(path), Puppet()
     data.prepare_data()
-    row["parameters"] = sum(p.numel() for p in system.parameters())
+    row["parameters"] = sum(p.numel() for p in model.parameters())
     row |= scores(path)
-    row["real-time factor"] = real_time_factor(system, data)
-    row["style: nearest speaker"] = style_accuracy(system, data)
-    if isinstance(system, StyleContentDisentanglement):
-        row["content: speaker by linear probe"] = content_probe(system, data)
-        row |= swaps(system, data)
-    for person in UNSEEN_SUBJECTS:
+    row["real-time factor"] = real_time_factor(model, data)
+    row["style: nearest speaker"] = style_accuracy(model, data)
+    if isinstance(model, StyleContentDisentanglement):
+        row["content: speaker by linear probe"] = content_probe(model, data)
+        row |= swaps(model, data)
+    for person in UNSEEN_IDENTITIES:
         adapted = path.with_name(f"{path.stem}_{person}.ckpt")
         if not adapted.is_file():
             options = ["--epochs", str(args.adapt_epochs), "--accelerator", "cpu", "--quiet"]
             adapt("adapt", ["--checkpoint", str(path), "--person", person, "-o", str(adapted), *options])
-        before, after = (person_lve(load_system(each), data, person) for each in (path, adapted))
+        before, after = (person_lve(load_model(each), data, person) for each in (path, adapted))
         row[f"{person} LVE before adapting"], row[f"{person} LVE after"] = before, after
         row[f"{person} LVE, after to before"] = after / before
     return row
@@ -97,7 +97,7 @@ def scores(path: Path) -> Row:
 
 
 @torch.inference_mode()
-def real_time_factor(system: SpeechAnimator, data: Puppet, seconds: int = 10) -> float:
+def real_time_factor(model: AnimationModel, data: Puppet, seconds: int = 10) -> float:
     """Time for ten seconds of speech, by that time; the better of two."""
     clip = data.clips("test_a")[0]
     audio = data.corpus.read_audio(clip, 0, data.corpus.frames(clip))
@@ -105,7 +105,7 @@ def real_time_factor(system: SpeechAnimator, data: Puppet, seconds: int = 10) ->
     taken = []
     for _ in range(2):
         started = time.monotonic()
-        system.animate(speech, subject=SEEN_SUBJECTS[0])
+        model.animate(speech, subject=SEEN_IDENTITIES[0])
         taken.append(time.monotonic() - started)
     return min(taken) / seconds
 
@@ -119,39 +119,39 @@ def held_out(data: Puppet) -> list[Any]:
     ]
 
 
-def styles(system: SpeechAnimator, samples: Sequence[Any]) -> torch.Tensor:
+def styles(model: AnimationModel, samples: Sequence[Any]) -> torch.Tensor:
     """A style vector for every clip, from its own motion."""
     return torch.stack(
-        [system.encode_style(s.motion[None], torch.ones(1, len(s.motion), dtype=torch.bool))[0] for s in samples]
+        [model.encode_style(s.motion[None], torch.ones(1, len(s.motion), dtype=torch.bool))[0] for s in samples]
     )
 
 
 @torch.inference_mode()
-def style_accuracy(system: SpeechAnimator, data: Puppet) -> float:
+def style_accuracy(model: AnimationModel, data: Puppet) -> float:
     """Share of held-out clips whose nearest other held-out clip, by style vector, is of the same speaker."""
     samples = held_out(data)
-    vectors = styles(system, samples)
+    vectors = styles(model, samples)
     distances = torch.cdist(vectors, vectors).fill_diagonal_(torch.inf)
     nearest = distances.argmin(1).tolist()
     return sum(samples[i].subject == samples[n].subject for i, n in enumerate(nearest)) / len(samples)
 
 
-def contents(system: StyleContentDisentanglement, samples: Sequence[Any]) -> list[torch.Tensor]:
+def contents(model: StyleContentDisentanglement, samples: Sequence[Any]) -> list[torch.Tensor]:
     """Content of each clip's motion, (frames, content_dim)."""
     with torch.inference_mode():
         return [
-            system.encode_content(s.motion[None], torch.ones(1, len(s.motion), dtype=torch.bool))[0] for s in samples
+            model.encode_content(s.motion[None], torch.ones(1, len(s.motion), dtype=torch.bool))[0] for s in samples
         ]
 
 
-def content_probe(system: StyleContentDisentanglement, data: Puppet) -> float:
+def content_probe(model: StyleContentDisentanglement, data: Puppet) -> float:
     """How often a linear classifier names the speaker from one frame's content; chance is 0.125.
 
     Fitted on three held-out sentences of each speaker, scored on the two others, every speaker counting alike.
     """
     samples = held_out(data)
     subjects = sorted({s.subject for s in samples})
-    features = contents(system, samples)
+    features = contents(model, samples)
     fitted = [i for i, s in enumerate(samples) if s.sentence in ("e28", "e29", "e30")]
     scored = [i for i in range(len(samples)) if i not in fitted]
     x = torch.cat([features[i] for i in fitted]).clone()
@@ -177,24 +177,24 @@ def content_probe(system: StyleContentDisentanglement, data: Puppet) -> float:
 
 
 @torch.inference_mode()
-def swaps(system: StyleContentDisentanglement, data: Puppet) -> Row:
+def swaps(model: StyleContentDisentanglement, data: Puppet) -> Row:
     """Content of one speaker with the style of another who says the same held-out sentence.
 
     FDD as the released scripts have it: signed, and the mean over the sentences; of each ordered pair of speakers its
     absolute value, and the mean over these.
     """
     samples = {(s.subject, s.sentence): s for s in held_out(data)}
-    upper = system.assets.regions["upper_face"]
+    upper = model.assets.regions["upper_face"]
     correlations: list[float] = []
     to_other: dict[tuple[str, str], list[float]] = {}
     to_source: dict[tuple[str, str], list[float]] = {}
     for (subject, sentence), source in samples.items():
         for other in (s for s in samples.values() if s.sentence == sentence and s.subject != subject):
             mask = torch.ones(1, len(source.motion), dtype=torch.bool)
-            content = system.encode_content(source.motion[None], mask)
-            style = system.encode_style(other.motion[None], torch.ones(1, len(other.motion), dtype=torch.bool))
-            made = system.decode(content, style, mask)[0]
-            openings = [opening(system, motion, source.template) for motion in (made, source.motion)]
+            content = model.encode_content(source.motion[None], mask)
+            style = model.encode_style(other.motion[None], torch.ones(1, len(other.motion), dtype=torch.bool))
+            made = model.decode(content, style, mask)[0]
+            openings = [opening(model, motion, source.template) for motion in (made, source.motion)]
             correlations.append(float(torch.corrcoef(torch.stack(openings))[0, 1]))
             pair = (subject, other.subject)
             to_other.setdefault(pair, []).append(deviation(made, other.motion, upper))
@@ -210,9 +210,9 @@ def swaps(system: StyleContentDisentanglement, data: Puppet) -> Row:
     }
 
 
-def opening(system: SpeechAnimator, motion: torch.Tensor, template: torch.Tensor) -> torch.Tensor:
+def opening(model: AnimationModel, motion: torch.Tensor, template: torch.Tensor) -> torch.Tensor:
     """Mean distance between the inner lips, (frames,)."""
-    pairs = system.assets.inner_lip_pairs
+    pairs = model.assets.inner_lip_pairs
     assert pairs is not None
     face = motion + template
     return torch.linalg.vector_norm(face[:, pairs[:, 0]] - face[:, pairs[:, 1]], dim=-1).mean(1)
@@ -228,28 +228,28 @@ def deviation(motion: torch.Tensor, truth: torch.Tensor, upper: torch.Tensor) ->
 
 
 @torch.inference_mode()
-def person_lve(system: SpeechAnimator, data: Puppet, person: str) -> float:
+def person_lve(model: AnimationModel, data: Puppet, person: str) -> float:
     """LVE (paper's protocol) of a person's test clips, each animated with the person's identity if it is known."""
-    lips = system.assets.regions["lips"]
+    lips = model.assets.regions["lips"]
     total, frames = 0.0, 0
     dataset = data.dataset("test_b")
     for index, clip in enumerate(dataset.clips):
         if clip.subject != person:
             continue
         sample = dataset[index]
-        sample.identity = system.assets.identity_index(person)
-        motion = system.generate(collate([sample]))[0]
+        sample.identity = model.assets.identity_index(person)
+        motion = model.generate(collate([sample]))[0]
         error = (motion - sample.motion)[:, lips].double().square().sum(-1).amax(-1)
         total, frames = total + float(error.sum()), frames + len(error)
     return total / frames
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Figures as lines, systems as columns, in Markdown."""
+    """Figures as lines, models as columns, in Markdown."""
     names = list(dict.fromkeys(itertools.chain.from_iterable(rows)))
-    lines = ["| | " + " | ".join(str(row["system"]) for row in rows) + " |", "|---|" + "---|" * len(rows)]
+    lines = ["| | " + " | ".join(str(row["model"]) for row in rows) + " |", "|---|" + "---|" * len(rows)]
     for name in names:
-        if name != "system":
+        if name != "model":
             lines.append(f"| {name} | " + " | ".join(shown(row.get(name)) for row in rows) + " |")
     return "\n".join(lines)
 

@@ -30,8 +30,8 @@ from facediff.data import Batch, Sample, SpeechMotionDataModule, collate
 from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
 from facediff.metrics import Region, SampleDiversity
-from facediff.systems import DualPathDiffusion, load_system
-from facediff.systems.checkpoint import imported
+from facediff.models import DualPathDiffusion, load_model
+from facediff.models.checkpoint import imported
 
 SAMPLERS = ("ddpm:1000", "ddim:50", "ddim:25", "ddim:10", "dpm_solver:20", "dpm_solver:10", "dpm_solver:5")
 TIMED_SECONDS = 10.0
@@ -94,20 +94,20 @@ def fastest(rows: Sequence[Scores], *, tolerance: float, kept: float) -> Scores:
     return min(good, key=lambda row: (row.steps, sum(fmean(row.lve[s]) / fmean(full.lve[s]) for s in full.lve)))
 
 
-def measure(system: DualPathDiffusion, batches: dict[str, list[Batch]], scores: Scores, seeds: int) -> None:
+def measure(model: DualPathDiffusion, batches: dict[str, list[Batch]], scores: Scores, seeds: int) -> None:
     """Make every clip with every seed, and score it."""
-    system.choose_sampler(scores.sampler, scores.steps)
+    model.choose_sampler(scores.sampler, scores.steps)
     regions = {
-        name: Region.from_indices(name, indices, n_vertices=system.n_vertices)
-        for name, indices in system.assets.regions.items()
+        name: Region.from_indices(name, indices, n_vertices=model.n_vertices)
+        for name, indices in model.assets.regions.items()
     }
     pairs = list(combinations(range(seeds), 2))
     for split, some in batches.items():
-        metrics = [system.evaluation.protocol.build(regions["lips"], regions["upper_face"]) for _ in range(seeds)]
+        metrics = [model.evaluation.protocol.build(regions["lips"], regions["upper_face"]) for _ in range(seeds)]
         distances = {pair: SampleDiversity(n_samples=2, pairing="all") for pair in pairs}
         for batch in some:
             told = {"lengths": batch.frame_lengths, "clip_names": batch.names}
-            made = [system.generate(batch, seed=seed) for seed in range(seeds)]
+            made = [model.generate(batch, seed=seed) for seed in range(seeds)]
             for metric, motion in zip(metrics, made, strict=True):
                 metric.update(motion, batch.motion, **told)
             for (one, other), distance in distances.items():
@@ -127,13 +127,13 @@ def ten_seconds(sample: Sample, frame_rate: float) -> Batch:
     return collate([replace(sample, audio=speech, motion=motion, decoy_audio=None, features=None)])
 
 
-def real_time_factor(system: DualPathDiffusion, batch: Batch, scores: Scores, repeats: int = 5) -> float:
+def real_time_factor(model: DualPathDiffusion, batch: Batch, scores: Scores, repeats: int = 5) -> float:
     """The quickest of several, the speech's encoding included, by the length of the speech."""
-    system.choose_sampler(scores.sampler, scores.steps)
+    model.choose_sampler(scores.sampler, scores.steps)
     taken = []
     for _ in range(repeats):
         started = time.perf_counter()
-        system.generate(batch)
+        model.generate(batch)
         taken.append(time.perf_counter() - started)
     return min(taken) * SAMPLE_RATE / batch.audio.shape[1]
 
@@ -175,16 +175,16 @@ def verdict(rows: Sequence[Scores], args: argparse.Namespace) -> str:
     )
 
 
-def heading(args: argparse.Namespace, system: DualPathDiffusion, batches: dict[str, list[Batch]]) -> str:
+def heading(args: argparse.Namespace, model: DualPathDiffusion, batches: dict[str, list[Batch]]) -> str:
     """What is measured, where and how."""
     packages = ", ".join(f"{name} {version(name)}" for name in ("facediff", "torch", "diffusers"))
     clips = ", ".join(f"{split} {sum(map(len, some))} clips" for split, some in batches.items())
-    synthetic = " (synthetic: says nothing about real people)" if system.assets.synthetic else ""
-    millions = sum(p.numel() for p in system.parameters()) / 1e6
+    synthetic = " (synthetic: says nothing about real people)" if model.assets.synthetic else ""
+    millions = sum(p.numel() for p in model.parameters()) / 1e6
     return "\n".join(
         [
-            f"- corpus: {system.assets.corpus}{synthetic}; {clips}; {args.seeds} seeds; protocol "
-            f"{system.evaluation.protocol.name}; {millions:.1f} million weights",
+            f"- corpus: {model.assets.corpus}{synthetic}; {clips}; {args.seeds} seeds; protocol "
+            f"{model.evaluation.protocol.name}; {millions:.1f} million weights",
             f"- machine: {processor()}, {torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f} at the start; "
             f"Python {platform.python_version()}, {packages}",
             f"- command: `{shlex.join(['python', 'tools/sampler_table.py', *args.words])}`",
@@ -201,17 +201,17 @@ def processor() -> str:
     return next(names, platform.processor() or platform.machine())
 
 
-def corpus_of(system: DualPathDiffusion, root: str | None) -> SpeechMotionDataModule:
+def corpus_of(model: DualPathDiffusion, root: str | None) -> SpeechMotionDataModule:
     """The corpus that a checkpoint was trained on.
 
     Raises:
         FaceDiffError: if its class is not imported.
     """
-    path = system.data_source.get("class_path", "")
+    path = model.data_source.get("class_path", "")
     made = imported(path, SpeechMotionDataModule)
     if made is None:
         raise FaceDiffError(f"the checkpoint's corpus is {path or 'not named'}; import the package that it comes from")
-    data = made(root=root or system.data_source["root"])
+    data = made(root=root or model.data_source["root"])
     data.prepare_data()
     return data
 
@@ -244,23 +244,23 @@ def main(words: Sequence[str] | None = None) -> int:
     args = options(sys.argv[1:] if words is None else words)
     if args.threads:
         torch.set_num_threads(args.threads)
-    system = load_system(args.checkpoint)
-    if not isinstance(system, DualPathDiffusion):
-        raise FaceDiffError(f"{args.checkpoint}: {type(system).__name__} has no sampler; give one of DualPathDiffusion")
-    data = corpus_of(system, args.data_root)
+    model = load_model(args.checkpoint)
+    if not isinstance(model, DualPathDiffusion):
+        raise FaceDiffError(f"{args.checkpoint}: {type(model).__name__} has no sampler; give one of DualPathDiffusion")
+    data = corpus_of(model, args.data_root)
     batches = {split: clips_of(data, split, args) for split in args.split or data.test_splits}
-    print(heading(args, system, batches), flush=True)
-    timed = ten_seconds(data.dataset(next(iter(batches)))[0], system.frame_rate)
+    print(heading(args, model, batches), flush=True)
+    timed = ten_seconds(data.dataset(next(iter(batches)))[0], model.frame_rate)
     rows = []
     for word in args.sampler:
         name, _, steps = word.partition(":")
         rows.append(Scores(name, int(steps)))
         started = time.monotonic()
-        measure(system, batches, rows[-1], args.seeds)
-        rows[-1].real_time_factor = real_time_factor(system, timed, rows[-1])
+        measure(model, batches, rows[-1], args.seeds)
+        rows[-1].real_time_factor = real_time_factor(model, timed, rows[-1])
         print(f"{rows[-1].name}: {time.monotonic() - started:.0f} s", file=sys.stderr, flush=True)
     for split in batches:
-        print(f"\n{split}:\n\n{table(rows, split, system.assets.unit)}")
+        print(f"\n{split}:\n\n{table(rows, split, model.assets.unit)}")
     print(f"\n{verdict(rows, args)}")
     if args.json:
         args.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")

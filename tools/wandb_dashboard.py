@@ -29,7 +29,7 @@ TERMS = ("reconstruction", "velocity", "acceleration", "face")
 METRICS = ("mve", "lve", "fdd", "fdd_absolute")
 SPLITS = {"test_a": "test A, seen people", "test_b": "test B, unseen people"}
 COLUMNS = (
-    "config:system",
+    "config:model",
     "config:component/decoder",
     "config:component/style_encoder",
     "config:data/corpus",
@@ -133,7 +133,7 @@ def save(view: Workspace) -> str:
         FaceDiffError: if there is no key or no answer, or the server refuses.
     """
     os.environ.setdefault("WANDB_SILENT", "true")
-    from facediff.commands.wandb_mode import why_offline
+    from facediff.cli.lightning import why_offline
 
     try:
         reason = why_offline()
@@ -153,9 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--entity", required=True, help="user or team on Weights & Biases")
     parser.add_argument("--project", default="facediff", help="project; default: facediff")
     parser.add_argument("--clips", nargs="+", default=[], metavar="CLIP", help="clips whose preview videos get a panel")
-    parser.add_argument(
-        "--terms", nargs="+", default=TERMS, metavar="TERM", help="terms of the loss, for other systems"
-    )
+    parser.add_argument("--terms", nargs="+", default=TERMS, metavar="TERM", help="terms of the loss, for other models")
     parser.add_argument("--dry-run", action="store_true", help="print the view's JSON; no network, nothing saved")
     parser.add_argument("--output", type=Path, help="write the view's JSON to a file; no network, nothing saved")
     options = parser.parse_args(arguments)
@@ -164,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.dry_run:
             print(as_json(view))
         if options.output is not None:
-            from facediff.files import atomic
+            from facediff.utils.files import atomic
 
             with atomic(options.output) as temporary:
                 temporary.write_text(as_json(view) + "\n", encoding="utf-8")

@@ -1,25 +1,32 @@
 """Data: the batch contract, speech files, and one data module per corpus."""
 
-from facediff.data.assets import Assets, Reference
-from facediff.data.base import SpeechMotionDataModule
-from facediff.data.batch import Batch, Sample, collate
-from facediff.data.biwi import Biwi
-from facediff.data.corpus import Clip, Corpus
-from facediff.data.mead3d import Mead3D
-from facediff.data.puppet import Puppet
-from facediff.data.vocaset import Vocaset
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Assets",
-    "Batch",
-    "Biwi",
-    "Clip",
-    "Corpus",
-    "Mead3D",
-    "Puppet",
-    "Reference",
-    "Sample",
-    "SpeechMotionDataModule",
-    "Vocaset",
-    "collate",
-]
+from facediff.utils.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from facediff.data.batch import Assets as Assets
+    from facediff.data.batch import Batch as Batch
+    from facediff.data.batch import Reference as Reference
+    from facediff.data.batch import Sample as Sample
+    from facediff.data.batch import collate as collate
+    from facediff.data.biwi import Biwi as Biwi
+    from facediff.data.corpus import Clip as Clip
+    from facediff.data.corpus import Corpus as Corpus
+    from facediff.data.datamodule import SpeechMotionDataModule as SpeechMotionDataModule
+    from facediff.data.mead3d import Mead3D as Mead3D
+    from facediff.data.puppet import Puppet as Puppet
+    from facediff.data.vocaset import Vocaset as Vocaset
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "batch": "Assets Batch Reference Sample collate",
+        "biwi": "Biwi",
+        "corpus": "Clip Corpus",
+        "datamodule": "SpeechMotionDataModule",
+        "mead3d": "Mead3D",
+        "puppet": "Puppet",
+        "vocaset": "Vocaset",
+    },
+)

@@ -1,4 +1,4 @@
-"""THE data contract: what one clip and one batch of clips are, for every corpus and every system.
+"""THE data contract: what one clip and one batch of clips are, for every corpus and every model.
 
 Audio is 16 kHz mono float32 and spans exactly the time of the motion. Motion is offsets from the subject's neutral
 template, in the corpus's unit of length. Tensors are padded with zeros; lengths say what is valid.
@@ -7,13 +7,15 @@ template, in the corpus's unit of length. Tensors are padded with zeros; lengths
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
+
+from facediff.errors import FaceDiffError
 
 UNKNOWN_IDENTITY = -1
 
@@ -35,7 +37,7 @@ class Sample:
         decoy_audio: speech of another sentence, as long as ``audio``; only for evaluation against shuffled audio.
         features: what the frozen part of the audio encoder makes of the clip's speech; None where it is not cached.
         repeated: whether another process scores the same clip.
-        style: a style vector that a system made, in place of what it would make of ``reference``.
+        style: a style vector that a model made, in place of what it would make of ``reference``.
     """
 
     audio: Float[Tensor, " samples"]
@@ -74,7 +76,7 @@ class Batch:
         features: padded features of the frozen part of the audio encoder; None unless all clips have them.
         feature_lengths: valid steps of the features.
         repeated: whether other processes score these clips, so that this one must not.
-        style: style vectors in place of what a system would make of the references; None unless all clips have one.
+        style: style vectors in place of what a model would make of the references; None unless all clips have one.
     """
 
     audio: Float[Tensor, "batch samples"]
@@ -192,3 +194,95 @@ def collate(samples: Sequence[Sample]) -> Batch:
         repeated=samples[0].repeated,
         style=torch.stack(styles) if len(styles) == len(samples) else None,
     )
+
+
+# What a checkpoint must hold about its corpus to animate a face without the corpus.
+
+ASSETS_KEY = "facediff_assets"
+"""Where a checkpoint keeps :meth:`Assets.state`."""
+
+DATA_SOURCE_KEY = "facediff_data"
+"""Where a checkpoint keeps which data module it was trained on (``class_path``) and where the corpus was (``root``)."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A reference motion that carries a person's style.
+
+    Attributes:
+        clip: the clip it was taken from.
+        motion: offsets from the template, half precision to keep checkpoints small.
+    """
+
+    clip: str
+    motion: Float[Tensor, "frames vertices 3"]
+
+
+@dataclass(frozen=True)
+class Assets:
+    """Everything about a corpus that animation needs.
+
+    Attributes:
+        corpus: name of the corpus.
+        synthetic: whether the corpus was made by a program rather than captured from people.
+        unit: unit of length of templates and motion.
+        frame_rate: motion frames a second.
+        identities: the training identities, in the order of the identity index.
+        templates: neutral face of every subject.
+        faces: triangles; None where the corpus has no mesh file.
+        colours: vertex colours (sRGB, 0 to 255) for pictures; None where the mesh file has none.
+        regions: vertex indices by region name: ``lips``, ``upper_face``.
+        inner_lip_pairs: (upper, lower) vertex pairs on the inner lips, for the mouth's opening.
+        references: a default style reference for every subject that has one.
+        motion_scale: factor that gives the training motion unit variance; None until it has been measured.
+    """
+
+    corpus: str
+    synthetic: bool
+    unit: str
+    frame_rate: float
+    identities: list[str]
+    templates: dict[str, Float[Tensor, "vertices 3"]]
+    faces: Int[Tensor, "faces 3"] | None
+    regions: dict[str, Int[Tensor, " region"]]
+    colours: UInt8[Tensor, "vertices 3"] | None = None
+    inner_lip_pairs: Int[Tensor, "pairs 2"] | None = None
+    references: dict[str, Reference] = field(default_factory=dict)
+    motion_scale: float | None = None
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of the topology."""
+        return len(next(iter(self.templates.values())))
+
+    def template(self, subject: str) -> Float[Tensor, "vertices 3"]:
+        """The neutral face of a subject.
+
+        Raises:
+            FaceDiffError: naming the known subjects.
+        """
+        if subject not in self.templates:
+            raise FaceDiffError(
+                f'identity: there is no "{subject}"; the checkpoint knows {", ".join(sorted(self.templates))}'
+            )
+        return self.templates[subject]
+
+    def identity_index(self, subject: str) -> int:
+        """Index of a training identity, −1 for anybody else."""
+        return self.identities.index(subject) if subject in self.identities else -1
+
+    def with_motion_scale(self, scale: float | None) -> Assets:
+        """The same with another motion scale."""
+        return replace(self, motion_scale=scale)
+
+    def state(self) -> dict[str, Any]:
+        """Plain containers and tensors, fit for a checkpoint that is loaded with ``weights_only=True``."""
+        state = dict(vars(self))
+        state["references"] = {name: (r.clip, r.motion) for name, r in self.references.items()}
+        return state
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> Assets:
+        """The inverse of :meth:`state`."""
+        references = {name: Reference(clip, motion) for name, (clip, motion) in state["references"].items()}
+        return cls(**{**state, "references": references})

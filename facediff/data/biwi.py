@@ -5,14 +5,16 @@ from __future__ import annotations
 import re
 from typing import ClassVar
 
-from facediff.data.base import SpeechMotionDataModule
+from facediff import registry
 from facediff.data.corpus import Clip
+from facediff.data.datamodule import SpeechMotionDataModule
 
 SEEN = ("F2", "F3", "F4", "M3", "M4", "M5")
 UNSEEN = ("F1", "F5", "F6", "F7", "F8", "M1", "M2", "M6")
 SENTENCES = {"train": range(1, 33), "val": range(33, 37), "test": range(37, 41)}
 
 
+@registry.corpus.register("Biwi")
 class Biwi(SpeechMotionDataModule):
     """BIWI (B3D(AC)^2) in the layout of FaceFormer, CodeTalker, SelfTalk and FaceDiffuser.
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from typing import Any, ClassVar, Literal
 
-from facediff.data.base import SpeechMotionDataModule, Split
-from facediff.data.corpus import Clip
+from facediff import registry
+from facediff.data.corpus import FLAME_SOURCES, Clip
+from facediff.data.datamodule import SpeechMotionDataModule, Split
 from facediff.data.dataset import ReferenceChoice
-from facediff.data.regions import FLAME_SOURCES
 
 EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry", "contempt")
 TRAIN = (
@@ -21,6 +21,7 @@ NEUTRAL_SENTENCES = {"train": range(1, 33), "val": range(33, 37), "test_a": rang
 EMOTIONAL_SENTENCES = {"train": range(1, 25), "val": range(25, 28), "test_a": range(28, 31)}
 
 
+@registry.corpus.register("Mead3D")
 class Mead3D(SpeechMotionDataModule):
     """3DMEAD as vertices, from EMOTE's reconstructions or in ProbTalk3D's layout.
 
@@ -40,8 +41,8 @@ class Mead3D(SpeechMotionDataModule):
         reference_frames: longest style reference, in frames.
         predict_split: the split that ``predict`` runs over; the first test split if None.
         people: folders of further people with FLAME's topology to train on.
-        newcomers: further subjects of the corpus to train on, with their clips of no split.
-        train_subjects: train on the clips of these people only; of all if None.
+        extra_identities: further subjects of the corpus to train on, with their clips of no split.
+        train_identities: train on the clips of these people only; of all if None.
         lips: file that says which vertices are the lips, or ``all``; the corpus's usual one if None.
         upper_face: the same for the upper face.
     """
@@ -79,8 +80,8 @@ class Mead3D(SpeechMotionDataModule):
         reference_frames: int = 100,
         predict_split: Split | None = None,
         people: list[str] | None = None,
-        newcomers: list[str] | None = None,
-        train_subjects: list[str] | None = None,
+        extra_identities: list[str] | None = None,
+        train_identities: list[str] | None = None,
         lips: str | None = None,
         upper_face: str | None = None,
     ) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-from facediff import puppet
-from facediff.data.base import SpeechMotionDataModule, Split
+from facediff import registry
+from facediff import synthetic as puppet
 from facediff.data.corpus import Clip
+from facediff.data.datamodule import SpeechMotionDataModule, Split
 from facediff.data.dataset import ReferenceChoice
-from facediff.files import cache_dir
+from facediff.utils.files import cache_dir
 
 
 def cache_root(seed: int) -> Path:
@@ -17,6 +18,7 @@ def cache_root(seed: int) -> Path:
     return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}"
 
 
+@registry.corpus.register("Puppet")
 class Puppet(SpeechMotionDataModule):
     """The built-in corpus: a face made by code that speaks with a real speech synthesiser; made on first use.
 
@@ -35,8 +37,8 @@ class Puppet(SpeechMotionDataModule):
         reference_frames: longest style reference, in frames.
         predict_split: the split that ``predict`` runs over; test A if None.
         people: folders of further people with this face's topology to train on.
-        newcomers: further subjects of the corpus to train on, with their clips of no split.
-        train_subjects: train on the clips of these people only; of all if None.
+        extra_identities: further subjects of the corpus to train on, with their clips of no split.
+        train_identities: train on the clips of these people only; of all if None.
         lips: file that says which vertices are the lips, or ``all``; the corpus's own if None.
         upper_face: the same for the upper face.
     """
@@ -46,7 +48,7 @@ class Puppet(SpeechMotionDataModule):
     unit = puppet.UNIT
     frame_rate: ClassVar[float] = float(puppet.FRAME_RATE)
     n_vertices = puppet.N_VERTICES
-    identities = list(puppet.SEEN_SUBJECTS)
+    identities = list(puppet.SEEN_IDENTITIES)
     mesh_files: ClassVar[tuple[str, ...]] = ("PUPPET.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
 
@@ -63,8 +65,8 @@ class Puppet(SpeechMotionDataModule):
         reference_frames: int = 100,
         predict_split: Split | None = None,
         people: list[str] | None = None,
-        newcomers: list[str] | None = None,
-        train_subjects: list[str] | None = None,
+        extra_identities: list[str] | None = None,
+        train_identities: list[str] | None = None,
         lips: str | None = None,
         upper_face: str | None = None,
     ) -> None:
@@ -83,7 +85,7 @@ class Puppet(SpeechMotionDataModule):
 
     def split_of(self, clip: Clip) -> str | None:
         """BIWI's way: by speaker and sentence number."""
-        seen = clip.subject in puppet.SEEN_SUBJECTS
+        seen = clip.subject in puppet.SEEN_IDENTITIES
         if clip.number in puppet.TEST_SENTENCES:
             return "test_a" if seen else "test_b"
         if not seen:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from typing import ClassVar
 
-from facediff.data.base import SpeechMotionDataModule
-from facediff.data.corpus import Clip
-from facediff.data.regions import FLAME_SOURCES
+from facediff import registry
+from facediff.data.corpus import FLAME_SOURCES, Clip
+from facediff.data.datamodule import SpeechMotionDataModule
 
 TRAIN = (
     "FaceTalk_170728_03272_TA",
@@ -24,6 +24,7 @@ TEST = ("FaceTalk_170809_00138_TA", "FaceTalk_170731_00024_TA")
 EVALUATED = range(21, 41)
 
 
+@registry.corpus.register("Vocaset")
 class Vocaset(SpeechMotionDataModule):
     """VOCASET in the layout of FaceFormer, CodeTalker, SelfTalk and TalkingStyle.
 

@@ -1,7 +1,6 @@
 """Takes to the files of other programs: meshes that move, point caches, videos, tables of weights."""
 
-from facediff.export.format import Format
-from facediff.export.options import ExportOptions
-from facediff.export.writing import FORMATS, check_export, write_takes
+from facediff.export.format import ExportOptions, Format
+from facediff.export.writing import FORMATS, check_export, write_animations
 
-__all__ = ["FORMATS", "ExportOptions", "Format", "check_export", "write_takes"]
+__all__ = ["FORMATS", "ExportOptions", "Format", "check_export", "write_animations"]

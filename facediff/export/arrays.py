@@ -8,31 +8,30 @@ from pathlib import Path
 
 import numpy as np
 
-from facediff.export.format import Format, Space
-from facediff.export.options import ExportOptions
-from facediff.takes import Take, write_archive
-from facediff.takes.motion_files import MotionWriter
+from facediff.animation import Animation, write_archive
+from facediff.animation.files import MotionWriter
+from facediff.export.format import ExportOptions, Format, Space
 
 
-def write_vertices(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write_vertices(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """Absolute vertices (T, V, 3), float32; written frame by frame."""
-    (take,) = takes
-    writer = MotionWriter(path, take.template.shape)
+    (animation,) = takes
+    writer = MotionWriter(path, animation.template.shape)
     try:
-        for frame in Space.of(take, options).frames(take):
+        for frame in Space.of(animation, options).frames(animation):
             writer.write(frame[None])
     finally:
         writer.close()
 
 
-def write_take(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write_animation(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """The take with everything it has, in another unit where one is chosen."""
-    (take,) = takes
-    space = Space.of(take, options)
+    (animation,) = takes
+    space = Space.of(animation, options)
     if options.unit is not None:
-        vertices = np.stack(list(space.frames(take)))
-        take = replace(take, vertices=vertices, template=space.place(take.template), unit=space.unit)
-    write_archive(path, take if options.speech else replace(take, speech=None))
+        vertices = np.stack(list(space.frames(animation)))
+        animation = replace(animation, vertices=vertices, template=space.place(animation.template), unit=space.unit)
+    write_archive(path, animation if options.speech else replace(animation, speech=None))
 
 
 VERTICES = Format(
@@ -43,7 +42,7 @@ VERTICES = Format(
 )
 TAKE = Format(
     help="NumPy: the whole take with mesh, speech, frame rate and unit",
-    write=write_take,
+    write=write_animation,
     then="`facediff export`, `view`, `blendshapes` and `retarget` take it without further options",
     holds_sound=True,
     needs_mesh=False,

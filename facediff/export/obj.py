@@ -8,34 +8,42 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.export.format import Format, Space
-from facediff.export.options import ExportOptions
-from facediff.export.sequence import write_folder
-from facediff.takes import Take
+from facediff.animation import Animation
+from facediff.export.format import ExportOptions, Format, Space, write_folder
 
 
-def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """Write one take as a folder of .obj files."""
-    (take,) = takes
-    faces, space = face_lines(take), Space.of(take, options)
-    write_folder(path, take, space, sound, lambda points: obj_text(points, take.colours, faces, comment(take, space)))
+    (animation,) = takes
+    faces, space = face_lines(animation), Space.of(animation, options)
+    write_folder(
+        path,
+        animation,
+        space,
+        sound,
+        lambda points: obj_text(points, animation.colours, faces, comment(animation, space)),
+    )
 
 
-def rest_mesh(take: Take, space: Space) -> bytes:
+def rest_mesh(animation: Animation, space: Space) -> bytes:
     """The neutral face, with every vertex in its place."""
-    return obj_text(space.place(take.template), take.colours, face_lines(take), comment(take, space))
+    return obj_text(
+        space.place(animation.template), animation.colours, face_lines(animation), comment(animation, space)
+    )
 
 
-def comment(take: Take, space: Space) -> str:
+def comment(animation: Animation, space: Space) -> str:
     """One line that says who wrote the file, and in what space."""
-    name = " ".join(take.name.split())
+    name = " ".join(animation.name.split())
     unit = " ".join(space.unit.split())
-    return f"# facediff: {name}, unit {unit} ({space.metres:g} m), {space.up} up, {take.frame_rate:g} frames a second"
+    return (
+        f"# facediff: {name}, unit {unit} ({space.metres:g} m), {space.up} up, {animation.frame_rate:g} frames a second"
+    )
 
 
-def face_lines(take: Take) -> bytes:
+def face_lines(animation: Animation) -> bytes:
     """The triangles, counted from 1, in the order and the winding of the take."""
-    return "".join(f"f {a} {b} {c}\n" for a, b, c in (take.triangles + 1).tolist()).encode()
+    return "".join(f"f {a} {b} {c}\n" for a, b, c in (animation.triangles + 1).tolist()).encode()
 
 
 def obj_text(

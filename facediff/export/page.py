@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from facediff.export.format import Format
-from facediff.export.options import ExportOptions
-from facediff.takes import Take
+from facediff.animation import Animation
+from facediff.export.format import ExportOptions, Format
 
 
-def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """Write an .html file; several takes are shown next to each other."""
-    from facediff.viewer import write_page
+    from facediff.export.viewer import write_page
 
-    write_page(path, [take if options.speech else replace(take, speech=None) for take in takes])
+    write_page(path, [animation if options.speech else replace(animation, speech=None) for animation in takes])
 
 
 FORMAT = Format(

@@ -8,30 +8,30 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.export.format import Format, Space
+from facediff.animation import Animation
+from facediff.export.format import ExportOptions, Format, Space, write_folder
 from facediff.export.obj import comment
-from facediff.export.options import ExportOptions
-from facediff.export.sequence import write_folder
-from facediff.takes import Take
 
 
-def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """Write one take as a folder of .ply files."""
-    (take,) = takes
-    space = Space.of(take, options)
-    corners = np.empty(len(take.triangles), [("count", "u1"), ("corners", "<i4", 3)])
-    corners["count"], corners["corners"] = 3, take.triangles
-    head, faces = header(take, comment(take, space)[2:]), corners.tobytes()
-    write_folder(path, take, space, sound, lambda points: head + vertex_bytes(points, take.colours) + faces)
+    (animation,) = takes
+    space = Space.of(animation, options)
+    corners = np.empty(len(animation.triangles), [("count", "u1"), ("corners", "<i4", 3)])
+    corners["count"], corners["corners"] = 3, animation.triangles
+    head, faces = header(animation, comment(animation, space)[2:]), corners.tobytes()
+    write_folder(path, animation, space, sound, lambda points: head + vertex_bytes(points, animation.colours) + faces)
 
 
-def header(take: Take, comment: str) -> bytes:
+def header(animation: Animation, comment: str) -> bytes:
     """The words before the numbers."""
-    colours = "" if take.colours is None else "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    colours = (
+        "" if animation.colours is None else "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    )
     return (
-        f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex {len(take.template)}\n"
+        f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex {len(animation.template)}\n"
         f"property float x\nproperty float y\nproperty float z\n{colours}"
-        f"element face {len(take.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+        f"element face {len(animation.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
     ).encode()
 
 

@@ -8,44 +8,42 @@ from pathlib import Path
 
 import numpy as np
 
-from facediff.export.format import Format, Space
+from facediff.animation import Animation
+from facediff.export.format import ExportOptions, Format, Space, write_wav
 from facediff.export.obj import rest_mesh
-from facediff.export.options import ExportOptions
-from facediff.export.sound import write_wav
-from facediff.takes import Take
 
 
-def write_pc2(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write_pc2(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """PC2, little endian: one sample a frame from frame 0 on; the format has no place for the frame rate."""
-    (take,) = takes
-    frames, vertices, _ = take.vertices.shape
-    space = Space.of(take, options)
+    (animation,) = takes
+    frames, vertices, _ = animation.vertices.shape
+    space = Space.of(animation, options)
     with path.open("wb") as stream:
         stream.write(struct.pack("<12siiffi", b"POINTCACHE2\0", 1, vertices, 0.0, 1.0, frames))
-        for points in space.frames(take):
+        for points in space.frames(animation):
             stream.write(np.ascontiguousarray(points, "<f4").tobytes())
-    write_beside(path, take, space, sound)
+    write_beside(path, animation, space, sound)
 
 
-def write_mdd(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write_mdd(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """MDD, big endian: the time of every frame in seconds, then the positions."""
-    (take,) = takes
-    frames, vertices, _ = take.vertices.shape
-    space = Space.of(take, options)
+    (animation,) = takes
+    frames, vertices, _ = animation.vertices.shape
+    space = Space.of(animation, options)
     with path.open("wb") as stream:
         stream.write(struct.pack(">ii", frames, vertices))
-        stream.write((np.arange(frames) / take.frame_rate).astype(">f4").tobytes())
-        for points in space.frames(take):
+        stream.write((np.arange(frames) / animation.frame_rate).astype(">f4").tobytes())
+        for points in space.frames(animation):
             stream.write(points.astype(">f4").tobytes())
-    write_beside(path, take, space, sound)
+    write_beside(path, animation, space, sound)
 
 
-def write_beside(path: Path, take: Take, space: Space, sound: str | None) -> None:
+def write_beside(path: Path, animation: Animation, space: Space, sound: str | None) -> None:
     """The mesh at rest, where there are triangles, and the speech."""
-    if take.faces is not None and len(take.faces):
-        path.with_suffix(".obj").write_bytes(rest_mesh(take, space))
+    if animation.faces is not None and len(animation.faces):
+        path.with_suffix(".obj").write_bytes(rest_mesh(animation, space))
     if sound is not None:
-        write_wav(path.with_name(sound), take)
+        write_wav(path.with_name(sound), animation)
 
 
 PC2 = Format(

@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from facediff.animation import Animation
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.export.format import Format, Space, facts
-from facediff.export.options import ExportOptions
-from facediff.export.sound import write_wav
-from facediff.export.surface import linear_colours, normals_of, outward
-from facediff.takes import Take
+from facediff.export.format import ExportOptions, Format, Space, facts, linear_colours, normals_of, outward, write_wav
 
 
-def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """Write one take as .usdc (binary) or .usda (text); frame t is time code t.
 
     Raises:
@@ -27,55 +24,55 @@ def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str 
         from pxr import Sdf, Tf, Usd, UsdGeom
     except ImportError as error:
         raise MissingExtraError("pxr", "usd", "writing USD") from error
-    (take,) = takes
-    space = Space.of(take, options)
+    (animation,) = takes
+    space = Space.of(animation, options)
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if space.up == "z" else UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, space.metres)
-    stage.SetTimeCodesPerSecond(take.frame_rate)
-    stage.SetFramesPerSecond(take.frame_rate)
+    stage.SetTimeCodesPerSecond(animation.frame_rate)
+    stage.SetFramesPerSecond(animation.frame_rate)
     stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(len(take.vertices) - 1)
-    root = Sdf.Path(f"/{Tf.MakeValidIdentifier(take.name)}")
+    stage.SetEndTimeCode(len(animation.vertices) - 1)
+    root = Sdf.Path(f"/{Tf.MakeValidIdentifier(animation.name)}")
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, root).GetPrim())
-    told: dict[str, Any] = facts(take, space)
+    told: dict[str, Any] = facts(animation, space)
     if sound is not None:
-        write_wav(path.with_name(sound), take)
+        write_wav(path.with_name(sound), animation)
         add_sound(stage, root.AppendChild("speech"), sound)
         told["speech"] = sound
     layer = stage.GetRootLayer()
     layer.customLayerData = {"facediff": told}
-    layer.documentation = f"{take.name}, written by facediff"
+    layer.documentation = f"{animation.name}, written by facediff"
     try:
-        add_face(stage, root.AppendChild("face"), take, space)
+        add_face(stage, root.AppendChild("face"), animation, space)
         if not layer.Export(str(path)):
             raise FaceDiffError(f"{path}: cannot be written; is the disk full?")
     except Tf.ErrorException as error:
         raise FaceDiffError(f"{path}: cannot be written; is the disk full?") from error
 
 
-def add_face(stage: Any, path: Any, take: Take, space: Space) -> None:  # noqa: ANN401 - usd-core has no type hints
+def add_face(stage: Any, path: Any, animation: Animation, space: Space) -> None:  # noqa: ANN401 - usd-core has no type hints
     """A polygon mesh without subdivision, with points, normals and extent of every frame."""
     from pxr import Sdf, UsdGeom, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, path)
-    faces = outward(take)
+    faces = outward(animation)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateDoubleSidedAttr(True)
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.ravel())))
     points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    for time, frame in enumerate([space.place(take.template), *space.frames(take)], start=-1):
+    for time, frame in enumerate([space.place(animation.template), *space.frames(animation)], start=-1):
         when = [] if time < 0 else [time]  # the default value is the neutral face
         points.Set(Vt.Vec3fArray.FromNumpy(frame), *when)
         normals.Set(Vt.Vec3fArray.FromNumpy(normals_of(frame, faces)), *when)
         extent.Set(Vt.Vec3fArray.FromNumpy(np.stack([frame.min(0), frame.max(0)])), *when)
-    if take.colours is not None:
+    if animation.colours is not None:
         colour = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
             "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
         )
-        colour.Set(Vt.Vec3fArray.FromNumpy(linear_colours(take.colours)))
+        colour.Set(Vt.Vec3fArray.FromNumpy(linear_colours(animation.colours)))
 
 
 def add_sound(stage: Any, path: Any, file: str) -> None:  # noqa: ANN401

@@ -9,15 +9,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.export.format import Format
-from facediff.export.options import ExportOptions
-from facediff.takes import Take, metres_per_unit
+from facediff.export.format import ExportOptions, Format
 
 Frame = npt.NDArray[np.uint8]
 
 
-def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """Write an .mp4 with the speech of the first take that has one.
 
     A take that ends before the longest stays on its last frame.
@@ -28,16 +27,16 @@ def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str 
     """
     from facediff.render import write_video
 
-    frames = max(len(take.vertices) for take in takes)
+    frames = max(len(animation.vertices) for animation in takes)
     shown: Iterable[Frame] = drawn_frames(takes, options)
     if not options.quiet:
         shown = _bar(shown, f"drawing {path.name}", frames)
-    speaker = next((take for take in takes if take.speech is not None), takes[0])
+    speaker = next((animation for animation in takes if animation.speech is not None), takes[0])
     heard = speaker.sound() if options.speech else None
     write_video(path, shown, speaker.frame_rate, heard, speaker.sample_rate)
 
 
-def drawn_frames(takes: Sequence[Take], options: ExportOptions) -> Iterator[Frame]:
+def drawn_frames(takes: Sequence[Animation], options: ExportOptions) -> Iterator[Frame]:
     """Pictures of takes side by side, one a frame; everything is checked before the first is drawn.
 
     Faces of one unit are seen by one camera, so that their sizes compare.
@@ -47,35 +46,35 @@ def drawn_frames(takes: Sequence[Take], options: ExportOptions) -> Iterator[Fram
     """
     from facediff.render import Camera, Renderer, side_by_side
 
-    if len({take.frame_rate for take in takes}) > 1:
-        told = ", ".join(f"{take.name} {take.frame_rate:g}" for take in takes)
+    if len({animation.frame_rate for animation in takes}) > 1:
+        told = ", ".join(f"{animation.name} {animation.frame_rate:g}" for animation in takes)
         raise FaceDiffError(f"the takes differ in frame rate ({told}); a video has one, so write a video for each")
-    metres = [metres_per_unit(take.unit) for take in takes]
+    metres = [metres_per_unit(animation.unit) for animation in takes]
     camera = None
     if len(set(metres)) == 1:
-        camera = Camera.framing([take.template for take in takes], view=options.view)
+        camera = Camera.framing([animation.template for animation in takes], view=options.view)
     renderers = [
         Renderer(
-            take.triangles,
-            template=take.template,
+            animation.triangles,
+            template=animation.template,
             view=options.view,
             size=options.size,
             camera=camera,
-            colours=take.colours,
+            colours=animation.colours,
         )
-        for take in takes
+        for animation in takes
     ]
-    frames = max(len(take.vertices) for take in takes)
-    motions = [held(take.vertices, frames) for take in takes]
+    frames = max(len(animation.vertices) for animation in takes)
+    motions = [held(animation.vertices, frames) for animation in takes]
     # Where nothing else is to be said, the corpora: that one is synthetic must not get lost on the way to a video.
-    corpora = dict.fromkeys(take.metadata["corpus"] for take in takes if "corpus" in take.metadata)
+    corpora = dict.fromkeys(animation.metadata["corpus"] for animation in takes if "corpus" in animation.metadata)
     footer = " – ".join(part for part in (options.footer or ", ".join(corpora), procedural(takes)) if part)
-    return side_by_side(renderers, motions, [take.name for take in takes], footer=footer or None)
+    return side_by_side(renderers, motions, [animation.name for animation in takes], footer=footer or None)
 
 
-def procedural(takes: Sequence[Take]) -> str:
+def procedural(takes: Sequence[Animation]) -> str:
     """What in the takes was made by rules and not learnt, in short: it must be told wherever it is seen."""
-    told = dict.fromkeys(re.sub(r" \([^)]*\)", "", take.metadata.get("procedural", "")) for take in takes)
+    told = dict.fromkeys(re.sub(r" \([^)]*\)", "", animation.metadata.get("procedural", "")) for animation in takes)
     words = ", ".join(text.replace(";", ",") for text in told if text)
     return f"procedural: {words}" if words else ""
 

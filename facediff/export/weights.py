@@ -5,28 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from facediff.animation import Animation
 from facediff.errors import FaceDiffError
-from facediff.export.format import Format
-from facediff.export.options import ExportOptions
-from facediff.export.sound import write_wav
-from facediff.takes import Take
+from facediff.export.format import ExportOptions, Format, write_wav
 
 
-def write(path: Path, takes: Sequence[Take], options: ExportOptions, sound: str | None) -> None:
+def write(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
     """Solve one take for a set of shapes and write the weights as .csv, the speech beside.
 
     Raises:
         FaceDiffError: if no set of shapes is given, or it does not fit the take.
     """
-    from facediff.blendshapes import SolveOptions, read_shapes, solve, write_live_link
+    from facediff.editing.blendshapes import SolveOptions, solve, write_live_link
+    from facediff.editing.shapes import read_shapes
 
-    (take,) = takes
+    (animation,) = takes
     if options.shapes is None:
         raise missing_shapes(path)
-    shapes = read_shapes(options.shapes, take.template, take.unit)
-    write_live_link(path, solve(take, shapes, SolveOptions()))
+    shapes = read_shapes(options.shapes, animation.template, animation.unit)
+    write_live_link(path, solve(animation, shapes, SolveOptions()))
     if sound is not None:
-        write_wav(path.with_name(sound), take)
+        write_wav(path.with_name(sound), animation)
 
 
 def missing_shapes(path: Path) -> FaceDiffError:

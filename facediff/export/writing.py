@@ -8,14 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.export import arrays, glb, obj, page, ply, point_cache, usd, video, weights
-from facediff.export.format import Format
-from facediff.export.options import ExportOptions
-from facediff.export.place import check_free, folder_of, numbered, staged
-from facediff.export.sound import speech_name
-from facediff.files import check_writable
-from facediff.takes import Take, metres_per_unit
+from facediff.export.format import ExportOptions, Format, check_free, folder_of, numbered, speech_name, staged
+from facediff.utils.files import check_writable
 
 FORMATS: Mapping[str, Format] = {
     ".glb": glb.FORMAT,
@@ -33,13 +30,13 @@ FORMATS: Mapping[str, Format] = {
 }
 
 
-def check_export(path: Path, options: ExportOptions, n_takes: int = 1) -> None:
+def check_export(path: Path, options: ExportOptions, n_samples: int = 1) -> None:
     """Refuse what can be refused before any work is done.
 
     Args:
         path: the file that is wanted; its suffix chooses the format.
         options: the choices.
-        n_takes: how many takes there will be.
+        n_samples: how many takes there will be.
 
     Raises:
         FaceDiffError: if the suffix is unknown, the format has no place for a choice, the set of shapes is missing, or
@@ -50,7 +47,7 @@ def check_export(path: Path, options: ExportOptions, n_takes: int = 1) -> None:
         raise FaceDiffError(f"{path}: has no suffix, which names the format; give one, such as {path.name}.glb")
     if path.suffix not in FORMATS:
         raise FaceDiffError(f'{path}: there is no format "{path.suffix}": {choices(path.suffix.lower(), FORMATS)}')
-    if n_takes < 1:
+    if n_samples < 1:
         raise FaceDiffError(f"{path}: there is no take to write; give at least one")
     made = FORMATS[path.suffix]
     check_space(path, made, options)
@@ -63,7 +60,7 @@ def check_export(path: Path, options: ExportOptions, n_takes: int = 1) -> None:
         raise FaceDiffError(f"tolerance of {options.tolerance_mm:g} mm: expected more than 0, such as 0.05")
     if made.package is not None and importlib.util.find_spec(made.package[0]) is None:
         raise MissingExtraError(*made.package, f"writing {path.suffix}")
-    for target in targets(path, made, n_takes):
+    for target in targets(path, made, n_samples):
         check_writable(target)
         if made.folder:
             check_free(folder_of(target))
@@ -89,7 +86,7 @@ def check_space(path: Path, made: Format, options: ExportOptions) -> None:
         raise FaceDiffError(f"{path}: {path.suffix} {told}; leave the axis away")
 
 
-def write_takes(path: Path, takes: Sequence[Take], options: ExportOptions | None = None) -> list[Path]:
+def write_animations(path: Path, takes: Sequence[Animation], options: ExportOptions | None = None) -> list[Path]:
     """Write takes in the format that the suffix names: every file appears whole, all of them or none.
 
     Args:
@@ -108,12 +105,12 @@ def write_takes(path: Path, takes: Sequence[Take], options: ExportOptions | None
     options = options or ExportOptions()
     check_export(path, options, len(takes))
     made = FORMATS[path.suffix]
-    for take in takes:
-        check_take(take, made)
-    groups = [takes] if made.several else [[take] for take in takes]
+    for animation in takes:
+        check_animation(animation, made)
+    groups = [takes] if made.several else [[animation] for animation in takes]
     goals = targets(path, made, len(takes))
-    for goal, take in zip(goals, takes, strict=False):
-        for beside in named_by_nobody(goal, take):
+    for goal, animation in zip(goals, takes, strict=False):
+        for beside in named_by_nobody(goal, animation):
             check_free(beside)
     sounds = [sound_of(goal, made, group[0], options) for goal, group in zip(goals, groups, strict=True)]
     with staged(path) as hidden:
@@ -124,37 +121,37 @@ def write_takes(path: Path, takes: Sequence[Take], options: ExportOptions | None
     return [path.with_name(name) for name in [*first, *sorted(written - set(first))]]
 
 
-def check_take(take: Take, made: Format) -> None:
+def check_animation(animation: Animation, made: Format) -> None:
     """Refuse a take that would make a broken file.
 
     Raises:
         FaceDiffError: naming the take and what is wrong with it.
     """
-    take.refuse_not_finite()
-    if not np.isfinite(take.template).all():
-        raise FaceDiffError(f"{take.name}: its template holds NaN or infinity; give a sound mesh")
-    if take.colours is not None and take.colours.shape != take.template.shape:
+    animation.refuse_not_finite()
+    if not np.isfinite(animation.template).all():
+        raise FaceDiffError(f"{animation.name}: its template holds NaN or infinity; give a sound mesh")
+    if animation.colours is not None and animation.colours.shape != animation.template.shape:
         raise FaceDiffError(
-            f"{take.name}: its vertex colours have shape {take.colours.shape}; expected {take.template.shape}"
+            f"{animation.name}: its vertex colours have shape {animation.colours.shape}; expected {animation.template.shape}"
         )
     if made.needs_mesh:
-        _ = take.triangles
+        _ = animation.triangles
 
 
-def targets(path: Path, made: Format, n_takes: int) -> list[Path]:
+def targets(path: Path, made: Format, n_samples: int) -> list[Path]:
     """The files that a user asked for."""
-    return [path] if made.several else numbered(path, n_takes)
+    return [path] if made.several else numbered(path, n_samples)
 
 
-def sound_of(path: Path, made: Format, take: Take, options: ExportOptions) -> str | None:
+def sound_of(path: Path, made: Format, animation: Animation, options: ExportOptions) -> str | None:
     """The name of the .wav that goes with a file; None where there is to be none."""
-    if not made.sound_beside or not options.speech or take.speech is None:
+    if not made.sound_beside or not options.speech or animation.speech is None:
         return None
     return f"{path.stem}.wav" if made.folder else speech_name(path)
 
 
-def named_by_nobody(path: Path, take: Take) -> list[Path]:
+def named_by_nobody(path: Path, animation: Animation) -> list[Path]:
     """What comes along with a file, beside the speech, without having been asked for by name."""
-    if path.suffix in (".pc2", ".mdd") and take.faces is not None:
+    if path.suffix in (".pc2", ".mdd") and animation.faces is not None:
         return [path.with_suffix(".obj")]
     return [path.with_suffix(".json")] if path.suffix == ".csv" else []

@@ -1,4 +1,4 @@
-"""Real-time factor: how long a system computes for one second of speech, and on what."""
+"""Real-time factor: how long a model computes for one second of speech, and on what."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def device_name(device: torch.device | str) -> str:
 
 
 def _processor() -> str:
-    """The processor's product name where the system tells it."""
+    """The processor's product name where the model tells it."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:
             for line in lines:

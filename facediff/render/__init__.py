@@ -9,12 +9,8 @@ Example:
     >>> write_video("out.mp4", frames, 25, audio, 16000)  # doctest: +SKIP
 """
 
-from facediff.render.camera import VIEWS, Camera
-from facediff.render.comparison import comparison
-from facediff.render.heat import heat_colours
-from facediff.render.panels import check_motion, contact_sheet, save_image, side_by_side
-from facediff.render.rasteriser import Renderer
-from facediff.render.shading import EVEN, STUDIO, Light, Look
+from facediff.render.panels import check_motion, comparison, contact_sheet, heat_colours, save_image, side_by_side
+from facediff.render.rasteriser import EVEN, STUDIO, VIEWS, Camera, Light, Look, Renderer
 from facediff.render.video import write_video
 
 __all__ = [

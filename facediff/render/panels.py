@@ -1,15 +1,133 @@
 """Several motions next to each other with labels, and sheets of pictures."""
 
+from __future__ import annotations
+
+import importlib
 from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
-from facediff.files import atomic
-from facediff.render.rasteriser import Renderer
-from facediff.render.text import draw_text
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.render.rasteriser import Renderer, opencv
+from facediff.utils.files import atomic
+
+# Words on pictures, in the one font that Pillow brings with it.
+
+
+def pillow(module: str) -> Any:  # noqa: ANN401 - imported on first use
+    """A module of Pillow, or a sentence that says how to get it."""
+    try:
+        return importlib.import_module(f"PIL.{module}")
+    except ImportError as error:
+        raise MissingExtraError("PIL", "render", "writing pictures and labels") from error
+
+
+def draw_text(
+    picture: npt.NDArray[np.uint8], text: str, *, colour: tuple[int, int, int], scale: float
+) -> npt.NDArray[np.uint8]:
+    """A copy of the picture with a line of text in its middle.
+
+    Args:
+        picture: (height, width, 3).
+        text: the line; made smaller where it is wider than the picture.
+        colour: sRGB, 0 to 255.
+        scale: height of the letters as a share of the picture's height.
+    """
+    if not text.strip():
+        return picture.copy()
+    height, width, _ = picture.shape
+    mask = _text_mask(text, max(round(scale * height), 9), round(0.94 * width))
+    rows, columns = min(mask.shape[0], height), min(mask.shape[1], width)
+    top, left = (height - rows) // 2, (width - columns) // 2
+    result = picture.copy()
+    area = result[top : top + rows, left : left + columns]
+    opacity = mask[:rows, :columns, None]
+    area[:] = np.rint(area * (1 - opacity) + np.asarray(colour) * opacity).astype(np.uint8)
+    return result
+
+
+@lru_cache(maxsize=64)
+def _text_mask(text: str, points: int, max_width: int) -> npt.NDArray[np.float32]:
+    """Opacity of a line of text (rows, columns); cached, since every frame of a video has the same label."""
+    image, draw, fonts = pillow("Image"), pillow("ImageDraw"), pillow("ImageFont")
+    while True:
+        font = fonts.load_default(size=points)
+        left, top, right, bottom = font.getbbox(text)
+        if right - left <= max_width or points <= 6:
+            break
+        points = max(6, min(points - 1, int(points * max_width / (right - left))))
+    # Ascent and descent, not the box of these letters: labels side by side then share a base line.
+    ascent, descent = font.getmetrics()
+    canvas = image.new("L", (max(int(right - left), 1), ascent + descent))
+    draw.Draw(canvas).text((-left, 0), text, font=font, fill=255)
+    mask = np.asarray(canvas, dtype=np.float32) / np.float32(255)
+    mask.setflags(write=False)
+    return mask
+
+
+# Numbers at vertices as colours: error heat maps.
+
+HEAT_MAP = "cividis"
+"""Name of the colour map, in OpenCV and matplotlib alike; its lightness grows evenly and it reads the same to those who
+cannot tell red from green (Nuñez, Anderton and Renslow 2018)."""
+
+
+def heat_ramp() -> npt.NDArray[np.uint8]:
+    """The colour map from lowest to highest as sRGB (256, 3)."""
+    cv2 = opencv()
+    levels = np.arange(256, dtype=np.uint8)[:, None]
+    ramp: npt.NDArray[np.uint8] = cv2.applyColorMap(levels, cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
+    return np.ascontiguousarray(ramp)
+
+
+def heat_colours(values: npt.NDArray[np.floating], highest: float, lowest: float = 0.0) -> npt.NDArray[np.uint8]:
+    """Colours of values, those outside the scale taking the colour of its nearer end.
+
+    Args:
+        values: numbers of any shape, such as distances (V,) or (T, V).
+        highest: value of the last colour.
+        lowest: value of the first colour.
+
+    Returns:
+        sRGB, of the values' shape and one axis of 3 more.
+
+    Raises:
+        FaceDiffError: if the scale has no extent or a value is not finite.
+    """
+    if not highest > lowest:
+        raise FaceDiffError(f"a colour scale from {lowest} to {highest} has no extent: give a highest above the lowest")
+    if not np.isfinite(values).all():
+        raise FaceDiffError("a heat map of NaN or infinity cannot be drawn: check where the values come from")
+    levels = np.rint((np.asarray(values, np.float64) - lowest) * (255 / (highest - lowest)))
+    return heat_ramp()[np.clip(levels, 0, 255).astype(np.uint8)]
+
+
+def heat_key(
+    ground: npt.NDArray[np.uint8], lowest: str, highest: str, *, colour: tuple[int, int, int]
+) -> npt.NDArray[np.uint8]:
+    """A copy of a picture with the colour map as a bar in its middle, its ends named.
+
+    Args:
+        ground: (height, width, 3), what the bar is drawn upon.
+        lowest: text left of the bar.
+        highest: text right of it.
+        colour: of the letters, sRGB, 0 to 255.
+    """
+    height, width, _ = ground.shape
+    left, right = round(0.25 * width), round(0.7 * width)
+    top, bottom = round(0.3 * height), max(round(0.7 * height), round(0.3 * height) + 1)
+    key = ground.copy()
+    levels = np.rint(np.linspace(0, 255, right - left)).astype(np.uint8)
+    key[top:bottom, left:right] = heat_ramp()[levels]
+    for text, start, end in ((lowest, 2 * left - right // 2, left), (highest, right, width)):
+        start = max(start, 0)
+        key[:, start:end] = draw_text(key[:, start:end], text, colour=colour, scale=0.5)
+    return key
+
 
 Frame = npt.NDArray[np.uint8]
 
@@ -152,8 +270,6 @@ def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str
 
 def save_image(path: str | Path, image: Frame) -> None:
     """Write a picture (height, width, 3) as PNG; it appears under its name only when complete."""
-    from facediff.render.text import pillow
-
     target = Path(path)
     if target.suffix.lower() != ".png":
         raise FaceDiffError(f'picture file "{target}" must end in .png.')
@@ -162,3 +278,56 @@ def save_image(path: str | Path, image: Frame) -> None:
     picture = pillow("Image").fromarray(image)
     with atomic(target) as temporary:
         picture.save(temporary)
+
+
+# Truth, prediction and where they differ, next to each other.
+
+_KEY_SHARE = 0.085
+_MIN_KEY = 20
+
+
+def comparison(
+    renderer: Renderer,
+    truth: npt.NDArray[np.floating],
+    prediction: npt.NDArray[np.floating],
+    *,
+    highest: float,
+    scale_label: str,
+    labels: tuple[str, str, str] = ("truth", "facediff", "error"),
+    footer: str = "",
+) -> Iterator[Frame]:
+    """Frames of the truth, the prediction, and the prediction coloured by each vertex's distance from the truth.
+
+    Everything is checked before the first frame is drawn.
+
+    Args:
+        renderer: draws all three panels.
+        truth: absolute positions (T, V, 3).
+        prediction: absolute positions (T, V, 3), in the truth's unit.
+        highest: distance that gets the last colour, in the motions' unit; equal scales make pictures comparable.
+        scale_label: how ``highest`` is written at the colour scale, such as "5 mm".
+        labels: texts above the three panels.
+        footer: text under the first two panels.
+
+    Returns:
+        A generator of T pictures, three panels wide, with strips above and below them.
+
+    Raises:
+        FaceDiffError: if the motions cannot be drawn or differ in length, or the scale has no extent.
+    """
+    for motion, label in zip((truth, prediction), labels, strict=False):
+        check_motion(motion, renderer.n_vertices, label)
+    if len(truth) != len(prediction):
+        raise FaceDiffError(
+            f'"{labels[0]}" has {len(truth)} frames and "{labels[1]}" {len(prediction)}: cut them to one length.'
+        )
+    errors = np.linalg.norm(np.asarray(prediction) - np.asarray(truth), axis=2)
+    heat = heat_colours(errors, highest)
+    frames = side_by_side(renderer, [truth, prediction, prediction], labels, colours=[None, None, heat])
+    ground = renderer.backdrop[-1:]
+    height = max(round(_KEY_SHARE * renderer.height / 2) * 2, _MIN_KEY)
+    strip = np.repeat(np.hstack([ground, ground]), height, axis=0)
+    strip = draw_text(strip, footer, colour=INK, scale=0.5)
+    key = heat_key(np.repeat(ground, height, axis=0), "0", scale_label, colour=INK)
+    foot = np.hstack([strip, key])
+    return (np.concatenate([frame, foot]) for frame in frames)

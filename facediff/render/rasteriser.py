@@ -1,23 +1,470 @@
 """Meshes to pictures without display or GPU, on the software rasteriser of OpenCV 5."""
 
-from collections.abc import Iterable, Iterator
-from typing import Any
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
-from facediff.render.camera import Camera
-from facediff.render.canvas import Canvas, Window, opencv
-from facediff.render.geometry import (
-    check_faces,
-    check_vertices,
-    face_outward,
-    hollowness,
-    is_open,
-    vertex_normals,
+from facediff.errors import FaceDiffError, MissingExtraError
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+
+# What a mesh tells the renderer: sound faces, which side is outside, smooth normals, hollows.
+
+Floats = npt.NDArray[np.floating[Any]]
+
+
+def check_vertices(vertices: npt.ArrayLike, name: str, n_vertices: int | None = None) -> npt.NDArray[np.float64]:
+    """One set of vertex positions as float64, refused with one sentence when it cannot be drawn.
+
+    Args:
+        vertices: positions (V, 3) in any length unit.
+        name: what the array is called in the message.
+        n_vertices: V where it is known already.
+    """
+    array = np.asarray(vertices)
+    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
+        raise FaceDiffError(f"{name} must have the shape (vertices, 3), got {array.shape}: x, y, z each.")
+    if n_vertices is not None and array.shape[0] != n_vertices:
+        raise FaceDiffError(
+            f"{name} has {array.shape[0]} vertices but the renderer's template has {n_vertices}: "
+            "draw a motion with the template and the faces of its own topology."
+        )
+    if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
+        raise FaceDiffError(f"{name} must hold real numbers, got {array.dtype}: convert it to float32.")
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise FaceDiffError(f"{name} holds NaN or infinity (first at vertex {bad}): check its source.")
+    return array
+
+
+def check_faces(faces: npt.ArrayLike, n_vertices: int) -> npt.NDArray[np.int32]:
+    """Triangles (F, 3) as int32, refused when one names a vertex that the template does not have."""
+    array = np.asarray(faces)
+    shaped = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
+    if not shaped or not np.issubdtype(array.dtype, np.integer):
+        raise FaceDiffError(
+            f"faces must be whole numbers of the shape (faces, 3), got {array.dtype} {array.shape}: "
+            "pass the triangles of the template's mesh file."
+        )
+    low, high = int(array.min()), int(array.max())
+    if low < 0 or high >= n_vertices:
+        raise FaceDiffError(
+            f"faces name vertex {low if low < 0 else high} but the template has vertices 0 to "
+            f"{n_vertices - 1}: pass the faces of the same topology (counting from 0)."
+        )
+    return array.astype(np.int32)
+
+
+def face_outward(faces: npt.NDArray[np.int32], template: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
+    """Turn all faces round if the mesh is wound inside out.
+
+    The sign of the flux that leaves through the faces decides. For a closed mesh it is the signed volume
+    whatever the reference point; for an open mask the point lies behind the mesh (z looks at the viewer).
+    """
+    low, high = template.min(axis=0), template.max(axis=0)
+    behind = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2] - (high - low).max()])
+    a, b, c = (template[faces[:, corner]] - behind for corner in range(3))
+    flux = np.einsum("ij,ij->", a, np.cross(b, c))
+    return faces if flux >= 0 else np.ascontiguousarray(faces[:, ::-1])
+
+
+def is_open(faces: npt.NDArray[np.int32]) -> bool:
+    """Whether an edge belongs to one face only, so that somebody may look inside."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    return bool((counts == 1).any())
+
+
+def vertex_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
+    """Unit normals (V, 3), each the mean of the adjacent faces' normals weighted by their areas.
+
+    A vertex without a face (or with faces of no area only) looks along +z.
+    """
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    # The cross product's length is twice the area: summing it unnormalised is the weighting.
+    normals = sum_at_vertices(_cross(b - a, c - a), faces, len(vertices))
+    length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
+    flat = length <= np.finfo(np.float64).tiny
+    normals[flat] = (0.0, 0.0, 1.0)
+    length[flat] = 1.0
+    return np.asarray(normals / length[:, None], dtype=np.float64)
+
+
+def hollowness(
+    vertices: Floats, normals: npt.NDArray[np.float64], faces: npt.NDArray[np.int32]
+) -> npt.NDArray[np.float64]:
+    """How far each vertex lies below its neighbourhood, as a share of the neighbourhood's radius (V,).
+
+    Positive in hollows (between the lips, in the corner of an eye), negative on ridges, near zero on
+    smooth parts: the mean of the adjacent faces' centres, seen along the normal.
+    """
+    centres = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
+    counts = np.maximum(np.bincount(faces.ravel(), minlength=len(vertices)), 1)
+    offset = sum_at_vertices(centres, faces, len(vertices)) / counts[:, None] - vertices
+    radius = np.sqrt(np.einsum("ij,ij->i", offset, offset)) + np.ptp(vertices, axis=0).max() * 1e-2
+    return np.asarray(np.einsum("ij,ij->i", offset, normals) / radius, dtype=np.float64)
+
+
+def sum_at_vertices(values: Floats, faces: npt.NDArray[np.int32], n_vertices: int) -> npt.NDArray[np.float64]:
+    """Add each face's values (F, 3) to its three vertices: (V, 3)."""
+    corners = faces.ravel()
+    return np.stack([np.bincount(corners, np.repeat(values[:, k], 3), minlength=n_vertices) for k in range(3)], axis=1)
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """Cross products of rows; numpy's own is several times slower on (F, 3)."""
+    return np.stack(
+        [
+            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
+            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
+            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
+        ],
+        axis=1,
+    )
+
+
+# Where the viewer stands: a long lens whose distance is chosen so that the template fills the picture.
+
+# Degrees by which the head turns about the vertical axis: negative turns the face to the viewer's left,
+# towards the key light.
+VIEWS: dict[str, float] = {"front": 0.0, "three_quarter": -35.0, "side": -90.0}
+
+# A portrait lens: the nose does not swell as it does with a wide angle.
+FIELD_OF_VIEW = math.radians(18.0)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A perspective camera that looks at `centre`; make one with `Camera.framing`.
+
+    Attributes:
+        centre: the point (x, y, z) that comes to the middle of the picture, in the mesh's unit.
+        rotation: rows of the 3 x 3 rotation from the mesh's axes to the camera's (x right, y up, z to viewer)
+        distance: from the camera to the centre, in the mesh's unit.
+        radius: how far vertices may lie from the centre and still be drawn, in the mesh's unit.
+    """
+
+    centre: tuple[float, ...]
+    rotation: tuple[tuple[float, ...], ...]
+    distance: float
+    radius: float
+
+    @classmethod
+    def framing(
+        cls,
+        templates: npt.ArrayLike | Sequence[npt.ArrayLike],
+        *,
+        view: str = "front",
+        aspect: float = 1.0,
+        margin: float = 0.1,
+    ) -> Camera:
+        """The camera that shows all of one template, or of several in one unit at equal scale.
+
+        Args:
+            templates: (V, 3), or a list of such arrays of any topologies.
+            view: a name in `VIEWS`.
+            aspect: width / height of the picture.
+            margin: share of the picture's half size that stays free on every side.
+        """
+        if view not in VIEWS:
+            raise FaceDiffError(f'view "{view}" is not known: choose one of {", ".join(VIEWS)}.')
+        if isinstance(templates, np.ndarray) and templates.ndim == 2:
+            templates = [templates]
+        points = np.concatenate([check_vertices(template, "template") for template in templates])  # type: ignore[union-attr]
+        size = float(np.ptp(points, axis=0).max())
+        if size <= 0:
+            raise FaceDiffError("template has no extent (all vertices coincide): pass the rest positions.")
+        rotation = _turn(math.radians(VIEWS[view]))
+        turned = points @ rotation.T
+        middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
+        x, y, z = (turned - middle).T
+        half = math.tan(FIELD_OF_VIEW / 2) * (1 - margin)
+        distance = float(max(np.max(np.abs(x) / (half * aspect) + z), np.max(np.abs(y) / half + z)))
+        return cls(
+            centre=tuple((middle @ rotation).tolist()),
+            rotation=tuple(tuple(row) for row in rotation.tolist()),
+            distance=distance,
+            radius=2 * size,
+        )
+
+    @property
+    def near(self) -> float:
+        """Depth before which nothing is drawn."""
+        return max(self.distance - self.radius, self.distance * 0.02)
+
+    @property
+    def far(self) -> float:
+        """Depth behind which nothing is drawn."""
+        return self.distance + self.radius
+
+    def to_camera(self, vertices: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+        """Positions (V, 3) in the camera's axes, origin at the camera: visible points have negative z."""
+        turned = (vertices - np.asarray(self.centre)) @ np.asarray(self.rotation).T
+        turned[:, 2] -= self.distance
+        return np.asarray(turned, dtype=np.float64)
+
+
+def _turn(angle: float) -> npt.NDArray[np.float64]:
+    """Rotation about the vertical axis by `angle` radians."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+
+
+# The look: material, lights and background, and the colour of every direction that a surface can face.
+#
+# All lights are far away and fixed to the camera, so the colour of a point depends on its normal only. It is
+# computed once for the half sphere of normals that face the viewer and then looked up per pixel, which makes
+# shading per pixel (not per vertex) affordable without a GPU. Light is added up in linear units.
+
+Colour = tuple[float, float, float]
+
+TABLE_SIZE = 256
+
+
+@dataclass(frozen=True)
+class Light:
+    """A far light.
+
+    Attributes:
+        direction: where it stands seen from the face: x right, y up, z to the viewer; any length.
+        colour: linear red, green, blue; 1 lights a white surface fully.
+        wrap: 0 for a small lamp, up to 1 for a large soft one that reaches round the edge.
+        gloss: strength of its highlight.
+    """
+
+    direction: Colour
+    colour: Colour
+    wrap: float = 0.3
+    gloss: float = 0.0
+
+
+# Key from the upper left, cool fill from the right, rim from behind at the right.
+STUDIO = (
+    Light((-0.55, 0.60, 0.80), (0.80, 0.76, 0.70), wrap=0.25, gloss=0.16),
+    Light((0.85, 0.05, 0.60), (0.14, 0.17, 0.22), wrap=0.5),
+    Light((0.75, 0.45, -0.55), (0.50, 0.52, 0.58), wrap=0.0),
 )
-from facediff.render.shading import TABLE_SIZE, Look, background, light_table, to_linear, to_srgb
+
+# The same strength from straight ahead: a symmetric face gives a symmetric picture.
+EVEN = (Light((0.0, 0.45, 0.9), (0.85, 0.83, 0.80), wrap=0.3, gloss=0.1),)
+
+
+@dataclass(frozen=True)
+class Look:
+    """Material, lights and background of a picture; colours are sRGB in [0, 1] unless a light's.
+
+    Attributes:
+        albedo: the surface's own colour where no per-vertex colours are given.
+        lights: the lamps beside the ambient light.
+        sky: linear ambient light on what faces up.
+        ground: linear ambient light on what faces down.
+        background_top: background at the upper edge.
+        background_bottom: background at the lower edge.
+        hollow: tint (linear) that hollows fade to, so that a mouth is dark and warm inside.
+    """
+
+    albedo: Colour = (0.90, 0.745, 0.66)
+    lights: tuple[Light, ...] = STUDIO
+    sky: Colour = (0.24, 0.26, 0.30)
+    ground: Colour = (0.12, 0.09, 0.08)
+    background_top: Colour = (0.93, 0.94, 0.955)
+    background_bottom: Colour = (0.76, 0.78, 0.815)
+    hollow: Colour = (0.10, 0.02, 0.015)
+
+
+def to_linear(srgb: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """SRGB values in [0, 1] to linear light."""
+    values = np.asarray(srgb, dtype=np.float64)
+    linear = np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
+
+
+def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Linear light in [0, 1] to sRGB."""
+    values = np.clip(np.asarray(linear, dtype=np.float64), 0, 1)
+    srgb = np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055)
+    return srgb.astype(np.float32)
+
+
+def light_table(look: Look) -> npt.NDArray[np.float32]:
+    """Light that leaves a surface, by the normal it has: (TABLE_SIZE, TABLE_SIZE, 4).
+
+    Row and column are the normal's y and x from -1 to 1 (row 0 is y = -1). Channels 0 to 2 hold what a
+    white matt surface sends back, channel 3 the highlight, which does not take the surface's colour.
+    """
+    axis = np.linspace(-1, 1, TABLE_SIZE)
+    x, y = np.meshgrid(axis, axis)
+    # Outside the unit disc lie interpolation errors at the outline only: treat them as the outline itself.
+    length = np.maximum(np.hypot(x, y), 1.0)
+    x, y = x / length, y / length
+    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], axis=-1)
+    up = (normal[..., 1:2] + 1) / 2
+    diffuse = (1 - up) * np.asarray(look.ground) + up * np.asarray(look.sky)
+    gloss = np.zeros_like(x)
+    for light in look.lights:
+        direction = np.asarray(light.direction) / np.linalg.norm(light.direction)
+        cosine = normal @ direction
+        # Red light travels furthest under skin: it reaches a little further round the edge of the shadow.
+        wrap = np.minimum(light.wrap + np.array([0.12, 0.02, 0.0]), 1.0) if light.wrap > 0 else np.zeros(3)
+        lit = np.maximum((cosine[..., None] + wrap) / (1 + wrap), 0)
+        diffuse += lit ** (1 + wrap) * np.asarray(light.colour)
+        half = direction + np.array([0.0, 0.0, 1.0])
+        half /= max(float(np.linalg.norm(half)), 1e-6)
+        shine = np.maximum(normal @ half, 0)
+        gloss += light.gloss * (0.6 * shine**18 + 0.4 * shine**60)
+    return np.concatenate([diffuse, gloss[..., None]], axis=-1).astype(np.float32)
+
+
+def background(look: Look, height: int, width: int) -> npt.NDArray[np.float32]:
+    """Soft gradient in linear light (height, width, 3), a little brighter behind the head."""
+    rows = np.linspace(0, 1, height)[:, None, None]
+    top, bottom = np.asarray(look.background_top), np.asarray(look.background_bottom)
+    blend = rows * rows * (3 - 2 * rows)
+    y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+    glow = 1 - 0.05 * np.clip(x * x + y * y, 0, 2)[..., None]
+    return to_linear(((1 - blend) * top + blend * bottom) * glow)
+
+
+# Buffers and the passes of OpenCV's software rasteriser that fill them.
+
+# Windows start and end on multiples of this many pixels, so that nothing computed on a coarser grid inside
+# them shimmers when a window grows with the motion.
+GRID = 8
+
+
+def opencv() -> ModuleType:
+    """OpenCV 5, or a sentence that says how to get it."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtraError("cv2", "render", "drawing meshes") from error
+    if not hasattr(cv2, "triangleRasterize"):
+        raise FaceDiffError(
+            f"drawing meshes needs OpenCV 5 or later, but {cv2.__version__} is installed: "
+            'run  pip install "facediff[render]"'
+        )
+    return cv2
+
+
+class Window:
+    """A rectangle of the picture, in pixels and in samples.
+
+    Args:
+        rows: first row and one past the last, in pixels.
+        columns: likewise.
+        supersample: samples per pixel and axis.
+    """
+
+    def __init__(self, rows: tuple[int, int], columns: tuple[int, int], supersample: int) -> None:
+        self.pixels = (slice(*rows), slice(*columns))
+        self.samples = tuple(slice(low * supersample, high * supersample) for low, high in (rows, columns))
+        self.size = (columns[1] - columns[0], rows[1] - rows[0])
+
+    def shrink(self, samples: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Average the samples of each pixel."""
+        cv2 = opencv()
+        return np.asarray(cv2.resize(samples, self.size, interpolation=cv2.INTER_AREA))
+
+
+class Canvas:
+    """A depth buffer and three interpolated values per sample.
+
+    Depth is kept as the rasteriser has it (0 at the near plane, 1 at the far plane and where nothing is).
+    Its other mode, which converts to distances and back around every call, loses what a second pass adds:
+    the empty samples come back a rounding error behind the far plane and count as untouchable.
+
+    Args:
+        camera: where the picture is taken from.
+        height: of the picture in pixels.
+        width: of the picture in pixels.
+        supersample: samples per pixel and axis.
+    """
+
+    def __init__(self, camera: Camera, height: int, width: int, supersample: int) -> None:
+        self.camera = camera
+        self.height, self.width, self.supersample = height, width, supersample
+        self._depth = np.ones((height * supersample, width * supersample), np.float32)
+        self._values = np.zeros((*self._depth.shape, 3), np.float32)
+        self._blank = np.broadcast_to(np.array([-1, -1, 0], np.float32), self._values.shape).copy()
+
+    def window(self, points: npt.NDArray[np.float64]) -> Window | None:
+        """The part of the picture that can show the points (V, 3, camera axes); None if there is none."""
+        ahead = points[points[:, 2] < -self.camera.near]
+        if len(ahead) == 0:
+            return None
+        scale = self.height / 2 / math.tan(FIELD_OF_VIEW / 2) / -ahead[:, 2]
+        row, column = self.height / 2 - scale * ahead[:, 1], self.width / 2 + scale * ahead[:, 0]
+        limits = []
+        for pixel, size in ((row, self.height), (column, self.width)):
+            low = max((math.floor(pixel.min()) - 2) // GRID * GRID, 0)
+            high = min(-((-math.ceil(pixel.max()) - 2) // GRID) * GRID, size)
+            if high <= low:
+                return None
+            limits.append((low, high))
+        return Window(limits[0], limits[1], self.supersample)
+
+    def clear(self, window: Window) -> None:
+        """Nothing drawn yet: depth 1, values (-1, -1, 0)."""
+        self._depth[window.samples] = 1
+        self._values[window.samples] = self._blank[window.samples]
+
+    def draw(
+        self,
+        positions: npt.NDArray[np.float32],
+        faces: npt.NDArray[np.int32],
+        values: npt.NDArray[np.floating[Any]],
+        side: str,
+    ) -> None:
+        """Interpolate values (V, 3) over the triangles where they are the nearest surface so far.
+
+        Args:
+            positions: vertices (V, 3) in camera axes.
+            faces: triangles (F, 3).
+            values: what to interpolate, in [0, 1].
+            side: which side of the triangles, "front", "back" or "both".
+        """
+        cv2 = opencv()
+        settings = cv2.TriangleRasterizeSettings()
+        settings.setShadingType(cv2.RASTERIZE_SHADING_SHADED)
+        settings.setGlCompatibleMode(cv2.RASTERIZE_COMPAT_INVDEPTH)
+        culled = {"front": "CW", "back": "CCW", "both": "NONE"}[side]
+        settings.setCullingMode(getattr(cv2, f"RASTERIZE_CULLING_{culled}"))
+        lens = (FIELD_OF_VIEW, self.camera.near, self.camera.far)
+        values, pose = values.astype(np.float32), np.eye(4, dtype=np.float32)
+        cv2.triangleRasterize(positions, faces, values, self._values, self._depth, pose, *lens, settings)
+
+    def value(self, window: Window, channel: int) -> npt.NDArray[np.float32]:
+        """One of the three values per sample of the window."""
+        return np.asarray(opencv().extractChannel(self._values[window.samples], channel), dtype=np.float32)
+
+    def values(self, window: Window) -> npt.NDArray[np.float32]:
+        """The three values per pixel of the window, averaged over its samples."""
+        return window.shrink(self._values[window.samples])
+
+    def coverage(self, window: Window) -> npt.NDArray[np.float32]:
+        """Share of each pixel that the mesh covers."""
+        cv2 = opencv()
+        covered = window.shrink(cv2.compare(self._depth[window.samples], 1.0, cv2.CMP_LT))
+        return np.asarray(covered * np.float32(1 / 255), dtype=np.float32)
+
+    def distances(self, window: Window, coverage: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Mean distance of each pixel's covered samples from the camera; meaningless where it has none."""
+        depth = window.shrink(self._depth[window.samples])
+        depth += coverage
+        depth -= 1  # what the empty samples added
+        depth /= np.maximum(coverage, np.float32(1e-3))
+        near, far = 1 / self.camera.near, 1 / self.camera.far
+        return np.asarray(1 / (np.float32(near) + depth * np.float32(far - near)), dtype=np.float32)
+
 
 # What is seen of a face's back keeps this share of its light: the inside of a head is dark.
 INSIDE = 0.2

@@ -1,5 +1,7 @@
 """Frames and sound to an mp4 file: H.264 and AAC, encoded in this process by PyAV."""
 
+from __future__ import annotations
+
 import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -14,6 +16,7 @@ from facediff.errors import FaceDiffError, MissingExtraError
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
+
 
 # Rates (Hz) that AAC knows; sound of any other rate is resampled to the highest common one.
 _AAC_RATES = (96000, 88200, 64000, 48000, 44100, 32000, 24000, 22050, 16000, 12000, 11025, 8000)
@@ -110,7 +113,7 @@ class _Encoder:
 
     def __init__(
         self,
-        container: "OutputContainer",
+        container: OutputContainer,
         rate: Fraction,
         size: tuple[int, int],
         sound: npt.NDArray[np.float32] | None,

@@ -13,10 +13,10 @@ import pytest
 
 from facediff.callbacks import CompiledTraining
 from facediff.errors import FaceDiffError
-from facediff.systems import DualPathDiffusion
+from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import Tiny
 
-MakeSystem = Callable[..., DualPathDiffusion]
+MakeModel = Callable[..., DualPathDiffusion]
 MakeTrainer = Callable[..., pl.Trainer]
 ROOT = Path(__file__).parents[2]
 
@@ -28,7 +28,7 @@ import lightning.pytorch as pl
 import torch
 from facediff import registry
 from facediff.callbacks import CompiledTraining
-from facediff.systems import DualPathDiffusion
+from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
 torch.set_num_threads(1)
@@ -36,8 +36,8 @@ calls, late = [], []
 
 class Last(pl.Callback):
     # As a preview at the end of training; it is before the other callback in the list.
-    def on_train_end(self, trainer, system):
-        late.append([name for name, part in system.named_modules() if part._compiled_call_impl is not None])
+    def on_train_end(self, trainer, model):
+        late.append([name for name, part in model.named_modules() if part._compiled_call_impl is not None])
 
 def backend(graph, _):
     calls.append(len(list(graph.graph.nodes)))
@@ -45,7 +45,7 @@ def backend(graph, _):
 
 def train(*callbacks):
     torch.manual_seed(0)
-    system = DualPathDiffusion(
+    model = DualPathDiffusion(
         n_vertices=VERTICES, identities=SEEN, frame_rate=25.0, dim=16, diffusion_steps=40,
         audio_encoder=partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0),
         style_encoder=partial(registry.style_encoder.tcn_gru_transformer, num_layers=1, dropout=0.0),
@@ -55,9 +55,9 @@ def train(*callbacks):
     )
     trainer = pl.Trainer(accelerator="cpu", devices=1, max_epochs=2, logger=False, enable_checkpointing=False,
         enable_progress_bar=False, enable_model_summary=False, callbacks=list(callbacks), log_every_n_steps=1)
-    trainer.fit(system, datamodule=Tiny(root=sys.argv[1], max_frames_per_batch=60))
-    left = [name for name, part in system.named_modules() if part._compiled_call_impl is not None]
-    weights = {name: value.double().sum().item() for name, value in system.state_dict().items()}
+    trainer.fit(model, datamodule=Tiny(root=sys.argv[1], max_frames_per_batch=60))
+    left = [name for name, part in model.named_modules() if part._compiled_call_impl is not None]
+    weights = {name: value.double().sum().item() for name, value in model.state_dict().items()}
     return float(trainer.callback_metrics["train/loss"]), weights, left
 
 plain = train()
@@ -82,13 +82,13 @@ def test_losses_weights_and_names_are_those_without(tiny_root: Path) -> None:
     assert late == [[]]
 
 
-def test_a_machine_that_cannot_compile_is_told(make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny) -> None:
+def test_a_machine_that_cannot_compile_is_told(make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny) -> None:
     def backend(*_: object) -> Callable[..., object]:
         raise RuntimeError("No working C++ compiler found")
 
     trainer = make_trainer(callbacks=[CompiledTraining(backend=backend)])  # type: ignore[arg-type]
     with pytest.raises(FaceDiffError, match=r"does not work on this machine \(.*C\+\+ compiler.*install a C\+\+ comp"):
-        trainer.fit(make_system(), datamodule=tiny)
+        trainer.fit(make_model(), datamodule=tiny)
 
 
 def test_a_system_without_a_network_is_told(make_trainer: MakeTrainer) -> None:
@@ -96,7 +96,7 @@ def test_a_system_without_a_network_is_told(make_trainer: MakeTrainer) -> None:
         CompiledTraining().on_fit_start(make_trainer(), pl.LightningModule())
 
 
-def test_a_part_that_is_not_there_is_named(make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny) -> None:
+def test_a_part_that_is_not_there_is_named(make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny) -> None:
     trainer = make_trainer(callbacks=[CompiledTraining(parts=["decoders"])])
     with pytest.raises(FaceDiffError, match=r'no part "decoders"; choose among .*fusion, .*decoder'):
-        trainer.fit(make_system(), datamodule=tiny)
+        trainer.fit(make_model(), datamodule=tiny)

@@ -24,12 +24,12 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from facediff.callbacks import GradientNorm, RunDescription, ScoreTable
-from facediff.callbacks.dashboard_media import draw_errors, measure_clips
-from facediff.systems import DualPathDiffusion
+from facediff.callbacks.dashboard import draw_errors, measure_clips
+from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import Tiny, write_tiny
 from tests.fakes.wandb_run import OfflineRun
 
-MakeSystem = Callable[..., DualPathDiffusion]
+MakeModel = Callable[..., DualPathDiffusion]
 MakeTrainer = Callable[..., pl.Trainer]
 
 
@@ -101,17 +101,15 @@ def test_two_processes_log_the_norm_of_the_mean(make_trainer: MakeTrainer, tmp_p
     np.testing.assert_allclose(columns(tmp_path, "gradient/norm"), [(26.0,), (65.0,)], rtol=1e-6)
 
 
-def fit(system: DualPathDiffusion, make_trainer: MakeTrainer, root: Path, **options: object) -> None:
+def fit(model: DualPathDiffusion, make_trainer: MakeTrainer, root: Path, **options: object) -> None:
     pl.seed_everything(1, workers=True, verbose=False)
-    make_trainer(max_epochs=2, limit_val_batches=0, **options).fit(
-        system, datamodule=Tiny(root=str(root), batch_size=4)
-    )
+    make_trainer(max_epochs=2, limit_val_batches=0, **options).fit(model, datamodule=Tiny(root=str(root), batch_size=4))
 
 
 def test_training_is_the_same_with_and_without(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny_root: Path, tmp_path: Path
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny_root: Path, tmp_path: Path
 ) -> None:
-    alone, watched = make_system(), make_system()
+    alone, watched = make_model(), make_model()
     fit(alone, make_trainer, tiny_root, gradient_clip_val=0.1)
     callbacks = [GradientNorm(components=True), RunDescription()]
     fit(watched, make_trainer, tiny_root, gradient_clip_val=0.1, callbacks=callbacks, logger=CSVLogger(tmp_path))
@@ -128,36 +126,36 @@ def test_training_is_the_same_with_and_without(
         assert sum(float(row[part] or 0) ** 2 for part in parts) == pytest.approx(float(row["gradient/norm"]) ** 2)
 
 
-def test_a_run_says_what_it_is(make_system: MakeSystem, make_trainer: MakeTrainer, tmp_path: Path) -> None:
+def test_a_run_says_what_it_is(make_model: MakeModel, make_trainer: MakeTrainer, tmp_path: Path) -> None:
     from facediff import registry
 
     root = write_tiny(tmp_path / "corpus")
     (root / "manifest.json").write_text(json.dumps({"frame_rate": 25}))
-    system = make_system(decoder=registry.decoder.gru, identity_encoder=registry.identity_encoder.none)
-    for parameter in system.network.fusion.parameters():
+    model = make_model(decoder=registry.decoder.gru, identity_encoder=registry.identity_encoder.none)
+    for parameter in model.network.fusion.parameters():
         parameter.requires_grad = False
-    frozen = sum(parameter.numel() for parameter in system.network.fusion.parameters())
-    fit(system, make_trainer, root, callbacks=[RunDescription()], logger=CSVLogger(tmp_path), max_steps=1)
+    frozen = sum(parameter.numel() for parameter in model.network.fusion.parameters())
+    fit(model, make_trainer, root, callbacks=[RunDescription()], logger=CSVLogger(tmp_path), max_steps=1)
     (path,) = tmp_path.rglob("hparams.yaml")
     said = yaml.safe_load(path.read_text())
     assert said["component/decoder"] == "gru"
     assert said["component/identity_encoder"] == "none"
     assert said["component/style_encoder"] == "tcn_gru_transformer"
-    assert said["system"] == "DualPathDiffusion"
+    assert said["model"] == "DualPathDiffusion"
     assert said["protocol"] == "paper"
     assert said["data/corpus"] == "tiny"
     assert said["data/synthetic"] is True
     assert said["data/people"] == "none"
     assert said["data/manifest"] == hashlib.sha256((root / "manifest.json").read_bytes()).hexdigest()
     assert said["parameters/frozen"] == frozen > 0
-    assert said["parameters/trainable"] + frozen == sum(np.prod(p.shape) for p in system.parameters())
+    assert said["parameters/trainable"] + frozen == sum(np.prod(p.shape) for p in model.parameters())
     assert said["version/torch"] == torch.__version__
     assert said["dim"] == 16  # what Lightning logs is still there
 
 
 @pytest.fixture
 def tested(
-    make_system: MakeSystem,
+    make_model: MakeModel,
     make_trainer: MakeTrainer,
     tiny_root: Path,
     tmp_path: Path,
@@ -168,20 +166,20 @@ def tested(
 
     monkeypatch.setenv("WANDB_DATA_DIR", str(tmp_path / "data"))
     wandb.finish()  # another test's run in this process
-    system = make_system(motion_scale="none")
+    model = make_model(motion_scale="none")
     table = ScoreTable(file=None, sequences_file=None, media_clips=3)
     trainer = make_trainer(logger=WandbLogger(save_dir=tmp_path), callbacks=[table, RunDescription()])
-    trainer.test(system, datamodule=Tiny(root=str(tiny_root), batch_size=3), verbose=False)
+    trainer.test(model, datamodule=Tiny(root=str(tiny_root), batch_size=3), verbose=False)
     wandb.finish()
     (folder,) = tmp_path.glob("wandb/offline-run-*")
-    system.eval()  # as it was during the test
-    return OfflineRun(folder), trainer, system
+    model.eval()  # as it was during the test
+    return OfflineRun(folder), trainer, model
 
 
 def test_the_worst_clips_have_sound_and_picture(
     tested: tuple[OfflineRun, pl.Trainer, DualPathDiffusion], tiny_root: Path
 ) -> None:
-    run, trainer, system = tested
+    run, trainer, model = tested
     table = run.table("test/sequences")
     rows = [dict(zip(table["columns"], values, strict=True)) for values in table["data"]]
     assert len(rows) == 18  # four clips and two, three methods each
@@ -199,8 +197,8 @@ def test_the_worst_clips_have_sound_and_picture(
         assert "0 to " in row["error"]["caption"]
     assert run.config["component/decoder"] == "style_transformer"
 
-    measured = measure_clips(trainer, system, shown)
-    for clip, row, picture in zip(measured, shown, draw_errors(system, measured), strict=True):
+    measured = measure_clips(trainer, model, shown)
+    for clip, row, picture in zip(measured, shown, draw_errors(model, measured), strict=True):
         # The protocol's MVE of a clip is the mean over vertices and frames of the same distances, so the picture shows
         # the motion that was scored although it was sampled alone and not in a batch of three.
         assert clip.errors.shape == (24,)
@@ -211,9 +209,9 @@ def test_the_worst_clips_have_sound_and_picture(
 def test_a_corpus_without_faces_has_sound_only(tested: tuple[OfflineRun, pl.Trainer, DualPathDiffusion]) -> None:
     from dataclasses import replace
 
-    run, trainer, system = tested
+    run, trainer, model = tested
     rows = [dict(zip(run.table("test/sequences")["columns"], run.table("test/sequences")["data"][0], strict=True))]
-    clips = measure_clips(trainer, system, rows)
-    system.adopt(replace(system.assets, faces=None))
+    clips = measure_clips(trainer, model, rows)
+    model.adopt(replace(model.assets, faces=None))
     with pytest.warns(UserWarning, match="tiny has no mesh file"):
-        assert draw_errors(system, clips) == [None]
+        assert draw_errors(model, clips) == [None]

@@ -22,18 +22,18 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 
 from facediff.callbacks import SamplingPreview
-from facediff.callbacks.sampling_preview_drawing import borrowed, default_error_scale, first_of_each_subject, length
-from facediff.cli import main
+from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_subject, length
+from facediff.cli.app import main
 from facediff.data import collate
 from facediff.data.corpus import Clip
 from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion, load_model
 from facediff.render import Renderer
-from facediff.render.heat import heat_colours
-from facediff.systems import DualPathDiffusion, load_system
+from facediff.render.panels import heat_colours
 from tests.fakes.tiny import Tiny
 from tests.fakes.wandb_run import OfflineRun
 
-MakeSystem = Callable[..., DualPathDiffusion]
+MakeModel = Callable[..., DualPathDiffusion]
 MakeTrainer = Callable[..., pl.Trainer]
 
 SIZE, SCALE = 64, 0.013  # not what the clips would give
@@ -66,13 +66,13 @@ class Losses(pl.Callback):
         self.found += [trainer.callback_metrics["val/loss"].item(), trainer.callback_metrics["val/lve"].item()]
 
 
-def shown(sheet: Path, system: DualPathDiffusion, clip: str, tiny: Tiny, seed: int = 0) -> bool:
-    """Whether the first picture of a sheet shows this system's motion and error, drawn by the renderer alone."""
+def shown(sheet: Path, model: DualPathDiffusion, clip: str, tiny: Tiny, seed: int = 0) -> bool:
+    """Whether the first picture of a sheet shows this model's motion and error, drawn by the renderer alone."""
     dataset = tiny.dataset("val")
     sample = dataset[[found.name for found in dataset.clips].index(clip)]
-    system.choose_sampler("ddim", 3)
+    model.choose_sampler("ddim", 3)
     with torch.inference_mode():
-        motion = system.eval().generate(collate([sample]), seed=seed)[0]
+        motion = model.eval().generate(collate([sample]), seed=seed)[0]
     mesh = tiny.assets()
     assert mesh.faces is not None
     width = SIZE * 3 // 4
@@ -89,15 +89,15 @@ def shown(sheet: Path, system: DualPathDiffusion, clip: str, tiny: Tiny, seed: i
     raise AssertionError("the truth is not on the sheet")
 
 
-def system_of(checkpoint: Path, *, averaged: bool) -> DualPathDiffusion:
-    system = load_system(checkpoint)
+def model_of(checkpoint: Path, *, averaged: bool) -> DualPathDiffusion:
+    model = load_model(checkpoint)
     weights = torch.load(checkpoint, weights_only=True)["state_dict" if averaged else "current_model_state"]
-    system.load_state_dict(weights)
-    return system
+    model.load_state_dict(weights)
+    return model
 
 
 def test_averaged_weights_are_shown(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     """After epoch 2 from validation; after epoch 3, which has none, at the end of training.
 
@@ -105,15 +105,15 @@ def test_averaged_weights_are_shown(
     """
     callbacks = [EMAWeightAveraging(decay=0.9, use_buffers=False), SamplingPreview(**{**SMALL, "clips": 1})]
     trainer = make_trainer(max_epochs=3, check_val_every_n_epoch=2, callbacks=[*callbacks, Weights(str(tmp_path))])
-    system = make_system(learning_rate=3e-3)
-    trainer.fit(system, datamodule=tiny)
+    model = make_model(learning_rate=3e-3)
+    trainer.fit(model, datamodule=tiny)
     assert sorted(path.name for path in (tmp_path / "previews").iterdir()) == ["epoch_0002", "epoch_0003"]
     for epoch in (2, 3):
         sheet = tmp_path / "previews" / f"epoch_{epoch:04d}" / "A_e05.png"
         for averaged in (True, False):
-            assert shown(sheet, system_of(tmp_path / f"{epoch}.ckpt", averaged=averaged), "A_e05", tiny) is averaged
-    final = system_of(tmp_path / "3.ckpt", averaged=True).state_dict()
-    assert all(torch.equal(tensor, final[name]) for name, tensor in system.state_dict().items())
+            assert shown(sheet, model_of(tmp_path / f"{epoch}.ckpt", averaged=averaged), "A_e05", tiny) is averaged
+    final = model_of(tmp_path / "3.ckpt", averaged=True).state_dict()
+    assert all(torch.equal(tensor, final[name]) for name, tensor in model.state_dict().items())
 
 
 class Broken(SamplingPreview):
@@ -154,30 +154,30 @@ def test_two_processes(tiny: Tiny, tiny_root: Path, tmp_path: Path) -> None:
         folder = tmp_path / "previews" / f"epoch_{epoch:04d}"
         assert sorted(path.name for path in folder.iterdir()) == [f"{c}.{s}" for c in CLIPS for s in ("mp4", "png")]
         for averaged in (True, False):
-            system = system_of(tmp_path / f"{epoch}.ckpt", averaged=averaged)
-            assert shown(folder / "B_e05.png", system, "B_e05", tiny) is averaged
+            model = model_of(tmp_path / f"{epoch}.ckpt", averaged=averaged)
+            assert shown(folder / "B_e05.png", model, "B_e05", tiny) is averaged
 
 
 @pytest.mark.parametrize("preview", [SamplingPreview, Broken])
 @pytest.mark.filterwarnings("ignore:the preview of:UserWarning")
 def test_training_is_the_same_digit_for_digit(
-    preview: type[SamplingPreview], make_system: MakeSystem, make_trainer: MakeTrainer, tiny_root: Path
+    preview: type[SamplingPreview], make_model: MakeModel, make_trainer: MakeTrainer, tiny_root: Path
 ) -> None:
     found = []
     for callbacks in ([], [preview(**SMALL)]):
         pl.seed_everything(3, verbose=False)
-        spy, system = Losses(), make_system()
+        spy, model = Losses(), make_model()
         trainer = make_trainer(max_epochs=2, val_check_interval=0.5, callbacks=[*callbacks, spy])
-        sampler = system.sampler
-        trainer.fit(system, datamodule=Tiny(root=str(tiny_root), window=9))
-        found.append([*spy.found, *(tensor.sum().item() for tensor in system.state_dict().values())])
-        assert system.sampler is sampler
+        sampler = model.sampler
+        trainer.fit(model, datamodule=Tiny(root=str(tiny_root), window=9))
+        found.append([*spy.found, *(tensor.sum().item() for tensor in model.state_dict().values())])
+        assert model.sampler is sampler
     assert len(found[0]) > 50
     assert found[0] == found[1]
 
 
 def test_clips_and_noise_are_the_same_in_every_epoch(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     """With weights that stand still, so do the pictures; another seed gives others."""
     sheets = []
@@ -185,7 +185,7 @@ def test_clips_and_noise_are_the_same_in_every_epoch(
         folder = tmp_path / str(len(sheets))
         preview = SamplingPreview(**{**SMALL, "names": ["B_e05"], "seed": seed, "seconds": 0.4, "error_scale": None})
         trainer = make_trainer(max_epochs=2, callbacks=[preview], default_root_dir=folder)
-        trainer.fit(make_system(learning_rate=0.0), datamodule=tiny)
+        trainer.fit(make_model(learning_rate=0.0), datamodule=tiny)
         one, two = sorted(folder.glob("previews/epoch_*/B_e05.png"))
         sheets += [np.asarray(Image.open(path)) for path in (one, two)]
         assert preview.state_dict() == {
@@ -201,12 +201,12 @@ def test_clips_and_noise_are_the_same_in_every_epoch(
 
 
 def test_it_is_drawn_when_it_is_due(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     def epochs(folder: str, trainer_options: dict[str, Any], **options: object) -> list[int]:
         preview = SamplingPreview(**{**SMALL, "clips": 1, "seconds": 0.1, **options})
         trainer = make_trainer(callbacks=[preview], default_root_dir=tmp_path / folder, **trainer_options)
-        trainer.fit(make_system(), datamodule=tiny)
+        trainer.fit(make_model(), datamodule=tiny)
         return sorted(int(path.name[-4:]) for path in (tmp_path / folder).glob("previews/*"))
 
     often = {"max_epochs": 7, "check_val_every_n_epoch": 3, "limit_train_batches": 1}
@@ -228,7 +228,7 @@ def test_a_resumed_run_goes_on_alike() -> None:
 
 
 def test_a_failing_preview_warns_and_leaves_nothing_half_written(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(self: Renderer, *arguments: object, **options: object) -> None:
         raise MemoryError("no memory for pictures")
@@ -236,35 +236,35 @@ def test_a_failing_preview_warns_and_leaves_nothing_half_written(
     monkeypatch.setattr(Renderer, "render", interrupted)
     trainer = make_trainer(callbacks=[SamplingPreview(**{**SMALL, "clips": 1})], logger=CSVLogger(tmp_path))
     with pytest.warns(UserWarning, match="preview of A_e05 after epoch 1 failed, and .* no memory for pictures"):
-        trainer.fit(make_system(), datamodule=tiny)
+        trainer.fit(make_model(), datamodule=tiny)
     assert trainer.current_epoch == 1
     assert not [path for path in tmp_path.rglob("*") if "previews" in str(path)]
 
 
 def test_a_logger_that_fails_does_not_keep_the_others_from_showing(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     board, table = TensorBoardLogger(tmp_path / "board"), CSVLogger(tmp_path / "csv")
     monkeypatch.setattr(type(board.experiment), "add_image", lambda *_, **__: 1 / 0)
     trainer = make_trainer(callbacks=[SamplingPreview(**SMALL)], logger=[board, table])
     with pytest.warns(UserWarning, match="after epoch 1 for TensorBoardLogger failed.*division by zero"):
-        trainer.fit(make_system(), datamodule=tiny)
+        trainer.fit(make_model(), datamodule=tiny)
     assert "preview/seconds" in (Path(table.log_dir) / "metrics.csv").read_text()
     assert len(list(Path(board.log_dir).glob("previews/epoch_0001/*"))) == 4
 
 
 def test_a_missing_package_is_told_once(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     trainer = make_trainer(max_epochs=2, callbacks=[SamplingPreview(**SMALL)])
     with pytest.warns(UserWarning, match=r"no previews in this run: .*facediff\[render\]") as told:
-        trainer.fit(make_system(), datamodule=tiny)
+        trainer.fit(make_model(), datamodule=tiny)
     assert sum("no previews" in str(warning.message) for warning in told) == 1
 
 
 def test_a_corpus_without_a_mesh_is_told_once(
-    make_system: MakeSystem,
+    make_model: MakeModel,
     make_trainer: MakeTrainer,
     tiny: Tiny,
     tmp_path: Path,
@@ -272,14 +272,14 @@ def test_a_corpus_without_a_mesh_is_told_once(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(tiny, "mesh_files", ("absent.ply",))
-    make_trainer(max_epochs=2, callbacks=[SamplingPreview(**SMALL)]).fit(make_system(), datamodule=tiny)
+    make_trainer(max_epochs=2, callbacks=[SamplingPreview(**SMALL)]).fit(make_model(), datamodule=tiny)
     told = capsys.readouterr().out
     assert told.count(f"no previews in this run: {tiny.root} holds no mesh to draw (absent.ply)") == 1
     assert told.count("preview") == 1
     assert not (tmp_path / "previews").exists()
 
 
-def test_bad_options_are_refused_at_once(make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny) -> None:
+def test_bad_options_are_refused_at_once(make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny) -> None:
     with pytest.raises(FaceDiffError, match="seconds is 0, expected a number above zero"):
         SamplingPreview(seconds=0)
     with pytest.raises(FaceDiffError, match='no view "side_wise": did you mean "side"'):
@@ -288,16 +288,16 @@ def test_bad_options_are_refused_at_once(make_system: MakeSystem, make_trainer: 
         SamplingPreview(sampler="dim")
     trainer = make_trainer(callbacks=[SamplingPreview(names=["A_e05", "A_e06"])])
     with pytest.raises(FaceDiffError, match="A_e06 is no validation clip"):
-        trainer.fit(make_system(), datamodule=tiny)
+        trainer.fit(make_model(), datamodule=tiny)
 
 
 def test_tensorboard_holds_pictures_and_sound(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     logger = TensorBoardLogger(tmp_path)
-    make_trainer(callbacks=[SamplingPreview(**SMALL)], logger=logger).fit(make_system(), datamodule=tiny)
+    make_trainer(callbacks=[SamplingPreview(**SMALL)], logger=logger).fit(make_model(), datamodule=tiny)
     events = EventAccumulator(logger.log_dir).Reload()
     assert events.Tags()["images"] == [f"preview/{clip}" for clip in CLIPS]
     assert events.Tags()["audio"] == [f"preview/{clip}" for clip in CLIPS]
@@ -310,14 +310,14 @@ def test_tensorboard_holds_pictures_and_sound(
 
 
 def test_wandb_holds_videos_and_a_growing_table(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wandb = pytest.importorskip("wandb")
     monkeypatch.chdir(tmp_path)
     wandb.finish()  # another test's run in this process
     logger = WandbLogger(project="facediff", save_dir=tmp_path, settings=wandb.Settings(console="off"))
     trainer = make_trainer(max_epochs=2, callbacks=[SamplingPreview(**SMALL)], logger=logger)
-    trainer.fit(make_system(), datamodule=tiny)
+    trainer.fit(make_model(), datamodule=tiny)
     # Ends wandb's own process too: all is on disk then, and a later test's starts in that test's folder.
     wandb.finish()
     wandb.teardown()
@@ -348,21 +348,21 @@ def test_the_shipped_configs_draw_and_the_last_one_counts(tiny_root: Path, tmp_p
         assert image.size[0] == 2 * 3 * 288 + 6
 
 
-def test_a_system_is_given_back_as_it_was_lent(make_system: MakeSystem) -> None:
-    system = make_system().train()
-    next(system.children()).eval()  # as a frozen part is
-    modes, sampler = [module.training for module in system.modules()], system.sampler
+def test_a_system_is_given_back_as_it_was_lent(make_model: MakeModel) -> None:
+    model = make_model().train()
+    next(model.children()).eval()  # as a frozen part is
+    modes, sampler = [module.training for module in model.modules()], model.sampler
 
     def fail() -> NoReturn:
-        with borrowed(system, "dpm_solver", 3):
-            assert not any(module.training for module in system.modules())
-            assert system.sampler is not sampler
+        with borrowed(model, "dpm_solver", 3):
+            assert not any(module.training for module in model.modules())
+            assert model.sampler is not sampler
             raise RuntimeError("in between")
 
     with pytest.raises(RuntimeError, match="in between"):
         fail()
-    assert [module.training for module in system.modules()] == modes
-    assert system.sampler is sampler
+    assert [module.training for module in model.modules()] == modes
+    assert model.sampler is sampler
 
 
 def test_each_persons_first_clip_comes_before_any_second() -> None:

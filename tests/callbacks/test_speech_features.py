@@ -12,12 +12,12 @@ import torch
 
 from facediff import registry
 from facediff.callbacks import SpeechFeatureCache
-from facediff.cli import main
+from facediff.cli.app import main
 from facediff.errors import FaceDiffError
-from facediff.systems import DualPathDiffusion
+from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import Tiny
 
-MakeSystem = Callable[..., DualPathDiffusion]
+MakeModel = Callable[..., DualPathDiffusion]
 MakeTrainer = Callable[..., pl.Trainer]
 
 
@@ -36,7 +36,7 @@ class Losses(pl.Callback):
 
 @pytest.fixture
 def losses(
-    make_system: MakeSystem, make_trainer: MakeTrainer, hubert_source: Path, tiny_root: Path
+    make_model: MakeModel, make_trainer: MakeTrainer, hubert_source: Path, tiny_root: Path
 ) -> Callable[..., tuple[list[float], int]]:
     """Losses of two epochs of training and validation, and how many clips went through the convolutions."""
 
@@ -45,15 +45,15 @@ def losses(
     ) -> tuple[list[float], int]:
         encoder = partial(registry.audio_encoder.hubert, source=str(hubert_source), frozen_layers=frozen)
         pl.seed_everything(1, workers=True, verbose=False)
-        system = make_system(audio_encoder=encoder, **options)
+        model = make_model(audio_encoder=encoder, **options)
         clips: list[int] = []
-        system.network.audio_encoder.hubert.feature_extractor.register_forward_pre_hook(
+        model.network.audio_encoder.hubert.feature_extractor.register_forward_pre_hook(
             lambda _, args: clips.append(len(args[0]))
         )
         spy = Losses()
         data = Tiny(root=str(tiny_root), window=window, max_frames_per_batch=60)
         trainer = make_trainer(max_epochs=2, callbacks=[spy, *callbacks])
-        trainer.fit(system, datamodule=data)
+        trainer.fit(model, datamodule=data)
         return spy.found, sum(clips)
 
     return train
@@ -115,11 +115,11 @@ def test_a_damaged_cache_file_is_made_anew(losses: Callable[..., tuple[list[floa
 
 
 def test_an_encoder_without_a_frozen_part_is_refused(
-    make_system: MakeSystem, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     trainer = make_trainer(callbacks=[SpeechFeatureCache(str(tmp_path))])
     with pytest.raises(FaceDiffError, match="the audio encoder mel has no frozen part"):
-        trainer.fit(make_system(), datamodule=tiny)
+        trainer.fit(make_model(), datamodule=tiny)
 
 
 def test_from_the_command_line(

@@ -11,7 +11,7 @@ import soundfile
 import torch
 
 from facediff.data import Biwi, Mead3D, SpeechMotionDataModule, Vocaset
-from facediff.data.regions import find_region
+from facediff.data.corpus import find_region
 from facediff.errors import FaceDiffError
 
 VERTICES = 10
@@ -161,9 +161,9 @@ def test_3dmead_names_tell_emotion_and_intensity_and_references_share_the_emotio
     for sample in [*data.dataset("train"), *data.dataset("test_a")]:
         assert sample.reference_name.split("_")[2] == sample.name.split("_")[2]
     # Whoever is tested on all clips has a style all the same, from another clip.
-    strangers = MiniMead(root=str(tmp_path), split="identity").dataset("test_b")
-    assert len(strangers) == 4
-    assert all(s.reference_name != s.name and s.reference_name[:4] == "W040" for s in strangers)
+    unseen = MiniMead(root=str(tmp_path), split="identity").dataset("test_b")
+    assert len(unseen) == 4
+    assert all(s.reference_name != s.name and s.reference_name[:4] == "W040" for s in unseen)
 
 
 def test_sixty_stored_frames_a_second_become_thirty_by_every_second(tmp_path: Path) -> None:

@@ -165,13 +165,13 @@ def test_a_region_index_out_of_range_names_the_file(broken: Path) -> None:
 
 
 def test_newcomers_train_on_their_clips_of_no_split(tiny_root: Path) -> None:
-    data = Tiny(root=str(tiny_root), newcomers=["C"])
+    data = Tiny(root=str(tiny_root), extra_identities=["C"])
     assert data.identities == ["C", "A", "B"]
     assert {clip.name for clip in data.clips("train") if clip.subject == "C"} == {f"C_e0{n}" for n in range(1, 6)}
     assert {clip.subject for clip in data.clips("test_b")} == {"C"}, "test clips stay test clips"
-    only = Tiny(root=str(tiny_root), newcomers=["C"], train_subjects=["C"])
+    only = Tiny(root=str(tiny_root), extra_identities=["C"], train_identities=["C"])
     assert {clip.subject for clip in only.clips("train")} == {"C"}
     assert only.identities == data.identities
     assert [clip.name for clip in only.clips("val")] == [clip.name for clip in data.clips("val")]
     with pytest.raises(FaceDiffError, match="A is there more than once"):
-        Tiny(root=str(tiny_root), newcomers=["A"])
+        Tiny(root=str(tiny_root), extra_identities=["A"])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli import main
+from facediff.cli.app import main
 
 PAGE = (Path(__file__).parents[2] / "docs" / "new_corpus.md").read_text()
 (SOURCE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facediff.data.sampling import ClipBatches, Pick
+from facediff.data.dataset import ClipBatches, Pick
 
 LENGTHS = st.lists(st.integers(1, 300), min_size=1, max_size=60)
 

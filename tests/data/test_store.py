@@ -10,8 +10,7 @@ import pytest
 import soundfile
 
 from facediff.data import audio
-from facediff.data.audio import read_speech, read_stretch
-from facediff.data.store import ArrayStore
+from facediff.data.audio import ArrayStore, read_speech, read_stretch
 from facediff.errors import FaceDiffError
 
 

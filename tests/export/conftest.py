@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from facediff.takes import Take
+from facediff.animation import Animation
 
 FRAMES, RATE = 40, 30.0
 
@@ -20,16 +20,16 @@ def ball() -> trimesh.Trimesh:
 
 
 @pytest.fixture
-def make_take(ball: trimesh.Trimesh) -> Callable[..., Take]:
+def make_animation(ball: trimesh.Trimesh) -> Callable[..., Animation]:
     """A take of 162 vertices in which five shapes move up and down; keyword arguments override."""
 
-    def make(**changes: object) -> Take:
+    def make(**changes: object) -> Animation:
         rng = np.random.default_rng(0)
         template = (np.array(ball.vertices) * [1, 1.3, 0.8] + [0, 0.02, 0.01]).astype(np.float32)
         shapes = rng.normal(0, 2e-3, (5, *template.shape))
         time = np.arange(FRAMES)[:, None] / RATE
         weights = np.sin(2 * np.pi * (1 + np.arange(5)) * time + np.arange(5)) * 0.5 ** np.arange(5)
-        take = Take(
+        animation = Animation(
             name="Hello Zoë",
             vertices=(template + np.tensordot(weights, shapes, axes=1)).astype(np.float32),
             template=template,
@@ -39,11 +39,11 @@ def make_take(ball: trimesh.Trimesh) -> Callable[..., Take]:
             colours=rng.integers(0, 256, (len(template), 3)).astype(np.uint8),
             metadata={"identity": "Zoë", "style": "F1_e01"},
         )
-        return replace(take, **changes)
+        return replace(animation, **changes)
 
     return make
 
 
 @pytest.fixture
-def take(make_take: Callable[..., Take]) -> Take:
-    return make_take()
+def animation(make_animation: Callable[..., Animation]) -> Animation:
+    return make_animation()

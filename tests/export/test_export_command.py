@@ -9,13 +9,15 @@ import pytest
 import soundfile
 import trimesh
 
-from facediff.cli import main
+from facediff.animation import Animation, write_archive
+from facediff.cli.app import main
 from facediff.export import FORMATS
-from facediff.takes import Take, write_archive
 
 
-def test_an_archive_needs_no_further_options(take: Take, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_archive(tmp_path / "in.npz", take)
+def test_an_archive_needs_no_further_options(
+    animation: Animation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_archive(tmp_path / "in.npz", animation)
     assert main(["export", str(tmp_path / "in.npz"), "-o", str(tmp_path / "out" / "a.glb")]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith(f"{tmp_path / 'out' / 'a.glb'}: ")
@@ -25,25 +27,27 @@ def test_an_archive_needs_no_further_options(take: Take, tmp_path: Path, capsys:
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"a.glb", "a.wav"}
 
 
-def test_a_bare_array_is_completed_by_options(take: Take, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(tmp_path / "x.npy", take.vertices.reshape(40, -1))
-    trimesh.Trimesh(take.template, take.triangles, process=False).export(tmp_path / "face.ply")
+def test_a_bare_array_is_completed_by_options(
+    animation: Animation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "x.npy", animation.vertices.reshape(40, -1))
+    trimesh.Trimesh(animation.template, animation.triangles, process=False).export(tmp_path / "face.ply")
     soundfile.write(tmp_path / "x.wav", np.zeros(44_100), 44_100)
     words = ["export", str(tmp_path / "x.npy"), "-o", str(tmp_path / "out.obj"), "--frame-rate", "30", "--unit", "m"]
     words += ["--mesh", str(tmp_path / "face.ply"), "--speech", str(tmp_path / "x.wav")]
     assert main([*words, "--output-unit", "cm", "--up", "z"]) == 0
     assert "42 files" in capsys.readouterr().out
     mesh = trimesh.load(tmp_path / "out_obj" / "out_0005.obj", process=False, maintain_order=True)
-    x, y, z = take.vertices[5].T
+    x, y, z = animation.vertices[5].T
     np.testing.assert_allclose(mesh.vertices, np.stack([x, -z, y], 1) * 100, atol=1e-5)
     assert soundfile.info(tmp_path / "out_obj" / "out.wav").duration == pytest.approx(40 / 30, abs=1e-3)
     assert main([*words, "--no-speech"]) == 0
     assert not (tmp_path / "out_obj" / "out.wav").exists()
 
 
-def test_takes_of_one_recording_are_told_apart_by_their_files(take: Take, tmp_path: Path) -> None:
+def test_takes_of_one_recording_are_told_apart_by_their_files(animation: Animation, tmp_path: Path) -> None:
     for name in ("mine", "theirs"):
-        write_archive(tmp_path / f"{name}.npz", take)
+        write_archive(tmp_path / f"{name}.npz", animation)
     page = tmp_path / "page.html"
     assert main(["export", str(tmp_path / "mine.npz"), str(tmp_path / "theirs.npz"), "-o", str(page)]) == 0
     assert "<title>mine · theirs – facediff</title>" in page.read_text(encoding="utf-8")

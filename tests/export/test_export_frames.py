@@ -14,8 +14,8 @@ import pytest
 import soundfile
 import trimesh
 
-from facediff.export import ExportOptions, write_takes
-from facediff.takes import Take, read_archive
+from facediff.animation import Animation, read_archive
+from facediff.export import ExportOptions, write_animations
 
 TURN = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # +90 degrees about x
 
@@ -41,16 +41,16 @@ def read_mdd(path: Path) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float3
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply"])
-def test_a_sequence_is_a_folder_with_a_mesh_for_every_frame(take: Take, tmp_path: Path, suffix: str) -> None:
+def test_a_sequence_is_a_folder_with_a_mesh_for_every_frame(animation: Animation, tmp_path: Path, suffix: str) -> None:
     folder = tmp_path / f"hello_{suffix[1:]}"
-    assert write_takes(tmp_path / f"hello{suffix}", [take]) == [folder]
+    assert write_animations(tmp_path / f"hello{suffix}", [animation]) == [folder]
     names = [f"hello_{index:04d}{suffix}" for index in range(40)]
     assert {file.name for file in folder.iterdir()} == {*names, "hello.wav", "sequence.json"}
     for index, name in enumerate(names):
         mesh = trimesh.load(folder / name, process=False, maintain_order=True)
-        np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), take.vertices[index])
-        np.testing.assert_array_equal(mesh.faces, take.triangles)
-        np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], take.colours, atol=0)
+        np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), animation.vertices[index])
+        np.testing.assert_array_equal(mesh.faces, animation.triangles)
+        np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], animation.colours, atol=0)
     told = json.loads((folder / "sequence.json").read_text())
     assert told["format"] == "facediff sequence 1"
     assert (told["frame_rate"], told["frames"], told["files"]) == (30.0, 40, f"hello_####{suffix}")
@@ -59,42 +59,42 @@ def test_a_sequence_is_a_folder_with_a_mesh_for_every_frame(take: Take, tmp_path
     assert soundfile.info(folder / "hello.wav").frames == round(40 / 30 * 16_000)
 
 
-def test_meshes_without_colours(make_take: Callable[..., Take], tmp_path: Path) -> None:
-    take = make_take(colours=None, speech=None)
+def test_meshes_without_colours(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    animation = make_animation(colours=None, speech=None)
     for suffix in (".obj", ".ply"):
-        (folder,) = write_takes(tmp_path / f"hello{suffix}", [take])
+        (folder,) = write_animations(tmp_path / f"hello{suffix}", [animation])
         mesh = trimesh.load(folder / f"hello_0039{suffix}", process=False, maintain_order=True)
-        np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), take.vertices[39])
+        np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), animation.vertices[39])
         assert not (folder / "hello.wav").exists()
 
 
-def test_point_caches_and_the_mesh_beside_them(take: Take, tmp_path: Path) -> None:
+def test_point_caches_and_the_mesh_beside_them(animation: Animation, tmp_path: Path) -> None:
     for suffix in (".pc2", ".mdd"):
         path = tmp_path / suffix[1:] / f"hello{suffix}"
-        assert write_takes(path, [take]) == [path, path.with_suffix(".obj"), path.with_suffix(".wav")]
+        assert write_animations(path, [animation]) == [path, path.with_suffix(".obj"), path.with_suffix(".wav")]
         mesh = trimesh.load(path.with_suffix(".obj"), process=False, maintain_order=True)
-        np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), take.template)
-        np.testing.assert_array_equal(mesh.faces, take.triangles)
+        np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), animation.template)
+        np.testing.assert_array_equal(mesh.faces, animation.triangles)
     positions, start, step = read_pc2(tmp_path / "pc2/hello.pc2")
-    np.testing.assert_array_equal(positions, take.vertices)
+    np.testing.assert_array_equal(positions, animation.vertices)
     assert (start, step) == (0, 1)
     positions, times = read_mdd(tmp_path / "mdd/hello.mdd")
-    np.testing.assert_array_equal(positions, take.vertices)
+    np.testing.assert_array_equal(positions, animation.vertices)
     np.testing.assert_array_equal(times, (np.arange(40) / 30).astype(np.float32))
 
 
-def test_point_caches_need_no_faces(make_take: Callable[..., Take], tmp_path: Path) -> None:
-    take = make_take(faces=None, speech=None)
+def test_point_caches_need_no_faces(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    animation = make_animation(faces=None, speech=None)
     for suffix in (".pc2", ".mdd", ".npy", ".npz"):
-        assert write_takes(tmp_path / f"hello{suffix}", [take]) == [tmp_path / f"hello{suffix}"]
+        assert write_animations(tmp_path / f"hello{suffix}", [animation]) == [tmp_path / f"hello{suffix}"]
 
 
-def test_unit_and_axis(make_take: Callable[..., Take], tmp_path: Path) -> None:
-    take = make_take(unit="mm")
+def test_unit_and_axis(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    animation = make_animation(unit="mm")
     options = ExportOptions(unit="cm", up="z", speech=False)
     for suffix in (".obj", ".ply", ".pc2", ".mdd", ".npy"):
-        write_takes(tmp_path / suffix[1:] / f"a{suffix}", [take], options)
-    want, rest = take.vertices @ TURN.T / 10, take.template @ TURN.T / 10
+        write_animations(tmp_path / suffix[1:] / f"a{suffix}", [animation], options)
+    want, rest = animation.vertices @ TURN.T / 10, animation.template @ TURN.T / 10
     for positions in (read_pc2(tmp_path / "pc2/a.pc2")[0], read_mdd(tmp_path / "mdd/a.mdd")[0]):
         np.testing.assert_allclose(positions, want, rtol=1e-6)
     np.testing.assert_allclose(np.load(tmp_path / "npy/a.npy"), want, rtol=1e-6)
@@ -110,22 +110,22 @@ def test_unit_and_axis(make_take: Callable[..., Take], tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.wav"))
 
 
-def test_numpy_files(take: Take, tmp_path: Path) -> None:
-    write_takes(tmp_path / "a.npy", [take])
+def test_numpy_files(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.npy", [animation])
     bare = np.load(tmp_path / "a.npy", mmap_mode="r", allow_pickle=False)
     assert bare.dtype == np.float32
-    np.testing.assert_array_equal(bare, take.vertices)
-    write_takes(tmp_path / "a.npz", [take])
-    np.testing.assert_array_equal(read_archive(tmp_path / "a.npz").vertices, take.vertices)
-    write_takes(tmp_path / "b.npz", [take], ExportOptions(unit="mm", speech=False))
+    np.testing.assert_array_equal(bare, animation.vertices)
+    write_animations(tmp_path / "a.npz", [animation])
+    np.testing.assert_array_equal(read_archive(tmp_path / "a.npz").vertices, animation.vertices)
+    write_animations(tmp_path / "b.npz", [animation], ExportOptions(unit="mm", speech=False))
     scaled = read_archive(tmp_path / "b.npz")
-    np.testing.assert_allclose(scaled.vertices, take.vertices * 1000, rtol=1e-6)
-    np.testing.assert_allclose(scaled.template, take.template * 1000, rtol=1e-6)
+    np.testing.assert_allclose(scaled.vertices, animation.vertices * 1000, rtol=1e-6)
+    np.testing.assert_allclose(scaled.template, animation.template * 1000, rtol=1e-6)
     assert (scaled.unit, scaled.speech) == ("mm", None)
 
 
-def test_a_memory_map_may_be_replaced_by_what_is_made_of_it(take: Take, tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", take.vertices)
+def test_a_memory_map_may_be_replaced_by_what_is_made_of_it(animation: Animation, tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", animation.vertices)
     mapped = np.load(tmp_path / "a.npy", mmap_mode="r")
-    write_takes(tmp_path / "a.npy", [replace(take, vertices=mapped)], ExportOptions(unit="mm"))
-    np.testing.assert_allclose(np.load(tmp_path / "a.npy"), take.vertices * 1000, rtol=1e-6)
+    write_animations(tmp_path / "a.npy", [replace(animation, vertices=mapped)], ExportOptions(unit="mm"))
+    np.testing.assert_allclose(np.load(tmp_path / "a.npy"), animation.vertices * 1000, rtol=1e-6)

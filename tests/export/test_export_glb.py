@@ -16,10 +16,10 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from facediff.animation import Animation
 from facediff.errors import FaceDiffError
-from facediff.export import ExportOptions, write_takes
-from facediff.export.morph import compress
-from facediff.takes import Take
+from facediff.export import ExportOptions, write_animations
+from facediff.export.glb import compress
 
 COMPONENTS = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
@@ -71,56 +71,56 @@ class Reader:
 
 @pytest.mark.parametrize("unit", ["m", "mm", "normalised (about 185 mm)"])
 def test_every_vertex_of_every_frame_comes_back_at_its_time(
-    make_take: Callable[..., Take], tmp_path: Path, unit: str
+    make_animation: Callable[..., Animation], tmp_path: Path, unit: str
 ) -> None:
-    take = make_take(unit=unit)
+    animation = make_animation(unit=unit)
     metres = {"m": 1.0, "mm": 0.001}.get(unit, 0.185)
-    write_takes(tmp_path / "a.glb", [take])
+    write_animations(tmp_path / "a.glb", [animation])
     reader = Reader(tmp_path / "a.glb")
     np.testing.assert_array_equal(reader.times, (np.arange(40) / 30).astype(np.float32))
     assert reader.weights.min() >= 0
     assert reader.weights.max() <= 1
     for index in range(40):
-        distance = np.linalg.norm(reader.at(float(reader.times[index])) - take.vertices[index] * metres, axis=-1)
+        distance = np.linalg.norm(reader.at(float(reader.times[index])) - animation.vertices[index] * metres, axis=-1)
         assert distance.max() <= 0.05e-3
-    between = (take.vertices[6] + take.vertices[7]) / 2 * metres
+    between = (animation.vertices[6] + animation.vertices[7]) / 2 * metres
     assert np.linalg.norm(reader.at(6.5 / 30) - between, axis=-1).max() <= 0.05e-3
 
 
-def test_few_shapes_are_enough_for_a_motion_of_few_shapes(take: Take, tmp_path: Path) -> None:
-    write_takes(tmp_path / "a.glb", [take], ExportOptions(tolerance_mm=0.001))
+def test_few_shapes_are_enough_for_a_motion_of_few_shapes(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.glb", [animation], ExportOptions(tolerance_mm=0.001))
     reader = Reader(tmp_path / "a.glb")
     assert len(reader.primitive.targets) == 10  # two halves of each of five components
     assert reader.gltf.meshes[0].extras["targetNames"] == [f"shape_{index:04d}" for index in range(10)]
-    np.testing.assert_allclose(reader.values(reader.primitive.attributes.POSITION), take.template)
+    np.testing.assert_allclose(reader.values(reader.primitive.attributes.POSITION), animation.template)
 
 
 def test_a_motion_that_cannot_be_compressed_gets_a_target_for_every_frame(
-    make_take: Callable[..., Take], tmp_path: Path
+    make_animation: Callable[..., Animation], tmp_path: Path
 ) -> None:
     noise = np.random.default_rng(1).normal(0, 0.01, (9, 162, 3))
-    template = make_take().template
-    take = make_take(vertices=(template + noise).astype(np.float32))
-    write_takes(tmp_path / "a.glb", [take])
+    template = make_animation().template
+    animation = make_animation(vertices=(template + noise).astype(np.float32))
+    write_animations(tmp_path / "a.glb", [animation])
     reader = Reader(tmp_path / "a.glb")
     assert len(reader.primitive.targets) == 9
     np.testing.assert_array_equal(reader.weights, np.eye(9))
     for index in range(9):
-        np.testing.assert_allclose(reader.at(index / 30), take.vertices[index], atol=1e-7)
+        np.testing.assert_allclose(reader.at(index / 30), animation.vertices[index], atol=1e-7)
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_short_and_still_takes(make_take: Callable[..., Take], tmp_path: Path, frames: int) -> None:
-    moving, still = make_take(), make_take().template
+def test_short_and_still_takes(make_animation: Callable[..., Animation], tmp_path: Path, frames: int) -> None:
+    moving, still = make_animation(), make_animation().template
     for name, vertices in {"moving": moving.vertices[:frames], "still": np.stack([still] * frames)}.items():
-        write_takes(tmp_path / f"{name}.glb", [make_take(vertices=vertices)])
+        write_animations(tmp_path / f"{name}.glb", [make_animation(vertices=vertices)])
         reader = Reader(tmp_path / f"{name}.glb")
         for index in range(frames):
             np.testing.assert_allclose(reader.at(index / 30), vertices[index], atol=1e-7)
 
 
-def test_the_file_keeps_the_rules_of_the_specification(take: Take, tmp_path: Path) -> None:
-    write_takes(tmp_path / "a.glb", [take])
+def test_the_file_keeps_the_rules_of_the_specification(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.glb", [animation])
     data = (tmp_path / "a.glb").read_bytes()
     magic, version, length, json_length, json_kind = struct.unpack_from("<4sIII4s", data)
     binary_length, binary_kind = struct.unpack_from("<I4s", data, 20 + json_length)
@@ -168,27 +168,29 @@ def test_the_file_keeps_the_rules_of_the_specification(take: Take, tmp_path: Pat
     }
 
 
-def test_the_face_is_whole_and_its_colours_are_linear(take: Take, tmp_path: Path) -> None:
-    write_takes(tmp_path / "a.glb", [take])
+def test_the_face_is_whole_and_its_colours_are_linear(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.glb", [animation])
     mesh = trimesh.load(tmp_path / "a.glb", process=False, maintain_order=True, force="mesh")
-    np.testing.assert_allclose(mesh.vertices, take.template, atol=1e-8)
-    assert {tuple(sorted(face)) for face in mesh.faces} == {tuple(sorted(face)) for face in take.triangles}
-    share = take.colours / 255  # type: ignore[operator]
+    np.testing.assert_allclose(mesh.vertices, animation.template, atol=1e-8)
+    assert {tuple(sorted(face)) for face in mesh.faces} == {tuple(sorted(face)) for face in animation.triangles}
+    share = animation.colours / 255  # type: ignore[operator]
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     reader = Reader(tmp_path / "a.glb")
     np.testing.assert_allclose(reader.values(reader.primitive.attributes.COLOR_0), linear, atol=1e-6)
 
 
 @pytest.mark.parametrize("inside_out", [False, True])
-def test_faces_and_normals_look_outward(make_take: Callable[..., Take], tmp_path: Path, inside_out: bool) -> None:
-    faces = make_take().triangles
-    take = make_take(faces=np.ascontiguousarray(faces[:, ::-1]) if inside_out else faces)
-    write_takes(tmp_path / "a.glb", [take])
+def test_faces_and_normals_look_outward(
+    make_animation: Callable[..., Animation], tmp_path: Path, inside_out: bool
+) -> None:
+    faces = make_animation().triangles
+    animation = make_animation(faces=np.ascontiguousarray(faces[:, ::-1]) if inside_out else faces)
+    write_animations(tmp_path / "a.glb", [animation])
     mesh = trimesh.load(tmp_path / "a.glb", process=False, maintain_order=True, force="mesh")
     assert mesh.volume > 0
     reader = Reader(tmp_path / "a.glb")
     for index in (0, 13, 39):
-        corners = take.vertices[index].astype(float)[faces]
+        corners = animation.vertices[index].astype(float)[faces]
         true = np.zeros((162, 3))  # area-weighted means of the faces around
         for corner in range(3):
             np.add.at(true, faces[:, corner], np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
@@ -220,17 +222,17 @@ def test_any_motion_is_within_the_tolerance(frames: int, rank: int, noise: float
     assert len(morphs.shapes) <= max(frames, 1)
 
 
-def test_more_vertices_than_short_indices_can_count(make_take: Callable[..., Take], tmp_path: Path) -> None:
+def test_more_vertices_than_short_indices_can_count(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     template = np.random.default_rng(0).normal(0, 0.1, (65_600, 3)).astype(np.float32)
     faces = np.array([[65_599, 0, 65_535]], np.int32)
-    take = make_take(vertices=template[None], template=template, faces=faces, colours=None, speech=None)
-    assert write_takes(tmp_path / "a.glb", [take]) == [tmp_path / "a.glb"]
+    animation = make_animation(vertices=template[None], template=template, faces=faces, colours=None, speech=None)
+    assert write_animations(tmp_path / "a.glb", [animation]) == [tmp_path / "a.glb"]
     reader = Reader(tmp_path / "a.glb")
     assert set(reader.values(reader.primitive.indices).tolist()) == {65_599, 0, 65_535}
     assert reader.primitive.attributes.COLOR_0 is None
 
 
-def test_a_mesh_without_faces_is_refused(make_take: Callable[..., Take], tmp_path: Path) -> None:
+def test_a_mesh_without_faces_is_refused(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="comes without a mesh"):
-        write_takes(tmp_path / "a.glb", [make_take(faces=None)])
+        write_animations(tmp_path / "a.glb", [make_animation(faces=None)])
     assert not list(tmp_path.iterdir())

@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from facediff.commands.export import parser
-from facediff.export import FORMATS, write_takes
-from facediff.takes import Take
+from facediff.animation import Animation
+from facediff.cli.export import parser
+from facediff.export import FORMATS, write_animations
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "docs" / "export.md", *sorted((ROOT / "docs" / "tools").glob("*.md"))]
@@ -49,8 +49,10 @@ def test_links_lead_somewhere() -> None:
             assert (page.parent / link).exists(), f"{page.name}: {link}"
 
 
-def test_the_picture_is_drawn_from_the_file_alone(take: Take, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_takes(tmp_path / "a.glb", [take])
+def test_the_picture_is_drawn_from_the_file_alone(
+    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_animations(tmp_path / "a.glb", [animation])
     words = [str(tmp_path / "a.glb"), str(tmp_path / "a.png"), "--times", "0", "0.5", "--size", "64"]
     monkeypatch.setattr(sys, "argv", ["glb_sheet.py", *words])
     runpy.run_path(str(ROOT / "tools" / "glb_sheet.py"), run_name="__main__")

@@ -11,15 +11,15 @@ import pytest
 import soundfile
 from pxr import Usd, UsdGeom, UsdMedia, UsdValidation
 
+from facediff.animation import Animation
 from facediff.errors import MissingExtraError
-from facediff.export import ExportOptions, write_takes
-from facediff.takes import Take
+from facediff.export import ExportOptions, write_animations
 
 
 @pytest.mark.parametrize("suffix", [".usdc", ".usda"])
-def test_every_vertex_of_every_frame_comes_back(take: Take, tmp_path: Path, suffix: str) -> None:
+def test_every_vertex_of_every_frame_comes_back(animation: Animation, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
-    assert write_takes(path, [take]) == [path, tmp_path / "a.wav"]
+    assert write_animations(path, [animation]) == [path, tmp_path / "a.wav"]
     stage = Usd.Stage.Open(str(path))
     root = stage.GetDefaultPrim()
     assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (30, 0, 39)
@@ -27,29 +27,29 @@ def test_every_vertex_of_every_frame_comes_back(take: Take, tmp_path: Path, suff
     mesh = UsdGeom.Mesh(root.GetChild("face"))
     assert mesh.GetSubdivisionSchemeAttr().Get() == "none"
     assert list(mesh.GetFaceVertexCountsAttr().Get()) == [3] * 320
-    np.testing.assert_array_equal(np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 3)), take.triangles)
+    np.testing.assert_array_equal(np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 3)), animation.triangles)
     points = mesh.GetPointsAttr()
     assert points.GetTimeSamples() == list(range(40))
-    np.testing.assert_array_equal(points.Get(), take.template)
+    np.testing.assert_array_equal(points.Get(), animation.template)
     for index in range(40):
-        np.testing.assert_array_equal(points.Get(index), take.vertices[index])
+        np.testing.assert_array_equal(points.Get(index), animation.vertices[index])
         low, high = mesh.GetExtentAttr().Get(index)
-        np.testing.assert_array_equal(low, take.vertices[index].min(0))
-        np.testing.assert_array_equal(high, take.vertices[index].max(0))
+        np.testing.assert_array_equal(low, animation.vertices[index].min(0))
+        np.testing.assert_array_equal(high, animation.vertices[index].max(0))
         normals = np.array(mesh.GetNormalsAttr().Get(index))
-        assert ((normals * (take.vertices[index] - take.vertices[index].mean(0))).sum(-1) > 0).all()
+        assert ((normals * (animation.vertices[index] - animation.vertices[index].mean(0))).sum(-1) > 0).all()
     assert mesh.GetNormalsInterpolation() == "vertex"
-    np.testing.assert_allclose(points.Get(6.5), (take.vertices[6] + take.vertices[7]) / 2, atol=1e-7)
+    np.testing.assert_allclose(points.Get(6.5), (animation.vertices[6] + animation.vertices[7]) / 2, atol=1e-7)
 
 
-def test_words_colours_and_sound(take: Take, tmp_path: Path) -> None:
-    write_takes(tmp_path / "a.usdc", [take])
+def test_words_colours_and_sound(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.usdc", [animation])
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     told = stage.GetRootLayer().customLayerData["facediff"]
     assert told["metadata"] == {"identity": "Zoë", "style": "F1_e01"}
     assert (told["name"], told["frame_rate"], told["unit"]) == ("Hello Zoë", 30.0, "m")
     colour = UsdGeom.PrimvarsAPI(stage.GetDefaultPrim().GetChild("face")).GetPrimvar("displayColor")
-    share = take.colours / 255  # type: ignore[operator]
+    share = animation.colours / 255  # type: ignore[operator]
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     np.testing.assert_allclose(colour.Get(), linear, atol=1e-6)
     assert colour.GetInterpolation() == "vertex"
@@ -58,15 +58,15 @@ def test_words_colours_and_sound(take: Take, tmp_path: Path) -> None:
     assert (sound.GetStartTimeAttr().Get(), sound.GetAuralModeAttr().Get()) == (0, "nonSpatial")
     samples, rate = soundfile.read(tmp_path / "a.wav", dtype="float32")
     assert rate == 16_000
-    np.testing.assert_array_equal(samples[:20_000], take.speech)
+    np.testing.assert_array_equal(samples[:20_000], animation.speech)
     assert len(samples) == round(40 / 30 * 16_000)
     assert not samples[20_000:].any()
 
 
 @pytest.mark.parametrize("suffix", [".usdc", ".usda"])
-def test_words_of_any_kind(make_take: Callable[..., Take], tmp_path: Path, suffix: str) -> None:
+def test_words_of_any_kind(make_animation: Callable[..., Animation], tmp_path: Path, suffix: str) -> None:
     words = {"a b:c": 'say "ü"\n\\ twice', "": "", "1": "{}"}
-    write_takes(tmp_path / f"a{suffix}", [make_take(name='1 "q" / é', metadata=words)])
+    write_animations(tmp_path / f"a{suffix}", [make_animation(name='1 "q" / é', metadata=words)])
     stage = Usd.Stage.Open(str(tmp_path / f"a{suffix}"))
     told = stage.GetRootLayer().customLayerData["facediff"]
     assert told["metadata"] == words
@@ -74,8 +74,8 @@ def test_words_of_any_kind(make_take: Callable[..., Take], tmp_path: Path, suffi
     assert len(UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("face")).GetPointsAttr().Get(0)) == 162
 
 
-def test_the_layer_complies_with_usd(take: Take, tmp_path: Path) -> None:
-    write_takes(tmp_path / "a.usdc", [take])
+def test_the_layer_complies_with_usd(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.usdc", [animation])
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) > 10
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
@@ -83,23 +83,23 @@ def test_the_layer_complies_with_usd(take: Take, tmp_path: Path) -> None:
     assert [error.GetErrorAsString() for error in found] == []
 
 
-def test_another_unit_and_z_up(make_take: Callable[..., Take], tmp_path: Path) -> None:
-    take = make_take(unit="mm", speech=None)
+def test_another_unit_and_z_up(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    animation = make_animation(unit="mm", speech=None)
     options = ExportOptions(unit="cm", up="z")
-    assert write_takes(tmp_path / "a.usda", [take], options) == [tmp_path / "a.usda"]
+    assert write_animations(tmp_path / "a.usda", [animation], options) == [tmp_path / "a.usda"]
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     assert (UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)) == (0.01, "Z")
     points = np.array(UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("face")).GetPointsAttr().Get(3))
     turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # +90 degrees about x
-    np.testing.assert_allclose(points, take.vertices[3] @ turn.T / 10, rtol=1e-6)
+    np.testing.assert_allclose(points, animation.vertices[3] @ turn.T / 10, rtol=1e-6)
     assert not stage.GetDefaultPrim().GetChild("speech")
 
 
 def test_without_usd_core_one_sentence_says_what_to_install(
-    take: Take, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pxr" else find(name))
     with pytest.raises(MissingExtraError, match=r'"pxr", which is not installed: run  pip install "facediff\[usd\]"'):
-        write_takes(tmp_path / "a.usdc", [take])
+        write_animations(tmp_path / "a.usdc", [animation])
     assert not list(tmp_path.iterdir())

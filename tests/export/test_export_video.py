@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from facediff.animation import Animation
 from facediff.errors import FaceDiffError
-from facediff.export import ExportOptions, video, write_takes
+from facediff.export import ExportOptions, video, write_animations
 from facediff.export.video import drawn_frames
-from facediff.takes import Take
 
 SMALL = ExportOptions(size=64)
 
@@ -24,8 +24,8 @@ def pictures(path: Path) -> npt.NDArray[np.uint8]:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
-def test_one_frame_for_every_frame_with_the_speech(take: Take, tmp_path: Path) -> None:
-    assert write_takes(tmp_path / "a.mp4", [take], SMALL) == [tmp_path / "a.mp4"]
+def test_one_frame_for_every_frame_with_the_speech(animation: Animation, tmp_path: Path) -> None:
+    assert write_animations(tmp_path / "a.mp4", [animation], SMALL) == [tmp_path / "a.mp4"]
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert container.streams.video[0].average_rate == 30
         sound = container.streams.audio[0]
@@ -37,26 +37,26 @@ def test_one_frame_for_every_frame_with_the_speech(take: Take, tmp_path: Path) -
     assert np.abs(face - face[0, 0]).max() > 40, "there is something on the background"
 
 
-def test_no_speech_is_a_silent_video(take: Take, tmp_path: Path) -> None:
-    write_takes(tmp_path / "a.mp4", [take], ExportOptions(size=64, speech=False, footer="synthetic corpus"))
+def test_no_speech_is_a_silent_video(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.mp4", [animation], ExportOptions(size=64, speech=False, footer="synthetic corpus"))
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert not container.streams.audio
 
 
-def test_the_corpus_is_named_below(make_take: Callable[..., Take]) -> None:
-    def height(take: Take, footer: str = "") -> int:
-        return len(next(drawn_frames([take], ExportOptions(size=64, footer=footer))))
+def test_the_corpus_is_named_below(make_animation: Callable[..., Animation]) -> None:
+    def height(animation: Animation, footer: str = "") -> int:
+        return len(next(drawn_frames([animation], ExportOptions(size=64, footer=footer))))
 
-    bare = height(make_take(metadata={}))
-    assert height(make_take(metadata={"corpus": "puppet (synthetic)"})) > bare
-    assert height(make_take(metadata={}), "synthetic corpus") > bare
+    bare = height(make_animation(metadata={}))
+    assert height(make_animation(metadata={"corpus": "puppet (synthetic)"})) > bare
+    assert height(make_animation(metadata={}), "synthetic corpus") > bare
 
 
 def test_several_takes_stand_side_by_side_and_wait_for_the_longest(
-    make_take: Callable[..., Take], tmp_path: Path
+    make_animation: Callable[..., Animation], tmp_path: Path
 ) -> None:
-    long, short = make_take(), make_take(vertices=make_take().vertices[:5], name="short")
-    assert write_takes(tmp_path / "a.mp4", [short, long], SMALL) == [tmp_path / "a.mp4"]
+    long, short = make_animation(), make_animation(vertices=make_animation().vertices[:5], name="short")
+    assert write_animations(tmp_path / "a.mp4", [short, long], SMALL) == [tmp_path / "a.mp4"]
     seen = pictures(tmp_path / "a.mp4").astype(int)
     assert len(seen) == 40
     assert seen.shape[2] == 128
@@ -65,25 +65,25 @@ def test_several_takes_stand_side_by_side_and_wait_for_the_longest(
     assert np.abs(right[20:] - right[6]).mean() > np.abs(left[20:] - left[6]).mean()
 
 
-def test_faces_of_one_unit_compare_in_size(make_take: Callable[..., Take], tmp_path: Path) -> None:
-    big = make_take(colours=None)
-    small = make_take(colours=None, vertices=big.vertices / 2, template=big.template / 2)
-    write_takes(tmp_path / "a.mp4", [big, small], SMALL)
+def test_faces_of_one_unit_compare_in_size(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    big = make_animation(colours=None)
+    small = make_animation(colours=None, vertices=big.vertices / 2, template=big.template / 2)
+    write_animations(tmp_path / "a.mp4", [big, small], SMALL)
     picture = pictures(tmp_path / "a.mp4")[0, -64:].astype(int)
     covered = (np.abs(picture - picture[:1, :1]).sum(-1) > 60).reshape(64, 2, 64).sum((0, 2))
     assert covered[1] < 0.5 * covered[0]
 
 
-def test_takes_of_different_frame_rates_are_refused(make_take: Callable[..., Take], tmp_path: Path) -> None:
+def test_takes_of_different_frame_rates_are_refused(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match=r"differ in frame rate \(Hello Zoë 30, b 25\)"):
-        write_takes(tmp_path / "a.mp4", [make_take(), make_take(name="b", frame_rate=25.0)], SMALL)
+        write_animations(tmp_path / "a.mp4", [make_animation(), make_animation(name="b", frame_rate=25.0)], SMALL)
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_procedural_is_told_under_the_video(take: Take) -> None:
+def test_what_is_procedural_is_told_under_the_video(animation: Animation) -> None:
     told = {"corpus": "puppet (synthetic)", "procedural": "blinks (17 a minute, seed 0); head sway (2 degrees, seed 0)"}
-    assert video.procedural([replace(take, metadata=told), take]) == "procedural: blinks, head sway"
-    assert video.procedural([take]) == ""
-    plain = next(drawn_frames([replace(take, metadata={"corpus": "puppet (synthetic)"})], ExportOptions(size=128)))
-    marked = next(drawn_frames([replace(take, metadata=told)], ExportOptions(size=128)))
+    assert video.procedural([replace(animation, metadata=told), animation]) == "procedural: blinks, head sway"
+    assert video.procedural([animation]) == ""
+    plain = next(drawn_frames([replace(animation, metadata={"corpus": "puppet (synthetic)"})], ExportOptions(size=128)))
+    marked = next(drawn_frames([replace(animation, metadata=told)], ExportOptions(size=128)))
     assert not np.array_equal(plain, marked)

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from facediff.animation import Animation, write_archive
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.export import FORMATS, ExportOptions, check_export, write_takes
-from facediff.takes import Take, write_archive
+from facediff.export import FORMATS, ExportOptions, check_export, write_animations
 
 OWN = [".glb", ".usdc", ".usda", ".obj", ".ply", ".pc2", ".mdd", ".mp4", ".npz", ".npy"]
 """Formats that need no set of shapes and no other room's page."""
@@ -84,28 +84,28 @@ def test_what_a_format_prescribes_may_be_said(tmp_path: Path, unit: str | None) 
 )
 @pytest.mark.parametrize("suffix", [".glb", ".usdc", ".obj", ".ply"])
 def test_takes_that_would_make_broken_files(
-    make_take: Callable[..., Take], tmp_path: Path, change: dict[str, object], sentence: str, suffix: str
+    make_animation: Callable[..., Animation], tmp_path: Path, change: dict[str, object], sentence: str, suffix: str
 ) -> None:
     for name in [name for name, value in change.items() if isinstance(value, str)]:
-        array = getattr(make_take(), name).copy()
+        array = getattr(make_animation(), name).copy()
         array[3 if name == "vertices" else 0] = np.nan
         change = {name: array}
     with pytest.raises(FaceDiffError) as caught:
-        write_takes(tmp_path / "new" / f"a{suffix}", [make_take(), make_take(**change)])
+        write_animations(tmp_path / "new" / f"a{suffix}", [make_animation(), make_animation(**change)])
     assert sentence in str(caught.value)
     assert "Hello Zoë" in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_several_takes_get_a_file_each(make_take: Callable[..., Take], tmp_path: Path) -> None:
-    first, second = make_take(), make_take(speech=None)
+def test_several_takes_get_a_file_each(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    first, second = make_animation(), make_animation(speech=None)
     second = replace(second, vertices=second.vertices[:7])
-    written = write_takes(tmp_path / "a.npy", [first, second])
+    written = write_animations(tmp_path / "a.npy", [first, second])
     assert written == [tmp_path / "a_take1.npy", tmp_path / "a_take2.npy"]
     assert [len(np.load(path)) for path in written] == [40, 7]
-    written = write_takes(tmp_path / "a.glb", [first, second])
+    written = write_animations(tmp_path / "a.glb", [first, second])
     assert [path.name for path in written] == ["a_take1.glb", "a_take2.glb", "a_take1.wav"]
-    written = write_takes(tmp_path / "a.ply", [first, second])
+    written = write_animations(tmp_path / "a.ply", [first, second])
     assert [path.name for path in written] == ["a_take1_ply", "a_take2_ply"]
     assert (written[1] / "a_take2_0006.ply").is_file()
     assert not (written[1] / "a_take2_0007.ply").exists()
@@ -113,24 +113,24 @@ def test_several_takes_get_a_file_each(make_take: Callable[..., Take], tmp_path:
 
 def test_no_take_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="no take to write"):
-        write_takes(tmp_path / "a.glb", [])
+        write_animations(tmp_path / "a.glb", [])
 
 
-def test_a_full_disk_leaves_nothing(take: Take, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_nothing(animation: Animation, tmp_path: Path) -> None:
     """A process that may not write files beyond a few kB, with the speech (which fails early) and without."""
-    write_archive(tmp_path / "take.npz", take)
+    write_archive(tmp_path / "take.npz", animation)
     program = """
         import resource, sys
         from pathlib import Path
         from facediff.errors import FaceDiffError
-        from facediff.export import ExportOptions, write_takes
+        from facediff.export import ExportOptions, write_animations
         from facediff.takes import read_archive
         take = read_archive(Path(sys.argv[1]))
         resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
         for suffix in sys.argv[3:]:
             for speech in (True, False):
                 try:
-                    write_takes(Path(sys.argv[2]) / f"a{suffix}", [take], ExportOptions(speech=speech, size=64))
+                    write_animations(Path(sys.argv[2]) / f"a{suffix}", [take], ExportOptions(speech=speech, size=64))
                 except FaceDiffError as error:
                     print(error)
     """
@@ -148,7 +148,9 @@ def test_a_full_disk_leaves_nothing(take: Take, tmp_path: Path) -> None:
     assert sorted(file.name for file in tmp_path.rglob("*")) == ["take.npz"]
 
 
-def test_if_the_last_of_several_fails_none_appears(take: Take, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_the_last_of_several_fails_none_appears(
+    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "a_take1.pc2").write_text("from before")
     write = Path.write_bytes
 
@@ -159,27 +161,27 @@ def test_if_the_last_of_several_fails_none_appears(take: Take, tmp_path: Path, m
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(FaceDiffError, match="No space left on device"):
-        write_takes(tmp_path / "a.pc2", [take, take])
+        write_animations(tmp_path / "a.pc2", [animation, animation])
     assert [file.name for file in tmp_path.iterdir()] == ["a_take1.pc2"]
     assert (tmp_path / "a_take1.pc2").read_text() == "from before"
 
 
-def test_files_beside_never_replace_the_users_own(take: Take, tmp_path: Path) -> None:
+def test_files_beside_never_replace_the_users_own(animation: Animation, tmp_path: Path) -> None:
     with wave.open(str(tmp_path / "hello.wav"), "wb") as own:
         own.setparams((2, 2, 48_000, 0, "NONE", ""))
         own.writeframes(bytes(4000))
     before = (tmp_path / "hello.wav").read_bytes()
     for _ in range(2):
-        written = write_takes(tmp_path / "hello.usda", [take])
+        written = write_animations(tmp_path / "hello.usda", [animation])
         assert [path.name for path in written] == ["hello.usda", "hello_speech.wav"]
     assert "@./hello_speech.wav@" in (tmp_path / "hello.usda").read_text()
     (tmp_path / "hello_speech.wav").write_bytes(before)
     with pytest.raises(FaceDiffError, match=r"hello_speech\.wav: is a file that facediff did not write"):
-        write_takes(tmp_path / "hello.glb", [take])
-    write_takes(tmp_path / "hello.glb", [take], ExportOptions(speech=False))
+        write_animations(tmp_path / "hello.glb", [animation])
+    write_animations(tmp_path / "hello.glb", [animation], ExportOptions(speech=False))
     (tmp_path / "face.obj").write_text("v 0 0 0\n")
     with pytest.raises(FaceDiffError, match=r"face\.obj: is a file that facediff did not write"):
-        write_takes(tmp_path / "face.mdd", [take])
+        write_animations(tmp_path / "face.mdd", [animation])
     assert (tmp_path / "face.obj").read_text() == "v 0 0 0\n"
     assert (tmp_path / "hello.wav").read_bytes() == (tmp_path / "hello_speech.wav").read_bytes() == before
     assert {file.name for file in tmp_path.iterdir()} == {
@@ -192,55 +194,55 @@ def test_files_beside_never_replace_the_users_own(take: Take, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "hello.wav", "hello_0003.ply"])
-def test_a_folder_with_something_of_the_users_is_not_replaced(take: Take, tmp_path: Path, name: str) -> None:
-    (folder,) = write_takes(tmp_path / "hello.ply", [take])
+def test_a_folder_with_something_of_the_users_is_not_replaced(animation: Animation, tmp_path: Path, name: str) -> None:
+    (folder,) = write_animations(tmp_path / "hello.ply", [animation])
     (folder / name).write_text("mine")
     with pytest.raises(FaceDiffError, match="hello_ply: is a folder with files that facediff did not write"):
-        write_takes(tmp_path / "hello.ply", [take])
+        write_animations(tmp_path / "hello.ply", [animation])
     assert (folder / name).read_text() == "mine"
 
 
 @pytest.mark.parametrize("suffix", OWN)
-def test_an_export_may_be_repeated(make_take: Callable[..., Take], tmp_path: Path, suffix: str) -> None:
+def test_an_export_may_be_repeated(make_animation: Callable[..., Animation], tmp_path: Path, suffix: str) -> None:
     options = ExportOptions(size=64)
-    first = write_takes(tmp_path / f"a{suffix}", [make_take()], options)
-    shorter = make_take(vertices=make_take().vertices[:9])
-    assert write_takes(tmp_path / f"a{suffix}", [shorter], options) == first
+    first = write_animations(tmp_path / f"a{suffix}", [make_animation()], options)
+    shorter = make_animation(vertices=make_animation().vertices[:9])
+    assert write_animations(tmp_path / f"a{suffix}", [shorter], options) == first
     assert sorted(tmp_path.iterdir()) == sorted(first)
     if first[0].is_dir():
         assert len(list(first[0].glob(f"*{suffix}"))) == 9
 
 
-def test_the_speech_beside_is_readable_everywhere(take: Take, tmp_path: Path) -> None:
-    write_takes(tmp_path / "a.glb", [take])
+def test_the_speech_beside_is_readable_everywhere(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.glb", [animation])
     with wave.open(str(tmp_path / "a.wav")) as sound:
         assert (sound.getnchannels(), sound.getsampwidth(), sound.getframerate()) == (1, 2, 16_000)
         assert sound.getnframes() == round(40 / 30 * 16_000)
         values = np.frombuffer(sound.readframes(20_000), "<i2")
-    np.testing.assert_array_equal(values / np.float32(32768), take.speech)
+    np.testing.assert_array_equal(values / np.float32(32768), animation.speech)
 
 
-def test_the_page_gets_all_takes(take: Take, tmp_path: Path) -> None:
+def test_the_page_gets_all_takes(animation: Animation, tmp_path: Path) -> None:
     path = tmp_path / "a.html"
-    assert write_takes(path, [take, take]) == [path]
+    assert write_animations(path, [animation, animation]) == [path]
     assert path.read_text(encoding="utf-8").lstrip().lower().startswith("<!doctype html>")
     silent = tmp_path / "b.html"
-    write_takes(silent, [take, take], ExportOptions(speech=False))
+    write_animations(silent, [animation, animation], ExportOptions(speech=False))
     assert silent.stat().st_size < path.stat().st_size
 
 
-def test_weights_are_solved_for_the_shapes(make_take: Callable[..., Take], tmp_path: Path) -> None:
-    rest = make_take().template
+def test_weights_are_solved_for_the_shapes(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    rest = make_animation().template
     rng = np.random.default_rng(3)
     shapes = {name: rng.normal(0, 3e-3, rest.shape) for name in ("jawOpen", "mouthFunnel")}
     (tmp_path / "shapes").mkdir()
-    faces = "".join(f"f {a} {b} {c}\n" for a, b, c in make_take().triangles + 1)
+    faces = "".join(f"f {a} {b} {c}\n" for a, b, c in make_animation().triangles + 1)
     for name, offset in {"neutral": np.zeros_like(rest), **shapes}.items():
         rows = "".join(f"v {x:.9f} {y:.9f} {z:.9f}\n" for x, y, z in rest + offset)
         (tmp_path / "shapes" / f"{name}.obj").write_text(rows + faces)
     opened = np.linspace(0, 1, 40)
-    take = make_take(vertices=(rest + opened[:, None, None] * shapes["jawOpen"]).astype(np.float32))
-    written = write_takes(tmp_path / "a.csv", [take], ExportOptions(shapes=tmp_path / "shapes"))
+    animation = make_animation(vertices=(rest + opened[:, None, None] * shapes["jawOpen"]).astype(np.float32))
+    written = write_animations(tmp_path / "a.csv", [animation], ExportOptions(shapes=tmp_path / "shapes"))
     assert [path.name for path in written] == ["a.csv", "a.json", "a.wav"]
     table = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     np.testing.assert_allclose(table["JawOpen"], opened, atol=0.03)

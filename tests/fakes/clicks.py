@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from facediff.takes import Take
+from facediff.animation import Animation
 
 RATE = 25
 SAMPLE_RATE = 16_000
@@ -20,7 +20,7 @@ def rectangle(left: float, right: float, bottom: float, top: float, depth: float
     return np.array([[left, bottom, depth], [right, bottom, depth], [right, top, depth], [left, top, depth]], float)
 
 
-def clicks(*, speech: bool = True, name: str = "clicks", lower: float = 0.0) -> Take:
+def clicks(*, speech: bool = True, name: str = "clicks", lower: float = 0.0) -> Animation:
     """The take: blue throat behind red lips; in an open frame the lower lip is `OPENING` mm further down.
 
     The middle of the picture shows the lower lip while the mouth is closed, and the throat while it is open.
@@ -37,7 +37,7 @@ def clicks(*, speech: bool = True, name: str = "clicks", lower: float = 0.0) -> 
     for frame in OPEN_FRAMES:
         start = frame * SAMPLE_RATE // RATE
         sound[start : start + 24] = 0.8 * (-1.0) ** np.arange(24)
-    return Take(
+    return Animation(
         name=name,
         vertices=vertices.astype(np.float32),
         template=template.astype(np.float32),

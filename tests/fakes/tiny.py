@@ -10,8 +10,8 @@ import numpy as np
 import soundfile
 import trimesh
 
-from facediff.data.base import SpeechMotionDataModule
 from facediff.data.corpus import Clip
+from facediff.data.datamodule import SpeechMotionDataModule
 
 SEEN = ["A", "B"]
 UNSEEN = "C"

@@ -20,7 +20,7 @@ PROJECT = ROOT / "docs" / "examples" / "outside_project"
 OWN_TESTS = "python -m pytest --confcutdir=tests/metrics -o filterwarnings=error tests/metrics"
 
 # Leaves an interpreter with the standard library, torch, torchmetrics and what these two require. Everything else is
-# not there, to the import system and to those who ask which packages are installed.
+# not there, to the import model and to those who ask which packages are installed.
 BARE = """
 import importlib.abc, importlib.metadata, re, runpy, sys
 

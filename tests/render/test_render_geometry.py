@@ -7,14 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from facediff.errors import FaceDiffError
-from facediff.render.geometry import (
-    check_faces,
-    check_vertices,
-    face_outward,
-    hollowness,
-    is_open,
-    vertex_normals,
-)
+from facediff.render.rasteriser import check_faces, check_vertices, face_outward, hollowness, is_open, vertex_normals
 
 MakeSphere = Callable[..., tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]]
 

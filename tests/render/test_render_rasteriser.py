@@ -11,7 +11,7 @@ import pytest
 
 from facediff.errors import FaceDiffError
 from facediff.render import EVEN, VIEWS, Camera, Light, Look, Renderer
-from facediff.render.shading import TABLE_SIZE, light_table, to_linear, to_srgb
+from facediff.render.rasteriser import TABLE_SIZE, light_table, to_linear, to_srgb
 
 MakeSphere = Callable[..., tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]]
 

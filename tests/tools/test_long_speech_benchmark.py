@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from facediff.systems import DualPathDiffusion
-from facediff.systems.windows import WindowPlan
+from facediff.models import DualPathDiffusion
+from facediff.models.inference import WindowPlan
 from tests.fakes.tiny import Tiny
 
 FOLDER = Path(__file__).parents[2] / "tools" / "benchmarks"
@@ -34,17 +34,17 @@ def tool(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_every_minute_and_both_ways_of_joining_are_told(
     tool: ModuleType,
-    make_system: Callable[..., DualPathDiffusion],
+    make_model: Callable[..., DualPathDiffusion],
     tiny: Tiny,
     tiny_root: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    system = make_system()
-    system.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-    system.data_source = {"class_path": "tests.fakes.tiny.Tiny", "root": str(tiny_root)}
-    system.windows = WindowPlan(1.2, 0.4, 0.5, 0.2, 2.0)
+    model = make_model()
+    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    model.data_source = {"class_path": "tests.fakes.tiny.Tiny", "root": str(tiny_root)}
+    model.windows = WindowPlan(1.2, 0.4, 0.5, 0.2, 2.0)
     with torch.inference_mode():
-        tool.judged(system.eval(), "A", 65.0, plans=False)
+        tool.judged(model.eval(), "A", 65.0, plans=False)
     told = capsys.readouterr().out
     assert "test sentences of A" in told
     assert len(re.findall(r"^ +1  \d\.\d{4}$", told, re.MULTILINE)) == 1
@@ -71,12 +71,12 @@ def test_the_measure_sees_a_jump_at_a_joint_and_none_where_there_is_none(
 
 
 def test_the_material_is_the_sentences_in_time(
-    tool: ModuleType, make_system: Callable[..., DualPathDiffusion], tiny: Tiny, tiny_root: Path
+    tool: ModuleType, make_model: Callable[..., DualPathDiffusion], tiny: Tiny, tiny_root: Path
 ) -> None:
-    system = make_system()
-    system.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-    system.data_source = {"class_path": "tests.fakes.tiny.Tiny", "root": str(tiny_root)}
-    made = tool.material(system, "B", 10.0)
+    model = make_model()
+    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    model.data_source = {"class_path": "tests.fakes.tiny.Tiny", "root": str(tiny_root)}
+    made = tool.material(model, "B", 10.0)
     samples = [s for split in tiny.test_splits for s in tiny.dataset(split) if s.subject == "B"]
     assert made.clip.motion.shape[1] >= 250
     assert made.clip.audio.shape[1] == made.clip.motion.shape[1] * 640

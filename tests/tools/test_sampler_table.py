@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from facediff.data import collate
 from facediff.errors import FaceDiffError
-from facediff.systems import DualPathDiffusion, load_system
+from facediff.models import DualPathDiffusion, load_model
 from tests.fakes.tiny import Tiny
 from tools import sampler_table
 from tools.sampler_table import Scores, fastest
@@ -25,19 +25,19 @@ SEEDS = 3
 
 @pytest.fixture
 def checkpoint(
-    make_system: Callable[..., DualPathDiffusion], make_trainer: Callable[..., pl.Trainer], tiny: Tiny, tmp_path: Path
+    make_model: Callable[..., DualPathDiffusion], make_trainer: Callable[..., pl.Trainer], tiny: Tiny, tmp_path: Path
 ) -> Path:
     trainer = make_trainer(limit_train_batches=1, limit_val_batches=0)
-    trainer.fit(make_system(), datamodule=tiny)
+    trainer.fit(make_model(), datamodule=tiny)
     trainer.save_checkpoint(tmp_path / "tiny.ckpt")
     return tmp_path / "tiny.ckpt"
 
 
-def motions(system: DualPathDiffusion, data: Tiny, split: str) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+def motions(model: DualPathDiffusion, data: Tiny, split: str) -> list[tuple[NDArray[Any], NDArray[Any]]]:
     """Of each clip alone: what every seed makes, and the truth."""
     found = []
     for sample in map(data.dataset(split).__getitem__, range(len(data.clips(split)))):
-        made = [system.generate(collate([sample]), seed=seed)[0].double().numpy() for seed in range(SEEDS)]
+        made = [model.generate(collate([sample]), seed=seed)[0].double().numpy() for seed in range(SEEDS)]
         found.append((np.stack(made), sample.motion.double().numpy()))
     return found
 
@@ -50,12 +50,12 @@ def test_the_numbers_are_those_of_numpy(checkpoint: Path, tiny: Tiny, capsys: py
     printed = capsys.readouterr().out
     rows = json.loads(numbers.read_text())
     assert [(row["sampler"], row["steps"]) for row in rows] == samplers
-    system, lips, upper = load_system(checkpoint), range(12), range(12, 24)
+    model, lips, upper = load_model(checkpoint), range(12), range(12, 24)
     for row in rows:
-        system.choose_sampler(row["sampler"], row["steps"])
+        model.choose_sampler(row["sampler"], row["steps"])
         assert row["real_time_factor"] > 0
         for split in ("test_a", "test_b"):
-            clips = motions(system, tiny, split)
+            clips = motions(model, tiny, split)
             for seed in range(SEEDS):
                 errors = [np.square(made[seed] - truth)[:, lips].sum(-1).max(-1) for made, truth in clips]
                 assert row["lve"][split][seed] == pytest.approx(np.concatenate(errors).mean(), rel=1e-4)
@@ -88,10 +88,10 @@ def test_a_share_of_the_clips_and_one_split(checkpoint: Path, capsys: pytest.Cap
 
 
 def test_a_corpus_that_is_not_there_is_named(checkpoint: Path) -> None:
-    system = load_system(checkpoint)
-    system.data_source = {"class_path": "their.corpora.Faces", "root": "/nowhere"}
+    model = load_model(checkpoint)
+    model.data_source = {"class_path": "their.corpora.Faces", "root": "/nowhere"}
     with pytest.raises(FaceDiffError, match=r"their\.corpora\.Faces"):
-        sampler_table.corpus_of(system, None)
+        sampler_table.corpus_of(model, None)
 
 
 def scores(sampler: str, steps: int, lve: list[float], diversity: float, other: float | None = None) -> Scores:

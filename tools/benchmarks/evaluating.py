@@ -10,7 +10,7 @@ truth and templates, once prepared, are float64, and predictions are what a netw
   own: every file is loaded, the frames of all sequences are put into a list and stacked, and what is taken over a
   region is made by a Python loop over its vertices, turned to frames first; the mean error of each sequence is computed
   beside that of all frames, as FaceDiffuser's does. One thread, as NumPy has it.
-- ``facediff``: `facediff.evaluate` on the same files, 1000 bootstrap resamples included, one worker and all.
+- ``facediff``: `facediff.evaluation` on the same files, 1000 bootstrap resamples included, one worker and all.
 - ``only reading``: the same files mapped into memory and each number added up once, by as many threads: how quick
   anything can be that looks at all of them.
 
@@ -107,7 +107,7 @@ def whole_corpus(root: Path, vertices: int) -> dict[str, float]:
 def facediff(root: Path, vertices: int, workers: int) -> dict[str, float]:
     """The same four numbers by facediff."""
     from facediff.data.corpus import read_templates
-    from facediff.evaluate import evaluate, read_region
+    from facediff.evaluation import evaluate, read_region
 
     report = evaluate(
         {"predictions": root / "predictions"},
@@ -185,12 +185,12 @@ def main() -> None:
     """Measure every way in a process of its own and print ratios."""
     args = parser().parse_args()
     if args.way:
-        import facediff.evaluate  # noqa: F401 - what importing costs is no part of scoring
+        import facediff.evaluation  # noqa: F401 - what importing costs is no part of scoring
 
         print(json.dumps(measure(ways(args)[args.way])))
         return
     if args.workers is None:
-        from facediff.machine import processors
+        from facediff.utils.jobs import processors
 
         args.workers = processors()
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:

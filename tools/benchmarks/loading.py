@@ -60,7 +60,7 @@ def processes() -> list[Path]:
 def resident() -> int:
     """Memory in bytes that this process and its loader processes hold for themselves or share among them.
 
-    Pages of mapped files are left out: they belong to the system's page cache, which gives them up when asked.
+    Pages of mapped files are left out: they belong to the model's page cache, which gives them up when asked.
     """
     total = 0
     for process in processes():

@@ -31,10 +31,9 @@ from sampling_tables import processor
 
 from facediff.data import Batch, SpeechMotionDataModule, collate
 from facediff.data.audio import SAMPLE_RATE, samples_for
-from facediff.systems import SpeechAnimator, load_system
-from facediff.systems.checkpoint import imported
-from facediff.systems.long_speech import SpeechStream
-from facediff.systems.windows import WindowPlan
+from facediff.models import AnimationModel, load_model
+from facediff.models.checkpoint import imported
+from facediff.models.inference import SpeechStream, WindowPlan
 
 Array = npt.NDArray[np.float64]
 
@@ -57,7 +56,7 @@ class Material:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoint", type=Path, help="a trained system whose corpus is on this machine")
+    parser.add_argument("--checkpoint", type=Path, help="a trained model whose corpus is on this machine")
     parser.add_argument("--subject", help="whose test sentences; the first identity if absent")
     parser.add_argument("--seconds", type=float, default=600.0, help="length of the speech (default: 600)")
     parser.add_argument("--size", action="store_true", help="random weights at the size of BIWI; speed and memory only")
@@ -75,50 +74,48 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif args.checkpoint is None:
         parser.error("give --checkpoint, or --size")
     else:
-        judged(load_system(args.checkpoint), args.subject, args.seconds, plans=args.plans)
+        judged(load_model(args.checkpoint), args.subject, args.seconds, plans=args.plans)
 
 
-def material(system: SpeechAnimator, subject: str, seconds: float) -> Material:
+def material(model: AnimationModel, subject: str, seconds: float) -> Material:
     """A person's test sentences, one after the other and again from the start, until they last long enough."""
-    source = system.data_source
+    source = model.data_source
     module = imported(source["class_path"], SpeechMotionDataModule)  # type: ignore[type-abstract]
     if module is None or not Path(source["root"]).is_dir():
         raise SystemExit(f"the corpus of the checkpoint ({source}) is not on this machine")
     data = module(root=source["root"])
     samples = [s for split in data.test_splits for s in data.dataset(split) if s.subject == subject]
     audio, motion, joints, frames = [], [], [], 0
-    while frames < seconds * system.frame_rate:
+    while frames < seconds * model.frame_rate:
         sample = samples[len(joints) % len(samples)]
         # Frames of a rate that does not divide 16 kHz do not last whole samples: each starts where it should.
-        start, end = (samples_for(n, system.frame_rate) for n in (frames, frames + len(sample.motion)))
+        start, end = (samples_for(n, model.frame_rate) for n in (frames, frames + len(sample.motion)))
         audio.append(torch.nn.functional.pad(sample.audio, (0, 9))[: end - start])
         motion.append(sample.motion)
         frames += len(sample.motion)
         joints.append(frames)
     whole = replace(samples[0], audio=torch.cat(audio), motion=torch.cat(motion), name="long", decoy_audio=None)
-    style = system.default_style(subject)
-    whole = replace(
-        whole, reference=style.motion.float(), features=None, identity=system.assets.identity_index(subject)
-    )
-    return Material(collate([whole]), system.assets.regions["lips"], joints[:-1])
+    style = model.default_style(subject)
+    whole = replace(whole, reference=style.motion.float(), features=None, identity=model.assets.identity_index(subject))
+    return Material(collate([whole]), model.assets.regions["lips"], joints[:-1])
 
 
-def by_windows(system: SpeechAnimator, clip: Batch, plan: WindowPlan) -> torch.Tensor:
+def by_windows(model: AnimationModel, clip: Batch, plan: WindowPlan) -> torch.Tensor:
     """Motion (T, V, 3)."""
-    stream = SpeechStream(system, clip, plan=plan)
+    stream = SpeechStream(model, clip, plan=plan)
     return torch.cat([part[0] for part in stream.over(clip.audio[0], frames=clip.motion.shape[1])])
 
 
-def hard_cut(system: SpeechAnimator, clip: Batch, plan: WindowPlan) -> torch.Tensor:
+def hard_cut(model: AnimationModel, clip: Batch, plan: WindowPlan) -> torch.Tensor:
     """The same windows, each made alone and cut where the next begins: what joints look like if nothing is done."""
-    perform = system.perform_window
-    system.perform_window = lambda clip, window, seeds, before: perform(  # type: ignore[method-assign]
+    generate_clips = model.generate_window
+    model.generate_window = lambda clip, window, seeds, before: generate_clips(  # type: ignore[method-assign]
         clip, replace(window, index=window.index * 1000, shared=0, fresh=window.frames), seeds, None
     )
     try:
-        return by_windows(system, clip, plan)
+        return by_windows(model, clip, plan)
     finally:
-        system.perform_window = perform  # type: ignore[method-assign]
+        model.generate_window = generate_clips  # type: ignore[method-assign]
 
 
 def lip_error(motion: torch.Tensor, truth: torch.Tensor, lips: torch.Tensor) -> Array:
@@ -143,30 +140,30 @@ def joints_of(frames: int, plan: WindowPlan, frame_rate: float) -> npt.NDArray[n
     return marked
 
 
-def judged(system: SpeechAnimator, subject: str | None, seconds: float, *, plans: bool) -> None:
+def judged(model: AnimationModel, subject: str | None, seconds: float, *, plans: bool) -> None:
     """Quality over time, at joints, and for other plans."""
-    subject = subject or system.identities[0]
-    made = material(system, subject, seconds)
-    truth, plan = made.clip.motion[0], system.windows
-    lasts = len(truth) / system.frame_rate
+    subject = subject or model.identities[0]
+    made = material(model, subject, seconds)
+    truth, plan = made.clip.motion[0], model.windows
+    lasts = len(truth) / model.frame_rate
     print(f"speech: test sentences of {subject}, {len(made.joints) + 1} in {lasts:.0f} s; {len(truth)} frames")
     print(f"windows of {plan.seconds:g} s, {plan.overlap:g} s shared\n")
     start = time.perf_counter()
-    motion = by_windows(system, made.clip, plan)
+    motion = by_windows(model, made.clip, plan)
     took = time.perf_counter() - start
     print(f"made in {took:.1f} s, real-time factor {took / lasts:.3f}; peak memory {peak():.2f} GiB resident")
     error = lip_error(motion, truth, made.lips)
     still = lip_error(torch.zeros_like(truth), truth, made.lips)
-    minute = round(60 * system.frame_rate)
+    minute = round(60 * model.frame_rate)
     print("\nlip error by minute, against a still face's (mean over frames of the worst lip vertex)")
     for i in range(0, len(truth) - minute // 2, minute):
         part = slice(i, i + minute)
         print(f"  {i // minute + 1:3d}  {error[part].mean() / still[part].mean():.4f}")
     print("\nacceleration, root mean square over vertices, at the joints of windows and elsewhere")
-    for name, candidate in (("joined", motion), ("hard cuts", hard_cut(system, made.clip, plan))):
-        tell_joints(name, acceleration(candidate), joints_of(len(truth), plan, system.frame_rate), made.joints)
+    for name, candidate in (("joined", motion), ("hard cuts", hard_cut(model, made.clip, plan))):
+        tell_joints(name, acceleration(candidate), joints_of(len(truth), plan, model.frame_rate), made.joints)
     if plans:
-        compare_plans(system, made)
+        compare_plans(model, made)
 
 
 def tell_joints(name: str, size: Array, marked: npt.NDArray[np.bool_], sentences: Sequence[int]) -> None:
@@ -186,42 +183,42 @@ def tell_joints(name: str, size: Array, marked: npt.NDArray[np.bool_], sentences
     print(f"  {'':10s} {share:.1%} of draws of as many frames elsewhere have as large a mean")
 
 
-def compare_plans(system: SpeechAnimator, made: Material) -> None:
+def compare_plans(model: AnimationModel, made: Material) -> None:
     """Windows of other lengths, and everything at once, on the first two minutes."""
-    frames = min(made.clip.motion.shape[1], round(120 * system.frame_rate))
+    frames = min(made.clip.motion.shape[1], round(120 * model.frame_rate))
     clip = replace(
         made.clip,
-        audio=made.clip.audio[:, : samples_for(frames, system.frame_rate)],
+        audio=made.clip.audio[:, : samples_for(frames, model.frame_rate)],
         motion=made.clip.motion[:, :frames],
-        audio_lengths=torch.tensor([samples_for(frames, system.frame_rate)]),
+        audio_lengths=torch.tensor([samples_for(frames, model.frame_rate)]),
         frame_lengths=torch.tensor([frames]),
     )
     truth = clip.motion[0]
     still = lip_error(torch.zeros_like(truth), truth, made.lips).mean()
     print("\nlengths of windows, on two minutes: lip error against a still face's, real-time factor, look-ahead in s")
-    whole = partial(system.perform, clip)
+    whole = partial(model.generate_clips, clip)
     ways = [("at once", None), ("sentence by sentence", None)]
     for name, _ in ways:
         start = time.perf_counter()
-        motion = whole()[0] if name == "at once" else sentence_by_sentence(system, clip, made.joints)
-        tell_plan(name, lip_error(motion, truth, made.lips).mean() / still, time.perf_counter() - start, frames, system)
+        motion = whole()[0] if name == "at once" else sentence_by_sentence(model, clip, made.joints)
+        tell_plan(name, lip_error(motion, truth, made.lips).mean() / still, time.perf_counter() - start, frames, model)
     for seconds, overlap, before, after in (
         (16, 1, 2, 0.5), (8, 1, 2, 0.5), (4, 1, 2, 0.5), (2, 0.5, 2, 0.5), (1, 0.4, 2, 0.3), (0.6, 0.28, 2, 0.2),
     ):  # fmt: skip
         plan = WindowPlan(seconds, overlap, before, after)
         start = time.perf_counter()
-        error = lip_error(by_windows(system, clip, plan), truth, made.lips).mean() / still
+        error = lip_error(by_windows(model, clip, plan), truth, made.lips).mean() / still
         name = f"{seconds:g} s, {overlap:g} s shared"
-        tell_plan(name, error, time.perf_counter() - start, frames, system, plan.look_ahead)
+        tell_plan(name, error, time.perf_counter() - start, frames, model, plan.look_ahead)
 
 
-def sentence_by_sentence(system: SpeechAnimator, clip: Batch, joints: Sequence[int]) -> torch.Tensor:
+def sentence_by_sentence(model: AnimationModel, clip: Batch, joints: Sequence[int]) -> torch.Tensor:
     """Each sentence alone: what the windows, which know no sentences, are measured against."""
     frames = clip.motion.shape[1]
     bounds = [0, *(joint for joint in joints if joint < frames), frames]
     made = []
     for start, end in zip(bounds, bounds[1:], strict=False):
-        first, last = (samples_for(frame, system.frame_rate) for frame in (start, end))
+        first, last = (samples_for(frame, model.frame_rate) for frame in (start, end))
         alone = replace(
             clip,
             audio=clip.audio[:, first:last],
@@ -229,15 +226,15 @@ def sentence_by_sentence(system: SpeechAnimator, clip: Batch, joints: Sequence[i
             audio_lengths=torch.tensor([last - first]),
             frame_lengths=torch.tensor([end - start]),
         )
-        made.append(system.perform(alone)[0])
+        made.append(model.generate_clips(alone)[0])
     return torch.cat(made)
 
 
 def tell_plan(
-    name: str, error: float, took: float, frames: int, system: SpeechAnimator, ahead: float | None = None
+    name: str, error: float, took: float, frames: int, model: AnimationModel, ahead: float | None = None
 ) -> None:
     """A line of the table."""
-    factor = took * system.frame_rate / frames
+    factor = took * model.frame_rate / frames
     print(f"  {name:22s} {error:.4f}  {factor:.3f}  {'' if ahead is None else f'{ahead:.2f}'}")
 
 
@@ -245,10 +242,10 @@ def sized(seconds: float, vertices: int) -> None:
     """Speed and memory at the size of BIWI; the motion is dropped window by window, as a writer drops it."""
     sizes = argparse.Namespace(dim=512, heads=8, layers=6, seconds=1.0, device="cpu", repeats=1)
     bench = build(sizes, vertices, tiny_encoder=False)
-    system = bench.system
+    model = bench.model
     clip = replace(bench.batch, audio=bench.batch.audio[:, :1000], audio_lengths=torch.tensor([1000]))
     speech = torch.randn(round(seconds * SAMPLE_RATE), generator=torch.Generator().manual_seed(0)) * 0.1
-    stream = SpeechStream(system, clip)
+    stream = SpeechStream(model, clip)
     print(f"model: {vertices} vertices, HuBERT base, random weights; {seconds:.0f} s of noise")
     start = time.perf_counter()
     frames = sum(part.shape[1] for part in stream.over(speech))

@@ -45,12 +45,12 @@ class TimedPreview(SamplingPreview):
     def _preview(
         self,
         trainer: Trainer,
-        system: LightningModule,
+        model: LightningModule,
         epochs: int,
         weights: AbstractContextManager[None] = nullcontext(),  # noqa: B008 - holds nothing
     ) -> None:
         start = now()
-        super()._preview(trainer, system, epochs, weights)
+        super()._preview(trainer, model, epochs, weights)
         self.costs = [*getattr(self, "costs", []), since(start)]
 
 

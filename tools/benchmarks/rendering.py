@@ -131,15 +131,15 @@ def preview() -> None:
     """Print what training epochs, default previews and those of the shipped config cost on the built-in corpus."""
     import yaml
 
-    from facediff.commands.lightning import run_cli
-    from facediff.shipped import config_dir
+    from facediff.cli.lightning import run_cli
+    from facediff.utils.files import config_dir
 
     callbacks = yaml.safe_load((config_dir() / "trainer" / "cpu.yaml").read_text(encoding="utf-8"))["callbacks"]
-    (shipped,) = (found["init_args"] for found in callbacks if found["class_path"].endswith("SamplingPreview"))
+    (bundled,) = (found["init_args"] for found in callbacks if found["class_path"].endswith("SamplingPreview"))
     with tempfile.TemporaryDirectory() as folder:
         words = ["--trainer.callbacks+=preview_clock.Clock", "--trainer.enable_progress_bar=false"]
         words += [f"--trainer.max_epochs={EPOCHS}", "--trainer.check_val_every_n_epoch=2"]
-        for name, options in (("TimedPreview", {}), ("ShippedPreview", shipped)):
+        for name, options in (("TimedPreview", {}), ("ShippedPreview", bundled)):
             words.append(f"--trainer.callbacks+=preview_clock.{name}")
             words += [f"--trainer.callbacks.{key}={value}" for key, value in {**options, "every_n_epochs": 2}.items()]
         words += ["--trainer.enable_model_summary=false", f"--trainer.logger.save_dir={folder}"]
@@ -150,10 +150,10 @@ def preview() -> None:
     print(f"machine: {machine()}; corpus puppet, model of configs/experiment/puppet.yaml")
     print(f"{'':<46}{'seconds':>9}{'CPU s':>9}")
     print(f"{'a training epoch':<46}{epoch[0]:>9.1f}{epoch[1]:>9.1f}")
-    every = shipped["every_n_epochs"]
+    every = bundled["every_n_epochs"]
     for words_for, name, epochs in (
         ("default", "TimedPreview", 10),
-        (f"shipped ({shipped['clips']} clip, {shipped['size']} pixels)", "ShippedPreview", every),
+        (f"shipped ({bundled['clips']} clip, {bundled['size']} pixels)", "ShippedPreview", every),
     ):
         cost = [median(column) for column in zip(*costs[name], strict=True)]
         print(f"{f'a preview, {words_for}':<46}{cost[0]:>9.1f}{cost[1]:>9.1f}")

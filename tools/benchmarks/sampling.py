@@ -67,7 +67,7 @@ def sizes(args: argparse.Namespace, bench: Bench) -> dict[str, float]:
     steppers = {}
     for vertices in (FLAME, args.vertices):
         one = bench if vertices == args.vertices else build(args, vertices, tiny_encoder=True)
-        sampler = registry.sampler.get("ddpm")(process=one.system.process)
+        sampler = registry.sampler.get("ddpm")(process=one.model.process)
         steppers[str(vertices)] = one.stepper("folded", sampler, one.conditions())
     found = bench.in_turn(steppers, 3 * bench.repeats)
     small, large = found[str(FLAME)], found[str(args.vertices)]
@@ -102,10 +102,10 @@ def options() -> argparse.Namespace:
 
 def in_full(args: argparse.Namespace, bench: Bench, seconds: float) -> dict[str, Any]:
     """The default sampler from start to end, the first time with folding, and memory before anything else ran."""
-    bench.system.choose_sampler(steps=args.full)
+    bench.model.choose_sampler(steps=args.full)
     name, steps = bench.usual()
-    first = bench.clock(lambda: bench.system.generate(bench.batch))
-    again = min(bench.clock(lambda: bench.system.generate(bench.batch)) for _ in range(bench.repeats))
+    first = bench.clock(lambda: bench.model.generate(bench.batch))
+    again = min(bench.clock(lambda: bench.model.generate(bench.batch)) for _ in range(bench.repeats))
     print(
         f"\n(b) {name} {steps}, folded, in full: {again:.4f} s, real-time factor {again / seconds:.4f}; "
         f"the first time, with folding and warming up, {first:.4f} s\n"
@@ -123,7 +123,7 @@ def main(args: argparse.Namespace) -> None:
     bench = build(args, args.vertices, tiny_encoder=args.tiny_encoder)
     print(heading(args, bench), flush=True)
     seconds = bench.batch.audio.shape[1] / SAMPLE_RATE
-    process = bench.system.process
+    process = bench.model.process
     # First, since the highest memory so far is all that a process can tell.
     full = in_full(args, bench, seconds) if args.full != 0 else None
     costs = bench.measure({name: registry.sampler.get(name)(process=process, steps=1000) for name in SAMPLERS})

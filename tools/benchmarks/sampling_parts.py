@@ -1,4 +1,4 @@
-"""A system and a clip to sample for it, and the clocks that time the parts of sampling; used by ``sampling.py``."""
+"""A model and a clip to sample for it, and the clocks that time the parts of sampling; used by ``sampling.py``."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from typing import Any
 
 import torch
 
-from facediff.components.audio_encoder.hubert import HubertEncoder
-from facediff.components.decoder.style_transformer import StyleTransformer
-from facediff.components.fusion.cross_attention import BidirectionalCrossAttention
-from facediff.components.style_encoder.tcn_gru_transformer import TcnGruTransformer
 from facediff.data import Assets, Batch, Sample, collate
 from facediff.data.audio import samples_for
-from facediff.diffusion.folding import fold
-from facediff.diffusion.samplers import Sampler
-from facediff.systems import DualPathDiffusion
-from facediff.systems.dual_path.network import Conditions, PreparedConditions
-from facediff.systems.dual_path.noise import ClipNoise
-from facediff.systems.dual_path.spaces import SamplingSpace, Space, choose_space
+from facediff.models import DualPathDiffusion
+from facediff.models.audio_encoders import HubertEncoder
+from facediff.models.decoders import StyleTransformer
+from facediff.models.dual_path import Conditions, PreparedConditions, SamplingSpace, Space, choose_space
+from facediff.models.folding import fold
+from facediff.models.fusions import BidirectionalCrossAttention
+from facediff.models.inference import ClipNoise
+from facediff.models.samplers import Sampler
+from facediff.models.style_encoders import TcnGruTransformer
 
 FRAME_RATE = 25.0
 REFERENCE_FRAMES = 100
@@ -77,22 +76,22 @@ class Costs:
 
 @dataclass(frozen=True)
 class Bench:
-    """A system and one clip to sample for it.
+    """A model and one clip to sample for it.
 
     Attributes:
-        system: the system, in evaluation mode.
+        model: the model, in evaluation mode.
         batch: one clip.
         repeats: timed repetitions of every part; one more before them warms up.
     """
 
-    system: DualPathDiffusion
+    model: DualPathDiffusion
     batch: Batch
     repeats: int
 
     def now(self) -> float:
         """The time in seconds, once the device has finished what it was given."""
-        if self.system.device.type == "cuda":
-            torch.cuda.synchronize(self.system.device)
+        if self.model.device.type == "cuda":
+            torch.cuda.synchronize(self.model.device)
         return time.perf_counter()
 
     def clock(self, work: Callable[[], object]) -> float:
@@ -108,14 +107,14 @@ class Bench:
 
     def conditions(self) -> PreparedConditions:
         """Everything that is computed once a clip."""
-        batch, network = self.batch, self.system.network
-        style = self.system.encode_style(batch.reference, batch.reference_mask)
+        batch, network = self.batch, self.model.network
+        style = self.model.encode_style(batch.reference, batch.reference_mask)
         found = network.conditions(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.identity, style)
-        return network.prepared(found, self.system.process.steps)
+        return network.prepared(found, self.model.process.steps)
 
     def once_a_clip(self) -> tuple[float, float]:
         """Seconds of the audio encoder, and of all other conditions."""
-        encoder = self.system.network.audio_encoder
+        encoder = self.model.network.audio_encoder
         entered: list[float] = []
         left: list[float] = []
         hooks = [
@@ -130,19 +129,19 @@ class Bench:
         return min(audio[1:]), min(others[1:])
 
     def usual(self) -> tuple[str, int]:
-        """Name and steps of the system's sampler."""
-        return self.system.hparams["sampler"]["class_path"].rpartition(".")[2], self.system.sampler.steps
+        """Name and steps of the model's sampler."""
+        return self.model.hparams["sampler"]["class_path"].rpartition(".")[2], self.model.sampler.steps
 
     def space(self, name: SamplingSpace, sampler: Sampler) -> Space:
-        """A sampling space, with the system's own cache."""
-        return choose_space(self.system.network, name, sampler, self.system._fold_cache)
+        """A sampling space, with the model's own cache."""
+        return choose_space(self.model.network, name, sampler, self.model._fold_cache)
 
     def stepper(self, name: SamplingSpace, sampler: Sampler, conditions: Conditions) -> Callable[[], None]:
         """A call that takes one step of the real loop: prediction, noise, update."""
         space, batch = self.space(name, sampler), self.batch
-        unit = ClipNoise(batch.names, batch.frame_lengths.tolist(), [0] * len(batch), self.system.device)
+        unit = ClipNoise(batch.names, batch.frame_lengths.tolist(), [0] * len(batch), self.model.device)
         shape = (*batch.motion.shape[:2], space.width)
-        state = space.noise(unit(torch.empty(shape, device=self.system.device)))
+        state = space.noise(unit(torch.empty(shape, device=self.model.device)))
         scheduler = sampler.make_scheduler()
         places = iter(scheduler.timesteps.tolist())
 
@@ -164,13 +163,13 @@ class Bench:
 
     def measure(self, samplers: dict[str, Sampler]) -> Costs:
         """Time every part."""
-        network, batch = self.system.network, self.batch
+        network, batch = self.model.network, self.batch
         audio_encoder, others = self.once_a_clip()
         conditions = self.conditions()
         bare = Conditions(conditions.audio, conditions.style, conditions.mask)
         first = next(iter(samplers.values()))
-        step = torch.full((len(batch),), self.system.process.steps // 2, device=self.system.device)
-        entered = torch.randn(*batch.motion.shape[:2], network.embed.out_features, device=self.system.device)
+        step = torch.full((len(batch),), self.model.process.steps // 2, device=self.model.device)
+        entered = torch.randn(*batch.motion.shape[:2], network.embed.out_features, device=self.model.device)
         decoded = network.core(entered, step, conditions)
         vertices = network.leave(decoded)
         maps = network.embed.weight.detach(), network.unembed.weight.detach(), network.unembed.bias.detach()
@@ -189,7 +188,7 @@ class Bench:
             core=cores["kept"],
             core_unprepared=cores["anew"],
             leave=self.quickest(lambda: network.leave(decoded)),
-            rest=self.quickest(lambda: vertices / self.system.scale),
+            rest=self.quickest(lambda: vertices / self.model.scale),
         )
         costs.step = {space: {} for space in SPACES}
         for name, sampler in samplers.items():
@@ -200,7 +199,7 @@ class Bench:
 
 
 def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool) -> Bench:
-    """The system with random weights, its assets, and one clip of noise as speech."""
+    """The model with random weights, its assets, and one clip of noise as speech."""
     from transformers import HubertConfig
 
     torch.manual_seed(0)
@@ -212,7 +211,7 @@ def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool) -> Ben
     }
     tiny |= {"conv_dim": (16,) * 7, "num_conv_pos_embeddings": 16, "num_conv_pos_embedding_groups": 2}
     config = HubertConfig(**(tiny if tiny_encoder else {})).to_dict()
-    system = DualPathDiffusion(
+    model = DualPathDiffusion(
         n_vertices=vertices,
         identities=IDENTITIES,
         frame_rate=FRAME_RATE,
@@ -222,7 +221,7 @@ def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool) -> Ben
         fusion=partial(BidirectionalCrossAttention, num_heads=args.heads),
         decoder=partial(StyleTransformer, num_layers=args.layers, num_heads=args.heads),
     )
-    system.adopt(
+    model.adopt(
         Assets(
             corpus="random weights",
             synthetic=True,
@@ -247,4 +246,4 @@ def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool) -> Ben
         sentence="",
         reference_name="reference",
     )
-    return Bench(system.eval().to(args.device), collate([sample]).to(args.device), args.repeats)
+    return Bench(model.eval().to(args.device), collate([sample]).to(args.device), args.repeats)

@@ -37,7 +37,7 @@ def peak_memory(device: str) -> str:
 
 def heading(args: argparse.Namespace, bench: Bench) -> str:
     """What is measured, and where."""
-    network = bench.system.network
+    network = bench.model.network
     millions = sum(p.numel() for p in network.parameters()) / 1e6
     speech = sum(p.numel() for p in network.audio_encoder.parameters()) / 1e6
     encoder = "tiny HuBERT" if args.tiny_encoder else "HuBERT base"

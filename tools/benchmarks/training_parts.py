@@ -18,16 +18,15 @@ import torch
 from loading import resident
 from torch import Tensor
 
-from facediff import losses
-from facediff.components.audio_encoder.hubert import HubertEncoder
-from facediff.components.decoder.style_transformer import StyleTransformer
-from facediff.components.fusion.cross_attention import BidirectionalCrossAttention
-from facediff.components.style_encoder.tcn_gru_transformer import TcnGruTransformer
 from facediff.data import Batch, Biwi
-from facediff.data.features import CachedFeatures
-from facediff.data.store import ArrayStore
-from facediff.diffusion.draws import unit_noise
-from facediff.systems import DualPathDiffusion
+from facediff.data.audio import ArrayStore
+from facediff.data.dataset import CachedFeatures
+from facediff.models import DualPathDiffusion, losses
+from facediff.models.audio_encoders import HubertEncoder
+from facediff.models.decoders import StyleTransformer
+from facediff.models.fusions import BidirectionalCrossAttention
+from facediff.models.samplers import unit_noise
+from facediff.models.style_encoders import TcnGruTransformer
 
 SUBJECTS = ["F2", "F3"]
 RATE = 25
@@ -117,7 +116,7 @@ class Bench:
         tiny |= {"intermediate_size": 64, "conv_dim": (16,) * 7, "num_conv_pos_embeddings": 16}
         tiny |= {"num_conv_pos_embedding_groups": 2}
         config = HubertConfig(**(tiny if args.tiny_encoder else {})).to_dict()
-        self.system = DualPathDiffusion(
+        self.model = DualPathDiffusion(
             n_vertices=args.vertices,
             identities=SUBJECTS,
             frame_rate=float(RATE),
@@ -129,8 +128,8 @@ class Bench:
             identity_dropout=0.1 if dropout else 0.0,
         )
         data = self.make_data()
-        self.system.adopt(data.assets().with_motion_scale(data.motion_scale()))
-        self.system.train()
+        self.model.adopt(data.assets().with_motion_scale(data.motion_scale()))
+        self.model.train()
         if not dropout:
             self._drop_nothing()
         self._optimizers: dict[bool, torch.optim.Optimizer] = {}
@@ -138,7 +137,7 @@ class Bench:
         self._compiled: dict[torch.nn.Module, Any] = {}
 
     def _drop_nothing(self) -> None:
-        for module in self.system.modules():
+        for module in self.model.modules():
             if isinstance(module, torch.nn.Dropout):
                 module.p = 0.0
             for name in ("dropout", "attention_dropout"):
@@ -146,9 +145,9 @@ class Bench:
                     setattr(module, name, 0.0)
 
     def optimizer(self, fused: bool) -> torch.optim.Optimizer:
-        """AdamW as the system makes it, or as PyTorch makes it unasked."""
+        """AdamW as the model makes it, or as PyTorch makes it unasked."""
         if fused not in self._optimizers:
-            trained = [p for p in self.system.parameters() if p.requires_grad]
+            trained = [p for p in self.model.parameters() if p.requires_grad]
             self._optimizers[fused] = torch.optim.AdamW(trained, lr=1e-4, weight_decay=0.05, fused=fused or None)
         return self._optimizers[fused]
 
@@ -171,7 +170,7 @@ class Bench:
     @torch.no_grad()
     def fill_cache(self, data: Biwi) -> CachedFeatures:
         """What the callback SpeechFeatureCache does when training starts."""
-        encoder = self.system.speech_encoder
+        encoder = self.model.speech_encoder
         features = CachedFeatures(ArrayStore(self.args.root / "cache"), f"{encoder.frozen_key()}:")
         for clip in data.clips("train"):
             audio = features.add(data.corpus, clip)
@@ -182,24 +181,24 @@ class Bench:
     def step(self, way: Way) -> tuple[int, int]:
         """One training step with its batch read; clips and frames of it."""
         batch = next(self.batches(way))
-        steps = self.system.process.draw_steps(len(batch), torch.device("cpu"))
+        steps = self.model.process.draw_steps(len(batch), torch.device("cpu"))
         shape = batch.motion.flatten(2).shape
         self._compile(way.compiled)
         noise = unit_noise(shape, torch.device("cpu")) if way.one_pass else torch.randn(shape)
         with torch.autocast("cpu", torch.bfloat16, enabled=way.mixed):
-            compute = self.system.losses_at if way.one_pass else self.one_by_one
+            compute = self.model.losses_at if way.one_pass else self.one_by_one
             loss = compute(batch, steps, noise)["loss"]
         loss.backward()
         del loss
         optimizer = self.optimizer(way.fused)
-        torch.nn.utils.clip_grad_norm_(self.system.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
         optimizer.step()
         optimizer.zero_grad()
         return len(batch), int(batch.frame_lengths.sum())
 
     def _compile(self, wanted: bool) -> None:
         """What the callback CompiledTraining does, or the undoing of it."""
-        for part in (self.system.network.fusion, self.system.network.decoder):
+        for part in (self.model.network.fusion, self.model.network.decoder):
             if wanted and part not in self._compiled:
                 part.compile(dynamic=True)
                 self._compiled[part] = part._compiled_call_impl
@@ -207,18 +206,18 @@ class Bench:
 
     def one_by_one(self, batch: Batch, step: Tensor, noise: Tensor) -> dict[str, Tensor]:
         """The losses as one writes them down: each a pass over prediction and truth."""
-        system = self.system
-        clean = batch.motion.flatten(2) * system.scale
-        noisy = system.process.add_noise(clean, noise, step)
-        predicted = system.network(noisy, step, system._conditions(batch)).view(batch.motion.shape)
+        model = self.model
+        clean = batch.motion.flatten(2) * model.scale
+        noisy = model.process.add_noise(clean, noise, step)
+        predicted = model.network(noisy, step, model._conditions(batch)).view(batch.motion.shape)
         truth, mask = clean.view(batch.motion.shape), batch.mask
         terms = {
             "reconstruction": losses.reconstruction_loss(predicted, truth, mask),
             "velocity": losses.velocity_loss(predicted, truth, mask),
             "acceleration": losses.acceleration_loss(predicted, truth, mask),
-            "face": losses.face_dynamics_loss(predicted, truth, mask, system.assets.regions["upper_face"]),
+            "face": losses.face_dynamics_loss(predicted, truth, mask, model.assets.regions["upper_face"]),
         }
-        return {**terms, "loss": sum((system.loss_weights[n] * t for n, t in terms.items()), clean.new_zeros(()))}
+        return {**terms, "loss": sum((model.loss_weights[n] * t for n, t in terms.items()), clean.new_zeros(()))}
 
 
 def in_turn(bench: Bench, ways: list[Way], rounds: int, clips: int) -> dict[str, dict[str, float]]:
@@ -264,29 +263,29 @@ def memory(bench: Bench, way: Way) -> dict[str, float]:
     with watched() as highest:
         for _ in range(2):
             bench.step(way)
-    return {"peak": float(highest[0]), "weights": 4.0 * sum(p.numel() for p in bench.system.parameters())}
+    return {"peak": float(highest[0]), "weights": 4.0 * sum(p.numel() for p in bench.model.parameters())}
 
 
 def curve(args: argparse.Namespace, way: Way) -> list[float]:
     """Losses of the first training steps; by single clips with summed gradients unless the way makes batches."""
     bench = Bench(args, args.frozen[0], dropout=False)
     bench.budget = args.max_frames // 2
-    system, optimizer = bench.system, bench.optimizer(fused=True)
+    model, optimizer = bench.model, bench.optimizer(fused=True)
     batches = bench.batches(replace(way, budget=True))
     found = []
     for number in range(args.curve_steps):
         batch = next(batches)
         draw = torch.Generator().manual_seed(number)
-        step = system.process.draw_steps(len(batch), torch.device("cpu"), draw)
+        step = model.process.draw_steps(len(batch), torch.device("cpu"), draw)
         noise = torch.randn(batch.motion.flatten(2).shape, generator=draw)
         with torch.autocast("cpu", torch.bfloat16, enabled=way.mixed):
             if way.budget:
-                total = system.losses_at(batch, step, noise)["loss"]
+                total = model.losses_at(batch, step, noise)["loss"]
                 total.backward()
                 found.append(total.item())
             else:
                 found.append(sum(clip_losses(bench, batch, step, noise)))
-        torch.nn.utils.clip_grad_norm_(system.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
         optimizer.zero_grad()
     return found
@@ -301,7 +300,7 @@ def clip_losses(bench: Bench, batch: Batch, step: Tensor, noise: Tensor) -> Iter
         # The means of a batch are over all its valid frames or differences, that of the face is over clips.
         shares = [max(0, length - order) / float((lengths - order).clamp_min(0).sum()) for order in range(3)]
         shares.append(1 / len(batch))
-        weights = bench.system.loss_weights
+        weights = bench.model.loss_weights
         loss = sum(share * weights[n] * terms[n] for n, share in zip((*names, "face"), shares, strict=True))
         assert isinstance(loss, Tensor)
         loss.backward()

@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from facediff.takes import Take
-from facediff.viewer import write_page
+from facediff.animation import Animation
+from facediff.export.viewer import write_page
 from tools.benchmarks.rendering import head
 from tools.browser.chromium import Chromium, find_chromium
 
@@ -40,7 +40,7 @@ PLAY = """(async () => {
 })()"""
 
 
-def minute(n_vertices: int, seconds: float, noise: float) -> Take:
+def minute(n_vertices: int, seconds: float, noise: float) -> Animation:
     """A talking egg in metres: jaw, brows and cheeks move at speech's pace, the head sways."""
     rng = np.random.default_rng(0)
     shape, faces = head(n_vertices)
@@ -60,7 +60,7 @@ def minute(n_vertices: int, seconds: float, noise: float) -> Take:
     speech = (0.2 * np.sin(2 * np.pi * 180 * np.arange(frames * SAMPLE_RATE // RATE) / SAMPLE_RATE)).astype(np.float32)
     front = np.flatnonzero(shape[:, 2] > 0)[:20].reshape(-1, 2)
     template = shape.astype(np.float32)
-    return Take(
+    return Animation(
         f"{len(shape)} vertices", vertices, template, RATE, faces.astype(np.int32), speech=speech, inner_lip_pairs=front
     )
 
@@ -83,7 +83,7 @@ def processor_seconds(browser: Chromium) -> float:
     return float(sum(each["cpuTime"] for each in browser.send("SystemInfo.getProcessInfo")["processInfo"]))
 
 
-def line(label: str, takes: list[Take], folder: Path, browser: Chromium | None, watch: float) -> str:
+def line(label: str, takes: list[Animation], folder: Path, browser: Chromium | None, watch: float) -> str:
     """One row of the table: write a page, and play it where there is a browser."""
     page = folder / "page.html"
     started = time.perf_counter()
@@ -111,10 +111,10 @@ def main(words: list[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for count in args.vertices:
             for label, noise in NOISES.items():
-                take = minute(count, args.seconds, noise)
-                print(line(f"{take.name}, {label}", [take], Path(folder), browser, args.watch), flush=True)
+                animation = minute(count, args.seconds, noise)
+                print(line(f"{animation.name}, {label}", [animation], Path(folder), browser, args.watch), flush=True)
                 if not noise:
-                    calm = take
+                    calm = animation
             other = replace(calm, vertices=calm.vertices[::-1], name="reversed")
             label = f"{calm.name}, truth beside prediction"
             print(line(label, [calm, other], Path(folder), browser, args.watch), flush=True)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from facediff.components.decoder import Decoder
+from facediff.models.decoders import Decoder
 
 
 class MovingAverageDecoder(Decoder):
     """Averages each frame with its neighbours and adds the mean style token.
 
     Args:
-        dim: channels; given by the system.
-        style_dim: channels of a style token; given by the system.
+        dim: channels; given by the model.
+        style_dim: channels of a style token; given by the model.
         reach: neighbours on either side.
     """
 

@@ -1,0 +1,149 @@
+"""The contract of a finished performance."""
+
+from __future__ import annotations
+
+import mmap
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+
+# How long a corpus's unit of length is.
+
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_ABOUT = re.compile(r"about ([0-9.]+) mm\b")
+
+
+def metres_per_unit(unit: str) -> float:
+    """Metres in one unit of length.
+
+    Args:
+        unit: ``m``, ``cm``, ``mm``, ``in``, a number of metres, or a description that says "about … mm", as that of a
+            corpus whose faces were normalised.
+
+    Raises:
+        FaceDiffError: if it is none of these.
+    """
+    about = _ABOUT.search(unit)
+    try:
+        value = float(about[1]) / 1000 if about else METRES.get(unit) or float(unit)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise FaceDiffError(f'unit "{unit}": expected one of {", ".join(METRES)}, or a number of metres above 0')
+    return value
+
+
+MAPPED_BYTES = 1 << 26
+"""How much of a memory map is read before its pages are let go."""
+
+
+@dataclass(frozen=True, eq=False)
+class Animation:
+    """One performance of one face.
+
+    Attributes:
+        name: what it is called in messages and in files.
+        vertices: (T, V, 3) absolute positions; float32, finite, possibly a memory map that is read frame by frame.
+            y points up and z towards the viewer.
+        template: (V, 3) the neutral face.
+        frame_rate: frames a second; frame t is shown from t / frame_rate on.
+        faces: (F, 3) triangles; None where the topology has no mesh, so that it can be neither drawn nor exported.
+        unit: unit of length, as :func:`facediff.animation.metres_per_unit` takes it.
+        speech: (S,) mono, full scale 1, starting with the first frame; None for a silent take.
+        sample_rate: of the speech, in Hz.
+        colours: (V, 3) vertex colours (sRGB, 0 to 255); None where there are none.
+        regions: vertex indices by region name (``lips``, ``upper_face``).
+        inner_lip_pairs: (P, 2) upper and lower vertices of the inner lips, for the mouth's opening; None if unknown.
+        metadata: plain words about how it was made: identity, style, what in it is procedural …
+
+    Raises:
+        FaceDiffError: if the arrays do not fit one another, or there is no frame.
+    """
+
+    name: str
+    vertices: npt.NDArray[np.float32]
+    template: npt.NDArray[np.float32]
+    frame_rate: float
+    faces: npt.NDArray[np.int32] | None = None
+    unit: str = "m"
+    speech: npt.NDArray[np.float32] | None = None
+    sample_rate: int = 16_000
+    colours: npt.NDArray[np.uint8] | None = None
+    regions: Mapping[str, npt.NDArray[np.int64]] = field(default_factory=dict)
+    inner_lip_pairs: npt.NDArray[np.int64] | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape = self.vertices.shape
+        if len(shape) != 3 or shape[2] != 3:
+            raise FaceDiffError(f"{self.name}: has shape {shape}; expected (frames, vertices, 3)")
+        if not shape[0]:
+            raise FaceDiffError(f"{self.name}: holds no frames; give a motion of at least one")
+        if self.template.shape != shape[1:]:
+            raise FaceDiffError(
+                f"{self.name}: has {shape[1]} vertices and its template {len(self.template)}; give the mesh that the "
+                f"motion was made for"
+            )
+        if self.faces is not None and len(self.faces) and not 0 <= self.faces.min() <= self.faces.max() < shape[1]:
+            raise FaceDiffError(
+                f"{self.name}: its triangles name vertex {int(self.faces.max())} of {shape[1]}; give the mesh that the "
+                f"motion was made for"
+            )
+        if not 0 < self.frame_rate <= 1000:
+            raise FaceDiffError(
+                f"{self.name}: frame rate {self.frame_rate:g} is impossible; expected e.g. 25, 30 or 60"
+            )
+        if self.sample_rate < 1:
+            raise FaceDiffError(f"{self.name}: sample rate {self.sample_rate} is impossible; expected e.g. 16000")
+        metres_per_unit(self.unit)
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts."""
+        return len(self.vertices) / self.frame_rate
+
+    @cached_property
+    def triangles(self) -> npt.NDArray[np.int32]:
+        """The triangles, where something cannot do without.
+
+        Raises:
+            FaceDiffError: if there are none.
+        """
+        if self.faces is None or not len(self.faces):
+            raise FaceDiffError(
+                f"{self.name}: comes without a mesh (triangles); give one with --mesh, or write .npy, .npz, .pc2 or "
+                f".mdd, which need none"
+            )
+        return self.faces
+
+    def frames(self) -> Iterator[npt.NDArray[np.float32]]:
+        """Frame after frame (V, 3); what has been read of a memory map is let go, so that memory stays small."""
+        mapped = self.vertices if isinstance(self.vertices, np.memmap) else None
+        step = max(1, MAPPED_BYTES // max(1, self.vertices[0].nbytes))
+        for start in range(0, len(self.vertices), step):
+            yield from self.vertices[start : start + step]
+            if mapped is not None and mapped.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
+                mapped._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+
+    def refuse_not_finite(self) -> None:
+        """Look at every frame.
+
+        Raises:
+            FaceDiffError: naming the first frame that holds NaN or infinity.
+        """
+        for index, frame in enumerate(self.frames()):
+            if not np.isfinite(frame).all():
+                raise FaceDiffError(f"{self.name}: frame {index} holds NaN or infinity; make the motion anew")
+
+    def sound(self) -> npt.NDArray[np.float32] | None:
+        """The speech as long as the motion: cut, or followed by silence; None for a silent take."""
+        if self.speech is None:
+            return None
+        wanted = round(self.seconds * self.sample_rate)
+        return np.pad(self.speech[:wanted], (0, max(0, wanted - len(self.speech)))).astype(np.float32)

@@ -1,0 +1,171 @@
+"""Writing what ``facediff predict`` predicts."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import BasePredictionWriter
+from lightning.pytorch.loggers import WandbLogger
+
+from facediff.callbacks.dashboard import measure_clips, wandb_media, worst_clips
+from facediff.models import AnimationModel
+from facediff.models.inference import Prediction
+from facediff.utils.files import atomic, write_rows
+
+# The table that ``facediff test`` prints.
+
+METHOD_NAMES = {"model": "model", "still": "still face", "shuffled": "model, shuffled speech"}
+
+
+class ScoreTable(Callback):
+    """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
+
+    Beside the model stand a face that never moves, and the model given another sentence's speech. Weights & Biases gets
+    the table of sequences as ``test/sequences``, with sound and a picture of the errors for the worst clips, and the
+    protocol's definition in the run's config.
+
+    Args:
+        file: name of the CSV file in the run's folder; None writes none.
+        sequences_file: name of the CSV file with one row per clip and method; None writes none.
+        media_clips: how many clips get sound and picture, the worst by LVE of all processes. They are predicted once
+            more, by the first process alone, one at a time; nothing is kept in memory during the test.
+    """
+
+    def __init__(
+        self,
+        file: str | None = "test_scores.csv",
+        sequences_file: str | None = "test_sequences.csv",
+        media_clips: int = 8,
+    ) -> None:
+        self.file = file
+        self.sequences_file = sequences_file
+        self.media_clips = media_clips
+
+    def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Print and write; runs before the model logs and empties its metrics."""
+        if not isinstance(pl_module, AnimationModel) or trainer.sanity_checking:
+            return
+        evaluation = pl_module.evaluation
+        rows = [row for split in evaluation.splits for row in evaluation.rows(split)]
+        sequences = evaluation.sequences()
+        folder = trainer.log_dir  # asked for on every process: the answer is broadcast
+        if not trainer.is_global_zero:
+            return
+        assets = pl_module.assets
+        print(format_table(rows, assets.corpus, synthetic=assets.synthetic))
+        print(evaluation.protocol.describe())
+        if self.file and folder:
+            path = Path(folder) / self.file
+            write_csv(path, rows)
+            print(f"written: {path}")
+        if self.sequences_file and folder:
+            write_rows(Path(folder) / self.sequences_file, sequences)
+            print(f"written: {Path(folder) / self.sequences_file}")
+        sys.stdout.flush()
+        loggers = [logger for logger in trainer.loggers if isinstance(logger, WandbLogger)]
+        if loggers:
+            worst = worst_clips(sequences, self.media_clips)
+            media = wandb_media(pl_module, measure_clips(trainer, pl_module, worst))
+            for logger in loggers:
+                log_sequences(logger, sequences, evaluation.protocol.describe(), media)
+
+
+def log_sequences(
+    logger: WandbLogger, sequences: list[dict[str, Any]], definition: str, media: dict[tuple[str, str], list[Any]]
+) -> None:
+    """Give Weights & Biases the table of sequences and the words that define its numbers.
+
+    Args:
+        logger: the logger.
+        sequences: one row per clip and method.
+        definition: what the protocol's numbers stand for.
+        media: sound and picture by split and clip; the model's rows that have them come first, in this order.
+    """
+    columns = list(sequences[0])
+    places = {key: place for place, key in enumerate(media)}
+    data: list[tuple[int, list[Any]]] = []
+    for row in sequences:
+        key = (row["split"], row["clip"])
+        shown = row["method"] == "model" and key in media
+        values = [*(row[name] for name in columns), *(media[key] if shown else (None, None))]
+        data.append((places[key] if shown else len(places), values))
+    data.sort(key=lambda entry: entry[0])  # stable: all others stay in their order
+    logger.log_table("test/sequences", columns=[*columns, "audio", "error"], data=[values for _, values in data])
+    logger.experiment.config.update({"protocol_definition": definition}, allow_val_change=True)
+
+
+def format_table(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool) -> str:
+    """The scores as text, with what they were taken over."""
+    names = [name for name in ("mve", "lve", "fdd", "fdd_absolute") if name in rows[0]]
+    kind = "SYNTHETIC corpus" if synthetic else "corpus"
+    lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}, unseen people: {rows[0]['unseen_identity']}"]
+    for region in rows[0]["regions"].values():
+        lines.append(f"region {region['name']}: {region['count']} vertices, hash {region['hash']}")
+    lines.append(
+        f"{'split':<8} {'who':<24}" + "".join(f"{name.upper():>13}" for name in names) + f"{'frames':>9}{'clips':>7}"
+    )
+    for row in rows:
+        scores = "".join(f"{row[name]:>13.4e}" for name in names)
+        lines.append(
+            f"{row['split']:<8} {METHOD_NAMES[row['method']]:<24}{scores}{row['frames']:>9}{row['sequences']:>7}"
+        )
+    return "\n".join(lines)
+
+
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """One line per split and method; regions as ``<region>_vertices`` and ``<region>_hash``."""
+    flat = []
+    for row in rows:
+        regions = row["regions"]
+        line = {key: value for key, value in row.items() if key != "regions"}
+        for part, region in regions.items():
+            line |= {f"{part}_vertices": region["count"], f"{part}_hash": region["hash"]}
+        flat.append(line)
+    write_rows(path, flat)
+
+
+class PredictionWriter(BasePredictionWriter):
+    """Writes every predicted clip as ``<clip>_condition_<identity>.npy``, (T, 3V) absolute vertices, float32.
+
+    The name and the shape are those of the field's released projects, so that their scripts read the files.
+
+    Args:
+        output_dir: the folder; ``predictions`` in the run's folder if None.
+    """
+
+    def __init__(self, output_dir: str | None = None) -> None:
+        super().__init__(write_interval="batch")
+        self.output_dir = output_dir
+        self.folder = Path()
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Settle the folder on every process at once: where the run's folder is, is broadcast."""
+        run = trainer.log_dir or trainer.default_root_dir
+        self.folder = Path(self.output_dir or Path(run) / "predictions")
+
+    def write_on_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        prediction: Any,  # noqa: ANN401
+        batch_indices: Sequence[int] | None,
+        batch: Any,  # noqa: ANN401
+        batch_idx: int,
+        dataloader_idx: int,
+    ) -> None:
+        """Write a batch's clips, each file whole or not at all."""
+        clips: list[Prediction] = prediction
+        for clip in clips:
+            path = self.folder / f"{clip.name}_condition_{clip.identity}.npy"
+            with atomic(path) as temporary:
+                np.save(temporary, clip.vertices.flatten(1).numpy())
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say where the files are."""
+        if trainer.is_global_zero:
+            print(f"written: {self.folder}")

@@ -1,0 +1,158 @@
+"""Training with parts of the network compiled by PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import nn
+from tqdm import tqdm
+
+from facediff.data import SpeechMotionDataModule
+from facediff.data.audio import ArrayStore
+from facediff.data.dataset import CachedFeatures
+from facediff.errors import FaceDiffError
+from facediff.models import AnimationModel
+from facediff.utils.files import cache_dir
+
+# Running the frozen part of an audio encoder once per clip instead of in every training step.
+
+
+class SpeechFeatureCache(Callback):
+    """Keeps what the frozen part of the audio encoder makes of every training and validation clip on disk.
+
+    The files are keyed by the frozen weights, the number of frozen layers, the precision and the speech itself, so a
+    changed encoder or a changed recording never meets old features. Training on whole clips gives the same losses as
+    without. Training on windows differs a little: the frozen part then hears the whole clip, not the window alone.
+
+    Args:
+        folder: where the features are kept; ``speech_features`` in the user's cache folder if None.
+    """
+
+    def __init__(self, folder: str | None = None) -> None:
+        self.folder = Path(folder).expanduser() if folder is not None else cache_dir() / "speech_features"
+
+    @torch.no_grad()
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Encode what is not there yet, each process its share, and let the data module read it.
+
+        Raises:
+            FaceDiffError: if the audio encoder has no frozen part.
+        """
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(pl_module, AnimationModel) or not isinstance(data, SpeechMotionDataModule):
+            raise FaceDiffError("SpeechFeatureCache works with facediff's models and data modules only")
+        encoder = pl_module.speech_encoder
+        key = encoder.frozen_key()
+        if key is None:
+            raise FaceDiffError(
+                f"SpeechFeatureCache: the audio encoder {type(encoder).__name__} has no frozen part to keep (or "
+                f"spec_augment is on); leave the callback away, or take one that has, e.g. --model.audio_encoder=hubert"
+            )
+        features = CachedFeatures(ArrayStore(self.folder), f"{key}:{trainer.precision}")
+        clips = [*data.clips("train"), *data.clips("val")]
+        rank, world = trainer.global_rank, trainer.world_size
+        shown = tqdm(
+            clips, desc="speech features", leave=False, disable=rank > 0 or trainer.progress_bar_callback is None
+        )
+        for place, clip in enumerate(shown):
+            audio = features.add(data.corpus, clip)
+            if audio is None or place % world != rank:
+                continue
+            batch = audio[None].to(pl_module.device)
+            with trainer.precision_plugin.forward_context():
+                encoded, lengths = encoder.frozen_features(batch, torch.tensor([audio.numel()], device=batch.device))
+            features.put(clip, encoded[0, : int(lengths[0])])
+        trainer.strategy.barrier("speech features")
+        data.features.reader = features
+
+
+class CompiledTraining(Callback):
+    """Compiles parts of the network with ``torch.compile`` for the training steps.
+
+    Checkpoints are as without it: parts are compiled in place and keep their names. Validation, previews and whatever
+    comes after training run the parts as they are. Each part is compiled once for all lengths of clips; the first steps
+    wait for that, a minute or so. Losses are the same but for rounding and dropout's draws.
+
+    Args:
+        parts: names of submodules of the model's network, such as ``decoder`` or ``style_encoder``.
+        backend: what compiles, as ``torch.compile`` calls it. The usual one needs a C++ compiler on a processor, and
+            Triton and a C compiler on a GPU.
+    """
+
+    def __init__(self, parts: Sequence[str] = ("fusion", "decoder"), backend: str = "inductor") -> None:
+        self.parts = list(parts)
+        self.backend = backend
+        self._compiled: list[nn.Module] = []
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Look whether anything can be compiled here.
+
+        Raises:
+            FaceDiffError: if a part is not there, or nothing can be compiled on this machine.
+        """
+        network = getattr(pl_module, "network", None)
+        if not isinstance(network, nn.Module):
+            raise FaceDiffError(
+                f"CompiledTraining: {type(pl_module).__name__} has no network whose parts could be compiled; leave the "
+                f"callback away"
+            )
+        known = dict(network.named_modules())
+        for name in self.parts:
+            if name not in known or not name:
+                there = ", ".join(child for child, _ in network.named_children())
+                raise FaceDiffError(
+                    f'CompiledTraining.parts: the network has no part "{name}"; choose among {there}, or parts of these'
+                )
+        try:
+            torch.compile(_probe, backend=self.backend)(torch.ones(8, device=pl_module.device))
+        except Exception as error:  # what it raises depends on what is missing
+            text = str(getattr(error, "inner_exception", error)).strip()
+            reason = text.splitlines()[0] if text else type(error).__name__
+            raise FaceDiffError(
+                f"CompiledTraining: torch.compile does not work on this machine ({reason}); install a C++ compiler "
+                f"such as g++, or leave the callback away"
+            ) from error
+        self._compiled = [known[name] for name in self.parts]
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Compile; nothing happens before a part is first used."""
+        for part in self._compiled:
+            if part._compiled_call_impl is None:
+                part.compile(backend=self.backend, dynamic=True)
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Go on with the compiled parts; a run that is resumed within an epoch has no such moment at first."""
+        self.on_train_start(trainer, pl_module)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """What other callbacks do when training has ended, such as a last preview, runs the parts as they are."""
+        self._undo()
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Sampling runs a part many times on shapes of its own, and would have it compiled for each."""
+        self._undo()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Go on with the compiled parts."""
+        if self._compiled and not trainer.sanity_checking:
+            self.on_train_start(trainer, pl_module)
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the model as it was."""
+        self._undo()
+        self._compiled = []
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Leave the model as it was, also after an interruption."""
+        self.on_fit_end(trainer, pl_module)
+
+    def _undo(self) -> None:
+        for part in self._compiled:
+            part._compiled_call_impl = None
+
+
+def _probe(values: torch.Tensor) -> torch.Tensor:
+    return (values.sin() * 2).sum()

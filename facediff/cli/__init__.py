@@ -1,0 +1,5 @@
+"""The command line: one module per subcommand."""
+
+from facediff.cli.app import main
+
+__all__ = ["main"]

@@ -1,5 +1,0 @@
-"""Fusions: where the speech features meet the embedded noisy motion."""
-
-from facediff.components.fusion.base import Fusion, FusionFactory
-
-__all__ = ["Fusion", "FusionFactory"]

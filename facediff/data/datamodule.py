@@ -1,0 +1,441 @@
+"""What every corpus's data module shares; a corpus adds its facts and its splits."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import torch
+from lightning.pytorch import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from facediff.data.batch import Assets, Batch, Reference, Sample, collate
+from facediff.data.corpus import Clip, Corpus, parse_name, read_manifest
+from facediff.data.dataset import (
+    BatchDataset,
+    ClipBatches,
+    FeatureSlot,
+    MotionDataset,
+    ReferenceChoice,
+    ReferencePolicy,
+)
+from facediff.errors import FaceDiffError
+from facediff.registry import plain
+
+# What the options of data modules have in common.
+
+
+def person_name(folder: Path) -> str:
+    """Whose folder it is, as ``facediff data import-person`` wrote it.
+
+    Raises:
+        FaceDiffError: if it is no such folder.
+    """
+    name = read_manifest(folder).get("person")
+    if not isinstance(name, str):
+        raise FaceDiffError(
+            f"data.people: {folder} is no person's folder (its manifest.json names none); make one with "
+            f"`facediff data import-person`"
+        )
+    return name
+
+
+def check_positive(**values: int | None) -> None:
+    """Refuse numbers below one.
+
+    Raises:
+        FaceDiffError: naming the argument.
+    """
+    for name, value in values.items():
+        if value is not None and value < 1:
+            raise FaceDiffError(f"data.{name}: is {value}, expected a whole number above zero")
+
+
+# What is measured on the training motion before training: its size and its principal components.
+
+FRAMES = 16
+"""Frames of each training clip, evenly spread, that are looked at."""
+
+PRINCIPAL_NUMBERS = 30_000_000
+"""Coordinates from which principal components are computed, about; bounds the memory (8 bytes each, twice)."""
+
+
+def motion_scale(corpus: Corpus, clips: Sequence[Clip]) -> float:
+    """Factor that gives motion unit variance: one over the root mean square of its coordinates.
+
+    Offsets from the template are centred near zero.
+
+    Args:
+        corpus: where the clips are.
+        clips: the training clips.
+
+    Raises:
+        FaceDiffError: if they hold no motion at all.
+    """
+    total, count = 0.0, 0
+    for motion in spread_frames(corpus, clips, FRAMES):
+        total += float(motion.double().square().sum())
+        count += motion.numel()
+    if not total:
+        raise FaceDiffError(f"{corpus.root}: the training split holds no motion at all; check vertices_npy/")
+    return float((count / total) ** 0.5)
+
+
+def principal_motion(corpus: Corpus, clips: Sequence[Clip], count: int) -> tuple[Tensor, Tensor]:
+    """Mean and principal components of motion.
+
+    Args:
+        corpus: where the clips are.
+        clips: the training clips.
+        count: at most so many components are given.
+
+    Returns:
+        the mean (3V,), and components (at most count, 3V), each as long as its standard deviation, the largest first;
+        in the corpus's unit.
+    """
+    most = max(2, PRINCIPAL_NUMBERS // (3 * corpus.n_vertices * max(1, len(clips))))
+    frames = torch.cat([motion.flatten(1) for motion in spread_frames(corpus, clips, min(most, FRAMES))]).double()
+    mean = frames.mean(0)
+    frames -= mean
+    # Of the frames' own products: a matrix as wide as the vertices would not fit into memory.
+    values, vectors = torch.linalg.eigh(frames @ frames.T)
+    kept = [i for i in reversed(range(len(values))) if values[i] > 1e-10 * values[-1]][:count]
+    shapes = vectors[:, kept].T @ frames / len(frames) ** 0.5
+    return mean.float(), shapes.float()
+
+
+def spread_frames(corpus: Corpus, clips: Sequence[Clip], count: int) -> Iterator[Tensor]:
+    """At most ``count`` evenly spread frames of every clip, one at a time (1, V, 3)."""
+    for clip in clips:
+        frames = corpus.frames(clip)
+        for index in torch.linspace(0, frames - 1, min(frames, count)).long().tolist():
+            yield corpus.read_motion(clip, index, index + 1)
+
+
+Split = Literal["train", "val", "test_a", "test_b"]
+
+
+class SpeechMotionDataModule(LightningDataModule, ABC):
+    """Speech with motion for training, validation and two tests: seen people (test A) and unseen ones (test B).
+
+    A corpus subclasses this, states the facts below and says which clips belong to a split.
+
+    Class attributes:
+        corpus_name: what the corpus is called, in tables and checkpoints.
+        synthetic: whether a program made it.
+        unit: unit of length; what a prepared folder's ``manifest.json`` says goes before it.
+        frame_rate: motion frames a second that the models see.
+        stored_frame_rate: motion frames a second of circulating copies, where that is another.
+        n_vertices: vertices of its topology.
+        identities: people of the training split, in the order of the identity index.
+        mesh_files: files with the faces, in the order of preference.
+        region_sources: files that say which vertices the regions are, in the order of preference.
+        region_help: where such files are had.
+        reference_attributes: what a style reference shares with its target where possible.
+        licence: under which terms the corpus is given out.
+        obtain: how the corpus is had.
+
+    Attributes:
+        pair_sentences: whether neighbours in training batches say the same sentence; a model that learns from such
+            pairs sets it in its ``setup``.
+
+    Args:
+        root: the corpus folder.
+        batch_size: clips a batch; looked at where no frame budget is given.
+        max_frames_per_batch: frame budget: training and evaluation batches hold clips of like length that fit into so
+            many frames once they are padded.
+        num_workers: loader processes.
+        window: longest training window in frames; whole clips if None.
+        reference: where a training target's style reference comes from: another clip of the same subject, or itself.
+        reference_frames: longest style reference, in frames.
+        predict_split: the split that ``predict`` runs over; the first test split if None.
+        people: folders of further people to train on, as ``facediff data import-person`` writes them; they come first
+            in the order of the identity index.
+        extra_identities: further subjects of the corpus to train on, with those of their clips that belong to no split; they
+            come next in the order of the identity index.
+        train_identities: train on the clips of these people only; of all if None.
+        lips: file that says which vertices are the lips, e.g. ``regions/lve.txt`` or ``FLAME_masks.pkl:lips``, or
+            ``all``; the corpus's usual one if None.
+        upper_face: the same for the upper face.
+    """
+
+    corpus_name: ClassVar[str]
+    synthetic: ClassVar[bool] = False
+    unit: str
+    frame_rate: ClassVar[float]
+    stored_frame_rate: ClassVar[float | None] = None
+    n_vertices: int
+    identities: list[str]
+    mesh_files: ClassVar[tuple[str, ...]]
+    region_sources: ClassVar[dict[str, tuple[str, ...]]] = {
+        "lips": ("regions/lve.txt",),
+        "upper_face": ("regions/fdd.txt",),
+    }
+    region_help: ClassVar[str] = ""
+    reference_attributes: ClassVar[tuple[str, ...]] = ()
+    licence: ClassVar[str] = "unknown"
+    obtain: ClassVar[str] = ""
+
+    def __init__(
+        self,
+        *,
+        root: str,
+        batch_size: int = 1,
+        max_frames_per_batch: int | None = None,
+        num_workers: int = 0,
+        window: int | None = None,
+        reference: ReferenceChoice = "same_subject",
+        reference_frames: int = 100,
+        predict_split: Split | None = None,
+        people: list[str] | None = None,
+        extra_identities: list[str] | None = None,
+        train_identities: list[str] | None = None,
+        lips: str | None = None,
+        upper_face: str | None = None,
+    ) -> None:
+        arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        super().__init__()
+        self.root = Path(root).expanduser()
+        self.batch_size = batch_size
+        self.max_frames_per_batch = max_frames_per_batch
+        self.num_workers = num_workers
+        self.window = window
+        self.reference: ReferenceChoice = reference
+        self.reference_frames = reference_frames
+        self.predict_split = predict_split
+        self.people = [Path(folder).expanduser() for folder in people or []]
+        self.regions = {
+            name: self.region_sources[name] if chosen is None else (chosen,)
+            for name, chosen in (("lips", lips), ("upper_face", upper_face))
+        }
+        self.extra_identities = list(extra_identities or [])
+        self.train_identities = None if train_identities is None else list(train_identities)
+        self.identities = [*map(person_name, self.people), *self.extra_identities, *type(self).identities]
+        for name in self.identities:
+            if self.identities.count(name) > 1:
+                told = "among the corpus's people and data.extra_identities; import the person by a new name, or leave one away"
+                raise FaceDiffError(f"data.people: {name} is there more than once {told}")
+        self.features = FeatureSlot()
+        self.pair_sentences = False
+        self._corpus: Corpus | None = None
+        self._assets: Assets | None = None
+        check_positive(batch_size=batch_size, window=window, reference_frames=reference_frames)
+        check_positive(max_frames_per_batch=max_frames_per_batch)
+        self.remember(arguments)
+
+    def remember(self, arguments: dict[str, Any]) -> None:
+        """Keep constructor arguments as plain data, so that checkpoints load with ``weights_only=True``."""
+        self.save_hyperparameters(plain(arguments))
+
+    @abstractmethod
+    def split_of(self, clip: Clip) -> str | None:
+        """The split a clip belongs to (``train``, ``val``, ``test_a``, ``test_b``), or None for none of them.
+
+        Clips of no split may serve as style references of their subject; clips of an evaluated split only where their
+        subject has no others. An imported person's clips are not asked for.
+        """
+
+    @classmethod
+    def parse_name(cls, name: str) -> Clip | None:
+        """Subject and sentence of a clip's name; None for a file that is no clip of the corpus."""
+        return parse_name(name)
+
+    @classmethod
+    def expected_clips(cls) -> dict[str, list[str]]:
+        """The clips of a complete corpus by split; empty where the corpus has no fixed list."""
+        return {}
+
+    @property
+    def corpus(self) -> Corpus:
+        """The corpus on disk.
+
+        Raises:
+            FaceDiffError: if the folder is not there; it says how the corpus is had.
+        """
+        if self._corpus is None:
+            if not self.root.is_dir():
+                raise FaceDiffError(f"{self.root}: no such folder; set data.root to your copy. {self.obtain}".rstrip())
+            self._corpus = Corpus(
+                self.root,
+                self.n_vertices,
+                self.frame_rate,
+                stored_frame_rate=self.stored_frame_rate,
+                parse=self.parse_name,
+                people=self.people,
+            )
+        return self._corpus
+
+    @property
+    def test_splits(self) -> list[str]:
+        """The test splits that have clips, in the order of the test loaders."""
+        return [split for split in ("test_a", "test_b") if self.clips(split)]
+
+    def clips(self, split: str) -> list[Clip]:
+        """The clips of a split, sorted by name."""
+        found = [clip for clip in self.corpus.clips.values() if self.find_split(clip) == split]
+        if split != "train" or self.train_identities is None:
+            return found
+        return [clip for clip in found if clip.subject in self.train_identities]
+
+    def find_split(self, clip: Clip) -> str | None:
+        """The split of any clip.
+
+        An imported person's own list says it of theirs, :meth:`split_of` of all others, and what extra_identities have in no
+        split is trained on.
+        """
+        if clip.root in self.people:
+            said = clip.attributes.get("split")
+            if said not in ("train", "val", "test"):
+                raise FaceDiffError(f"{clip.root / 'clips.csv'}: split of {clip.name} is {said!r}; train, val or test")
+            return "test_a" if said == "test" else said
+        split = self.split_of(clip)
+        return "train" if split is None and clip.subject in self.extra_identities else split
+
+    def missing_clips(self) -> dict[str, list[str]]:
+        """Clips of a complete corpus that are not there, by split."""
+        there = self.corpus.clips
+        return {split: [name for name in names if name not in there] for split, names in self.expected_clips().items()}
+
+    def reference_policy(self) -> ReferencePolicy:
+        """References come from training clips, and from clips of no split for people who are not trained on.
+
+        Whoever has clips in evaluated splits only is given another of these clips, never the target itself.
+        """
+        candidates: dict[str, list[Clip]] = {}
+        evaluated: dict[str, list[Clip]] = {}
+        for clip in self.corpus.clips.values():
+            chosen = candidates if self.find_split(clip) in ("train", None) else evaluated
+            chosen.setdefault(clip.subject, []).append(clip)
+        return ReferencePolicy(
+            {**evaluated, **candidates}, self.reference_attributes, self.reference, self.reference_frames
+        )
+
+    def dataset(self, split: str, *, training: bool = False) -> MotionDataset:
+        """The samples of a split: whole clips with fixed references, or (``training``) random windows and references.
+
+        Raises:
+            FaceDiffError: if the split has no clip.
+        """
+        clips = self.clips(split)
+        if not clips:
+            raise FaceDiffError(
+                f"{self.root}: no clip of split {split}; `facediff data check {self.root}` tells what is missing"
+            )
+        policy = self.reference_policy()
+        if not training or self.reference != "self":
+            policy.check(clips)
+        return MotionDataset(
+            self.corpus,
+            clips,
+            self.identities,
+            policy,
+            training=training,
+            window=self.window if training else None,
+            decoys=split.startswith("test"),
+            features=self.features,
+        )
+
+    def assets(self) -> Assets:
+        """What a checkpoint keeps of this corpus; the motion scale is left for :meth:`motion_scale` to measure."""
+        if self._assets is None:
+            corpus = self.corpus
+            mesh = corpus.read_mesh(self.mesh_files)
+            self._assets = Assets(
+                corpus=self.corpus_name,
+                synthetic=self.synthetic,
+                unit=str(read_manifest(self.root).get("unit") or self.unit),
+                frame_rate=self.frame_rate,
+                identities=list(self.identities),
+                templates=dict(corpus.templates),
+                faces=None if mesh is None else torch.from_numpy(mesh.faces),
+                colours=None if mesh is None or mesh.colours is None else torch.from_numpy(mesh.colours),
+                regions={
+                    name: corpus.read_region(sources, name, self.region_help).tensor()
+                    for name, sources in self.regions.items()
+                },
+                inner_lip_pairs=corpus.read_pairs("inner_lip_pairs.txt"),
+                references=self._default_references(),
+            )
+        return self._assets
+
+    def motion_scale(self) -> float:
+        """Factor that gives the training motion unit variance.
+
+        Raises:
+            FaceDiffError: if the training clips hold no motion at all.
+        """
+        return motion_scale(self.corpus, self.clips("train"))
+
+    def principal_motion(self, count: int) -> tuple[Tensor, Tensor]:
+        """Mean (3V,) and at most ``count`` principal components (components, 3V) of the training motion."""
+        return principal_motion(self.corpus, self.clips("train"), count)
+
+    def _default_references(self) -> dict[str, Reference]:
+        references = {}
+        for subject, clips in sorted(self.reference_policy().candidates.items()):
+            if subject in self.corpus.templates:
+                clip = self.default_reference(clips)
+                motion = self.corpus.read_motion(clip, 0, self.reference_frames)
+                references[subject] = Reference(clip.name, motion.half())
+        return references
+
+    def default_reference(self, clips: list[Clip]) -> Clip:
+        """The clip whose style stands for a subject when nobody asks for another."""
+        return clips[0]
+
+    def prepare_data(self) -> None:
+        """Say what a complete corpus has and this folder has not; called on one process only."""
+        missing = {split: len(names) for split, names in self.missing_clips().items() if names}
+        if missing:
+            counts = ", ".join(f"{count} of {split}" for split, count in missing.items())
+            print(f"{self.corpus_name}: clips that are not there and are left out: {counts}", flush=True)
+
+    def train_dataloader(self) -> DataLoader[list[Sample]]:
+        """Shuffled training batches, each process its own."""
+        return self._loader("train", training=True)
+
+    def val_dataloader(self) -> DataLoader[list[Sample]]:
+        """Validation batches."""
+        return self._loader("val")
+
+    def test_dataloader(self) -> list[DataLoader[list[Sample]]]:
+        """One loader per test split, in the order of :attr:`test_splits`."""
+        return [self._loader(split) for split in self.test_splits]
+
+    def predict_dataloader(self) -> DataLoader[Sample]:
+        """The clips of ``predict_split`` in order."""
+        split: str = self.predict_split or [*self.test_splits, "test_a"][0]
+        return DataLoader(self.dataset(split), batch_size=self.batch_size, collate_fn=collate, **self._loader_options())
+
+    def _loader(self, split: str, *, training: bool = False) -> DataLoader[list[Sample]]:
+        samples = self.dataset(split, training=training)
+        trainer = self.trainer
+        batches = ClipBatches(
+            samples.frames() if self.max_frames_per_batch is not None else [0] * len(samples),
+            batch_size=self.batch_size,
+            max_frames=self.max_frames_per_batch,
+            training=training,
+            seed=int(os.environ.get("PL_GLOBAL_SEED", "0")),
+            rank=trainer.global_rank if trainer is not None else 0,
+            world_size=trainer.world_size if trainer is not None else 1,
+            groups=[clip.sentence for clip in samples.clips] if self.pair_sentences else None,
+        )
+        # The sampler gives whole batches, so the loader must not batch again.
+        return DataLoader(
+            BatchDataset(samples), sampler=batches, batch_size=None, collate_fn=collate, **self._loader_options()
+        )
+
+    def _loader_options(self) -> dict[str, Any]:
+        return {
+            "num_workers": self.num_workers,
+            "pin_memory": torch.cuda.is_available(),
+            "persistent_workers": self.num_workers > 0,
+        }
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        """Move every tensor of the batch."""
+        return batch.to(device)

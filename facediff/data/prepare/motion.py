@@ -1,0 +1,271 @@
+"""FLAME parameters of one clip as reconstruction projects write them: EMOTE's HDF5 files and ProbTalk3D's arrays.
+
+EMOTE (Daněček et al. 2023, the inferno repository) has the datasets ``shape`` (1, T, 300), ``exp`` (1, T, 100) and
+``jaw`` (1, T, 3); older files were written by hickle, which puts them into the group ``data`` and quotes their names.
+ProbTalk3D (Wu et al. 2024) has one array (1, T, 403) with the three side by side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.mesh.flame import EXPRESSIONS, SHAPES
+from facediff.mesh.mesh import surface_area
+
+if TYPE_CHECKING:
+    import h5py
+
+
+# The normalisation of BIWI that CodeTalker introduced and that most later work takes over.
+#
+# Source: the preprocessing published with CodeTalker (Xing et al., CVPR 2023; repository Doubiiu/CodeTalker).
+
+
+def codetalker(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
+    """Turn a frame (V, 3) by pi about x, centre it on its own mean vertex, scale it to a surface area of one.
+
+    Mean and area are the frame's own. An opening jaw moves the mean and enlarges the area, so a part of its motion
+    becomes a shift and a scale of the whole face; what was published on BIWI contains this, and so must this.
+
+    Raises:
+        ValueError: if the mesh has no area, or a vertex is not finite.
+    """
+    turned = np.asarray(vertices, np.float64) * (1.0, -1.0, -1.0)
+    centred = turned - turned.mean(axis=0)
+    area = surface_area(centred, faces)
+    if not (np.isfinite(area) and area > 0):
+        raise ValueError(f"a surface area of {area}")
+    return centred / np.sqrt(area)
+
+
+# Changing the frame rate of motion without aliases.
+
+CROSSINGS = 24
+"""Zero crossings of the filter on each side."""
+BAND = 0.9
+"""Where the filter has fallen to one half, as a share of the lower one of the two Nyquist frequencies."""
+KAISER = 8.0
+"""Shape of the window: the stop band lies 80 dB down, the transition is a tenth of the Nyquist frequency wide."""
+BLOCK = 64
+"""Frames that are made at a time."""
+
+
+def resampled_length(frames: int, rate_in: float, rate_out: float) -> int:
+    """Frames at the new rate that last as long as ``frames`` at the old one, rounded."""
+    return round(frames * rate_out / rate_in)
+
+
+def resample_frames(
+    motion: npt.NDArray[np.floating],
+    rate_in: float,
+    rate_out: float,
+    *,
+    out: npt.NDArray[np.floating] | None = None,
+) -> npt.NDArray[np.floating]:
+    """Motion at another frame rate, low-pass filtered; frame k of the result is at time k / ``rate_out``.
+
+    Frame 0 stays frame 0. The filter is a sinc under a Kaiser window (Smith, "Digital Audio Resampling", 2002),
+    evaluated at every output frame's exact time, so any ratio of rates will do (29.97 to 25), and constants are kept.
+    Beyond its ends the motion goes on reflected in its first and last frame, which keeps its slope there. ``motion``
+    and ``out`` may be memory-mapped: a block of frames is in memory at a time.
+
+    Args:
+        motion: (T, C) coordinates over time; further dimensions are allowed.
+        rate_in: frames a second of ``motion``.
+        rate_out: frames a second of the result.
+        out: where to write, shape (round(T · rate_out / rate_in), C); a new array of ``motion``'s type if None.
+
+    Returns:
+        the resampled motion.
+
+    Raises:
+        FaceDiffError: if a rate is not positive, or there is no frame to give out.
+    """
+    if not (rate_in > 0 and rate_out > 0 and math.isfinite(rate_in) and math.isfinite(rate_out)):
+        raise FaceDiffError(f"frame rates {rate_in:g} and {rate_out:g}: expected positive numbers of frames a second")
+    length = resampled_length(len(motion), rate_in, rate_out)
+    if length < 1:
+        raise FaceDiffError(
+            f"motion of {len(motion)} frames at {rate_in:g} frames a second: too short for {rate_out:g} frames a second"
+        )
+    shape = (length, *motion.shape[1:])
+    if out is None:
+        out = np.empty(shape, motion.dtype)
+    if out.shape != shape:
+        raise FaceDiffError(f"resampling: out has shape {out.shape}, expected {shape}")
+    if rate_in == rate_out:
+        for first in range(0, length, BLOCK):
+            out[first : first + BLOCK] = motion[first : first + BLOCK]
+        return out
+    for made, used, weights in _blocks(len(motion), length, rate_in, rate_out):
+        rows = np.asarray(motion[used], np.float64)
+        out[made] = (weights @ rows.reshape(len(rows), -1)).reshape(-1, *motion.shape[1:])
+    return out
+
+
+def _blocks(
+    frames: int, length: int, rate_in: float, rate_out: float
+) -> Iterator[tuple[slice, slice, npt.NDArray[np.float64]]]:
+    """Frames to make, frames to make them from, and the matrix that does it."""
+    step = rate_in / rate_out
+    band = BAND * min(1.0, rate_out / rate_in)
+    reach = CROSSINGS / band
+    for first in range(0, length, BLOCK):
+        times = np.arange(first, min(first + BLOCK, length)) * step
+        sources = np.arange(math.floor(times[0] - reach), math.ceil(times[-1] + reach) + 1)
+        weights = _filter(times[:, None] - sources, band, reach)
+        weights /= weights.sum(axis=1, keepdims=True)
+        yield (slice(first, first + len(times)), *_reflected(weights, sources, frames))
+
+
+def _filter(distance: npt.NDArray[np.floating], band: float, reach: float) -> npt.NDArray[np.float64]:
+    """The windowed sinc at distances in input frames."""
+    inside = np.sqrt(np.clip(1.0 - np.square(distance / reach), 0.0, None))
+    weights: npt.NDArray[np.float64] = np.where(
+        np.abs(distance) < reach, np.sinc(band * distance) * np.i0(KAISER * inside), 0.0
+    )
+    return weights
+
+
+def _reflected(
+    weights: npt.NDArray[np.float64], sources: npt.NDArray[np.int64], frames: int
+) -> tuple[slice, npt.NDArray[np.float64]]:
+    """Weights of frames that exist: a frame beyond an end is twice the end minus its mirror image.
+
+    What reaches beyond the other end, in motion shorter than the filter, stops there.
+    """
+    last = frames - 1
+    mirrored = np.where(sources < 0, -sources, np.where(sources > last, 2 * last - sources, sources)).clip(0, last)
+    first, stop = int(mirrored.min()), int(mirrored.max()) + 1
+    before, after = sources < 0, sources > last
+    if before.any():
+        first = 0
+    if after.any():
+        stop = frames
+    folded = np.zeros((len(weights), stop - first))
+    sign = np.where(before | after, -1.0, 1.0)
+    np.add.at(folded.T, mirrored - first, (sign * weights).T)
+    if before.any():
+        folded[:, 0] += 2.0 * weights[:, before].sum(axis=1)
+    if after.any():
+        folded[:, -1] += 2.0 * weights[:, after].sum(axis=1)
+    return slice(first, stop), folded
+
+
+WIDTHS = {"shape": SHAPES, "exp": EXPRESSIONS, "jaw": 3}
+ALL = sum(WIDTHS.values())
+MOST_FRAMES = 1_000_000
+HDF5_SUFFIXES = (".hdf5", ".h5")
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of a clip of T frames.
+
+    Attributes:
+        shape: (S,) shape coefficients, their mean over the clip.
+        expression: (T, E) expression coefficients.
+        jaw: (T, 3) rotation of the jaw, axis-angle in radians.
+    """
+
+    shape: Array
+    expression: Array
+    jaw: Array
+
+
+def read_parameters(path: Path) -> Parameters:
+    """Read a clip's parameters: ``shape_pose_cam.hdf5`` of EMOTE (flat or by hickle), or ProbTalk3D's ``.npy``.
+
+    The shape is averaged over all frames alike: which frames a face was well seen in is not in these files. Rotation
+    of the head and the camera are left out.
+
+    Raises:
+        FaceDiffError: if the file is missing or damaged, lacks something, or holds NaN.
+        MissingExtraError: if h5py is not installed and needed.
+    """
+    if not path.is_file():
+        raise FaceDiffError(f"{path}: no such file; expected FLAME parameters, .hdf5 or .npy")
+    parts = _read_hdf5(path) if path.suffix.lower() in HDF5_SUFFIXES else _read_array(path)
+    for name, values in parts.items():
+        bad = ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            raise FaceDiffError(
+                f"{path}: frame {int(np.argmax(bad))} (counted from 0) of {name} holds NaN or infinity; leave the clip "
+                f"out or get it anew"
+            )
+    frames = len(parts["exp"])
+    if len(parts["jaw"]) != frames or len(parts["shape"]) not in (1, frames):
+        counts = ", ".join(f"{len(values)} of {name}" for name, values in parts.items())
+        raise FaceDiffError(f"{path}: its frames do not agree ({counts}); get it anew")
+    return Parameters(parts["shape"].mean(axis=0), parts["exp"], parts["jaw"])
+
+
+def _read_array(path: Path) -> dict[str, Array]:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise FaceDiffError(f"{path}: not a readable NumPy array, perhaps truncated ({error}); get it anew") from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind != "f" or array.shape[-1:] != (ALL,):
+        kind = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else "an archive"
+        raise FaceDiffError(f"{path}: holds {kind}; expected floats of shape (1, frames, {ALL}), FLAME parameters")
+    joined = _as_frames(array, ALL, f"{path}: the array")
+    ends = np.cumsum(list(WIDTHS.values()))
+    return dict(zip(WIDTHS, np.split(joined, ends[:-1], axis=1), strict=True))
+
+
+def _read_hdf5(path: Path) -> dict[str, Array]:
+    try:
+        import h5py
+    except ImportError as error:
+        raise MissingExtraError("h5py", "prepare", "reading FLAME reconstructions (.hdf5)") from error
+    try:
+        with h5py.File(path, "r") as file:
+            holder = file if "exp" in file else file.get("data", file)
+            # hickle has the key with its quotes as a name.
+            names = {name.strip("\"'"): name for name in holder} if isinstance(holder, h5py.Group) else {}
+            absent = [name for name in WIDTHS if name not in names]
+            if absent:
+                raise FaceDiffError(
+                    f"{path}: has no {', '.join(absent)} (it has {', '.join(sorted(names)) or 'nothing'}); expected "
+                    f"shape, exp and jaw, as shape_pose_cam.hdf5 has them"
+                )
+            return {name: _dataset(holder, names[name], width, path) for name, width in WIDTHS.items()}
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
+        raise FaceDiffError(f"{path}: not a readable HDF5 file, perhaps truncated ({error}); get it anew") from error
+
+
+def _dataset(holder: h5py.Group, name: str, most: int, path: Path) -> Array:
+    import h5py
+
+    where = f"{path}: {name}"
+    link, dataset = holder.get(name, getlink=True), holder.get(name)
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiu":
+        raise FaceDiffError(f"{where} holds no numbers; expected floats of shape (1, frames, up to {most})")
+    # A file from elsewhere has no business to read other files of this machine.
+    if isinstance(link, h5py.ExternalLink) or dataset.external or dataset.is_virtual:
+        raise FaceDiffError(f"{where} lies in another file; expected a file that holds its own data")
+    if max(dataset.shape, default=0) > MOST_FRAMES:
+        raise FaceDiffError(f"{where} has shape {dataset.shape}; expected at most {MOST_FRAMES} frames")
+    return _as_frames(dataset[()], most, where)
+
+
+def _as_frames(values: npt.NDArray[np.generic], most: int, where: str) -> Array:
+    """(T, D) from (1, T, D), the way in which these projects keep a batch of one."""
+    exact = most in (WIDTHS["jaw"], ALL)  # of shape and expression, the last coefficients may be left out
+    frames = values[0] if values.ndim == 3 and len(values) == 1 else values
+    if frames.ndim != 2 or not len(frames) or not (most if exact else 1) <= frames.shape[1] <= most:
+        raise FaceDiffError(
+            f"{where} has shape {values.shape}; expected (1, frames, {'' if exact else 'up to '}{most}) with at least "
+            f"one frame"
+        )
+    return frames.astype(np.float64)

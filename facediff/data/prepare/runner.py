@@ -1,0 +1,632 @@
+"""Carrying out a plan: resumable after a kill at any moment, in parallel, with a manifest at the end."""
+
+from __future__ import annotations
+
+import errno
+import json
+import multiprocessing
+import os
+import pickle  # noqa: S403 - writes a pickle, opens none
+import re
+import shutil
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import metadata
+from multiprocessing.context import BaseContext
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.files import atomic, check_writable, sha256
+from facediff.utils.jobs import THREAD_VARIABLES, processors, start_worker, unheard
+
+# Finding and copying files of a raw folder, which may hold the data set or the folder that an archive unpacked to.
+
+
+def bases(raw: Path) -> list[Path]:
+    """The raw folder and the folders in it, sorted: places where a data set may begin.
+
+    Raises:
+        FaceDiffError: if there is no such folder or it cannot be read.
+    """
+    if not raw.is_dir():
+        raise FaceDiffError(f"{raw}: no such folder; expected the raw data set as it was distributed")
+    return [raw, *folders_in(raw)]
+
+
+def folders_in(folder: Path) -> list[Path]:
+    """Folders in a folder, sorted, without hidden ones.
+
+    Raises:
+        FaceDiffError: if it cannot be read.
+    """
+    try:
+        return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    except OSError as error:
+        raise FaceDiffError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
+
+
+def find_file(raw: Path, name: str) -> Path | None:
+    """A file of this name in the raw folder or one folder deeper; None if there is none."""
+    return next((path for base in bases(raw) if (path := base / name).is_file()), None)
+
+
+def find_regions(raw: Path, given: Path | None) -> Path | None:
+    """The folder with the lists of vertices: the one given, else ``regions/`` of the raw folder if there is one.
+
+    Raises:
+        FaceDiffError: if the one given is no folder or holds no list.
+    """
+    if given is None:
+        return next((path for base in bases(raw) if (path := base / "regions").is_dir()), None)
+    if not region_files(given):
+        raise FaceDiffError(f"{given}: expected a folder with lists of vertices, e.g. lve.txt and fdd.txt")
+    return given
+
+
+def region_files(folder: Path | None) -> list[Path]:
+    """The lists of vertices in a folder."""
+    return [] if folder is None else sorted(path for path in folder.glob("*.txt") if path.is_file())
+
+
+def copy_files(sources: Sequence[Path], out: Path, folder: str = "") -> list[str]:
+    """Copy files into the output folder (or a folder in it) under their own names; returns their relative paths."""
+    written = []
+    for source in sources:
+        target = out / folder / source.name
+        with atomic(target) as temporary:
+            shutil.copyfile(source, temporary)
+        written.append(target.relative_to(out).as_posix())
+    return written
+
+
+# What preparing a corpus consists of: the clips to write, and how their files are written.
+
+Precision = Literal["float32", "float64"]
+"""How motion is stored; float32 takes half the disk."""
+
+CLIP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,199}")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One clip to write.
+
+    Attributes:
+        name: the clip's name, e.g. ``F2_e01``.
+        work: gets the output folder, writes ``vertices_npy/<name>.npy`` and ``wav/<name>.wav``, each atomically, and
+            returns the number of frames. Must be picklable: a ``functools.partial`` of a function of a module.
+        frames: number of frames if that is known cheaply, for the estimate of the disk space.
+
+    Raises:
+        FaceDiffError: if the name is unfit for a file name; names come from raw data and must not leave the folder.
+    """
+
+    name: str
+    work: Callable[[Path], int]
+    frames: int | None = None
+
+    def __post_init__(self) -> None:
+        if not CLIP_NAME.fullmatch(self.name):
+            raise FaceDiffError(
+                f'clip name "{self.name}": expected letters, digits, "_" and "-" only; rename it in the raw data'
+            )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What there is to do, made by a quick scan of the raw folder.
+
+    Attributes:
+        corpus: ``biwi``, ``vocaset`` or ``mead3d``.
+        frame_rate: motion frames a second, as written.
+        unit: unit of the written vertices.
+        n_vertices: vertices of every frame.
+        options: plain values that decide what is written, ``dtype`` among them; a resumed run must have the same.
+        jobs: one for each clip.
+        shared: writes what clips share (``templates.pkl``, mesh, ``regions/``, ``clips.csv``) and returns the paths of
+            those files, relative to the output folder. Runs in the calling process; may run again.
+        missing: what is not there: clip or file, and what was expected where.
+        notes: other remarks for the user, one sentence each.
+    """
+
+    corpus: str
+    frame_rate: float
+    unit: str
+    n_vertices: int
+    options: dict[str, Any]
+    jobs: list[Job]
+    shared: Callable[[Path], list[str]]
+    missing: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def motion_file(out: Path, clip: str) -> Path:
+    """Where a clip's vertices go."""
+    return out / "vertices_npy" / f"{clip}.npy"
+
+
+def speech_file(out: Path, clip: str) -> Path:
+    """Where a clip's speech goes."""
+    return out / "wav" / f"{clip}.wav"
+
+
+def write_motion(path: Path, vertices: npt.NDArray[np.floating], dtype: Precision = "float32") -> None:
+    """Write absolute vertices (T, V, 3) as a (T, 3V) array, atomically.
+
+    Raises:
+        FaceDiffError: if there is no frame, a value is not finite, or the file cannot be written.
+    """
+    frames = len(vertices)
+    if not frames:
+        raise FaceDiffError(f"{path.stem}: has no frame; expected at least one")
+    finite = np.isfinite(vertices).reshape(frames, -1).all(axis=1)
+    if not finite.all():
+        raise FaceDiffError(
+            f"{path.stem}: frame {int(np.argmin(finite))} (counted from 0) holds NaN or infinity; leave the clip out "
+            f"or get it anew"
+        )
+    rows = np.ascontiguousarray(vertices.reshape(frames, -1), dtype=dtype)
+    with atomic(path) as temporary:
+        np.save(temporary, rows, allow_pickle=False)
+
+
+def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
+    """Write speech (S,) in -1 … 1 as 16 kHz mono 16-bit wav, atomically; what exceeds the range is clipped.
+
+    Reading it back gives ``round(32768 x) / 32768``: 16-bit speech at 16 kHz goes through unchanged.
+    """
+    try:
+        import soundfile
+    except ImportError as error:
+        raise MissingExtraError("soundfile", "audio", "writing speech") from error
+    from facediff.data.audio import SAMPLE_RATE
+
+    whole = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)
+    with atomic(path) as temporary:
+        soundfile.write(temporary, whole, SAMPLE_RATE, subtype="PCM_16")
+
+
+def write_templates(path: Path, templates: Mapping[str, npt.NDArray[np.floating]]) -> None:
+    """Write neutral faces (V, 3) by subject as the pickle of NumPy arrays that the field's loaders open.
+
+    Equal faces give equal bytes: each array gets NumPy's own instance of its type, because a pickle also records which
+    arrays share a type's instance, and that depends on where they came from.
+    """
+    plain: dict[str, npt.NDArray[np.floating]] = {}
+    for name, vertices in templates.items():
+        plain[str(name)] = np.empty(vertices.shape, np.dtype(vertices.dtype.str))
+        plain[str(name)][...] = vertices
+    with atomic(path) as temporary:
+        temporary.write_bytes(pickle.dumps(plain, protocol=4))
+
+
+# The records that preparing keeps in its output folder: one while it is at work, one when it has ended.
+
+STATE = "prepare.json"
+"""There while preparing is at work or was cut short."""
+MANIFEST = "manifest.json"
+"""There when it has ended: what was written, what is missing, what failed."""
+
+
+def version() -> str:
+    """Version of the installed facediff."""
+    try:
+        return metadata.version("facediff")
+    except metadata.PackageNotFoundError:  # run from a source tree on the path
+        return "unknown"
+
+
+def recipe(plan: Plan) -> dict[str, Any]:
+    """What decides the bytes that are written; a run may be taken up only with the same."""
+    return {"facediff": version(), "corpus": plan.corpus, "options": json.loads(json.dumps(plan.options))}
+
+
+def read_record(path: Path) -> dict[str, Any] | None:
+    """A record, or None if there is none.
+
+    Raises:
+        FaceDiffError: if the file is no record of this program.
+    """
+    if not path.is_file():
+        return None
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise FaceDiffError(
+            f"{path}: cannot be read ({error}); remove {path.parent}, or choose another folder"
+        ) from error
+    if not isinstance(record, dict) or not {"corpus", "options"} <= set(record):
+        raise FaceDiffError(f"{path}: not written by `facediff data prepare`; choose another folder to write to")
+    return record
+
+
+def write_record(path: Path, record: dict[str, Any]) -> None:
+    """Write a record atomically."""
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def refuse_other_recipe(out: Path, record: dict[str, Any], plan: Plan) -> None:
+    """Refuse to mix what was written with other options, or by another version, with what this plan writes.
+
+    Raises:
+        FaceDiffError: naming what differs.
+    """
+    now = recipe(plan)
+    before: dict[str, Any] = {"facediff": record.get("facediff"), "corpus": record["corpus"]}
+    wanted = {"facediff": now["facediff"], "corpus": now["corpus"]}
+    before |= {f"--{name.replace('_', '-')}": value for name, value in dict(record["options"]).items()}
+    wanted |= {f"--{name.replace('_', '-')}": value for name, value in now["options"].items()}
+    differ = [name for name in {**before, **wanted} if before.get(name) != wanted.get(name)]
+    if differ:
+        words = "; ".join(f"{name} was {_word(before.get(name))} and is {_word(wanted.get(name))}" for name in differ)
+        raise FaceDiffError(
+            f"{out}: was begun with other settings ({words}); use the same, choose another folder, or remove this one"
+        )
+
+
+def _word(value: object) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def describe_files(
+    out: Path, files: Iterable[str], workers: int, step: Callable[[], object]
+) -> dict[str, dict[str, int | str]]:
+    """Size and SHA-256 of files, given by path relative to ``out``; ``step`` is called after each."""
+
+    def describe(name: str) -> tuple[str, dict[str, int | str]]:
+        path = out / name
+        digest = sha256(path)
+        step()
+        return name, {"bytes": path.stat().st_size, "sha256": digest}
+
+    # Threads are enough: hashing leaves the interpreter's lock alone.
+    with ThreadPoolExecutor(workers) as pool:
+        return dict(pool.map(describe, sorted(files)))
+
+
+def same_sizes(out: Path, record: dict[str, Any]) -> bool:
+    """Whether every file of a manifest is there with its size; contents are not read."""
+    files: dict[str, dict[str, Any]] = record.get("files", {})
+    return all(
+        (out / name).is_file() and (out / name).stat().st_size == facts["bytes"] for name, facts in files.items()
+    )
+
+
+def manifest(
+    plan: Plan, clips: dict[str, int], failed: dict[str, str], files: dict[str, dict[str, int | str]]
+) -> dict[str, Any]:
+    """The final record. Nothing in it depends on the time or the way in which the files were made."""
+    frames = sum(clips.values())
+    return {
+        **recipe(plan),
+        "frame_rate": plan.frame_rate,
+        "unit": plan.unit,
+        "n_vertices": plan.n_vertices,
+        "totals": {
+            "clips": len(clips),
+            "frames": frames,
+            "seconds": round(frames / plan.frame_rate, 3),
+            "bytes": sum(int(facts["bytes"]) for facts in files.values()),
+        },
+        "clips": dict(sorted(clips.items())),
+        "missing": plan.missing,
+        "failed": dict(sorted(failed.items())),
+        "notes": plan.notes,
+        "files": files,
+    }
+
+
+# Running clips in several processes, so that a stop at any moment leaves nothing running and nothing half-written.
+
+AHEAD = 2
+"""Clips handed out per worker at a time: none waits for work, and few are lost when the run is stopped."""
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a clip.
+
+    Attributes:
+        name: the clip.
+        frames: frames written; None if it failed.
+        problem: the sentence that says why.
+        hopeless: the next clip would fail for the same reason: a package is missing or the disk is full.
+    """
+
+    name: str
+    frames: int | None
+    problem: str = ""
+    hopeless: bool = False
+
+
+def attempt(job: Job, out: Path) -> Outcome:
+    """Write one clip; an error that the user can put right becomes an outcome."""
+    try:
+        return Outcome(job.name, job.work(out))
+    except FaceDiffError as error:
+        cause = error.__cause__
+        full = isinstance(cause, OSError) and cause.errno in NO_SPACE
+        return Outcome(job.name, None, str(error), full or isinstance(error, MissingExtraError))
+    except Exception as error:
+        error.add_note(f"while preparing clip {job.name}")
+        raise
+
+
+def run_jobs(jobs: Sequence[Job], out: Path, workers: int) -> Generator[Outcome]:
+    """Outcomes as they come; in this process if there is one worker.
+
+    Raises:
+        FaceDiffError: if a worker process dies.
+    """
+    if min(workers, len(jobs)) <= 1:
+        for job in jobs:
+            yield attempt(job, out)
+        return
+    with _single_threaded():
+        pool = ProcessPoolExecutor(min(workers, len(jobs)), mp_context=_context(jobs), initializer=start_worker)
+        try:
+            yield from _hand_out(pool, jobs, out, AHEAD * workers)
+        except BrokenProcessPool as error:
+            raise FaceDiffError(
+                f"{out}: a worker process died, perhaps for want of memory; run the same command again with fewer "
+                f"--workers, finished clips are kept"
+            ) from error
+        finally:
+            # Clips at work are finished, those that wait are dropped.
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _hand_out(pool: ProcessPoolExecutor, jobs: Sequence[Job], out: Path, ahead: int) -> Iterator[Outcome]:
+    """A few clips at a time, since a job may carry its sound with it."""
+    waiting = iter(jobs)
+    running: set[Future[Outcome]] = set()
+    while True:
+        while len(running) < ahead and (job := next(waiting, None)) is not None:
+            with unheard():
+                running.add(pool.submit(partial(attempt, job, out)))
+        if not running:
+            return
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        for future in done:
+            yield future.result()
+
+
+def _context(jobs: Sequence[Job]) -> BaseContext:
+    """Never a plain fork: the caller may have started threads.
+
+    A fork server imports what the jobs need once for all workers, instead of once each.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    functions = {getattr(job.work, "func", job.work) for job in jobs}
+    context.set_forkserver_preload([__name__, "facediff.data.audio", *sorted({f.__module__ for f in functions})])
+    return context
+
+
+@contextmanager
+def _single_threaded() -> Iterator[None]:
+    """Processes started inside compute on one thread each; there are as many of them as there are processors."""
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+LOCK = ".prepare.lock"
+WAV_HEADER = 44
+
+
+@dataclass(frozen=True)
+class Report:
+    """What preparing did.
+
+    Attributes:
+        out: the corpus folder.
+        clips: frames of every clip that is there now.
+        written: number of clips written by this run; the others were there.
+        failed: what went wrong, by clip.
+        missing: what the raw folder lacks, and what was expected where.
+        notes: other remarks.
+        totals: counts, as in the manifest.
+    """
+
+    out: Path
+    clips: dict[str, int]
+    written: int
+    failed: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    totals: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def sound(self) -> bool:
+        """Whether every clip of the plan was written."""
+        return not self.failed
+
+
+def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = False) -> Report:
+    """Write a corpus folder.
+
+    A run that was killed is taken up where it was: clips whose two files are there are kept. A second run over a
+    complete folder changes nothing. A clip that fails does not stop the others.
+
+    Args:
+        plan: what to write.
+        out: the folder; new, empty, or begun by this function with the same options.
+        workers: processes; as many as there are processors if None.
+        quiet: no progress bars.
+
+    Raises:
+        FaceDiffError: if the folder cannot be written, holds something else or was begun with other options, if the
+            disk is too small, or if another run is at work in it.
+    """
+    workers = processors() if workers is None else workers
+    if workers < 1:
+        raise FaceDiffError(f"--workers: is {workers}; expected 1 or more")
+    if out.exists() and not out.is_dir():
+        raise FaceDiffError(f"{out}: is a file; expected a folder to write the corpus to")
+    check_writable(out / STATE)
+    with _alone_in(out):
+        before = read_record(out / MANIFEST)
+        begun = read_record(out / STATE) or before
+        if begun is None:
+            _refuse_foreign(out)
+        finished = {job.name: frames for job in plan.jobs if (frames := finished_frames(plan, job, out))}
+        if (
+            before is not None
+            and not (out / STATE).exists()
+            and _says(before, plan, finished)
+            and same_sizes(out, before)
+        ):
+            return _report(plan, out, before, 0)
+        if begun is not None:
+            refuse_other_recipe(out, begun, plan)
+        _refuse_strays(plan, out)
+        pending = [job for job in plan.jobs if job.name not in finished]
+        _check_space(plan, pending, out)
+        write_record(out / STATE, recipe(plan))
+        _sweep(out)
+        return _carry_out(plan, pending, finished, out, workers, quiet)
+
+
+def _carry_out(
+    plan: Plan, pending: list[Job], finished: dict[str, int], out: Path, workers: int, quiet: bool
+) -> Report:
+    try:
+        from tqdm import tqdm
+    except ImportError as error:
+        raise MissingExtraError("tqdm", "prepare", "preparing a data set") from error
+
+    shared = plan.shared(out)
+    clips, failed = dict(finished), {}
+    silent = True if quiet else None  # None: silent where the output is no terminal
+    bar = tqdm(total=len(plan.jobs), initial=len(finished), desc=plan.corpus, unit="clip", disable=silent)
+    with bar, closing(run_jobs(pending, out, workers)) as outcomes:
+        for outcome in outcomes:
+            if outcome.hopeless:
+                raise FaceDiffError(outcome.problem)
+            if outcome.frames is None:
+                failed[outcome.name] = outcome.problem
+                for file in _files(out, outcome.name):  # damaged ones of an earlier run
+                    file.unlink(missing_ok=True)
+            else:
+                clips[outcome.name] = outcome.frames
+            bar.update()
+    files = [*shared, *(file.relative_to(out).as_posix() for name in clips for file in _files(out, name))]
+    with tqdm(total=len(files), desc="checksums", unit="file", disable=silent) as bar:
+        record = manifest(plan, clips, failed, describe_files(out, files, workers, bar.update))
+    write_record(out / MANIFEST, record)
+    (out / STATE).unlink()
+    return _report(plan, out, record, len(clips) - len(finished))
+
+
+def finished_frames(plan: Plan, job: Job, out: Path) -> int | None:
+    """Frames of a clip whose motion and speech are both there and whole; None for any other."""
+    motion, speech = _files(out, job.name)
+    try:
+        if speech.stat().st_size <= WAV_HEADER:
+            return None
+        array = np.load(motion, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+    whole = array.ndim == 2 and array.shape[1] == 3 * plan.n_vertices and array.dtype == _dtype(plan)
+    return len(array) if whole else None
+
+
+def _files(out: Path, name: str) -> tuple[Path, Path]:
+    return motion_file(out, name), speech_file(out, name)
+
+
+def _dtype(plan: Plan) -> np.dtype[Any]:
+    return np.dtype(plan.options.get("dtype", "float32"))
+
+
+def _says(record: dict[str, Any], plan: Plan, finished: dict[str, int]) -> bool:
+    """Whether a manifest records just this plan, carried out without a failure."""
+    same = all(record.get(key) == value for key, value in recipe(plan).items() if key != "facediff")
+    wanted = {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": finished}
+    return same and len(finished) == len(plan.jobs) and all(record.get(key) == value for key, value in wanted.items())
+
+
+def _report(plan: Plan, out: Path, record: dict[str, Any], written: int) -> Report:
+    return Report(out, record["clips"], written, record["failed"], plan.missing, plan.notes, record["totals"])
+
+
+@contextmanager
+def _alone_in(out: Path) -> Iterator[None]:
+    """Keep a second run out of the folder; a run that was killed keeps nobody out."""
+    made = not out.exists()
+    out.mkdir(parents=True, exist_ok=True)
+    lock = out / LOCK
+    with lock.open("w") as stream:
+        try:
+            import fcntl
+
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise FaceDiffError(f"{out}: another `facediff data prepare` is at work here; wait for its end") from error
+        except (ImportError, OSError):
+            pass  # Windows, or a network disk without locks: two runs at once are the user's lookout
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+            if made:
+                with suppress(OSError):  # not empty, as a rule
+                    out.rmdir()
+
+
+def _refuse_foreign(out: Path) -> None:
+    found = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
+    if found:
+        raise FaceDiffError(
+            f"{out}: holds other files ({', '.join(found[:3])}{' …' if len(found) > 3 else ''}) and was not begun by "
+            f"`facediff data prepare`; choose a new folder"
+        )
+
+
+def _refuse_strays(plan: Plan, out: Path) -> None:
+    """A clip that the raw folder has no more would be read as a part of the corpus, unseen by the manifest."""
+    names = {job.name for job in plan.jobs}
+    for path in (*sorted(out.glob("vertices_npy/*.npy")), *sorted(out.glob("wav/*.wav"))):
+        if not path.name.startswith(".") and path.stem not in names:
+            raise FaceDiffError(
+                f"{path}: is no clip of the raw folder (any more); remove the file, or choose another folder"
+            )
+
+
+def _sweep(out: Path) -> None:
+    """Remove what killed runs left half-written."""
+    for path in out.rglob(".*.partial-*"):
+        path.unlink(missing_ok=True)
+
+
+def _check_space(plan: Plan, pending: list[Job], out: Path) -> None:
+    known = [job.frames for job in pending if job.frames is not None]
+    if not known:
+        return
+    frames = sum(known) / len(known) * len(pending)
+    need = frames * (3 * plan.n_vertices * _dtype(plan).itemsize + 2 * 16_000 / plan.frame_rate)
+    free = shutil.disk_usage(out).free
+    if need > free:
+        raise FaceDiffError(
+            f"{out}: about {need / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free; make room, choose another "
+            f"disk, or prepare fewer subjects"
+        )

@@ -1,0 +1,310 @@
+"""VOCASET from its raw distribution.
+
+Source of the data: Cudeiro et al., "Capture, Learning, and Synthesis of 3D Speaking Styles", CVPR 2019. The raw folder
+holds ``data_verts.npy`` (frames of all clips, 60 a second, in metres), ``subj_seq_to_idx.pkl`` (which row is which
+frame), ``raw_audio_fixed.pkl`` and ``templates.pkl``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.prepare.runner import (
+    Job,
+    Plan,
+    Precision,
+    copy_files,
+    find_file,
+    find_regions,
+    motion_file,
+    region_files,
+    speech_file,
+    write_motion,
+    write_speech,
+    write_templates,
+)
+from facediff.errors import FaceDiffError
+from facediff.utils.pickles import load_pickle
+
+RAW_RATE = 60
+SUBJECTS = 12
+SENTENCES = [f"sentence{i:02d}" for i in range(1, 41)]
+VERTICES, ROWS, AUDIO, TEMPLATES = "data_verts.npy", "subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl"
+OPTIONAL = {
+    "FLAME_sample.ply": "the mesh, for drawing; the VOCA repository has it in template/",
+    "FLAME_masks.pkl": "lips and upper face; from flame.is.tue.mpg.de (FLAME vertex masks)",
+}
+LISTS = "not needed beside FLAME_masks.pkl; the FaceDiffuser repository has it in data/vocaset/regions/"
+FULL_SCALE = 32768.0
+"""Of 16-bit samples."""
+SAMPLE_RATES = (8_000, 192_000)
+
+Decimation = Literal["every_second", "filtered"]
+Array = npt.NDArray[np.float64]
+
+
+class Recording(NamedTuple):
+    """What the raw files say of one clip.
+
+    Attributes:
+        rows: row of ``data_verts.npy`` for each frame, in the order of the frames.
+        audio: the entry of ``raw_audio_fixed.pkl``: ``{"audio": samples, "sample_rate": …}``.
+        where: names the clip in messages.
+    """
+
+    rows: npt.NDArray[np.int64]
+    audio: object
+    where: str
+
+
+def plan(
+    raw: Path,
+    *,
+    frame_rate: Literal[30, 60] = 30,
+    decimate: Decimation = "every_second",
+    dtype: Precision = "float32",
+    regions: Path | None = None,
+) -> Plan:
+    """Scan a raw folder of VOCASET. The sound of all clips is read into memory, once.
+
+    Args:
+        raw: the folder, or the folder above it.
+        frame_rate: 30, which every published model uses; or 60, as in the raw files, for other projects' loaders
+        decimate: how 60 becomes 30: ``every_second`` frame, beginning with the first, as published work has it; or
+            ``filtered``, which takes away first what would alias
+        dtype: of the motion on disk
+        regions: folder with lists of vertices; regions/ of the raw folder if not given
+
+    Raises:
+        FaceDiffError: if a file is missing or is not what it should be, or no clip is complete.
+    """
+    vertices, templates_path = _need(raw, VERTICES), _need(raw, TEMPLATES)
+    row_map, sounds = _nested(_need(raw, ROWS)), _nested(_need(raw, AUDIO))
+    shape = open_vertices(vertices).shape
+    templates = _read_templates(templates_path, shape[1], vertices)
+    missing: dict[str, str] = {}
+    notes: list[str] = []
+    extras = [path for name in OPTIONAL if (path := find_file(raw, name)) is not None]
+    found_regions = find_regions(raw, regions)
+    _miss_extras(extras, found_regions, missing)
+    jobs = []
+    for name, recording in _complete(row_map, sounds, templates, missing, notes):
+        frames = len(recording.rows) if frame_rate == RAW_RATE else -(-len(recording.rows) // 2)
+        jobs.append(Job(name, partial(write_clip, name, recording, vertices, frame_rate, decimate, dtype), frames))
+    if len(row_map) < SUBJECTS:
+        notes.append(f"{ROWS} has {len(row_map)} of the {SUBJECTS} subjects")
+    if not jobs:
+        reasons = "; ".join(f"{name}: {text}" for name, text in list(missing.items())[:3])
+        raise FaceDiffError(f"{raw}: no clip of VOCASET can be prepared ({reasons or 'the files name none'})")
+    return Plan(
+        corpus="vocaset",
+        frame_rate=float(frame_rate),
+        unit="m",
+        n_vertices=shape[1],
+        options={"frame_rate": frame_rate, "decimate": decimate, "dtype": dtype},
+        jobs=jobs,
+        shared=partial(_write_shared, templates, extras, found_regions),
+        missing=missing,
+        notes=notes,
+    )
+
+
+def _complete(
+    row_map: dict[str, dict[str, Any]],
+    sounds: dict[str, dict[str, Any]],
+    templates: dict[str, Array],
+    missing: dict[str, str],
+    notes: list[str],
+) -> Iterator[tuple[str, Recording]]:
+    """Name and recording of every clip that has motion, sound and a template; the others go to ``missing``."""
+    for subject in sorted({*row_map, *sounds}):
+        if subject not in templates:
+            missing[f"template of {subject}"] = f"expected in {TEMPLATES}; no clip of {subject} is written without it"
+            continue
+        rows_of, sound_of = row_map.get(subject, {}), sounds.get(subject, {})
+        for sentence in sorted({*SENTENCES, *rows_of, *sound_of}):
+            name = f"{subject}_{sentence}"
+            lacking = [file for file, there in ((ROWS, rows_of), (AUDIO, sound_of)) if there.get(sentence) is None]
+            if lacking:
+                missing[name] = f"not in {' nor in '.join(lacking)}; the distribution lacks some"
+            else:
+                rows = _rows(rows_of[sentence], name, notes)
+                yield name, Recording(rows, sound_of[sentence], f"{subject} {sentence}")
+
+
+def write_clip(
+    name: str, recording: Recording, vertices: Path, frame_rate: int, decimate: Decimation, dtype: Precision, out: Path
+) -> int:
+    """Write one clip and return its number of frames.
+
+    As many frames are used as both the map and the sound have, as in VOCA.
+
+    Args:
+        name: the clip's name.
+        recording: its rows and its sound.
+        vertices: ``data_verts.npy``.
+        frame_rate: 30 or 60.
+        decimate: how 60 becomes 30.
+        dtype: of the motion on disk.
+        out: the corpus folder.
+
+    Raises:
+        FaceDiffError: if a row is not there or holds NaN, or the sound cannot be used.
+    """
+    from facediff.data.audio import to_speech
+
+    samples, rate = read_samples(recording.audio, recording.where)
+    frames = min(len(recording.rows), round(len(samples) / rate * RAW_RATE))
+    if not frames:
+        raise FaceDiffError(
+            f"{recording.where}: has {len(recording.rows)} frames in {ROWS} and {len(samples)} samples in {AUDIO}; "
+            f"expected at least one frame of both"
+        )
+    rows = recording.rows[:frames]
+    store = open_vertices(vertices)
+    wrong = (rows < 0) | (rows >= len(store))
+    if wrong.any():
+        frame = int(np.argmax(wrong))
+        raise FaceDiffError(
+            f"{recording.where}: frame {frame} is row {rows[frame]} in {ROWS}, but {vertices} has {len(store)} rows; "
+            f"the files belong to different releases or one is truncated"
+        )
+    motion = np.asarray(store[rows])
+    finite = np.isfinite(motion).all(axis=(1, 2))
+    if not finite.all():
+        frame = int(np.argmin(finite))
+        raise FaceDiffError(f"{recording.where}: frame {frame}, row {rows[frame]} of {vertices}, holds NaN or infinity")
+    motion = halved(motion, decimate) if frame_rate != RAW_RATE else motion
+    speech = to_speech(samples, rate, recording.where)
+    write_motion(motion_file(out, name), motion, dtype)
+    write_speech(speech_file(out, name), speech)
+    return len(motion)
+
+
+def halved(motion: npt.NDArray[np.floating], decimate: Decimation) -> npt.NDArray[np.floating]:
+    """Motion (T, V, 3) at half its frame rate; frame k of the result is frame 2 k."""
+    if decimate == "every_second":
+        return motion[::2]
+    from facediff.data.prepare.motion import resample_frames
+
+    return resample_frames(motion.reshape(len(motion), -1), RAW_RATE, RAW_RATE // 2).reshape(-1, *motion.shape[1:])
+
+
+def read_samples(entry: object, where: str) -> tuple[npt.NDArray[np.float32], float]:
+    """Samples (S,) or (S, channels) in -1 … 1 and sample rate of an entry ``{"audio": …, "sample_rate": …}``.
+
+    Whole numbers are 16-bit samples, whatever their type; so are floats beyond -1 … 1.
+
+    Raises:
+        FaceDiffError: if the entry is something else.
+    """
+    if not isinstance(entry, dict) or not {"audio", "sample_rate"} <= set(entry):
+        raise FaceDiffError(f'{where}: expected a dict with "audio" and "sample_rate" in {AUDIO}')
+    try:
+        rate, samples = float(entry["sample_rate"]), np.squeeze(np.asarray(entry["audio"]))
+    except (TypeError, ValueError) as error:
+        raise FaceDiffError(f"{where}: its sound in {AUDIO} is no array of numbers with a rate ({error})") from error
+    if not SAMPLE_RATES[0] <= rate <= SAMPLE_RATES[1]:
+        raise FaceDiffError(
+            f"{where}: sample rate {rate:g} in {AUDIO}; expected {SAMPLE_RATES[0]} to {SAMPLE_RATES[1]}"
+        )
+    channels = min(samples.shape) if samples.ndim == 2 else 1
+    if samples.ndim not in (1, 2) or channels > 2 or samples.size == 0 or samples.dtype.kind not in "if":
+        raise FaceDiffError(
+            f"{where}: its sound in {AUDIO} has shape {samples.shape} and type {samples.dtype}; expected one row of "
+            f"signed samples, or two"
+        )
+    if samples.ndim == 2 and samples.shape[0] < samples.shape[1]:
+        samples = samples.T
+    peak = float(np.abs(samples.astype(np.float64)).max())
+    if peak > FULL_SCALE:
+        raise FaceDiffError(f"{where}: a sample of its sound in {AUDIO} is {peak:g}; expected 16-bit samples")
+    full = 1.0 if samples.dtype.kind == "f" and not peak > 1.0 else FULL_SCALE
+    return (samples / full).astype(np.float32), rate
+
+
+def open_vertices(path: Path) -> npt.NDArray[np.floating]:
+    """All frames (N, V, 3), memory-mapped.
+
+    Raises:
+        FaceDiffError: if the file is truncated or holds something else.
+    """
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise FaceDiffError(f"{path}: not a readable NumPy array, perhaps truncated ({error}); get it anew") from error
+    if array.ndim == 2 and array.shape[1] % 3 == 0:
+        array = array.reshape(len(array), -1, 3)
+    if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind != "f" or not array.size:
+        raise FaceDiffError(f"{path}: has shape {array.shape} and type {array.dtype}; expected (rows, 5023, 3) floats")
+    return array
+
+
+def _need(raw: Path, name: str) -> Path:
+    path = find_file(raw, name)
+    if path is None:
+        raise FaceDiffError(
+            f"{raw / name}: no such file; expected {VERTICES}, {ROWS}, {AUDIO} and {TEMPLATES} as voca.is.tue.mpg.de "
+            f"gives them out"
+        )
+    return path
+
+
+def _nested(path: Path) -> dict[str, dict[str, Any]]:
+    """A pickle with a dict from subject to a dict by sentence."""
+    loaded = load_pickle(path)
+    if not isinstance(loaded, dict) or not all(isinstance(inner, dict) for inner in loaded.values()):
+        raise FaceDiffError(f"{path}: expected a dict from subject to a dict by sentence; get the file anew")
+    return {str(subject): {str(key): value for key, value in inner.items()} for subject, inner in loaded.items()}
+
+
+def _read_templates(path: Path, n_vertices: int, vertices: Path) -> dict[str, Array]:
+    loaded = load_pickle(path)
+    if not isinstance(loaded, dict):
+        raise FaceDiffError(f"{path}: expected a dict from subject to (V, 3) array, got {type(loaded).__name__}")
+    templates = {}
+    for subject, value in loaded.items():
+        array = np.asarray(value)
+        if array.dtype.kind not in "fi" or array.size != 3 * n_vertices:
+            raise FaceDiffError(
+                f"{path}: the template of {subject} has shape {array.shape}, but the frames of {vertices} have "
+                f"{n_vertices} vertices; expected the same mesh everywhere"
+            )
+        if not np.isfinite(array).all():
+            raise FaceDiffError(f"{path}: the template of {subject} holds NaN or infinity; get the file anew")
+        templates[str(subject)] = array.reshape(-1, 3).astype(np.float64)
+    return templates
+
+
+def _rows(frames: object, name: str, notes: list[str]) -> npt.NDArray[np.int64]:
+    """Rows of a clip in the order of its frames."""
+    try:
+        pairs = sorted((int(frame), int(row)) for frame, row in dict(frames).items())  # type: ignore[call-overload]
+    except (TypeError, ValueError) as error:
+        raise FaceDiffError(
+            f"{ROWS}: {name}: expected a dict from frame to row ({error}); get the file anew"
+        ) from error
+    if pairs and pairs[-1][0] != len(pairs) - 1:
+        notes.append(f"{name}: {ROWS} leaves out some of the frames up to {pairs[-1][0]}; it is written without them")
+    return np.array([row for _, row in pairs], np.int64)
+
+
+def _miss_extras(extras: list[Path], regions: Path | None, missing: dict[str, str]) -> None:
+    there = {path.name for path in (*extras, *region_files(regions))}
+    missing.update(
+        {name: f"no such file in the raw folder: {text}" for name, text in OPTIONAL.items() if name not in there}
+    )
+    for name in ("lve.txt", "fdd.txt"):
+        if name not in there and "FLAME_masks.pkl" not in there:
+            missing[f"regions/{name}"] = f"no such file in the raw folder: {LISTS}"
+
+
+def _write_shared(templates: dict[str, Array], extras: list[Path], regions: Path | None, out: Path) -> list[str]:
+    write_templates(out / "templates.pkl", templates)
+    return ["templates.pkl", *copy_files(extras, out), *copy_files(region_files(regions), out, "regions")]

@@ -1,0 +1,1 @@
+"""Changes to finished animations: retargeting, blendshapes, procedural motion, expressiveness."""

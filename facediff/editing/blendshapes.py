@@ -1,0 +1,506 @@
+"""From a take to weights of blendshapes: one bounded least-squares problem over all frames."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from facediff.animation import Animation, metres_per_unit
+from facediff.editing.shapes import ARKIT, ROTATIONS, ShapeSet, absent_from, beyond_arkit, live_link_name, mirror_pairs
+from facediff.errors import FaceDiffError, choices
+from facediff.utils.files import atomic, check_writable
+
+# Box-bounded quadratic programs over a whole take: projected Newton with block-tridiagonal steps.
+
+SUFFICIENT = 1e-4
+"""Share of the promised decrease that a step must bring (Armijo)."""
+SHORTEST = 1e-12
+NEAR = 1e-3
+"""How near a bound counts as on it, at most; less near the solution."""
+JITTER = 1e-10
+"""Added to the diagonal, which is one, of the matrix of a step only: dependent shapes leave it singular."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """½ Σ_t x_tᵀ M x_t − Σ_t r_tᵀ x_t + ½ c Σ_t ‖x_t − x_{t−1}‖², lower ≤ x_t ≤ upper; float64 throughout.
+
+    Attributes:
+        matrix: M (K, K), symmetric, positive semi-definite, with a diagonal of about one.
+        right: r (T, K).
+        coupling: c, not negative.
+        lower: (K,).
+        upper: (K,).
+    """
+
+    matrix: Tensor
+    right: Tensor
+    coupling: float
+    lower: Tensor
+    upper: Tensor
+
+    def clip(self, x: Tensor) -> Tensor:
+        """The nearest point of the box."""
+        return torch.minimum(torch.maximum(x, self.lower), self.upper)
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """Of the objective, (T, K)."""
+        slope = x @ self.matrix - self.right
+        step = self.coupling * (x[1:] - x[:-1])
+        slope[1:] += step
+        slope[:-1] -= step
+        return slope
+
+    def change(self, slope: Tensor, moved: Tensor) -> float:
+        """How the objective changes when x with this gradient moves; free of the cancellation of a difference."""
+        curve = (moved @ self.matrix * moved).sum() + self.coupling * (moved[1:] - moved[:-1]).square().sum()
+        return float((slope * moved).sum() + 0.5 * curve)
+
+    def residual(self, x: Tensor) -> Tensor:
+        """|x − clip(x − gradient)|, (T, K): zero exactly where the optimality (KKT) conditions hold."""
+        return (x - self.clip(x - self.gradient(x))).abs()
+
+
+def minimise(problem: Problem, tolerance: Tensor, max_iterations: int) -> tuple[Tensor, bool]:
+    """The box's point of least value.
+
+    Bertsekas, "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 1982:
+    variables on a bound whose gradient pushes outwards follow the gradient, the others take Newton's step; both are
+    clipped to the box, and the step is shortened until the objective falls enough, which makes it converge from
+    anywhere. The free variables of all frames are solved for at once.
+
+    Args:
+        problem: the program.
+        tolerance: (K,) what may be left of :meth:`Problem.residual`.
+        max_iterations: steps at most.
+
+    Returns:
+        x (T, K), and whether it met the tolerance.
+    """
+    free = torch.ones_like(problem.right, dtype=torch.bool)
+    x = problem.clip(_newton(problem, problem.right, free))
+    width = float((problem.upper - problem.lower).min())
+    for _ in range(max_iterations):
+        left = problem.residual(x)
+        if bool((left <= tolerance).all()):
+            return x, True
+        slope = problem.gradient(x)
+        near = min(NEAR * width, float(left.max()))
+        held = ((x <= problem.lower + near) & (slope > 0)) | ((x >= problem.upper - near) & (slope < 0))
+        direction = torch.where(held, -slope, _newton(problem, torch.where(held, 0.0, -slope), ~held))
+        following = _step(problem, x, slope, direction, held)
+        if following is None:
+            break
+        x = following
+    return x, bool((problem.residual(x) <= tolerance).all())
+
+
+def _step(problem: Problem, x: Tensor, slope: Tensor, direction: Tensor, held: Tensor) -> Tensor | None:
+    """The longest sufficient step along the clipped direction; None where rounding lets the objective fall no more."""
+    length = 1.0
+    promise = -float((slope * torch.where(held, 0.0, direction)).sum())
+    while length > SHORTEST:
+        following = problem.clip(x + length * direction)
+        moved = following - x
+        wanted = length * promise - float((slope * torch.where(held, moved, 0.0)).sum())
+        if problem.change(slope, moved) <= -SUFFICIENT * wanted:
+            return following if bool(moved.any()) else None
+        length /= 2
+    return None
+
+
+def _newton(problem: Problem, right: Tensor, free: Tensor) -> Tensor:
+    """Solve for the free variables, the others being zero: (T, K).
+
+    The matrix is block-tridiagonal, M + c·(number of neighbours) on the diagonal and −c beside it; block elimination
+    goes once forth and once back over the frames.
+    """
+    frames, count = right.shape
+    eye = torch.eye(count, dtype=right.dtype)
+    both = free[:, :, None] & free[:, None, :]
+    neighbours = torch.full((frames,), 2.0, dtype=right.dtype)
+    neighbours[0] -= 1
+    neighbours[-1] -= 1
+    extra = problem.coupling * neighbours[:, None] + JITTER
+    # Variables that are held get a row of the identity.
+    blocks = torch.where(both, problem.matrix, 0.0) + torch.diag_embed(torch.where(free, extra, 1.0))
+    if not problem.coupling:
+        return torch.linalg.solve(blocks, right[..., None])[..., 0] * free
+    beside = problem.coupling * (free[1:] & free[:-1]).to(right.dtype)
+    solved = torch.empty_like(right)
+    factors: list[Tensor] = []
+    for t in range(frames):
+        block, goal = blocks[t], right[t]
+        if t:
+            inverse = torch.cholesky_solve(eye, factors[-1])
+            block = block - beside[t - 1][:, None] * inverse * beside[t - 1]
+            goal = goal + beside[t - 1] * (inverse @ solved[t - 1])
+        factors.append(torch.linalg.cholesky(block))
+        solved[t] = goal
+    for t in reversed(range(frames)):
+        goal = solved[t] if t == frames - 1 else solved[t] + beside[t] * solved[t + 1]
+        solved[t] = torch.cholesky_solve(goal[:, None], factors[t])[:, 0]
+    return solved * free
+
+
+# How weights are solved for.
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """Choices of a solve; all strengths are shares of a shape's own energy, so that they mean the same for every shape.
+
+    Attributes:
+        smoothness: how much a weight's change from frame to frame costs; at 0.02, a movement to and fro five times a
+            second keeps 98 % of its size. Stated for 30 frames a second and converted to the take's frame rate.
+        symmetry: how much a difference between the weights of a left shape and its right one costs.
+        ridge: how much weights cost by themselves, which chooses the smallest among equally good ones.
+        lower: least weight.
+        upper: greatest weight.
+        region: name of the take's region that is looked at; None for the whole face.
+        area_weighted: count vertices by the area around them, so that finely meshed places do not count for more;
+            without triangles, all count alike.
+        tolerance: what may be left of the optimality conditions, in weights.
+        max_iterations: of Newton's method.
+    """
+
+    smoothness: float = 0.02
+    symmetry: float = 0.0
+    ridge: float = 1e-6
+    lower: float = 0.0
+    upper: float = 1.0
+    region: str | None = None
+    area_weighted: bool = True
+    tolerance: float = 1e-8
+    max_iterations: int = 200
+
+    def __post_init__(self) -> None:
+        for name in ("smoothness", "symmetry", "ridge"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise FaceDiffError(f"{name} {getattr(self, name):g}: expected a strength of 0 (off) or more")
+        if not -math.inf < self.lower < self.upper < math.inf:
+            raise FaceDiffError(f"bounds {self.lower:g} to {self.upper:g}: expected the lower one first, as in 0 1")
+        if not (self.tolerance > 0 and self.max_iterations > 0):
+            raise FaceDiffError(
+                f"tolerance {self.tolerance:g} and {self.max_iterations} iterations: expected both above 0"
+            )
+
+
+# Weights of blendshapes, frame by frame.
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """What :func:`facediff.editing.blendshapes` found.
+
+    Attributes:
+        names: K names.
+        values: (T, K) weights.
+        residual_rms_mm: (T,) root-mean-square distance that each frame's vertices are left with, in millimetres.
+        residual_max_mm: (T,) greatest such distance.
+        amplitude_mm: the motion's own size: root-mean-square distance of all vertices in all frames from the template.
+        frame_rate: frames a second.
+        still: names whose shape moves no vertex, and whose weight therefore says nothing.
+        metadata: the take's, and how the weights were solved for.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    residual_rms_mm: Array
+    residual_max_mm: Array
+    amplitude_mm: float
+    frame_rate: float
+    still: tuple[str, ...] = ()
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Names of ARKit's that had no shape, in ARKit's order."""
+        return absent_from(self.names)
+
+    @property
+    def extra(self) -> tuple[str, ...]:
+        """Names that are not ARKit's."""
+        return beyond_arkit(self.names)
+
+    @property
+    def residual_share(self) -> Array:
+        """(T,) each frame's residual as a share of the motion's amplitude; zero for a motion that stands still."""
+        if self.amplitude_mm <= 0:
+            return np.zeros_like(self.residual_rms_mm)
+        return self.residual_rms_mm / self.amplitude_mm
+
+
+# Weights as CSV.
+
+FORMAT = "facediff blendshape weights 1"
+DAY = 24 * 3600
+
+
+def write_live_link(path: Path, weights: Weights) -> None:
+    """Write a table as Epic's app Live Link Face records it, and what it cannot say beside it.
+
+    A row for each frame: timecode, number of values (61), ARKit's 52 names in order, turns of head and eyes. Names
+    without a shape and all turns are 0; ``<name>.json`` declares them, and holds the frame rate and each frame's
+    residual. Both files appear whole or not at all.
+
+    Raises:
+        FaceDiffError: if a file cannot be written.
+    """
+    column = {name: index for index, name in enumerate(weights.names)}
+    header = ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
+    rows = (
+        [
+            timecode(frame, weights.frame_rate),
+            str(len(ARKIT) + len(ROTATIONS)),
+            *(f"{values[column[name]]:.8f}" if name in column else "0.00000000" for name in ARKIT),
+            *("0.00000000" for _ in ROTATIONS),
+        ]
+        for frame, values in enumerate(weights.values)
+    )
+    _write_both(path, header, rows, _about(weights, in_table=ARKIT, rotations=True))
+
+
+def write_weights(path: Path, weights: Weights) -> None:
+    """Write a plain table, and ``<name>.json`` beside it: time in seconds, every weight, residuals in millimetres.
+
+    Raises:
+        FaceDiffError: if a file cannot be written.
+    """
+    header = ["time", *weights.names, "residual_rms_mm", "residual_max_mm"]
+    rows = (
+        [
+            f"{frame / weights.frame_rate:.6f}",
+            *(f"{value:.8f}" for value in values),
+            f"{weights.residual_rms_mm[frame]:.6f}",
+            f"{weights.residual_max_mm[frame]:.6f}",
+        ]
+        for frame, values in enumerate(weights.values)
+    )
+    _write_both(path, header, rows, _about(weights, in_table=weights.names, rotations=False))
+
+
+def timecode(frame: int, frame_rate: float) -> str:
+    """HH:MM:SS:FF.mmm of a frame, from midnight on; a broken frame rate counts as the next whole one (no frame drops).
+
+    Frames are counted within the second, and the digits after the point are thousandths of a frame, always 0 here.
+    """
+    whole = max(1, round(frame_rate))
+    seconds = frame // whole % DAY
+    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}:{frame % whole:02d}.000"
+
+
+def _about(weights: Weights, in_table: Sequence[str], *, rotations: bool) -> dict[str, object]:
+    """What a table does not say."""
+    return {
+        "format": FORMAT,
+        "frame_rate": weights.frame_rate,
+        "frames": len(weights.values),
+        "absent": list(weights.absent),
+        "absent_means": "no shape was given under these names: their weights are 0 and say nothing",
+        "still": list(weights.still),
+        "not_in_table": [name for name in weights.names if name not in in_table],
+        **(
+            {"rotations": "head and eyes were not solved for: their columns are 0 and say nothing"} if rotations else {}
+        ),
+        "amplitude_mm": round(weights.amplitude_mm, 6),
+        "residual_rms_mm": [round(float(value), 6) for value in weights.residual_rms_mm],
+        "residual_max_mm": [round(float(value), 6) for value in weights.residual_max_mm],
+        "metadata": dict(weights.metadata),
+    }
+
+
+def _write_both(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]], about: dict[str, object]) -> None:
+    if path.suffix.lower() != ".csv":
+        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a table .csv')
+    # Both, before one is there.
+    for file in (path, path.with_suffix(".json")):
+        check_writable(file)
+    with atomic(path.with_suffix(".json")) as beside, atomic(path) as temporary:
+        with temporary.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(header)
+            writer.writerows(rows)
+        beside.write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+CHUNK_BYTES = 32 * 2**20
+STATED_RATE = 30.0
+"""Frames a second for which the smoothness is stated."""
+
+
+@dataclass(frozen=True)
+class _Moving:
+    """The shapes that move something, on the vertices that count.
+
+    Attributes:
+        places: which of the set's shapes these are.
+        vertices: (N,) vertices that count.
+        area: (N,) their shares, which sum to one.
+        deltas: (K, 3N) displacements.
+        energy: (K,) weighted mean square of each.
+    """
+
+    places: npt.NDArray[np.int64]
+    vertices: npt.NDArray[np.int64]
+    area: Array
+    deltas: Array
+    energy: Array
+
+
+def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None = None) -> Weights:
+    """Weights w_t that bring the shapes nearest to a take.
+
+    Minimises Σ_t ½‖Σ_k w_tk d_k − (x_t − template)‖² + ½λ Σ_t Σ_k e_k (w_tk − w_{t−1,k})² + ½σ Σ_t Σ_(l,r) ½(e_l + e_r)
+    (w_tl − w_tr)² + ½ρ Σ_t Σ_k e_k w_tk² with lower ≤ w ≤ upper, where d_k are the displacements of shape k, norms are
+    means over vertices weighted by area, and e_k = ‖d_k‖² makes the strengths λ (smoothness), σ (symmetry) and ρ
+    (ridge) the same for shapes that move much and little. All frames are solved for together.
+
+    Args:
+        animation: the performance.
+        shapes: of the take's topology.
+        options: the usual ones if None.
+
+    Raises:
+        FaceDiffError: if the topologies differ, a frame is not finite, the region is unknown, or no shape moves
+            anything.
+    """
+    options = options or SolveOptions()
+    if shapes.deltas.shape[1] != len(animation.template):
+        raise FaceDiffError(
+            f"{animation.name}: has {len(animation.template)} vertices and the shapes {shapes.deltas.shape[1]}; give shapes of "
+            f"the same mesh, or carry them over with `facediff blendshapes --carry`"
+        )
+    moving = _moving(animation, shapes, options)
+    scale = np.sqrt(moving.energy)
+    weighted = moving.deltas * np.repeat(moving.area, 3) / scale[:, None]
+    right, amplitude = _products(animation, moving, weighted)
+    gram = weighted @ (moving.deltas / scale[:, None]).T
+    problem = _problem(gram, right, scale, [shapes.names[k] for k in moving.places], options, animation.frame_rate)
+    found, converged = minimise(problem, torch.from_numpy(options.tolerance * scale), options.max_iterations)
+    values = np.zeros((len(right), len(shapes.names)))
+    values[:] = np.clip(0.0, options.lower, options.upper)
+    # Division may lead past a bound by a rounding error.
+    values[:, moving.places] = np.clip(found.numpy() / scale, options.lower, options.upper)
+    rms, most = _residuals(animation, moving, values[:, moving.places])
+    millimetres = 1000.0 * metres_per_unit(animation.unit)
+    told = {
+        "smoothness": f"{options.smoothness:g}",
+        "symmetry": f"{options.symmetry:g}",
+        "ridge": f"{options.ridge:g}",
+        "bounds": f"{options.lower:g} {options.upper:g}",
+        "region": options.region or "whole face",
+        "converged": "yes" if converged else f"no, after {options.max_iterations} iterations",
+    }
+    return Weights(
+        names=shapes.names,
+        values=values,
+        residual_rms_mm=millimetres * rms,
+        residual_max_mm=millimetres * most,
+        amplitude_mm=millimetres * amplitude,
+        frame_rate=animation.frame_rate,
+        still=tuple(name for k, name in enumerate(shapes.names) if k not in moving.places),
+        metadata={**animation.metadata, **{f"solve {key}": value for key, value in told.items()}},
+    )
+
+
+def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Array:
+    """A third of the area of every triangle around each vertex, (V,)."""
+    a, b, c = (np.asarray(vertices, np.float64)[faces[:, corner]] for corner in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
+    total: Array = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices)).astype(np.float64)
+    return total
+
+
+def _moving(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> _Moving:
+    used = np.arange(len(animation.template))
+    if options.region is not None:
+        if not animation.regions:
+            raise FaceDiffError(f"{animation.name}: has no regions; give --checkpoint, or leave the region away")
+        if options.region not in animation.regions:
+            raise FaceDiffError(
+                f'{animation.name}: has no region "{options.region}"; {choices(options.region, animation.regions)}'
+            )
+        used = np.unique(np.asarray(animation.regions[options.region], np.int64))
+    area = np.ones(len(used))
+    if options.area_weighted and animation.faces is not None and len(animation.faces):
+        whole = vertex_areas(animation.template, animation.faces)[used]
+        area = whole if whole.sum() > 0 else area
+    area = area / max(float(area.sum()), np.finfo(float).tiny)
+    deltas = shapes.deltas[:, used].reshape(len(shapes.names), -1).astype(np.float64)
+    energy = np.square(deltas) @ np.repeat(area, 3)
+    still = np.array([name in shapes.still for name in shapes.names])
+    places = np.flatnonzero(~still & (energy > 1e-12 * energy.max(initial=0.0)))
+    if not len(places):
+        raise FaceDiffError(
+            f"{animation.name}: no shape moves any vertex that counts; give other shapes or another region"
+        )
+    return _Moving(places, used, area, deltas[places], energy[places])
+
+
+def _displacements(animation: Animation, moving: _Moving, frames: slice) -> Array:
+    """Displacements (frames, N, 3) from the template; refuses what is not finite."""
+    chunk = np.asarray(animation.vertices[frames], np.float64)
+    finite = np.isfinite(chunk).all(axis=(1, 2))
+    if not finite.all():
+        bad = frames.start + int(np.argmin(finite))
+        raise FaceDiffError(f"{animation.name}: frame {bad} holds NaN or infinity; make the motion anew")
+    moved: Array = (chunk - np.asarray(animation.template, np.float64))[:, moving.vertices]
+    return moved
+
+
+def _slices(animation: Animation) -> list[slice]:
+    step = max(1, CHUNK_BYTES // (24 * len(animation.template)))
+    return [slice(first, first + step) for first in range(0, len(animation.vertices), step)]
+
+
+def _products(animation: Animation, moving: _Moving, weighted: Array) -> tuple[Array, float]:
+    """Each frame's products with the weighted shapes (T, K), and the motion's root mean square."""
+    products, square = [], 0.0
+    for frames in _slices(animation):
+        moved = _displacements(animation, moving, frames)
+        products.append(moved.reshape(len(moved), -1) @ weighted.T)
+        square += float(np.square(moved).sum())
+    return np.concatenate(products), float(np.sqrt(square / (len(animation.vertices) * len(moving.vertices))))
+
+
+def _residuals(animation: Animation, moving: _Moving, values: Array) -> tuple[Array, Array]:
+    """Root mean square and maximum (T,) over the vertices of the distances that are left."""
+    rms, most = [], []
+    for frames in _slices(animation):
+        moved = _displacements(animation, moving, frames)
+        square = np.square(moved - (values[frames] @ moving.deltas).reshape(moved.shape)).sum(axis=-1)
+        rms.append(np.sqrt(square.mean(axis=-1)))
+        most.append(np.sqrt(square.max(axis=-1)))
+    return np.concatenate(rms), np.concatenate(most)
+
+
+def _problem(
+    gram: Array, right: Array, scale: Array, names: list[str], options: SolveOptions, frame_rate: float
+) -> Problem:
+    """The quadratic program in weights times the root of each shape's energy, whose matrix has ones on its diagonal."""
+    matrix = gram + options.ridge * np.eye(len(scale))
+    for left, other in mirror_pairs(tuple(names)):
+        cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[other] ** 2)
+        row = np.zeros(len(scale))
+        row[left], row[other] = 1.0 / scale[left], -1.0 / scale[other]
+        matrix += cost * np.outer(row, row)
+    return Problem(
+        torch.from_numpy(0.5 * (matrix + matrix.T)),
+        torch.from_numpy(right),
+        # A movement that takes as many seconds takes more steps at a higher frame rate, each the smaller.
+        options.smoothness * (frame_rate / STATED_RATE) ** 2,
+        torch.from_numpy(options.lower * scale),
+        torch.from_numpy(options.upper * scale),
+    )

@@ -1,0 +1,137 @@
+"""Larger or smaller motion, region by region, without seams."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation
+from facediff.editing.procedural import DIRECTED, Array, Eyes, noted, room_for, smooth_step
+from facediff.errors import FaceDiffError, choices
+
+ALL = "all"
+"""The name of all vertices that no other name is given for."""
+FALL_OFF = 0.06
+"""Width of a region's soft border, as a share of the face's size (the diagonal of its box): about 2 cm on a head."""
+HIGHEST = 4.0
+"""Motion more than this many times as large is no face's any more."""
+CHUNK = 1024
+
+
+def read_factors(words: str) -> dict[str, float]:
+    """Factors by region from a command line's words: ``1.2`` (all), or ``upper_face=1.5,lips=0.9``.
+
+    Raises:
+        FaceDiffError: if they are neither, a name comes twice, or a factor is not in 0 … 4.
+    """
+    factors: dict[str, float] = {}
+    for word in words.split(","):
+        name, equals, number = word.rpartition("=")
+        name = name.strip() if equals else ALL
+        try:
+            factor = float(number)
+        except ValueError:
+            factor = math.nan
+        if not name or not 0 <= factor <= HIGHEST:
+            raise FaceDiffError(
+                f"--expressiveness {words}: expected a factor from 0 to {HIGHEST:g} (1.2), or factors by region "
+                f"(upper_face=1.5,lips=0.9)"
+            )
+        if name in factors:
+            raise FaceDiffError(f"--expressiveness {words}: names {name} twice; give one factor for it")
+        factors[name] = factor
+    return factors
+
+
+def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], name: str) -> None:
+    """Refuse a region that there is not.
+
+    Raises:
+        FaceDiffError: naming the regions that ``name`` has.
+    """
+    for region in factors:
+        if region != ALL and region not in regions:
+            raise FaceDiffError(f'{name}: has no region "{region}" to scale: {choices(region, [*regions, ALL])}')
+
+
+def scale_regions(animation: Animation, factors: Mapping[str, float], eyes: Eyes | None = None) -> Animation:
+    """Scale how far every vertex goes from the neutral face.
+
+    Args:
+        animation: its head must not sway yet.
+        factors: by region of the take; ``all`` stands for every vertex that no other name covers. 1 changes nothing.
+        eyes: where they are known, the closing of the lids is left as it is: a blink stays a blink, and lids that meet
+            do not run through each other.
+
+    Raises:
+        FaceDiffError: if the take has no such region.
+    """
+    factor = region_factors(animation.template, animation.regions, factors, animation.name).astype(np.float32)
+    vertices = room_for(animation.vertices)
+    lids, closing = eyes.lids() if eyes is not None and eyes.closing is not None else (np.zeros(0, np.int64), None)
+    for index, frame in enumerate(animation.vertices):
+        offsets = frame - animation.template
+        scaled = factor[:, None] * offsets
+        if closing is not None:
+            share = np.clip((offsets[lids] * closing).sum(-1) / (closing**2).sum(-1), 0.0, 1.0)
+            scaled[lids] += ((1.0 - factor[lids]) * share)[:, None] * closing
+        vertices[index] = animation.template + scaled
+    told = ", ".join(f"{name} {value:g}" for name, value in factors.items())
+    return noted(animation, vertices, DIRECTED, f"expressiveness ({told})")
+
+
+def region_factors(
+    template: npt.NDArray[np.floating],
+    regions: Mapping[str, npt.NDArray[np.integer]],
+    factors: Mapping[str, float],
+    name: str = "expressiveness",
+    fall_off: float | None = None,
+) -> Array:
+    """The factor of every vertex (V,), a blend of the regions' factors.
+
+    A region weighs 1 on its own vertices and falls to 0 over ``fall_off`` outside of it, by the distance d in the
+    neutral face: 1 − s(d / fall_off) with s(t) = 3t² − 2t³. Where weights sum to more than 1 they are divided by their
+    sum, and what lacks to 1 belongs to ``all``: together they are a partition of unity. Between a region's factor f and
+    that of the rest, g, vertices at x and y differ by no more than 1.5 |f − g| |x − y| / fall_off, since a distance
+    changes no faster than its place, and s no faster than 1.5.
+
+    Args:
+        template: (V, 3) the neutral face.
+        regions: vertex indices by name.
+        factors: by region, or ``all`` (1 if absent).
+        name: what lacks a region, for the message.
+        fall_off: in the template's unit; 0.06 of the face's size if None.
+
+    Raises:
+        FaceDiffError: if a region is not there.
+    """
+    check_factors(factors, regions, name)
+    places = np.asarray(template, np.float64)
+    width = FALL_OFF * float(np.linalg.norm(np.ptp(places, axis=0))) if fall_off is None else fall_off
+    named = [region for region in factors if region != ALL]
+    weights = np.zeros((len(named), len(places)))
+    for row, region in zip(weights, named, strict=True):
+        row[:] = 1.0 - smooth_step(_distances(places, np.asarray(regions[region]), width) / max(width, 1e-12))
+    total = weights.sum(axis=0)
+    weights /= np.maximum(total, 1.0)
+    rest = np.clip(1.0 - total, 0.0, None)
+    of_regions = np.array([factors[region] for region in named]) @ weights if named else np.zeros(len(places))
+    return np.asarray(of_regions + rest * factors.get(ALL, 1.0))
+
+
+def _distances(places: Array, region: npt.NDArray[np.integer], limit: float) -> Array:
+    """Distance of every vertex (V,) from the nearest one of a region; beyond ``limit`` it may be infinite."""
+    found = np.full(len(places), np.inf)
+    if not len(region):  # as of a face that was carried to a mesh without it
+        return found
+    chosen = places[region]
+    near = np.flatnonzero(((places > chosen.min(0) - limit) & (places < chosen.max(0) + limit)).all(axis=1))
+    for first in range(0, len(near), CHUNK):
+        some = near[first : first + CHUNK]
+        square = (places[some] ** 2).sum(1)[:, None] + (chosen**2).sum(1) - 2.0 * places[some] @ chosen.T
+        found[some] = np.sqrt(np.maximum(square.min(axis=1), 0.0))
+    found[region] = 0.0  # rounding leaves a little
+    return found

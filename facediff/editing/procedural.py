@@ -1,0 +1,467 @@
+"""Procedural head sway: slow, small turns and shifts of the whole head."""
+
+from __future__ import annotations
+
+import secrets
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation
+from facediff.errors import FaceDiffError
+from facediff.mesh.flame import rotations
+
+# What all changes to a take have in common: random numbers of their own, smooth steps, a note in the metadata.
+
+Array = npt.NDArray[np.float64]
+
+PROCEDURAL = "procedural"
+"""Metadata key: what was added by a program, not learnt from anybody."""
+DIRECTED = "directed"
+"""Metadata key: how the take's own motion was changed."""
+SWAYS = "head sway"
+"""How a swaying head is called in the metadata; such a take moves as a whole, so nothing can be laid on it any more."""
+
+CHUNK = 256
+"""Frames that are worked on at a time where not one by one."""
+
+Layer = Literal["blinks", "gaze", "sway"]
+STREAMS: dict[Layer, int] = {"blinks": 1, "gaze": 2, "sway": 3}
+
+
+def random_of(layer: Layer, seed: int) -> np.random.Generator:
+    """Random numbers of a layer: adding or leaving away another layer does not change them."""
+    return np.random.default_rng([seed, STREAMS[layer]])
+
+
+def smooth_step(values: npt.ArrayLike) -> Array:
+    """3t² − 2t³ of values limited to 0 … 1: from 0 to 1 with flat ends."""
+    t = np.clip(np.asarray(values, np.float64), 0.0, 1.0)
+    return np.asarray(t * t * (3.0 - 2.0 * t))
+
+
+def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """An array of the same shape to write to: in memory, or on disk where the vertices are a memory map themselves.
+
+    A file on disk lies beside the map's, or where temporary files go if that folder cannot be written, and vanishes
+    with the array.
+    """
+    if not isinstance(vertices, np.memmap):
+        return np.empty(vertices.shape, np.float32)
+    beside = Path(vertices.filename).parent if vertices.filename is not None else Path(tempfile.gettempdir())
+    name = f".facediff-{secrets.token_hex(8)}.partial"
+    try:
+        path = beside / name
+        made = np.memmap(path, np.float32, "w+", shape=vertices.shape)
+    except OSError:
+        path = Path(tempfile.gettempdir()) / name
+        made = np.memmap(path, np.float32, "w+", shape=vertices.shape)
+    with suppress(OSError):  # Windows keeps a file that is in use
+        path.unlink()
+    return made
+
+
+def parts(frames: int) -> Iterator[slice]:
+    """Consecutive frames, some at a time."""
+    return (slice(first, first + CHUNK) for first in range(0, frames, CHUNK))
+
+
+def copied(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """A copy to work on, see :func:`room_for`."""
+    made = room_for(vertices)
+    for part in parts(len(vertices)):
+        made[part] = vertices[part]
+    return made
+
+
+def noted(animation: Animation, vertices: npt.NDArray[np.float32], key: str, words: str) -> Animation:
+    """The take with other vertices (T, V, 3), and words added to an entry of its metadata."""
+    before = animation.metadata.get(key)
+    told = words if before is None else f"{before}; {words}"
+    return replace(animation, vertices=vertices, metadata={**animation.metadata, key: told})
+
+
+# Where a topology's eyelids and eyeballs are, and how the lids shut.
+
+Indices = npt.NDArray[np.int64]
+
+GIVE = (
+    "give --eyes FILE, which says where lids and eyeballs are (docs/directing.md shows one for FLAME and for any mesh)"
+)
+STILL = 0.01
+"""Vertices that a blink moves by less than this share of its largest way are left alone."""
+MEET = 0.12
+"""Where the lids meet, from the lower (0) to the upper edge (1): the lower lid hardly rises in a blink."""
+AHEAD = 0.025
+"""The shut upper lid lies further out by this share of the eye's width: its way is straight, the eyeball is round."""
+REACH = 0.4
+"""How far from the edges the skin follows, as a share of the eye's width."""
+
+
+@dataclass(frozen=True, eq=False)
+class Eyes:
+    """The eyes of a face.
+
+    Attributes:
+        closing: (V, 3) way from open to shut lids, in the face's unit; zero wherever a blink moves nothing. None if it
+            is not known.
+        eyeballs: vertices of each eyeball.
+        source: who says so, for messages.
+
+    Raises:
+        FaceDiffError: if the closing moves nothing or is not finite, or an eyeball is no set of four vertices or more.
+    """
+
+    closing: npt.NDArray[np.float32] | None
+    eyeballs: tuple[Indices, ...]
+    source: str
+
+    def __post_init__(self) -> None:
+        if self.closing is not None and not (np.isfinite(self.closing).all() and self.closing.any()):
+            raise FaceDiffError(f"{self.source}: its blink moves nothing, or holds NaN; give the shape of shut eyes")
+        if any(len(ball) < 4 for ball in self.eyeballs):
+            raise FaceDiffError(f"{self.source}: an eyeball of less than four vertices has no centre; name all of them")
+
+    def lids(self) -> tuple[Indices, npt.NDArray[np.float32]]:
+        """The vertices (L,) that a blink moves, and their ways (L, 3).
+
+        Raises:
+            FaceDiffError: if the way is not known.
+        """
+        if self.closing is None:
+            raise FaceDiffError(f"{self.source}: does not say how the lids shut; {GIVE}")
+        way = np.linalg.norm(self.closing, axis=-1)
+        chosen = np.flatnonzero(way > STILL * way.max())
+        return chosen, self.closing[chosen]
+
+
+def sphere_centre(points: npt.NDArray[np.floating]) -> Array:
+    """Centre (3,) of the sphere nearest to points (N, 3), which may be a part of it only, by linear least squares.
+
+    |x − c|² = r² is linear in c and r² − |c|²: 2 x·c + (r² − |c|²) = |x|².
+    """
+    middle = np.asarray(points, np.float64).mean(axis=0)
+    local = np.asarray(points, np.float64) - middle
+    solution = np.linalg.lstsq(
+        np.concatenate([2.0 * local, np.ones((len(local), 1))], axis=1), (local**2).sum(axis=1), rcond=None
+    )[0]
+    return np.asarray(middle + solution[:3])
+
+
+def closing_of_lids(
+    template: npt.NDArray[np.floating], lids: list[tuple[Indices, Indices]], rigid: Indices | None = None
+) -> npt.NDArray[np.float32]:
+    """How lids shut (V, 3), from the vertices of their edges alone.
+
+    Both edges run from one corner of the eye to the other. Each edge vertex goes to the line between them at its own
+    share of the way along; the skin around follows its nearest edge vertices, less and less up to 0.4 of the eye's
+    width away.
+
+    Args:
+        template: (V, 3) the neutral face with open eyes, y up and z to the viewer.
+        lids: for each eye the vertices of the upper and of the lower edge.
+        rigid: vertices that do not follow (eyeballs).
+    """
+    places = np.asarray(template, np.float64)
+    closing = np.zeros_like(places)
+    for upper, lower in lids:
+        top, bottom = places[upper], places[lower]
+        if np.linalg.norm(top[0] - bottom[0]) > np.linalg.norm(top[0] - bottom[-1]):
+            bottom = bottom[::-1]
+            lower = lower[::-1]
+        width = max(float(np.linalg.norm(np.ptp(edge, axis=0))) for edge in (top, bottom))
+        edge = np.concatenate([upper, lower])
+        way = np.concatenate([_ways(top, bottom, width), _ways(bottom, top, width)])
+        way[len(upper) :] *= MEET
+        way[: len(upper)] *= 1.0 - MEET
+        way[: len(upper), 2] += AHEAD * width * _arch(top)
+        way[len(upper) :, 2] += 0.5 * AHEAD * width * _arch(bottom)
+        distance = np.linalg.norm(places[:, None] - places[edge], axis=-1)
+        near = np.flatnonzero(distance.min(axis=1) < REACH * width)
+        share = 1.0 - smooth_step(distance[near].min(axis=1) / (REACH * width))
+        # Inverse distances to the fourth power: at an edge vertex its own way alone, in between a blend.
+        pull = 1.0 / np.maximum(distance[near], 1e-6 * width) ** 4
+        blended = share[:, None] * (pull @ way) / pull.sum(axis=1, keepdims=True)
+        larger = np.linalg.norm(blended, axis=1) > np.linalg.norm(closing[near], axis=1)
+        closing[near[larger]] = blended[larger]
+    if rigid is not None:
+        closing[rigid] = 0.0
+    return closing.astype(np.float32)
+
+
+def _along(edge: Array) -> Array:
+    """Share of the way along an edge (N, 3) at each of its vertices (N,), 0 to 1."""
+    steps = np.linalg.norm(np.diff(edge, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)]) / max(float(steps.sum()), 1e-12)
+
+
+def _ways(edge: Array, other: Array, width: float) -> Array:
+    """From each vertex of an edge (N, 3) to the other edge, at the same share of the way along."""
+    if len(edge) < 2 or len(other) < 2 or width <= 0:
+        raise FaceDiffError("lids: an edge needs two vertices at least, from one corner of the eye to the other")
+    at, knots = _along(edge), _along(other)
+    target = np.stack([np.interp(at, knots, other[:, axis]) for axis in range(3)], axis=1)
+    return np.asarray(target - edge)
+
+
+def _arch(edge: Array) -> Array:
+    """1 in the middle of an edge, 0 at the corners (N,)."""
+    return np.asarray(np.sin(np.pi * _along(edge)))
+
+
+# Procedural blinks.
+#
+# How often people blink is from Bentivoglio et al., "Analysis of blink rate patterns in normal subjects", Movement
+# Disorders 12(6), 1997: 17 times a minute at rest, 26 in conversation, 4.5 when reading.
+
+RATE = 17.0
+"""Blinks a minute of somebody at rest."""
+RATES = (1.0, 40.0)
+CLOSE, SHUT, OPEN = 0.10, 0.03, 0.20
+"""Seconds that the lids take to shut, stay shut, and take to open: about a third of a second, quicker down than up."""
+SPREAD = (0.85, 1.2)
+"""How much shorter and longer than that a blink may be."""
+GAP = 0.15
+"""Seconds from one blink's end to the next one's start at least."""
+DOUBLE = 0.12
+"""Share of blinks that another one follows at once."""
+WIDENED = -0.5
+"""How far an eye may be open beyond the neutral face, in closings, that a blink still makes up for."""
+
+
+def add_blinks(animation: Animation, eyes: Eyes, *, rate: float = RATE, seed: int = 0) -> Animation:
+    """Let the eyes blink, beside whatever blinks the take has.
+
+    The lids' own closing a and the blink's b make a + b (1 − a): at b = 0 the take's own, at b = 1 shut, never more. An
+    eye that is shut already stays just so.
+
+    Args:
+        animation: its head must not sway yet.
+        eyes: of the take's topology.
+        rate: blinks a minute, 1 to 40.
+        seed: equal seeds give equal blinks.
+
+    Raises:
+        FaceDiffError: if the rate is impossible, or the eyes' lids are not known.
+    """
+    lids, closing = eyes.lids()
+    curve = blink_curve(len(animation.vertices), animation.frame_rate, rate=rate, seed=seed)
+    vertices = copied(animation.vertices)
+    size = (closing**2).sum(axis=-1)
+    for index in np.flatnonzero(curve):
+        offsets = vertices[index, lids] - animation.template[lids]
+        shut = np.clip((offsets * closing).sum(axis=-1) / size, WIDENED, 1.0)
+        vertices[index, lids] += ((1.0 - shut) * np.float32(curve[index]))[:, None] * closing
+    return noted(animation, vertices, PROCEDURAL, f"blinks ({rate:g} a minute, seed {seed})")
+
+
+def blink_curve(frames: int, frame_rate: float, *, rate: float = RATE, seed: int = 0) -> Array:
+    """How far the eyes are shut in every frame (T,), 0 to 1.
+
+    Intervals are a gamma distribution of shape 2 above the shortest possible one, with the mean that the rate asks for.
+    No two blinks overlap, none begins before the first frame or ends after the last, each is fully shut for a frame.
+
+    Raises:
+        FaceDiffError: if the rate is not in 1 … 40.
+    """
+    if not RATES[0] <= rate <= RATES[1]:
+        raise FaceDiffError(
+            f"--blinks {rate:g}: expected blinks a minute, {RATES[0]:g} to {RATES[1]:g} (17 at rest, 26 in talk)"
+        )
+    random = random_of("blinks", seed)
+    times = np.arange(frames) / frame_rate
+    last = times[-1] if frames else 0.0
+    hold = max(SHUT, 1.0 / frame_rate)  # so that one frame at least falls into it
+    usual = CLOSE + hold + OPEN
+    least = usual * SPREAD[1] + GAP
+    # A double blink is two for one interval; the mean of all intervals from start to start stays 60 / rate.
+    mean = 60.0 * (1.0 + DOUBLE) / rate - DOUBLE * (usual + GAP)
+    curve = np.zeros(frames)
+    start = random.uniform(0.0, 1.0) * mean
+    while start < last:
+        for _ in range(2 if random.random() < DOUBLE else 1):
+            length = float(random.uniform(*SPREAD))
+            down, up = CLOSE * length, OPEN * length
+            end = start + down + hold + up
+            if end <= last:
+                span = slice(int(start * frame_rate), int(end * frame_rate) + 2)
+                now = times[span]
+                curve[span] = np.maximum(curve[span], smooth_step((now - start) / down) * smooth_step((end - now) / up))
+            following, start = start, end + GAP
+        start = following + least + float(random.gamma(2.0, max(mean - least, 0.05) / 2.0))
+    return curve
+
+
+# Procedural gaze: fixations, and quick turns of both eyes between them.
+#
+# A saccade of A degrees takes 21 ms + 2.2 ms · A (Carpenter, "Movements of the Eyes", 1988).
+
+DEGREES_GAZE = 4.0
+"""Farthest from straight ahead if nothing is said: the eyes wander over a listener's face."""
+WIDEST_GAZE = 20.0
+AHEAD_SECONDS, ASIDE_SECONDS = 1.6, 0.6
+"""Mean duration of a fixation straight ahead, and elsewhere."""
+SHORTEST = 0.2
+"""Seconds between saccades at least."""
+UPWARDS = 0.5
+"""The eyes turn up and down less than sideways."""
+LIDS_PER_DEGREE = 0.012
+"""How far the lids close with each degree that the eyes look down, as a share of a full closing (up: they open)."""
+
+
+def add_gaze(animation: Animation, eyes: Eyes, *, degrees: float = DEGREES_GAZE, seed: int = 0) -> Animation:
+    """Let the eyes wander: eyeballs turn about their centres, lids follow slightly.
+
+    Args:
+        animation: its head must not sway yet.
+        eyes: of the take's topology; where the lids' closing is not known, they stay.
+        degrees: how far from straight ahead the eyes turn at most.
+        seed: equal seeds give equal gaze.
+
+    Raises:
+        FaceDiffError: if the angle is impossible, or the eyeballs are not known.
+    """
+    if not eyes.eyeballs:
+        raise FaceDiffError(f"{eyes.source}: does not say which vertices are the eyeballs; {GIVE}")
+    angles = gaze_curve(len(animation.vertices), animation.frame_rate, degrees=degrees, seed=seed)
+    turns = gaze_rotations(angles)
+    vertices = copied(animation.vertices)
+    for ball in eyes.eyeballs:
+        rest = animation.template[ball].astype(np.float64)
+        centre = sphere_centre(rest)
+        for part in parts(len(vertices)):
+            # An eyeball that the take moves is turned where it is.
+            moved = (vertices[part, ball] - rest).mean(axis=1)[:, None]
+            arms = vertices[part, ball] - moved - centre
+            vertices[part, ball] = arms @ turns[part].swapaxes(1, 2) + centre + moved
+    if eyes.closing is not None:
+        lids, closing = eyes.lids()
+        follow = (-LIDS_PER_DEGREE * angles[:, 1]).astype(np.float32)
+        for index in np.flatnonzero(follow):
+            vertices[index, lids] += follow[index] * closing
+    return noted(animation, vertices, PROCEDURAL, f"gaze ({degrees:g} degrees, seed {seed})")
+
+
+def gaze_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_GAZE, seed: int = 0) -> Array:
+    """Where the eyes look in every frame, (T, 2): degrees to the face's left and upwards.
+
+    Fixations straight ahead and elsewhere take turns, now and then two elsewhere; it begins and ends straight ahead.
+
+    Raises:
+        FaceDiffError: if the angle is not above 0 and at most 20.
+    """
+    if not 0 < degrees <= WIDEST_GAZE:
+        raise FaceDiffError(f"--gaze {degrees:g}: expected degrees above 0 and up to {WIDEST_GAZE:g}")
+    random = random_of("gaze", seed)
+    times = np.arange(frames) / frame_rate
+    last = float(times[-1]) if frames else 0.0
+    curve = np.zeros((frames, 2))
+    here, now = np.zeros(2), _fixation(random, AHEAD_SECONDS)
+    while now < last:
+        elsewhere = not here.any() or random.random() < 0.25
+        there = _target(random, degrees) if elsewhere else np.zeros(2)
+        stay = _fixation(random, ASIDE_SECONDS if elsewhere else AHEAD_SECONDS)
+        if now + stay >= last - SHORTEST:  # no time to come back
+            there = np.zeros(2)
+        seconds = 0.021 + 0.0022 * float(np.linalg.norm(there - here))
+        first = int(now * frame_rate)
+        curve[first:] = here + smooth_step((times[first:] - now) / seconds)[:, None] * (there - here)
+        here, now = there, now + seconds + stay
+    return curve
+
+
+def _fixation(random: np.random.Generator, mean: float) -> float:
+    return SHORTEST + float(random.gamma(2.0, (mean - SHORTEST) / 2.0))
+
+
+def _target(random: np.random.Generator, degrees: float) -> Array:
+    """Small turns are commoner than large ones; none is farther than ``degrees``."""
+    size = degrees * min(1.0, 0.25 + float(random.exponential(0.35)))
+    direction = random.uniform(0.0, 2.0 * np.pi)
+    return np.array([size * np.cos(direction), UPWARDS * size * np.sin(direction)])
+
+
+def gaze_rotations(angles: npt.NDArray[np.floating]) -> Array:
+    """Rotations (T, 3, 3) that turn z to the left by the first and up by the second of the angles (T, 2) in degrees."""
+    left, up = np.deg2rad(np.asarray(angles, np.float64)).T
+    cos, sin, one, zero = np.cos, np.sin, np.ones_like(left), np.zeros_like(left)
+    sideways = np.array([[cos(left), zero, sin(left)], [zero, one, zero], [-sin(left), zero, cos(left)]])
+    upwards = np.array([[one, zero, zero], [zero, cos(up), sin(up)], [zero, -sin(up), cos(up)]])
+    return np.asarray(np.moveaxis(sideways, 2, 0) @ np.moveaxis(upwards, 2, 0))
+
+
+DEGREES_SWAY = 2.0
+"""Largest turn if nothing is said."""
+WIDEST_SWAY = 15.0
+BAND = (0.08, 0.6)
+"""Hertz: slower cannot be seen, quicker is a tremble."""
+WAVES = 6
+AXES = np.array([0.7, 1.0, 0.5])
+"""How much of the turning is nodding, shaking and tilting."""
+SHIFT = 0.004
+"""Largest shift for each degree of turning, as a share of the head's height: about a millimetre."""
+AT_REST = 1.0
+"""Seconds over which the sway swells and dies away."""
+
+
+def add_sway(animation: Animation, *, degrees: float = DEGREES_SWAY, seed: int = 0) -> Animation:
+    """Let the head sway; all vertices move as one. It is the last change to a take: nothing can be laid on it after.
+
+    Args:
+        animation: any take.
+        degrees: largest turn.
+        seed: equal seeds give equal sway.
+
+    Raises:
+        FaceDiffError: if the angle is impossible.
+    """
+    turns, shifts = sway_curve(len(animation.vertices), animation.frame_rate, degrees=degrees, seed=seed)
+    matrices = rotations(turns)
+    template = np.asarray(animation.template, np.float64)
+    pivot, height = neck(template), float(np.ptp(template[:, 1]))
+    vertices = room_for(animation.vertices)
+    for index, frame in enumerate(animation.vertices):
+        moving = turns[index].any() or shifts[index].any()  # at rest to the last bit
+        vertices[index] = (frame - pivot) @ matrices[index].T + pivot + height * shifts[index] if moving else frame
+    return noted(animation, vertices, PROCEDURAL, f"{SWAYS} ({degrees:g} degrees, seed {seed})")
+
+
+def neck(template: npt.NDArray[np.floating]) -> Array:
+    """Where a head (V, 3) turns: low in its middle, and well behind the face, also where the mesh has no back."""
+    low, high = template.min(axis=0), template.max(axis=0)
+    height = high[1] - low[1]
+    return np.array([0.5 * (low[0] + high[0]), low[1] + 0.15 * height, high[2] - 0.6 * height])
+
+
+def sway_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_SWAY, seed: int = 0) -> tuple[Array, Array]:
+    """Turns (T, 3), axis-angle in radians, and shifts (T, 3), in head heights; zero in the first and the last frame.
+
+    Sums of six sines between 0.08 and 0.6 Hz, so that nothing is quick; the largest turn is ``degrees``.
+
+    Raises:
+        FaceDiffError: if the angle is not above 0 and at most 15.
+    """
+    if not 0 < degrees <= WIDEST_SWAY:
+        raise FaceDiffError(f"--sway {degrees:g}: expected degrees above 0 and up to {WIDEST_SWAY:g}")
+    random = random_of("sway", seed)
+    times = np.arange(frames) / frame_rate
+    last = float(times[-1]) if frames else 0.0
+    ramp = max(min(AT_REST, last / 3.0), 1e-6)
+    rest = smooth_step(times / ramp) * smooth_step((last - times) / ramp)
+    rates = random.uniform(*BAND, (6, WAVES))
+    phases = random.uniform(0.0, 2.0 * np.pi, (6, WAVES))
+    waves = np.sin(2.0 * np.pi * rates * times[:, None, None] + phases).sum(axis=-1) * rest[:, None]
+    turns, shifts = waves[:, :3] * AXES, waves[:, 3:]
+    return _largest(turns, np.deg2rad(degrees)), _largest(shifts, SHIFT * degrees)
+
+
+def _largest(vectors: Array, size: float) -> Array:
+    """Vectors (T, 3) scaled so that the longest has a size."""
+    longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
+    return vectors * (size / longest) if longest > 0 else vectors

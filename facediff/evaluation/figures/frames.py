@@ -1,0 +1,215 @@
+"""The figure of chosen moments: truth and methods below one another, times or phonemes side by side."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from facediff.errors import FaceDiffError, choices
+from facediff.evaluation.figures.material import Array, Material, Painter
+from facediff.evaluation.figures.page import Grid, Heading, Paper, check_output, save, style
+
+# When which phoneme is spoken in a clip.
+
+STRESS, LENGTH = "ˈˌ", "ː"
+BILABIALS = ("p", "b", "m")
+"""Phonemes for which the lips close."""
+
+
+@dataclass(frozen=True)
+class Phoneme:
+    """A phoneme in time.
+
+    Attributes:
+        start: where it begins, in seconds.
+        end: where it ends.
+        ipa: the phoneme, with stress and length marks; empty for a pause.
+        viseme: names of its visemes, joined by "+"; may be empty.
+        word: the word it belongs to; empty if that is not known.
+    """
+
+    start: float
+    end: float
+    ipa: str
+    viseme: str = ""
+    word: str = ""
+
+    @property
+    def middle(self) -> float:
+        """The middle of its time, in seconds."""
+        return (self.start + self.end) / 2
+
+    @property
+    def plain(self) -> str:
+        """The phoneme without stress marks."""
+        return self.ipa.strip(STRESS)
+
+
+def phonemes_file(corpus: Path | None, clip: str) -> Path | None:
+    """Where a corpus has a clip's phonemes; None if it has none."""
+    path = None if corpus is None else corpus / "phonemes" / f"{clip}.csv"
+    return path if path is not None and path.is_file() else None
+
+
+def read_phonemes(path: Path) -> list[Phoneme]:
+    """Phonemes of a table with the columns ``start``, ``end`` (seconds) and ``ipa``, and maybe ``viseme``, ``word``.
+
+    Raises:
+        FaceDiffError: if the file is not that.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = list(csv.DictReader(stream))
+        found = [
+            Phoneme(float(row["start"]), float(row["end"]), row["ipa"] or "", row.get("viseme") or "", _word(row))
+            for row in rows
+        ]
+    except (OSError, UnicodeDecodeError, csv.Error, KeyError, ValueError, TypeError) as error:
+        raise FaceDiffError(
+            f"{path}: not readable as phonemes ({error}); expected a table with the columns start, end (seconds), ipa"
+        ) from error
+    if not found or any(not (math.isfinite(p.end) and 0 <= p.start <= p.end) for p in found):
+        raise FaceDiffError(f"{path}: expected phonemes whose start is not below 0 and not after their end")
+    return found
+
+
+def _word(row: dict[str, str]) -> str:
+    return (row.get("word") or "").strip()
+
+
+def find_phoneme(wanted: str, phonemes: Sequence[Phoneme], clip: str) -> Phoneme:
+    """A phoneme by name: ``m`` is the first of the clip, ``m:2`` the second.
+
+    A name that is in the clip to the letter goes first; else stress marks are passed over, then length marks and
+    diacritics; else it is the name of a viseme, ``PP``.
+
+    Raises:
+        FaceDiffError: if the clip has no such phoneme, or not so many.
+    """
+    name, _, number = wanted.rpartition(":") if re.search(r".:\d+$", wanted) else (wanted, "", "1")
+    place, spoken = int(number), [phoneme for phoneme in phonemes if phoneme.ipa]
+    for same in (
+        lambda p: p.ipa == name,
+        lambda p: p.plain == name.strip(STRESS),
+        lambda p: _bare(p.ipa) == _bare(name),
+        lambda p: name in p.viseme.split("+"),
+    ):
+        found = [phoneme for phoneme in spoken if same(phoneme)]
+        if found:
+            if 1 <= place <= len(found):
+                return found[place - 1]
+            raise FaceDiffError(f'phoneme "{wanted}": clip {clip} has {name} {len(found)} times, counted from 1')
+    known = dict.fromkeys(phoneme.plain for phoneme in spoken)
+    raise FaceDiffError(f'phoneme "{wanted}": not spoken in clip {clip}: {choices(name, known)}')
+
+
+def _bare(ipa: str) -> str:
+    """Without stress, length and diacritics."""
+    letters = unicodedata.normalize("NFD", ipa)
+    return "".join(letter for letter in letters if letter not in STRESS + LENGTH and not unicodedata.combining(letter))
+
+
+HIGHEST = 50.0
+"""Largest height of a picture in mm."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A moment of a clip.
+
+    Attributes:
+        time: in seconds.
+        phoneme: what is spoken then; None if it was chosen by its time alone.
+    """
+
+    time: float
+    phoneme: Phoneme | None = None
+
+    @property
+    def heading(self) -> Heading:
+        """What is written above its column."""
+        if self.phoneme is None or not self.phoneme.ipa:
+            return Heading(small=f"{self.time:.2f} s")
+        word = f" {self.phoneme.word}" if self.phoneme.word else ""
+        return Heading(f"/{self.phoneme.plain}/{word}", f"{self.time:.2f} s")
+
+
+def frame_at(time: float, frame_rate: float) -> int:
+    """Number of the frame that is shown at a time: frame k lasts from k / frame_rate to (k + 1) / frame_rate.
+
+    -1 for a time that is no number.
+    """
+    return int(np.floor(time * frame_rate + 1e-6)) if np.isfinite(time) else -1
+
+
+def pick_frames(material: Material, clip: str, moments: Sequence[Moment]) -> dict[str, list[Array]]:
+    """Faces (V, 3) of the truth and each method at every moment.
+
+    Raises:
+        FaceDiffError: if a moment is outside a motion, or a frame holds NaN or infinity.
+    """
+    picked: dict[str, list[Array]] = {}
+    for name, motion in material.open(clip).items():
+        picked[name] = []
+        for moment in moments:
+            frame, path = frame_at(moment.time, material.rate), material.path(clip, name)
+            if not 0 <= frame < len(motion):
+                raise FaceDiffError(
+                    f"{path}: has no frame at {moment.time:g} s; {name} lasts from 0 to "
+                    f"{len(motion) / material.rate:g} s ({len(motion)} frames at {material.rate:g} a "
+                    f"second; --frame-rate says another rate)"
+                )
+            face = np.asarray(motion[frame], np.float64)
+            if not np.isfinite(face).all():
+                raise FaceDiffError(f"{path}: frame {frame} holds NaN or infinity (counted from 0); choose another")
+            picked[name].append(face)
+    return picked
+
+
+def draw_frames(
+    material: Material,
+    clip: str,
+    moments: Sequence[Moment],
+    output: Path,
+    *,
+    paper: Paper | None = None,
+    view: str = "front",
+    region: Sequence[int] | None = None,
+) -> None:
+    """Draw truth and methods, a row each, at chosen moments, a column each.
+
+    Args:
+        material: what to draw from.
+        clip: ``<subject>_<sentence>``.
+        moments: the columns.
+        output: ``.png``, ``.pdf`` or ``.svg``.
+        paper: width, resolution and font.
+        view: a name in :data:`facediff.render.VIEWS`.
+        region: vertices to show closely, such as the lips; the whole face if None.
+
+    Raises:
+        FaceDiffError: if there is no moment, no mesh, or a file cannot be used.
+    """
+    check_output(output)
+    if not moments:
+        raise FaceDiffError("choose what the columns show, with --times or --phonemes")
+    paper = paper or Paper()
+    faces, shape = material.mesh([clip])
+    painter = Painter(faces, shape, view=view, colours=material.colours, region=region)
+    picked = pick_frames(material, clip, moments)
+    with style(paper):
+        headings = [moment.heading for moment in moments]
+        grid = Grid(paper, material.names, headings, aspect=painter.aspect, highest=HIGHEST, remark=material.remark)
+        painter.set_size(*grid.pixels)
+        page = grid.page()
+        for row, shown in enumerate(picked.values()):
+            for column, face in enumerate(shown):
+                page.picture(painter.paint(face), *grid.place(row, column))
+        save(page.figure, output)

@@ -1,0 +1,297 @@
+"""Figures of numbers at vertices: how much each moves, and how far it is from the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.evaluation.figures.material import FLAT, TRUTH, Array, Material, Painter, chunks, shortest
+from facediff.evaluation.figures.page import (
+    GAP,
+    SMALLEST_TEXT,
+    Grid,
+    Heading,
+    Page,
+    Paper,
+    check_output,
+    plain,
+    save,
+    style,
+    wrapped,
+)
+
+# The numbers behind pictures of the face: how much each vertex moves, and how far it is from the truth.
+
+
+class Moments:
+    """Mean, population standard deviation and maximum over frames that come a few at a time.
+
+    Chan, Golub and LeVeque's update (1983) of mean and sum of squared deviations: exact to rounding for any number of
+    frames, where a difference of sums of squares is not.
+
+    Args:
+        n_vertices: numbers a frame.
+    """
+
+    def __init__(self, n_vertices: int) -> None:
+        self.count = 0
+        self.mean: Array = np.zeros(n_vertices)
+        self.maximum: Array = np.zeros(n_vertices)
+        self._squares: Array = np.zeros(n_vertices)
+
+    def add(self, values: Array) -> None:
+        """Take in values (frames, n_vertices), none below zero."""
+        count = self.count + len(values)
+        mean = values.mean(0)
+        apart = mean - self.mean
+        self._squares += ((values - mean) ** 2).sum(0) + apart**2 * (self.count * len(values) / count)
+        self.mean = self.mean + apart * (len(values) / count)
+        self.maximum = np.maximum(self.maximum, values.max(0))
+        self.count = count
+
+    @property
+    def deviation(self) -> Array:
+        """Population standard deviation (n_vertices,)."""
+        return np.asarray(np.sqrt(self._squares / max(self.count, 1)))
+
+
+@dataclass(frozen=True)
+class VertexMap:
+    """A number at each vertex, in the vertices' unit.
+
+    Attributes:
+        mean: mean over frames (V,).
+        deviation: population standard deviation over frames (V,).
+        maximum: maximum over frames (V,).
+        frames: frames that they are over.
+    """
+
+    mean: Array
+    deviation: Array
+    maximum: Array
+    frames: int
+
+
+def motion_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, VertexMap], list[str]]:
+    """How far each vertex is from the subject's template, over all frames of the clips, of truth and methods.
+
+    Where lengths differ, the frames that all have are taken, so that the panels of a figure compare alike.
+
+    Returns:
+        a map by name, the truth's first; and notes on frames that were left out.
+
+    Raises:
+        FaceDiffError: if a file cannot be used or a template is missing.
+    """
+    found = {name: Moments(material.n_vertices) for name in material.names}
+    notes = []
+    for clip in clips:
+        template, motions = material.template(clip), material.open(clip)
+        frames, note = shortest(motions)
+        notes += [f"{clip}: {note}"] if note else []
+        for name, motion in motions.items():
+            for _, part in chunks(motion, material.path(clip, name), frames):
+                found[name].add(np.linalg.norm(part - template, axis=2))
+    return {name: _map(moments) for name, moments in found.items()}, notes
+
+
+def error_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, VertexMap], list[str]]:
+    """How far each vertex is from the truth's, over all frames of the clips, of every method.
+
+    Returns:
+        a map by method; and notes on frames that were left out.
+
+    Raises:
+        FaceDiffError: if a file cannot be used.
+    """
+    found = {name: Moments(material.n_vertices) for name in material.methods}
+    notes = []
+    for clip in clips:
+        motions = material.open(clip)
+        frames, note = shortest(motions)
+        notes += [f"{clip}: {note}"] if note else []
+        for name, moments in found.items():
+            true = chunks(motions[TRUTH], material.path(clip, TRUTH), frames)
+            predicted = chunks(motions[name], material.path(clip, name), frames)
+            for (_, one), (_, other) in zip(predicted, true, strict=True):
+                moments.add(np.linalg.norm(one - other, axis=2))
+    return {name: _map(moments) for name, moments in found.items()}, notes
+
+
+def _map(moments: Moments) -> VertexMap:
+    return VertexMap(moments.mean, moments.deviation, moments.maximum, moments.count)
+
+
+HIGHEST = 70.0
+"""Largest height of a picture in mm."""
+
+BAR, BAR_SPACE = 2.5, 16.0
+"""Width of a colour bar, and of the bar with its numbers and label, in mm."""
+
+Statistic = Literal["mean", "max", "both"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of pictures with one colour scale.
+
+    Attributes:
+        label: what the colour bar says, without the unit.
+        values: numbers (V,) by column, in the vertices' unit.
+        highest: value of the last colour, in the unit shown; the largest value of the row if None.
+    """
+
+    label: str
+    values: dict[str, Array]
+    highest: float | None = None
+
+
+def draw_heatmap(
+    material: Material,
+    clips: Sequence[str],
+    output: Path,
+    *,
+    paper: Paper | None = None,
+    view: str = "front",
+    highest: tuple[float | None, float | None] = (None, None),
+) -> list[str]:
+    """Draw mean and standard deviation over time of each vertex's distance from the template, truth and methods.
+
+    Args:
+        material: what to draw from.
+        clips: clips whose frames count.
+        output: ``.png``, ``.pdf`` or ``.svg``.
+        paper: width, resolution and font.
+        view: a name in :data:`facediff.render.VIEWS`.
+        highest: ends of the colour scales of mean and deviation, in the unit shown; the largest value if None.
+
+    Returns:
+        notes on what was left out.
+
+    Raises:
+        FaceDiffError: if there is no mesh, or a file cannot be used.
+    """
+    check_output(output)
+    mesh = material.mesh(clips)
+    maps, notes = motion_maps(material, clips)
+    rows = [
+        Row("mean of motion", {name: each.mean for name, each in maps.items()}, highest[0]),
+        Row("std of motion", {name: each.deviation for name, each in maps.items()}, highest[1]),
+    ]
+    _draw(material, mesh, rows, output, paper or Paper(), view)
+    return notes
+
+
+def draw_error(
+    material: Material,
+    clips: Sequence[str],
+    output: Path,
+    *,
+    paper: Paper | None = None,
+    view: str = "front",
+    statistic: Statistic = "mean",
+    highest: tuple[float | None, float | None] = (None, None),
+) -> list[str]:
+    """Draw how far each vertex is from the truth's, mean or maximum over frames, a column for each method.
+
+    Args:
+        material: what to draw from.
+        clips: clips whose frames count.
+        output: ``.png``, ``.pdf`` or ``.svg``.
+        paper: width, resolution and font.
+        view: a name in :data:`facediff.render.VIEWS`.
+        statistic: over frames: ``mean``, ``max``, or ``both``, a row each.
+        highest: ends of the colour scales of mean and maximum, in the unit shown; the largest value if None.
+
+    Returns:
+        notes on what was left out.
+
+    Raises:
+        FaceDiffError: if there is no mesh, or a file cannot be used.
+    """
+    check_output(output)
+    mesh = material.mesh(clips)
+    maps, notes = error_maps(material, clips)
+    rows = {
+        "mean": Row("mean error", {name: each.mean for name, each in maps.items()}, highest[0]),
+        "max": Row("maximum error", {name: each.maximum for name, each in maps.items()}, highest[1]),
+    }
+    chosen = list(rows.values()) if statistic == "both" else [rows[statistic]]
+    _draw(material, mesh, chosen, output, paper or Paper(), view)
+    return notes
+
+
+def _draw(
+    material: Material,
+    mesh: tuple[npt.NDArray[np.int32], Array],
+    rows: Sequence[Row],
+    output: Path,
+    paper: Paper,
+    view: str,
+) -> None:
+    from facediff.render.panels import heat_colours
+
+    factor, unit = material.scale
+    ends = [scale_end(row.values, factor, row.highest) for row in rows]
+    faces, shape = mesh
+    painter = Painter(faces, shape, view=view, look=FLAT)
+    names = list(rows[0].values)
+    with style(paper):
+        grid = Grid(
+            paper,
+            [""] * len(rows),
+            [Heading(name) for name in names],
+            aspect=painter.aspect,
+            highest=HIGHEST,
+            right=BAR_SPACE + 2 * GAP,
+            remark=material.remark,
+        )
+        painter.set_size(*grid.pixels)
+        page = grid.page()
+        for number, (row, end) in enumerate(zip(rows, ends, strict=True)):
+            for column, name in enumerate(names):
+                colours = heat_colours(row.values[name] * factor, end)
+                page.picture(painter.paint(shape, colours), *grid.place(number, column))
+            beyond = max(float(values.max()) for values in row.values.values()) * factor > end * (1 + 1e-9)
+            _bar(page, grid, number, end, f"{row.label} [{unit}]", beyond=beyond)
+        save(page.figure, output)
+
+
+def scale_end(values: Mapping[str, Array], factor: float, highest: float | None) -> float:
+    """Value of a row's last colour, in the unit shown.
+
+    Raises:
+        FaceDiffError: if it is not above 0.
+    """
+    if highest is not None:
+        if not (np.isfinite(highest) and highest > 0):
+            raise FaceDiffError(f"the end of a colour scale is {highest:g}; expected a number above 0")
+        return highest
+    largest = max(float(each.max()) for each in values.values()) * factor
+    return largest if largest > 0 else 1.0  # nothing moves: any scale is right
+
+
+def _bar(page: Page, grid: Grid, row: int, end: float, label: str, *, beyond: bool) -> None:
+    """A colour bar at the right of a row, of the very colours that the meshes have."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+    from matplotlib.ticker import MaxNLocator
+
+    from facediff.render.panels import heat_ramp
+
+    _, top = grid.place(row, 0)
+    height = min(grid.height * 0.9, 45.0)
+    axes = page.axes(grid.end + 2 * GAP, top + (grid.height - height) / 2, BAR, height)
+    shown = ScalarMappable(Normalize(0, end), ListedColormap(heat_ramp() / 255))
+    bar = page.figure.colorbar(shown, cax=axes, extend="max" if beyond else "neither")
+    lines = wrapped(label, grid.height, SMALLEST_TEXT, page.paper.font)  # it must not run into the next row's
+    bar.set_label(plain("\n".join(lines)), size=SMALLEST_TEXT)
+    bar.outline.set_linewidth(0.4)
+    bar.locator = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
+    bar.update_ticks()

@@ -1,0 +1,367 @@
+"""What figures are drawn from: the clips that truth and all methods have, and what is known about their mesh."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
+
+from facediff.data.corpus import ALL
+from facediff.errors import FaceDiffError, choices
+from facediff.evaluation.files import (
+    DEFAULT_PATTERNS,
+    OWN,
+    TRUTH_PATTERN,
+    NamePattern,
+    Truth,
+    index_truths,
+    list_names,
+    pair_up,
+)
+from facediff.evaluation.scoring import read_vertices
+from facediff.render import EVEN, Camera, Light, Look, Renderer
+from facediff.render.rasteriser import FIELD_OF_VIEW
+
+TRUTH = "truth"
+"""What the truth is called in a figure."""
+
+CHUNK = 2**20
+"""Coordinates that are widened to float64 at a time: 8 MB, however long a clip is."""
+
+LISTED = 12
+"""Clips that a message names at most."""
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Material:
+    """The files of truth and methods, and what lies beside them.
+
+    Attributes:
+        truths: truths by clip, ``<subject>_<sentence>``.
+        methods: each method's predictions by clip; methods in the order in which they are drawn.
+        n_vertices: vertices V of the mesh.
+        frame_rate: frames a second of the predictions, and of the truth after ``truth_stride``; None if not known.
+        truth_stride: every how many-th frame of a truth is taken.
+        unit: unit of length of the vertices.
+        templates: neutral face (V, 3) by subject.
+        faces: triangles (F, 3); None if no mesh is known.
+        rest: positions (V, 3) of the mesh file; None if no mesh is known.
+        colours: sRGB (V, 3) of the mesh file; None if it has none.
+        corpus: the corpus folder that the truth belongs to, if it does.
+        remark: what is written below every figure, such as that the corpus is synthetic.
+    """
+
+    truths: dict[str, Truth]
+    methods: dict[str, dict[str, Path]]
+    n_vertices: int
+    frame_rate: float | None = None
+    truth_stride: int = 1
+    unit: str = ""
+    templates: Mapping[str, Tensor] = field(default_factory=dict)
+    faces: npt.NDArray[np.int32] | None = None
+    rest: Array | None = None
+    colours: npt.NDArray[np.uint8] | None = None
+    corpus: Path | None = None
+    remark: str = ""
+
+    @property
+    def names(self) -> list[str]:
+        """The truth's name and the methods'."""
+        return [TRUTH, *self.methods]
+
+    @property
+    def scale(self) -> tuple[float, str]:
+        """What lengths are multiplied with to be shown, and the unit that they are shown in."""
+        return (1000.0, "mm") if self.unit == "m" else (1.0, self.unit.partition(" (")[0] or "unit of the vertices")
+
+    @property
+    def rate(self) -> float:
+        """Frames a second.
+
+        Raises:
+            FaceDiffError: if nothing says it.
+        """
+        if self.frame_rate is None:
+            raise FaceDiffError("nothing says how many frames a second the predictions have; give --frame-rate")
+        return self.frame_rate
+
+    def choose(self, clips: Sequence[str] | None = None) -> list[str]:
+        """Clips to draw: those asked for, else all that the truth and every method have.
+
+        Raises:
+            FaceDiffError: if a clip is not there, or there is none that all have.
+        """
+        common = [clip for clip in self.truths if all(clip in files for files in self.methods.values())]
+        if clips is None:
+            if not common:
+                raise FaceDiffError(
+                    f"{' and '.join(self.names)} have no clip in common; the truth has {few(self.truths)}; "
+                    f"say how files are named with --pattern and --truth-pattern"
+                )
+            return common
+        for clip in clips:
+            if clip not in self.truths:
+                raise FaceDiffError(f'there is no clip "{clip}": {few(self.truths, clip)}')
+            for method, files in self.methods.items():
+                if clip not in files:
+                    raise FaceDiffError(f'{method} has no prediction of clip "{clip}": {few(files, clip)}')
+        return list(dict.fromkeys(clips))  # one that was named twice counts once
+
+    def open(self, clip: str) -> dict[str, Tensor]:
+        """Absolute vertices (T, V, 3) of the truth and of each method, memory-mapped, each in its own length.
+
+        Raises:
+            FaceDiffError: if a file is unreadable, empty, or of another mesh than the truth.
+        """
+        opened = {TRUTH: read_vertices(self.truths[clip].path, self.n_vertices, self.truth_stride)}
+        for method, files in self.methods.items():
+            try:
+                opened[method] = read_vertices(files[clip], self.n_vertices)
+            except FaceDiffError as error:
+                raise FaceDiffError(
+                    f"{method}: {error}; all methods of a figure have the truth's mesh of {self.n_vertices} vertices"
+                ) from error
+        return opened
+
+    def path(self, clip: str, name: str) -> Path:
+        """Where a clip's vertices lie, of the truth or of a method."""
+        return self.truths[clip].path if name == TRUTH else self.methods[name][clip]
+
+    def template(self, clip: str) -> Array:
+        """Neutral face (V, 3) of a clip's subject.
+
+        Raises:
+            FaceDiffError: if there is none.
+        """
+        subject = self.truths[clip].name.subject
+        if subject not in self.templates:
+            known = f"there are templates of {', '.join(self.templates)}" if self.templates else "give --templates FILE"
+            raise FaceDiffError(f"no template of {subject}, needed by clip {clip}; {known}")
+        return np.asarray(self.templates[subject], np.float64)
+
+    def mesh(self, clips: Sequence[str]) -> tuple[npt.NDArray[np.int32], Array]:
+        """Triangles (F, 3), and a face at rest (V, 3): the mean of the clips' templates, else the mesh file's own.
+
+        Raises:
+            FaceDiffError: if no mesh is known.
+        """
+        if self.faces is None or self.rest is None:
+            raise FaceDiffError(
+                "nothing says how the vertices are joined to faces; give --mesh FILE, a .ply or .obj of this topology"
+            )
+        subjects = dict.fromkeys(self.truths[clip].name.subject for clip in clips)
+        found = [np.asarray(self.templates[name], np.float64) for name in subjects if name in self.templates]
+        return self.faces, np.mean(found, axis=0) if found else self.rest
+
+
+def find_clips(
+    methods: Mapping[str, Path],
+    truth: Path,
+    *,
+    subjects: Sequence[str] = (),
+    patterns: Sequence[str] = DEFAULT_PATTERNS,
+    truth_pattern: str = TRUTH_PATTERN,
+    identity: str = OWN,
+) -> tuple[dict[str, Truth], dict[str, dict[str, Path]]]:
+    """Which file is which clip's, as ``facediff evaluate`` tells it.
+
+    Args:
+        methods: folder of predictions by method.
+        truth: folder of truths.
+        subjects: known subjects.
+        patterns: how predictions may be named.
+        truth_pattern: how truths are named.
+        identity: ``own``, or the identity whose predictions are drawn.
+
+    Returns:
+        truths by clip, and each method's predictions by clip.
+
+    Raises:
+        FaceDiffError: if a folder is missing or has no file that can be told, or a method none of a truth's clip.
+    """
+    if identity == ALL:
+        raise FaceDiffError("--identity all: a figure shows one condition; expected own or an identity's name")
+    if TRUTH in methods:
+        raise FaceDiffError(f'a method cannot be called "{TRUTH}"; name it with NAME=FOLDER')
+    names, _ = list_names(truth, [NamePattern(truth_pattern, subjects)])
+    truths = dict(sorted(index_truths(names).items()))
+    if not truths:
+        raise FaceDiffError(f"{truth}: no file is named like {truth_pattern}.npy; say how with --truth-pattern")
+    readers = [NamePattern(pattern, subjects) for pattern in patterns]
+    found: dict[str, dict[str, Path]] = {}
+    for method, folder in methods.items():
+        files, _ = list_names(folder, readers)
+        pairs = pair_up(files, truths, identity).pairs
+        if not pairs:
+            raise FaceDiffError(
+                f"{folder}: no file is a prediction of a truth's clip under the condition {identity}; the truth has "
+                f"{few(truths)}; say how files are named with --pattern, or choose another --identity"
+            )
+        found[method] = {pair.clip: next(iter(pair.predictions.values())) for pair in pairs}
+    return truths, found
+
+
+def few(clips: Mapping[str, object], like: str = "") -> str:
+    """The names of clips for a message, not more than a few, the nearest first."""
+    import difflib
+
+    if len(clips) <= LISTED:
+        return choices(like, clips) if like else ", ".join(clips)
+    near = difflib.get_close_matches(like, clips, n=LISTED, cutoff=0.3) if like else []
+    if near:
+        return f'did you mean "{near[0]}"? near are {", ".join(near)} of {len(clips)}'
+    return f"{', '.join(list(clips)[:LISTED])} … ({len(clips)} in all)"
+
+
+def shortest(motions: Mapping[str, Tensor]) -> tuple[int, str | None]:
+    """Frames that all motions have, and a note on what that cuts; None if they are of one length."""
+    lengths = {name: len(motion) for name, motion in motions.items()}
+    frames = min(lengths.values())
+    if len(set(lengths.values())) == 1:
+        return frames, None
+    told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+    return frames, f"lengths differ ({told} frames): cut to the first {frames}"
+
+
+def chunks(motion: Tensor, path: Path, frames: int | None = None) -> Iterator[tuple[int, Array]]:
+    """A motion (T, V, 3) in float64, a few frames at a time, each with the number of its first frame.
+
+    Args:
+        motion: the motion.
+        path: its file, for messages.
+        frames: frames to read; all if None.
+
+    Raises:
+        FaceDiffError: at NaN or infinity.
+    """
+    frames = len(motion) if frames is None else frames
+    step = max(1, CHUNK // max(1, motion[0].numel()))
+    for first in range(0, frames, step):
+        part = np.asarray(motion[first : min(first + step, frames)], np.float64)
+        finite = np.isfinite(part).all((1, 2))
+        if not finite.all():
+            bad = first + int(np.argmin(finite))
+            raise FaceDiffError(f"{path}: frame {bad} holds NaN or infinity (counted from 0); repair or leave it out")
+        yield first, part
+
+
+# Pictures of meshes for figures: on white, cut to the face, all with one camera.
+
+WHITE = (1.0, 1.0, 1.0)
+
+SHADED = Look(lights=EVEN, background_top=WHITE, background_bottom=WHITE)
+"""For faces: light from straight ahead, the same on both halves."""
+
+FLAT = Look(
+    lights=(Light((0.0, 0.25, 0.97), (0.45, 0.45, 0.45), wrap=1.0),),
+    sky=(0.55, 0.55, 0.55),
+    ground=(0.55, 0.55, 0.55),
+    background_top=WHITE,
+    background_bottom=WHITE,
+)
+"""For colours that stand for numbers: what faces the viewer has exactly its colour, without highlights."""
+
+MARGIN = 0.015
+"""Share of the face's size that stays free on every side, for motion that leaves the template."""
+
+HALF = math.tan(FIELD_OF_VIEW / 2)
+"""Half the extent of a camera's picture at distance 1."""
+
+SMALLEST = 40
+"""Fewest pixels of a picture that shows anything."""
+
+AROUND_LIPS = 0.9
+"""How much more than the lips a close-up shows on every side, as a share of their width."""
+
+
+class Painter:
+    """Draws one topology, white around, with a camera framed once on a face at rest.
+
+    Args:
+        faces: triangles (F, 3).
+        shape: the face at rest (V, 3).
+        view: a name in ``VIEWS``.
+        look: material and lights.
+        colours: sRGB (V, 3) of the surface; the look's material if None.
+        region: vertices to show closely; the whole mesh if None.
+    """
+
+    def __init__(
+        self,
+        faces: npt.NDArray[np.int32],
+        shape: Array,
+        *,
+        view: str = "front",
+        look: Look = SHADED,
+        colours: npt.NDArray[np.uint8] | None = None,
+        region: Sequence[int] | None = None,
+    ) -> None:
+        self.faces, self.shape, self.look, self.colours = faces, shape, look, colours
+        framed = shape if region is None else _box_around(shape[list(region)])
+        whole, camera = Camera.framing(shape, view=view), Camera.framing(framed, view=view)
+        # A close-up must not cut off the ears, which lie behind what it is framed on.
+        self._camera = replace(camera, radius=max(camera.radius, whole.radius))
+        points = self._camera.to_camera(framed)
+        seen = points[:, :2] / -points[:, 2:]
+        margin = MARGIN * np.ptp(seen, axis=0).max()
+        # The camera leaves free what perspective takes from the far parts: pictures are cut to what is seen.
+        self._seen = np.clip(seen.min(0) - margin, -HALF, HALF), np.clip(seen.max(0) + margin, -HALF, HALF)
+        self._cut = slice(0), slice(0)
+        self._renderer: Renderer | None = None
+
+    @property
+    def aspect(self) -> float:
+        """Width of a picture by its height."""
+        low, high = self._seen
+        return float((high[0] - low[0]) / (high[1] - low[1]))
+
+    def set_size(self, width: int, height: int) -> None:
+        """Say how many pixels a picture has.
+
+        Raises:
+            FaceDiffError: if they are too few to see anything.
+        """
+        if min(width, height) < SMALLEST:
+            raise FaceDiffError(
+                f"a picture of {width} × {height} pixels shows nothing; draw fewer columns, or raise --width or --dpi"
+            )
+        low, high = self._seen
+        scale = height / (high[1] - low[1])
+        size = math.ceil(2 * HALF * scale)
+        left, top = round((HALF + low[0]) * scale), round((HALF - high[1]) * scale)
+        left, top = min(max(left, 0), max(size - width, 0)), min(max(top, 0), max(size - height, 0))
+        self._cut = slice(top, top + height), slice(left, left + width)
+        self._renderer = Renderer(
+            self.faces,
+            template=self.shape,
+            size=(max(size, height), max(size, width)),
+            camera=self._camera,
+            look=self.look,
+            colours=self.colours,
+        )
+
+    def paint(self, vertices: Array, colours: npt.NDArray[np.uint8] | None = None) -> npt.NDArray[np.uint8]:
+        """A picture (height, width, 3) of a face (V, 3) on pure white."""
+        if self._renderer is None:
+            raise ValueError("say the size first, with set_size")
+        picture, backdrop = (
+            each[self._cut] for each in (self._renderer.render(vertices, colours=colours), self._renderer.backdrop)
+        )
+        picture[(picture == backdrop).all(-1)] = 255  # the backdrop darkens towards its corners
+        return picture
+
+
+def _box_around(points: Array) -> Array:
+    """The points with the corners of a larger box."""
+    low, high = points.min(0), points.max(0)
+    more = AROUND_LIPS / 2 * (high[0] - low[0])
+    low, high = low - (more, more, 0), high + (more, more, 0)
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
+    return np.concatenate([points, corners])

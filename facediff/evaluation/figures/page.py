@@ -1,0 +1,348 @@
+"""A figure of exact size in millimetres: fonts, colours and files as journals want them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.utils.files import atomic, check_writable
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+SUFFIXES = (".png", ".pdf", ".svg")
+COLUMN, PAGE = 85.0, 175.0
+"""Widths in mm of a column and of a page of the usual journals."""
+
+SMALLEST_TEXT, TEXT = 7.0, 8.0
+"""Sizes of letters in points."""
+
+POINTS_PER_MM = 72 / 25.4
+FONT = "DejaVu Sans"
+"""The font that matplotlib brings: it has the letters of the IPA, and is the same on every machine."""
+
+BLACK, GREY, FAINT = "#000000", "#595959", "#BFBFBF"
+
+# Okabe and Ito's colours (2008), without black, which is the truth's, and yellow, which is too faint for lines.
+LINES: tuple[tuple[str, Any], ...] = (
+    ("#0072B2", "-"),
+    ("#D55E00", (0, (5, 1.5))),
+    ("#009E73", (0, (1.2, 1.2))),
+    ("#CC79A7", (0, (5, 1.5, 1.2, 1.5))),
+    ("#E69F00", (0, (3, 1))),
+    ("#56B4E9", (0, (8, 1.5, 1.2, 1.5, 1.2, 1.5))),
+)
+"""Colour and dashes of each line, so that lines are told apart without colours too."""
+
+
+@dataclass(frozen=True)
+class Paper:
+    """What a figure is drawn on.
+
+    Attributes:
+        width: of the figure in mm.
+        dpi: pixels an inch, of PNG and of the pictures inside PDF and SVG.
+        font: family of all letters.
+    """
+
+    width: float = PAGE
+    dpi: int = 300
+    font: str = FONT
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not 30 <= self.width <= 1000:
+            raise FaceDiffError(f"--width {self.width:g}: expected millimetres from 30 to 1000, e.g. 85 or 175")
+        if not 50 <= self.dpi <= 1200:
+            raise FaceDiffError(f"--dpi {self.dpi}: expected pixels an inch from 50 to 1200, e.g. 300")
+
+    def pixels(self, mm: float) -> int:
+        """Whole pixels of a length."""
+        return round(mm * self.dpi / 25.4)
+
+
+def matplotlib() -> ModuleType:
+    """The package, or a sentence that says how to get it.
+
+    Raises:
+        MissingExtraError: if it is not installed.
+    """
+    try:
+        import matplotlib as package
+        import matplotlib.backends.backend_agg
+        import matplotlib.figure  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("matplotlib", "figures", "drawing figures") from error
+    return package
+
+
+def check_output(path: Path) -> None:
+    """Refuse, before any work is done, a suffix that is no format, or a place that cannot be written.
+
+    Raises:
+        FaceDiffError: if either is so.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise FaceDiffError(f'--output {path}: unknown suffix "{path.suffix}"; expected one of {", ".join(SUFFIXES)}')
+    check_writable(path)
+
+
+@contextmanager
+def style(paper: Paper) -> Iterator[None]:
+    """Settings under which a figure is made and saved; the caller's own come back afterwards.
+
+    Raises:
+        FaceDiffError: if the font is not installed, or lacks a letter.
+    """
+    package = matplotlib()
+    _check_font(paper.font)
+    settings = {
+        "font.family": [paper.font],
+        "font.size": TEXT,
+        "axes.labelsize": TEXT,
+        "axes.titlesize": TEXT,
+        "xtick.labelsize": SMALLEST_TEXT,
+        "ytick.labelsize": SMALLEST_TEXT,
+        "legend.fontsize": TEXT,
+        "legend.frameon": False,
+        "legend.handlelength": 2.6,
+        "axes.linewidth": 0.6,
+        "xtick.major.width": 0.6,
+        "ytick.major.width": 0.6,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.formatter.use_mathtext": False,
+        "pdf.fonttype": 42,
+        "svg.fonttype": "none",
+        "svg.hashsalt": "facediff",
+    }
+    with package.rc_context(), warnings.catch_warnings():
+        package.rcdefaults()  # a matplotlibrc of the user's must not change the figure
+        package.rcParams.update(settings)
+        warnings.filterwarnings("error", r"Glyph \d+ .*missing", UserWarning)
+        try:
+            yield
+        except UserWarning as warning:
+            if "Glyph" not in str(warning):
+                raise
+            letter = str(warning).partition(" missing")[0]
+            raise FaceDiffError(f"the font {paper.font} lacks a letter ({letter}); choose one with --font") from warning
+
+
+def _check_font(name: str) -> None:
+    from matplotlib import font_manager
+
+    known = sorted(set(font_manager.get_font_names()))
+    if name not in known:
+        raise FaceDiffError(f'--font: there is no "{name}": {choices(name, known)}')
+
+
+class Page:
+    """A figure whose parts are placed in millimetres from its upper left corner.
+
+    Args:
+        paper: what it is drawn on.
+        height: in mm.
+    """
+
+    def __init__(self, paper: Paper, height: float) -> None:
+        self.paper, self.height = paper, height
+        self.figure = new_figure(paper, height)
+        self._size = (paper.pixels(paper.width), paper.pixels(height))
+
+    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
+        """Axes in a rectangle whose edges lie on whole pixels."""
+        return self._axes(*(self.paper.pixels(mm) for mm in (left, top, width, height)))
+
+    def picture(self, picture: npt.NDArray[np.uint8], left: float, top: float) -> None:
+        """A picture (height, width, 3), pixel for pixel."""
+        size = picture.shape[1], picture.shape[0]
+        axes = self._axes(self.paper.pixels(left), self.paper.pixels(top), *size)
+        axes.set_axis_off()
+        axes.imshow(picture, interpolation="none", aspect="auto", extent=(0, size[0], 0, size[1]))
+
+    def text(self, text: str, x: float, y: float, **options: object) -> None:
+        """Text at a place; options are those of matplotlib's ``Figure.text``."""
+        settings: dict[str, Any] = {"va": "center", "ha": "center", "size": TEXT, **options}
+        self.figure.text(x / self.paper.width, 1 - y / self.height, plain(text), **settings)
+
+    def _axes(self, left: int, top: int, width: int, height: int) -> Axes:
+        across, down = self._size
+        return self.figure.add_axes((left / across, 1 - (top + height) / down, width / across, height / down))
+
+
+def new_figure(paper: Paper, height: float, **options: object) -> Figure:
+    """An empty figure of whole pixels, without any of pyplot's state; options are those of matplotlib's ``Figure``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    settings: dict[str, Any] = dict(options)
+    # A hair more than whole pixels, which matplotlib rounds down to.
+    size = [(paper.pixels(mm) + 1e-3) / paper.dpi for mm in (paper.width, height)]
+    figure = Figure(figsize=(size[0], size[1]), dpi=paper.dpi, facecolor="white", **settings)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure in the format of the file's suffix, whole or not at all; the same figure gives the same bytes.
+
+    Call it inside :func:`style`.
+
+    Raises:
+        FaceDiffError: if the suffix is unknown or the file cannot be written.
+    """
+    check_output(path)
+    dates: dict[str, dict[str, Any]] = {
+        ".png": {"Software": None},
+        ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+        ".svg": {"Date": None, "Creator": None},
+    }
+    suffix = path.suffix.lower()
+    with atomic(path) as temporary:
+        figure.savefig(temporary, format=suffix[1:], dpi="figure", metadata=dates[suffix])
+
+
+def plain(text: str) -> str:
+    """Text that matplotlib does not take for a formula."""
+    return text.replace("$", r"\$")
+
+
+def text_width(text: str, size: float, font: str = FONT) -> float:
+    """Width of a line of text in mm, at a size in points."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(family=font, size=size), False)
+    return float(width) / POINTS_PER_MM
+
+
+def wrapped(text: str, width: float, size: float, font: str = FONT) -> list[str]:
+    """Text in lines no wider than so many mm: broken behind blanks, "-" and "_" where that is enough, else anywhere."""
+    words: list[str] = [""]
+    for letter in text:
+        words[-1] += letter
+        if letter in " -_":
+            words.append("")
+    lines = [""]
+    for word in filter(None, words):
+        if lines[-1] and text_width(lines[-1] + word.rstrip(), size, font) > width:
+            lines.append("")
+        lines[-1] += word
+        while len(lines[-1]) > 1 and text_width(lines[-1].rstrip(), size, font) > width:
+            fits = max(1, sum(text_width(lines[-1][: n + 1], size, font) <= width for n in range(len(lines[-1]))))
+            lines[-1:] = [lines[-1][:fits], lines[-1][fits:]]
+    return [line.rstrip() for line in lines if line.strip()] or [""]
+
+
+def line_height(size: float) -> float:
+    """Height of a line of text in mm, at a size in points."""
+    return 1.25 * size / POINTS_PER_MM
+
+
+# Pictures in rows and columns with their labels, laid out in millimetres.
+
+GAP = 1.0
+"""Millimetres between pictures, and between pictures and labels."""
+
+NAME_LINES = 2
+"""Lines that a row's name may have."""
+
+
+@dataclass(frozen=True)
+class Heading:
+    """What is written above a column: a line in large letters and one in small ones; either may be empty."""
+
+    large: str = ""
+    small: str = ""
+
+
+class Grid:
+    """Places of pictures of one size; row names stand upright at the left, headings above the columns.
+
+    Args:
+        paper: what the figure is drawn on.
+        rows: name of each row.
+        columns: heading of each column.
+        aspect: width of a picture by its height.
+        highest: largest height of a picture in mm.
+        right: mm that stay free at the right, for colour bars.
+        remark: small text below everything.
+    """
+
+    def __init__(
+        self,
+        paper: Paper,
+        rows: Sequence[str],
+        columns: Sequence[Heading],
+        *,
+        aspect: float,
+        highest: float,
+        right: float = 0.0,
+        remark: str = "",
+    ) -> None:
+        self.paper, self.rows, self.columns, self.remark = paper, rows, columns, remark
+        line = line_height(TEXT)
+        lines = 1 if any(rows) else 0
+        for _ in range(NAME_LINES):  # how many lines a name takes depends on the height, which depends on them
+            names = lines * line + (GAP if lines else 0)
+            width = (paper.width - names - right - GAP * (len(columns) - 1)) / len(columns)
+            height = min(width / aspect, highest)
+            self.names = [wrapped(name, height, TEXT, paper.font) for name in rows]
+            lines = min(max(map(len, self.names)), NAME_LINES) if any(rows) else 0
+        self.width, self.height = aspect * height, height
+        used = names + len(columns) * self.width + (len(columns) - 1) * GAP + right
+        self.left = (paper.width - used) / 2 + names
+        self.headings = [wrapped(heading.large, self.width, TEXT, paper.font) for heading in columns]
+        self.header = max(len(text) * line * any(text) for text in self.headings)
+        self.header += line_height(SMALLEST_TEXT) * any(heading.small for heading in columns)
+        self.header += GAP if self.header else 0.0  # half above the headings, half below
+        self.bottom = self.header + len(rows) * self.height + (len(rows) - 1) * GAP
+        self.total = self.bottom + (line_height(SMALLEST_TEXT) + GAP / 2 if remark else 0.0)
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Width and height of a picture in pixels."""
+        return self.paper.pixels(self.width), self.paper.pixels(self.height)
+
+    @property
+    def end(self) -> float:
+        """Where the last column ends, in mm from the left."""
+        return self.left + len(self.columns) * (self.width + GAP) - GAP
+
+    def place(self, row: int, column: int) -> tuple[float, float]:
+        """Left and top of a picture, in mm."""
+        return self.left + column * (self.width + GAP), self.header + row * (self.height + GAP)
+
+    def page(self) -> Page:
+        """A page with all labels on it."""
+        page = Page(self.paper, self.total)
+        for row, lines in enumerate(self.names):
+            _, top = self.place(row, 0)
+            shown = lines if len(lines) <= NAME_LINES else [*lines[: NAME_LINES - 1], lines[NAME_LINES - 1][:-1] + "…"]
+            for number, text in enumerate(reversed(shown)):
+                x = self.left - GAP - (number + 0.5) * line_height(TEXT)
+                page.text(text, x, top + self.height / 2, rotation=90)
+        small = line_height(SMALLEST_TEXT) * any(heading.small for heading in self.columns)
+        for column, heading in enumerate(self.columns):
+            x = self.place(0, column)[0] + self.width / 2
+            if heading.small:
+                page.text(heading.small, x, self.header - GAP / 2 - small / 2, size=SMALLEST_TEXT, color=GREY)
+            for number, text in enumerate(reversed(self.headings[column])):
+                page.text(text, x, self.header - GAP / 2 - small - (number + 0.5) * line_height(TEXT))
+        if self.remark:
+            y = self.bottom + GAP / 2 + line_height(SMALLEST_TEXT) / 2
+            page.text(self.remark, self.end, y, ha="right", size=SMALLEST_TEXT, color=GREY)
+        return page

@@ -1,0 +1,327 @@
+"""Finding the vertices of the lips and the upper face beside the files that are scored."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from facediff.data.corpus import ALL, MOTION_FOLDERS, find_region
+from facediff.errors import FaceDiffError
+from facediff.metrics import TOPOLOGIES, Region
+from facediff.utils.pickles import load_pickle
+
+# What a file's name says: who speaks, what is said, and whose style the prediction was given.
+
+DEFAULT_PATTERNS = ("{subject}_{sentence}_condition_{identity}", "{subject}_{sentence}")
+"""How predictions are named unless told otherwise; the first is that of the field's released projects."""
+
+TRUTH_PATTERN = "{subject}_{sentence}"
+"""How truths are named unless told otherwise."""
+
+FIELDS = ("subject", "sentence", "identity")
+
+
+@dataclass(frozen=True)
+class Name:
+    """What a file's name says.
+
+    Attributes:
+        subject: who speaks.
+        sentence: what is said.
+        identity: whose style the prediction was given; None if the name does not say.
+    """
+
+    subject: str
+    sentence: str
+    identity: str | None = None
+
+    @property
+    def clip(self) -> str:
+        """``<subject>_<sentence>``, under which prediction and truth find each other."""
+        return f"{self.subject}_{self.sentence}"
+
+
+class NamePattern:
+    """Takes names apart by a pattern such as ``{subject}_{sentence}_condition_{identity}``.
+
+    Subjects and sentences may hold underscores themselves. Where a name can be read in several ways, a known subject
+    goes first, then a subject that is also the identity, then the split at the last underscore.
+
+    Args:
+        pattern: the name without ``.npy``, or the path below the folder if it has a ``/``. It has ``{subject}`` and
+            ``{sentence}`` and may have ``{identity}``.
+        subjects: known subjects.
+
+    Raises:
+        FaceDiffError: if the pattern has other fields, or lacks one.
+    """
+
+    def __init__(self, pattern: str, subjects: Collection[str] = ()) -> None:
+        self.pattern = pattern
+        parts = re.split(r"\{(\w*)\}", pattern.removesuffix(".npy"))
+        fields = parts[1::2]
+        if sorted(fields) not in (sorted(FIELDS), sorted(FIELDS[:2])) or "{" in "".join(parts[::2]):
+            raise FaceDiffError(
+                f"{pattern}: a pattern of file names has {{subject}} and {{sentence}} once each, may have "
+                f"{{identity}} once, and has no other field"
+            )
+        known = "|".join(re.escape(name) for name in sorted(subjects, key=len, reverse=True))
+        readings = [{"subject": known, "sentence": "[^/]+"}] if known else []
+        if "identity" in fields and fields.index("subject") < fields.index("identity"):
+            readings.append({"subject": "[^/]+", "sentence": "[^/]+", "identity": "(?P=subject)"})
+        readings += [{"subject": "[^/]+", "sentence": "[^/_]+"}, {"subject": "[^/]+", "sentence": "[^/]+"}]
+        self._readings = [re.compile(_expression(parts, reading)) for reading in readings]
+
+    def match(self, name: str) -> Name | None:
+        """The fields of a name; None if it is not of this pattern."""
+        for reading in self._readings:
+            found = reading.fullmatch(name)
+            if found:
+                return Name(**found.groupdict())
+        return None
+
+
+def _expression(parts: Sequence[str], reading: dict[str, str]) -> str:
+    """The regular expression of a pattern whose fields read as given."""
+    return "".join(
+        f"(?P<{part}>{reading.get(part, '[^/]+')})" if place % 2 else re.escape(part)
+        for place, part in enumerate(parts)
+    )
+
+
+def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path, Name], list[str]]:
+    """The ``.npy`` files of a folder by what their names say, sorted, and the names that no pattern fits.
+
+    Files whose names begin with a dot are passed over.
+
+    Raises:
+        FaceDiffError: if there is no such folder, or no ``.npy`` file in it.
+    """
+    if not folder.is_dir():
+        raise FaceDiffError(f"{folder}: no such folder; expected one with .npy files of vertices")
+    deep = any("/" in pattern.pattern for pattern in patterns)
+    files = sorted(file for file in folder.glob("**/*.npy" if deep else "*.npy") if not file.name.startswith("."))
+    if not files:
+        raise FaceDiffError(f"{folder}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
+    found: dict[Path, Name] = {}
+    unnamed = []
+    for file in files:
+        name = file.relative_to(folder).as_posix().removesuffix(".npy")
+        read = next((match for pattern in patterns if (match := pattern.match(name))), None)
+        if read is None:
+            unnamed.append(f"{name}.npy")
+        else:
+            found[file] = read
+    return found, unnamed
+
+
+# Which prediction belongs to which truth, and what is left over on either side.
+
+OWN = "own"
+"""Which conditions are scored: the subject's own identity, or the mean over all."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The truth of one clip.
+
+    Attributes:
+        path: its file.
+        name: who says what.
+    """
+
+    path: Path
+    name: Name
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A clip and the predictions that are scored on it.
+
+    Attributes:
+        clip: ``<subject>_<sentence>``.
+        truth: its truth.
+        predictions: files by identity; several only if the mean over conditions is asked for. The identity is "" where
+            the file's name does not say it.
+    """
+
+    clip: str
+    truth: Truth
+    predictions: dict[str, Path]
+
+
+@dataclass
+class Pairing:
+    """What one method has.
+
+    Attributes:
+        pairs: what can be scored, sorted by clip.
+        without_truth: files of clips that have no truth.
+        without_prediction: clips that have no prediction of the conditions asked for.
+        unused: files of clips that have a truth, under conditions that were not asked for.
+        unnamed: files whose names no pattern fits.
+    """
+
+    pairs: list[Pair] = field(default_factory=list)
+    without_truth: list[str] = field(default_factory=list)
+    without_prediction: list[str] = field(default_factory=list)
+    unused: list[str] = field(default_factory=list)
+    unnamed: list[str] = field(default_factory=list)
+
+
+def index_truths(names: Mapping[Path, Name]) -> dict[str, Truth]:
+    """Truths by clip.
+
+    Raises:
+        FaceDiffError: if two files are of the same clip.
+    """
+    truths: dict[str, Truth] = {}
+    for path, name in names.items():
+        if name.clip in truths:
+            raise FaceDiffError(
+                f"{path}: is the truth of {name.clip}, as {truths[name.clip].path} is; keep one of them"
+            )
+        truths[name.clip] = Truth(path, name)
+    return truths
+
+
+def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], identity: str) -> Pairing:
+    """Find each truth's predictions.
+
+    Args:
+        predictions: what the names of a method's files say.
+        truths: truths by clip.
+        identity: ``own``: the prediction conditioned on the subject itself, or else the one whose name has no
+            condition; ``all``: every condition; or a condition's name.
+
+    Raises:
+        FaceDiffError: if two files are of the same clip and condition.
+    """
+    made = Pairing()
+    by_clip: dict[str, dict[str, Path]] = {}
+    own: dict[str, str] = {}
+    for path, name in predictions.items():
+        if name.clip not in truths:
+            made.without_truth.append(path.name)
+            continue
+        conditions = by_clip.setdefault(name.clip, {})
+        condition = name.identity or ""
+        if condition in conditions:
+            raise FaceDiffError(
+                f"{path}: is the same clip and condition as {conditions[condition]}; keep one, or name files "
+                f"apart with --pattern"
+            )
+        conditions[condition] = path
+        if name.identity is not None and name.identity in (name.subject, truths[name.clip].name.subject):
+            own[name.clip] = name.identity
+    for clip, truth in sorted(truths.items()):
+        there = by_clip.get(clip, {})
+        chosen = _choose(there, own.get(clip, "") if identity == OWN else identity)
+        made.unused += sorted(path.name for name, path in there.items() if name not in chosen)
+        if chosen:
+            made.pairs.append(Pair(clip, truth, {name: there[name] for name in chosen}))
+        else:
+            made.without_prediction.append(clip)
+    return made
+
+
+def _choose(there: Mapping[str, Path], wanted: str) -> list[str]:
+    """The conditions to score of those that are there; "" stands for a name without a condition."""
+    if wanted == ALL:
+        return sorted(name for name in there if name) or list(there)
+    return [wanted] if wanted in there else []
+
+
+# What lies beside the files that are scored: templates, and how many vertices the mesh has.
+
+
+def find_truths(folder: Path) -> tuple[Path, Path | None]:
+    """The folder that holds the truth's files, and the corpus folder that it belongs to, if it does.
+
+    Args:
+        folder: a corpus folder, its ``vertices_npy``, or any other folder of files.
+
+    Raises:
+        FaceDiffError: if there is no such folder.
+    """
+    if not folder.is_dir():
+        raise FaceDiffError(f"{folder}: no such folder; expected the truth's motion files, or a corpus folder")
+    for name in MOTION_FOLDERS:
+        if (folder / name).is_dir():
+            return folder / name, folder
+    return folder, folder.parent if folder.name in MOTION_FOLDERS else None
+
+
+def count_vertices(topology: str | None, templates: Path | None, truth: Path) -> int:
+    """Vertices of the mesh: as the topology says, else the templates, else the first readable truth.
+
+    Raises:
+        FaceDiffError: if none of them says it.
+    """
+    if topology in TOPOLOGIES:
+        return TOPOLOGIES[topology].n_vertices
+    if templates is not None:
+        loaded = load_pickle(templates)
+        sizes = [np.size(value) for value in loaded.values()] if isinstance(loaded, dict) else []
+        if sizes and sizes[0] and sizes[0] % 3 == 0:
+            return int(sizes[0]) // 3
+        raise FaceDiffError(f"{templates}: expected a dict from subject to (V, 3) array")
+    for path in sorted(truth.glob("**/*.npy")):
+        try:
+            shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
+        except (ValueError, OSError, EOFError):
+            continue
+        if len(shape) in (2, 3) and np.prod(shape[1:]) % 3 == 0 and np.prod(shape[1:]):
+            return int(np.prod(shape[1:])) // 3
+    raise FaceDiffError(f"{truth}: no file says how many vertices the mesh has; say it with --n-vertices")
+
+
+Part = Literal["lips", "upper_face"]
+
+USUAL: dict[Part, tuple[str, ...]] = {
+    "lips": ("lve.txt", "FLAME_masks.pkl:lips"),
+    "upper_face": ("fdd.txt", "FLAME_masks.pkl:forehead+eye_region"),
+}
+"""Sources that are looked for if none is named."""
+
+OPTIONS: dict[Part, str] = {"lips": "--lips", "upper_face": "--upper-face"}
+
+
+def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, source: str | None = None) -> Region:
+    """A region from one of the files that circulate.
+
+    Args:
+        part: ``lips`` or ``upper_face``.
+        n_vertices: vertices of the mesh.
+        folder: where to look; the working folder if None.
+        source: a text file of indices; a pickle; ``FLAME_masks.pkl:lips``, one or several (joined by "+") masks of a
+            pickle; ``mouth_mask.txt>0.1``, the vertices of a file of weights above a threshold; or ``all``. Without
+            one, ``lve.txt`` or ``fdd.txt`` is taken, else the masks of FLAME.
+
+    Raises:
+        FaceDiffError: if it is not there, or not what it should be.
+    """
+    named = part.replace("_", " ")
+    advice = f"give --regions FOLDER with {USUAL[part][0]} or FLAME_masks.pkl in it, or {OPTIONS[part]} FILE"
+    if source is None and folder is None:
+        raise FaceDiffError(f"nothing says which vertices are the {named}; {advice}")
+    root = folder or Path()
+    files = {each: root / each.partition(">")[0].partition(":")[0] for each in ([source] if source else USUAL[part])}
+    chosen = next((each for each, path in files.items() if each == ALL or path.is_file()), None)
+    if chosen is None:
+        raise FaceDiffError(f"{' and '.join(map(str, files.values()))}: not there; expected the {named}; {advice}")
+    file, above, threshold = chosen.partition(">")
+    if not above:
+        return find_region(root, [chosen], chosen, n_vertices)
+    try:
+        region = Region.from_weights(root / file, float(threshold), name=chosen)
+        region.check(n_vertices)
+    except ValueError as error:
+        message = str(error)
+        raise FaceDiffError(message if str(root / file) in message else f"{root / file}: {message}") from error
+    return region

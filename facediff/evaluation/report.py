@@ -1,0 +1,562 @@
+"""What an evaluation found, as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.evaluation.files import Pair, Pairing
+from facediff.evaluation.scoring import ClipScores, Column
+from facediff.metrics import Region
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A bootstrap confidence interval over sequences.
+
+    Attributes:
+        low: its lower end.
+        high: its upper end.
+    """
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """One number of one method.
+
+    Attributes:
+        protocol: whose definition.
+        metric: ``mve``, ``lve``, ``fdd``, ``fdd_absolute`` or ``fdd_signed``.
+        value: the number, in the vertices' unit or that squared, as the definition says.
+        interval: None with a single sequence or without resamples.
+        frames: frames behind it.
+        sequences: sequences behind it.
+    """
+
+    protocol: str
+    metric: str
+    value: float
+    interval: Interval | None
+    frames: int
+    sequences: int
+
+
+@dataclass(frozen=True)
+class SequenceScores:
+    """The numbers of one clip under one method.
+
+    Attributes:
+        method: the method.
+        clip: ``<subject>_<sentence>``.
+        subject: who speaks.
+        sentence: what is said.
+        conditions: identities that the predictions were given; empty where the names do not say.
+        frames: frames scored, all conditions together.
+        cut_prediction: frames cut from predictions.
+        cut_truth: frames cut from the truth.
+        scores: ``<protocol>/<metric>`` to value; the mean over conditions where there are several.
+    """
+
+    method: str
+    clip: str
+    subject: str
+    sentence: str
+    conditions: tuple[str, ...]
+    frames: int
+    cut_prediction: int
+    cut_truth: int
+    scores: dict[str, float]
+
+    def row(self) -> dict[str, Any]:
+        """The same in one flat row for a table."""
+        found = asdict(self)
+        scores = found.pop("scores")
+        return {**found, "conditions": " ".join(self.conditions), **scores}
+
+
+@dataclass(frozen=True)
+class Missing:
+    """What of one method was not scored.
+
+    Attributes:
+        without_truth: files of clips that have no truth.
+        without_prediction: clips that have no prediction of the conditions asked for.
+        unused: files under conditions that were not asked for.
+        unnamed: files whose names no pattern fits.
+        unusable: clip to reason: unreadable files, other meshes, subjects without a template.
+    """
+
+    without_truth: list[str] = field(default_factory=list)
+    without_prediction: list[str] = field(default_factory=list)
+    unused: list[str] = field(default_factory=list)
+    unnamed: list[str] = field(default_factory=list)
+    unusable: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """Everything about one method.
+
+    Attributes:
+        name: what it is called.
+        folder: where its files lie.
+        scores: its numbers, protocol by protocol.
+        sequences: the numbers of each clip, sorted by clip.
+        missing: what was not scored.
+    """
+
+    name: str
+    folder: str
+    scores: list[Score]
+    sequences: list[SequenceScores]
+    missing: Missing
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A method against the first, over the sequences that both have.
+
+    Attributes:
+        method: the method.
+        baseline: the first.
+        protocol: whose definition.
+        metric: which number.
+        difference: the method's score minus the baseline's.
+        interval: of the difference, over the same resamples; None as in :class:`Score`.
+        sequences: how many sequences both have.
+    """
+
+    method: str
+    baseline: str
+    protocol: str
+    metric: str
+    difference: float
+    interval: Interval | None
+    sequences: int
+
+
+@dataclass(frozen=True)
+class Report:
+    """What an evaluation found.
+
+    Attributes:
+        truth: the folder of truths.
+        lips: lip vertices.
+        upper_face: upper-face vertices; None if no protocol uses them.
+        n_vertices: vertices of the mesh.
+        protocols: the definition of each protocol, by name.
+        identity: which conditions were scored.
+        truth_stride: 2 if every second frame of the truth was taken, and so on.
+        resamples: bootstrap resamples; 0 for none.
+        level: of the intervals, e.g. 0.95.
+        seed: of the resamples.
+        methods: the results, in the order asked for.
+        comparisons: every further method against the first.
+        unnamed_truths: files among the truths whose names do not fit the pattern.
+        remarks: whether the regions are those in use on the topology, if one was named.
+    """
+
+    truth: str
+    lips: Region
+    upper_face: Region | None
+    n_vertices: int
+    protocols: dict[str, str]
+    identity: str
+    truth_stride: int
+    resamples: int
+    level: float
+    seed: int
+    methods: list[MethodResult]
+    comparisons: list[Comparison]
+    unnamed_truths: list[str]
+    remarks: list[str]
+
+    def regions(self) -> dict[str, dict[str, Any]]:
+        """Name, vertex count, hash and repeated indices of each region."""
+        parts = {"lips": self.lips, "upper_face": self.upper_face}
+        return {
+            part: {
+                "name": region.name,
+                "count": region.count,
+                "hash": region.hash,
+                "duplicates": region.duplicates,
+            }
+            for part, region in parts.items()
+            if region is not None
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON; every score carries its protocol, regions, frames and sequences."""
+        regions = self.regions()
+        return {
+            "truth": self.truth,
+            "n_vertices": self.n_vertices,
+            "regions": regions,
+            "remarks": self.remarks,
+            "protocols": self.protocols,
+            "identity": self.identity,
+            "truth_stride": self.truth_stride,
+            "bootstrap": {"resamples": self.resamples, "level": self.level, "seed": self.seed},
+            "methods": [_report_method(method, regions) for method in self.methods],
+            "comparisons": [asdict(comparison) for comparison in self.comparisons],
+            "unnamed_truths": self.unnamed_truths,
+        }
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One flat row for each sequence and method."""
+        return [sequence.row() for method in self.methods for sequence in method.sequences]
+
+
+def _report_method(method: MethodResult, regions: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """A method as plain data, each score with the region that it was taken over."""
+    found = asdict(method)
+    for score in found["scores"]:
+        part = {"lve": "lips", "mve": ""}.get(score["metric"], "upper_face")
+        score["region"] = regions[part] if part else "all vertices"
+    return found
+
+
+# From the values of sequences to a score, and how sure it is.
+
+Array = npt.NDArray[np.float64]
+
+BLOCK = 2**20
+"""Counts that are held at a time while resampling: memory does not grow with the number of resamples."""
+
+
+def pooled(values: Array, weights: Array) -> Array:
+    """Scores of sequences: Σ w v / Σ w.
+
+    Args:
+        values: (sequences, columns).
+        weights: likewise; frames where all frames count alike, 1 where all sequences do.
+
+    Returns:
+        (columns,).
+    """
+    return np.asarray((values * weights).sum(0) / weights.sum(0))
+
+
+def draws(sequences: int, resamples: int, seed: int) -> Iterator[Array]:
+    """How often each sequence is in each resample, drawn with replacement, a block of resamples at a time.
+
+    Args:
+        sequences: how many there are, and how many are drawn for each resample.
+        resamples: how many resamples.
+        seed: of the random numbers.
+
+    Yields:
+        (resamples of the block, sequences).
+    """
+    random = np.random.default_rng(seed)
+    step = max(1, BLOCK // sequences)
+    shares = np.full(sequences, 1 / sequences)
+    for start in range(0, resamples, step):
+        yield random.multinomial(sequences, shares, min(step, resamples - start)).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """Confidence intervals by resampling sequences (Efron's percentile interval).
+
+    Args:
+        resamples: how many; 0 for no intervals.
+        level: share of the resamples inside an interval.
+        seed: of the random numbers; equal seeds and numbers of sequences give the same resamples.
+
+    Raises:
+        FaceDiffError: if a number is out of range.
+    """
+
+    resamples: int = 1000
+    level: float = 0.95
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.resamples < 0:
+            raise FaceDiffError(f"bootstrap is {self.resamples}; expected a number of resamples, or 0 for no intervals")
+        if not 0 < self.level < 1:
+            raise FaceDiffError(f"level is {self.level:g}; expected a share between 0 and 1, such as 0.95")
+        if self.seed < 0:
+            raise FaceDiffError(f"seed is {self.seed}; expected a whole number from 0")
+
+    def scores(self, values: Array, weights: Array) -> Array | None:
+        """The score of every resample: a ratio of sums, so that a sequence keeps the weight of its frames.
+
+        Args:
+            values: (sequences, columns).
+            weights: likewise.
+
+        Returns:
+            (resamples, columns); None without resamples, or with a single sequence, of which they would tell nothing.
+        """
+        if not self.resamples or len(values) < 2:
+            return None
+        weighted = values * weights
+        # einsum and not a matrix product: its digits do not depend on threads or on the processor's library.
+        blocks = [
+            np.einsum("rs,sc->rc", counts, weighted) / np.einsum("rs,sc->rc", counts, weights)
+            for counts in draws(len(values), self.resamples, self.seed)
+        ]
+        return np.concatenate(blocks)
+
+    def intervals(self, scores: Array | None, columns: int) -> list[Interval | None]:
+        """The middle of the scores of the resamples, for each column.
+
+        Args:
+            scores: (resamples, columns), as :meth:`scores` gives them.
+            columns: how many columns.
+        """
+        if scores is None:
+            return [None] * columns
+        ends = np.quantile(scores, [(1 - self.level) / 2, (1 + self.level) / 2], axis=0)
+        return [Interval(float(low), float(high)) for low, high in ends.T]
+
+
+# The values of all clips of a method, and what becomes of them.
+
+
+class MethodTable:
+    """One method's values: a row a clip, sorted by clip, so that no order of files or workers changes a digit.
+
+    Args:
+        name: what the method is called.
+        folder: where its files lie.
+        pairing: what it has, and what not.
+        found: scores by clip, or in words why there are none.
+        columns: what the values are.
+
+    Raises:
+        FaceDiffError: if nothing can be scored.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        folder: str,
+        pairing: Pairing,
+        found: Mapping[str, ClipScores | str],
+        columns: Sequence[Column],
+    ) -> None:
+        self.name = name
+        self.folder = folder
+        self.columns = columns
+        self.missing = Missing(
+            pairing.without_truth,
+            pairing.without_prediction,
+            pairing.unused,
+            pairing.unnamed,
+            {clip: reason for clip, reason in sorted(found.items()) if isinstance(reason, str)},
+        )
+        self.rows: list[tuple[Pair, ClipScores]] = []
+        for pair in pairing.pairs:
+            scores = found[pair.clip]
+            if isinstance(scores, ClipScores):
+                self.rows.append((pair, scores))
+        if not self.rows:
+            raise FaceDiffError(f"{folder}: {_why_nothing(self.missing)}")
+        self.clips = [pair.clip for pair, _ in self.rows]
+        self.values: Array = np.array([scores.values for _, scores in self.rows])
+        by_frames = np.array([column.pooling == "frames" for column in columns])
+        self.weights: Array = np.where(by_frames, np.array([scores.weights for _, scores in self.rows]), 1.0)
+
+    def result(self, bootstrap: Bootstrap) -> MethodResult:
+        """The scores with their intervals, and the values of each clip."""
+        totals = pooled(self.values, self.weights)
+        intervals = bootstrap.intervals(bootstrap.scores(self.values, self.weights), len(self.columns))
+        frames = sum(scores.frames for _, scores in self.rows)
+        return MethodResult(
+            self.name,
+            self.folder,
+            [
+                Score(column.protocol, column.metric, float(total), interval, frames, len(self.rows))
+                for column, total, interval in zip(self.columns, totals, intervals, strict=True)
+            ],
+            [self._sequence(pair, scores) for pair, scores in self.rows],
+            self.missing,
+        )
+
+    def _sequence(self, pair: Pair, scores: ClipScores) -> SequenceScores:
+        return SequenceScores(
+            self.name,
+            pair.clip,
+            pair.truth.name.subject,
+            pair.truth.name.sentence,
+            tuple(pair.predictions),
+            scores.frames,
+            scores.cut_prediction,
+            scores.cut_truth,
+            {column.name: value for column, value in zip(self.columns, scores.values, strict=True)},
+        )
+
+    def compare(self, baseline: MethodTable, bootstrap: Bootstrap) -> list[Comparison]:
+        """This method's scores minus another's, over the clips that both have and over the same resamples.
+
+        Empty if they share no clip.
+        """
+        common = sorted(set(self.clips) & set(baseline.clips))
+        if not common:
+            return []
+        ours, theirs = (table.places(common) for table in (self, baseline))
+        a = self.values[ours], self.weights[ours]
+        b = baseline.values[theirs], baseline.weights[theirs]
+        mine, other = bootstrap.scores(*a), bootstrap.scores(*b)
+        spread = None if mine is None or other is None else mine - other
+        return [
+            Comparison(
+                self.name, baseline.name, column.protocol, column.metric, float(difference), interval, len(common)
+            )
+            for column, difference, interval in zip(
+                self.columns, pooled(*a) - pooled(*b), bootstrap.intervals(spread, len(self.columns)), strict=True
+            )
+        ]
+
+    def places(self, clips: Sequence[str]) -> list[int]:
+        """The rows of some clips."""
+        place = {clip: row for row, clip in enumerate(self.clips)}
+        return [place[clip] for clip in clips]
+
+
+def _why_nothing(missing: Missing) -> str:
+    """One sentence for a method of which nothing can be scored: the first thing that stands in the way."""
+    if missing.unusable:
+        clip, reason = next(iter(missing.unusable.items()))
+        return f"nothing can be scored; of {clip}: {reason}"
+    if missing.unused:
+        return (
+            f"no prediction has the condition asked for, but {missing.unused[0]} is there; choose --identity all or "
+            f"an identity's name"
+        )
+    if missing.without_truth:
+        return f"no prediction has a truth, {missing.without_truth[0]} for one; check --truth-pattern and the folders"
+    example = missing.unnamed[0] if missing.unnamed else "no file"
+    return f"no file's name is understood, {example} for one; say with --pattern how files are named"
+
+
+# An evaluation as text for people.
+
+SHOWN = 5
+"""Names that are listed before the rest is counted."""
+
+
+def text(report: Report) -> str:
+    """Scores by protocol, comparisons, and what was cut, skipped or missing."""
+    lines = [
+        f"truth {report.truth}" + (f", every {report.truth_stride}. frame" if report.truth_stride > 1 else ""),
+        f"mesh of {report.n_vertices} vertices; conditions: {report.identity}",
+    ]
+    for part, region in report.regions().items():
+        again = f", {region['duplicates']} repeated in the source" if region["duplicates"] else ""
+        lines.append(
+            f"{part.replace('_', ' ')} {region['name']}: {region['count']} vertices, hash {region['hash']}{again}"
+        )
+    lines += report.remarks
+    for name in report.protocols:
+        lines += ["", f"protocol {name}", *_scores(report, name), *_comparisons(report, name)]
+    if any(score.interval for method in report.methods for score in method.scores):
+        lines += [
+            "",
+            f"[…]: {report.level:.0%} intervals, {report.resamples} bootstrap resamples of the sequences, "
+            f"seed {report.seed}",
+        ]
+    left_out = _left_out(report)
+    lines += ["", *(left_out or ["everything there was scored; nothing was cut, skipped or missing"])]
+    for definition in report.protocols.values():
+        lines += ["", definition]
+    return "\n".join(lines)
+
+
+def _scores(report: Report, protocol: str) -> list[str]:
+    rows = []
+    for method in report.methods:
+        scores = [score for score in method.scores if score.protocol == protocol]
+        cells = [f"{score.value:.4e}{_interval(score.interval)}" for score in scores]
+        rows.append([method.name, *cells, str(scores[0].frames), str(scores[0].sequences)])
+    metrics = [score.metric for score in report.methods[0].scores if score.protocol == protocol]
+    return _align([["", *metrics, "frames", "sequences"], *rows])
+
+
+def _comparisons(report: Report, protocol: str) -> list[str]:
+    """Differences from the first method; a star where the interval leaves zero out."""
+    rows: dict[str, list[str]] = {}
+    counts: dict[str, int] = {}
+    for found in report.comparisons:
+        if found.protocol == protocol:
+            sure = found.interval is not None and (found.interval.low > 0 or found.interval.high < 0)
+            cell = f"{found.difference:+.4e}{_interval(found.interval, '+')}{'*' if sure else ''}"
+            rows.setdefault(found.method, []).append(cell)
+            counts[found.method] = found.sequences
+    if not rows:
+        return []
+    metrics = [score.metric for score in report.methods[0].scores if score.protocol == protocol]
+    body = [[f"{method} − {report.methods[0].name}", *cells, str(counts[method])] for method, cells in rows.items()]
+    head = "difference, over the sequences that both have (*: the interval leaves out 0)"
+    return [head, *_align([["", *metrics, "sequences"], *body])]
+
+
+def _interval(interval: Interval | None, sign: str = "") -> str:
+    return "" if interval is None else f" [{interval.low:{sign}.3e}, {interval.high:{sign}.3e}]"
+
+
+def _align(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.rjust(width) if place else cell.ljust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _left_out(report: Report) -> list[str]:
+    """What was cut, skipped or missing."""
+    lines = []
+    if report.unnamed_truths:
+        lines.append(f"truths whose names do not fit: {_names(report.unnamed_truths)}")
+    for method in report.methods:
+        lines += [f"{method.name}: {line}" for line in _table_method(method)]
+    shared = {clip for method in report.methods[:1] for clip in _clips(method)}
+    if any(_clips(method) != shared for method in report.methods):
+        lines.append("the methods were not scored on the same sequences: compare the differences, not the scores")
+    return lines
+
+
+def _clips(method: MethodResult) -> set[str]:
+    return {sequence.clip for sequence in method.sequences}
+
+
+def _table_method(method: MethodResult) -> list[str]:
+    missing = method.missing
+    cut = [
+        f"{each.clip} (prediction {each.cut_prediction}, truth {each.cut_truth})"
+        for each in method.sequences
+        if each.cut_prediction or each.cut_truth
+    ]
+    listed = {
+        "frames cut": cut,
+        "clips without a prediction": missing.without_prediction,
+        "predictions without a truth": missing.without_truth,
+        "predictions under other conditions": missing.unused,
+        "files whose names do not fit": missing.unnamed,
+    }
+    lines = [f"{what}: {_names(names)}" for what, names in listed.items() if names]
+    unusable = [f"{clip} is left out: {reason}" for clip, reason in missing.unusable.items()]
+    more = [f"{len(unusable) - SHOWN} more are left out (--json lists all)"] if len(unusable) > SHOWN else []
+    return lines + unusable[:SHOWN] + more
+
+
+def _names(names: Iterable[str]) -> str:
+    """How many, and the first few."""
+    found = list(names)
+    more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    return f"{len(found)}: {', '.join(found[:SHOWN])}{more}"

@@ -1,0 +1,307 @@
+"""The numbers of one clip, from the metrics themselves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facediff.data.corpus import open_vertices
+from facediff.errors import FaceDiffError
+from facediff.evaluation.files import Pair
+from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMetric, VertexError
+from facediff.metrics.clips import Clips, align
+from facediff.metrics.one_pass import one_pass
+from facediff.metrics.options import LengthRule, Pooling
+from facediff.utils.jobs import processors
+
+NATIVE = (np.float16, np.float32, np.float64)
+"""Types that torch reads as they are."""
+
+OPENING = Lock()
+"""Held while a file is opened: NumPy reads a file's header with ast, which two threads at once may break in
+Python 3.11 (SystemError, "AST constructor recursion depth mismatch")."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One score of one protocol.
+
+    Attributes:
+        protocol: the protocol's name.
+        metric: the score's name there: ``mve``, ``lve``, ``fdd``, ``fdd_absolute``.
+        pooling: how sequences become one number.
+        rule: what the protocol does where lengths differ.
+        source: which of the scorer's metrics gives the value of a sequence.
+        absolute: whether its sign is dropped.
+    """
+
+    protocol: str
+    metric: str
+    pooling: Pooling
+    rule: LengthRule
+    source: str
+    absolute: bool = False
+
+    @property
+    def name(self) -> str:
+        """``<protocol>/<metric>``."""
+        return f"{self.protocol}/{self.metric}"
+
+
+@dataclass(frozen=True)
+class ClipScores:
+    """What one clip gave, the mean over its conditions where there are several.
+
+    Attributes:
+        values: a value for each column.
+        weights: frames behind it, for pooling by frames.
+        frames: frames scored, all conditions together.
+        cut_prediction: frames cut from predictions.
+        cut_truth: frames cut from the truth.
+    """
+
+    values: tuple[float, ...]
+    weights: tuple[float, ...]
+    frames: int
+    cut_prediction: int
+    cut_truth: int
+
+
+class Scorer:
+    """Scores clips by several protocols; what two protocols share is computed once.
+
+    May be used by several threads at once.
+
+    Args:
+        protocols: what to compute.
+        lips: lip vertices.
+        upper_face: upper-face vertices; None if no protocol has FDD.
+        templates: neutral face (V, 3) by subject; empty if no protocol has FDD.
+        n_vertices: vertices of the mesh.
+        truth_stride: 2 takes every second frame of the truth, and so on.
+
+    Raises:
+        FaceDiffError: if a protocol needs what is not given, or a region does not fit the mesh.
+    """
+
+    def __init__(
+        self,
+        protocols: Sequence[Protocol],
+        *,
+        lips: Region,
+        upper_face: Region | None,
+        templates: Mapping[str, Tensor],
+        n_vertices: int,
+        truth_stride: int = 1,
+    ) -> None:
+        self.columns: list[Column] = []
+        self.metrics: dict[str, SequenceMetric] = {}
+        self.templates = templates
+        self.n_vertices = n_vertices
+        self.truth_stride = truth_stride
+        self.remarks: list[str] = []
+        for protocol in protocols:
+            try:
+                built = protocol.build(lips, upper_face)
+                for region in (built.lips, built.upper):
+                    if region is not None:
+                        region.check(n_vertices)
+            except ValueError as error:
+                raise FaceDiffError(f"protocol {protocol.name}: {error}") from error
+            self.remarks += [remark for remark in built.summary().remarks if remark not in self.remarks]
+            for name, metric in cast(Sequence[tuple[str, SequenceMetric]], built.items(copy_state=False)):
+                self._add(protocol, name, metric)
+        self.needs_template = any(isinstance(metric, FaceDynamicsDeviation) for metric in self.metrics.values())
+        if self.needs_template and not templates:
+            raise FaceDiffError("FDD needs each subject's neutral face: give --templates, or a protocol without FDD")
+
+    def _add(self, protocol: Protocol, name: str, metric: SequenceMetric) -> None:
+        absolute = False
+        if isinstance(metric, FaceDynamicsDeviation):
+            absolute = metric.sign == "absolute"
+            source = f"fdd {metric.region}"
+            if metric.sign != "signed":
+                metric = FaceDynamicsDeviation(cast(Region, metric.region), sign="signed", check_finite=False)
+        elif isinstance(metric, VertexError):
+            source = f"{metric.reduction} {metric.squared} {metric.region}"
+        else:
+            source = f"{protocol.name} {name}"
+        self.metrics.setdefault(source, metric)
+        pooling: Pooling = "sequences" if source.startswith("fdd") else protocol.pooling
+        self.columns.append(Column(protocol.name, name, pooling, protocol.length_rule, source, absolute))
+
+    def score(self, pair: Pair) -> ClipScores | str:
+        """The scores of a clip; in words why it has none if a file of it cannot be used.
+
+        Raises:
+            FaceDiffError: if it holds NaN or infinity, or a protocol refuses its lengths.
+        """
+        subject = pair.truth.name.subject
+        template = self.templates.get(subject)
+        if self.needs_template and template is None:
+            return f"no template for {subject}"
+        try:
+            truth = read_vertices(pair.truth.path, self.n_vertices, self.truth_stride)
+            predictions = {
+                condition: read_vertices(path, self.n_vertices) for condition, path in pair.predictions.items()
+            }
+        except FaceDiffError as error:
+            return str(error)
+        done = [
+            self._score(pair.predictions[condition].stem, prediction, truth, template)
+            for condition, prediction in predictions.items()
+        ]
+        weights = np.array([each.weights for each in done])
+        values = np.array([each.values for each in done])
+        by_frames = np.array([column.pooling == "frames" for column in self.columns])
+        # A condition's share of the clip is its frames where all frames count alike; they differ only if one was cut.
+        shares = np.where(by_frames, weights, 1.0)
+        return ClipScores(
+            tuple(((values * shares).sum(0) / shares.sum(0)).tolist()),
+            tuple(weights.mean(0).tolist()),
+            sum(each.frames for each in done),
+            sum(each.cut_prediction for each in done),
+            sum(each.cut_truth for each in done),
+        )
+
+    def _score(self, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> ClipScores:
+        """One prediction."""
+        aligned: dict[str, Clips] = {}
+        for column in self.columns:
+            if column.rule not in aligned:
+                # Every rule that does not refuse the lengths leaves the same frames, those that both sides have.
+                aligned[column.rule] = self._align(column, name, prediction, truth, template)
+        first = next(iter(aligned.values()))
+        found = self._values(first)
+        each = [(found[column.source], column.absolute) for column in self.columns]
+        frames = first.clips[0].frames
+        return ClipScores(
+            tuple(abs(value) if absolute else value for value, absolute in each),
+            (float(frames),) * len(each),
+            frames,
+            first.cut_prediction,
+            first.cut_truth,
+        )
+
+    def _values(self, clips: Clips) -> dict[str, float]:
+        """What each source says of the one clip.
+
+        Raises:
+            FaceDiffError: if it holds NaN or infinity.
+        """
+        clip = clips.clips[0]
+        errors = {source: metric for source, metric in self.metrics.items() if isinstance(metric, VertexError)}
+        dynamics = {
+            source: metric for source, metric in self.metrics.items() if isinstance(metric, FaceDynamicsDeviation)
+        }
+        means, deviations = one_pass(
+            clip.prediction,
+            clip.truth,
+            errors=[metric.wanted() for metric in errors.values()],
+            template=clip.template,
+            uppers=[metric.indices for metric in dynamics.values()],
+        )
+        found = dict(zip([*errors, *dynamics], torch.stack([*means, *deviations]).tolist(), strict=True))
+        # An error over all vertices is finite only if every value of the frames is: the clip need not be read again.
+        whole = [found[source] for source, metric in errors.items() if metric.region is None]
+        if not whole or not all(map(math.isfinite, found.values())):
+            try:
+                clips.check_finite()
+            except ValueError as error:
+                raise FaceDiffError(f"protocol {self.columns[0].protocol}: {error}") from error
+        others = self.metrics.keys() - found.keys()
+        return found | {source: float(self.metrics[source].clip_value(clip)) for source in others}
+
+    @staticmethod
+    def _align(column: Column, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> Clips:
+        try:
+            clips = align(prediction, truth, clip_names=[name], rule=column.rule)
+        except ValueError as error:
+            raise FaceDiffError(f"protocol {column.protocol}: {error}") from error
+        return clips.with_templates([template])
+
+
+def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
+    """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3) of any floating-point type, memory-mapped.
+
+    Raises:
+        FaceDiffError: if the file is unreadable or of another shape.
+    """
+    with OPENING:
+        # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
+        array = open_vertices(path, n_vertices, "c")[::stride]
+    if array.dtype not in NATIVE or not array.dtype.isnative:
+        array = array.astype(array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64)
+    return torch.from_numpy(array)
+
+
+# Scoring many clips on all processors.
+
+
+def score_all(
+    scorer: Scorer, jobs: Sequence[tuple[str, Pair]], workers: int | None, *, progress: bool = False
+) -> dict[str, dict[str, ClipScores | str]]:
+    """The scores of every job.
+
+    Threads do it: nearly all of the time goes into torch, which lets other threads run, and a thread starts at once
+    where a process would first take seconds, and a hundred megabytes, to import torch.
+
+    Args:
+        scorer: scores a clip.
+        jobs: method and clip.
+        workers: clips that are scored at a time; as many as processors if None.
+        progress: whether to show a bar.
+
+    Returns:
+        what the scorer said, by method and clip.
+
+    Raises:
+        FaceDiffError: the first that a clip raises; clips not yet begun are left.
+    """
+    found: dict[str, dict[str, ClipScores | str]] = {method: {} for method, _ in jobs}
+    with _one_thread_each(), _steps(len(jobs), shown=progress) as step:
+        pool = ThreadPoolExecutor(min(workers or processors(), max(len(jobs), 1)))
+        try:
+            running = {pool.submit(scorer.score, pair): (method, pair.clip) for method, pair in jobs}
+            for future in as_completed(running):
+                method, clip = running[future]
+                found[method][clip] = future.result()
+                step()
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return found
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Keep torch from giving each worker threads of its own; also, digits then do not depend on the machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def _steps(total: int, *, shown: bool) -> Iterator[Callable[[], object]]:
+    """A progress bar on standard error, if it is a terminal and tqdm is there; what is given is called after a clip."""
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        shown = False
+    if not shown:
+        yield lambda: None
+        return
+    with tqdm(total=total, desc="clips", unit="clip", disable=None) as bar:
+        yield bar.update

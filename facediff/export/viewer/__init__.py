@@ -1,0 +1,13 @@
+"""One HTML file that plays takes in any browser: pictures in WebGL 2, speech as their clock, nothing from a network.
+
+Importing this costs NumPy only; the colours of the heat map come from :mod:`facediff.render`, which needs OpenCV.
+
+Example:
+    >>> from facediff.animation import read_animation
+    >>> from facediff.export.viewer import write_page
+    >>> write_page(path, [read_animation(true), read_animation(predicted)], truth=0)  # doctest: +SKIP
+"""
+
+from facediff.export.viewer.page import write_page
+
+__all__ = ["write_page"]

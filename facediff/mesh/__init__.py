@@ -1,0 +1,30 @@
+"""What depends on the mesh alone: faces of a template, coarser ones, and laying faces onto one another."""
+
+from facediff.mesh.alignment import (
+    RigidMotion,
+    Similarity,
+    align,
+    face_size,
+    median_face,
+    remove_rigid_motion,
+    robust_align,
+    stable_vertices,
+)
+from facediff.mesh.hierarchy import MeshHierarchy, MeshLevel, mesh_hierarchy
+from facediff.mesh.mesh import Mesh, read_mesh
+
+__all__ = [
+    "Mesh",
+    "MeshHierarchy",
+    "MeshLevel",
+    "RigidMotion",
+    "Similarity",
+    "align",
+    "face_size",
+    "median_face",
+    "mesh_hierarchy",
+    "read_mesh",
+    "remove_rigid_motion",
+    "robust_align",
+    "stable_vertices",
+]

@@ -1,0 +1,400 @@
+"""Laying one set of points onto another: least squares, and a robust fit that part of the points may disagree with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+
+Array = npt.NDArray[np.float64]
+
+TUKEY = 4.685
+"""Residuals beyond this many scales have no weight (Holland and Welsch, 1977: 95 % efficient for normal residuals)."""
+MEDIAN_TO_SCALE = 1.5382
+"""Median length of a 3-D normal vector of unit standard deviation (the Maxwell distribution's median)."""
+TRIALS = 64
+"""Random triples for the robust start: with 42 % outliers, all triples hold one once in ten million times."""
+JUDGES = 256
+"""Points that judge the trials."""
+ITERATIONS = 60
+TOLERANCE = 1e-9
+DEGENERATE = 1e-12
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x → scale · rotation x + translation.
+
+    Attributes:
+        rotation: (3, 3) proper rotation.
+        translation: (3,), in the unit of the target.
+        scale: target units to a source unit.
+    """
+
+    rotation: Array
+    translation: Array
+    scale: float = 1.0
+
+    def apply(self, points: npt.NDArray[np.floating]) -> Array:
+        """Map points (..., 3), in float64."""
+        moved: Array = self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation
+        return moved
+
+    def inverse(self) -> Similarity:
+        """The way back."""
+        turned = self.rotation.T
+        return Similarity(turned, -(turned @ self.translation) / self.scale, 1.0 / self.scale)
+
+    def then(self, other: Similarity) -> Similarity:
+        """This map followed by another one."""
+        translation = other.apply(self.translation)
+        return Similarity(other.rotation @ self.rotation, translation, other.scale * self.scale)
+
+
+def align(
+    source: npt.NDArray[np.floating],
+    target: npt.NDArray[np.floating],
+    *,
+    weights: npt.NDArray[np.floating] | None = None,
+    scale: bool = False,
+) -> Similarity:
+    """The map from source to target (both (N, 3)) with the least weighted sum of squared distances.
+
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991. The
+    rotation is proper even where a reflection would fit better.
+
+    Args:
+        source: points to move.
+        target: where they should come to lie, in the same order.
+        weights: (N,), none negative; all alike if None.
+        scale: whether to fit the scale; 1 otherwise.
+
+    Raises:
+        FaceDiffError: if shapes differ, a value is not finite, or the points do not determine a rotation: fewer than
+            three with weight, all in one place or all on a line.
+    """
+    source, target, weights = _checked(source, target, weights)
+    return _similarity(*_fit(source[None], target, weights[None], scale))
+
+
+def robust_align(
+    source: npt.NDArray[np.floating],
+    target: npt.NDArray[np.floating],
+    *,
+    weights: npt.NDArray[np.floating] | None = None,
+    scale: bool = False,
+) -> Similarity:
+    """The map from source to target that most points agree on; up to some 40 % of them may have moved.
+
+    An MM-estimate: it starts from the triple of points whose fit has the least median residual (Rousseeuw, "Least
+    median of squares regression", JASA 1984), since a least-squares start is drawn along by a jaw that moves as one,
+    and goes on by iteratively re-weighted least squares with Tukey's biweight, whose scale is the median residual.
+    The triples are drawn with a fixed seed: equal input gives equal output.
+
+    Args:
+        source: points to move (N, 3).
+        target: where they should come to lie (N, 3).
+        weights: (N,), none negative, which multiply the robust ones; points of weight 0 are left out. Alike if None.
+        scale: whether to fit the scale; 1 otherwise.
+
+    Raises:
+        FaceDiffError: as :func:`align`.
+    """
+    source, target, weights = _checked(source, target, weights)
+    return _similarity(*robust_fit(source[None], target, weights, scale=scale))
+
+
+def robust_fit(
+    source: Array, target: Array, weights: Array | None = None, *, scale: bool = False, near: bool = False
+) -> tuple[Array, Array, Array]:
+    """:func:`robust_align` of many sources (B, N, 3) to one target (N, 3) at a time; inputs are not checked.
+
+    With ``near``, the sources lie on the target but for little, and the search for a start is left out.
+
+    Returns:
+        rotations (B, 3, 3), translations (B, 3) and scales (B,).
+    """
+    base = np.ones(len(target)) if weights is None else weights
+    used = base > 0
+    if not used.all():
+        source, target, base = source[:, used], target[used], base[used]
+    size = face_size(target)
+    if near:
+        rotation, translation, factor = _unmoved(len(source))
+    else:
+        rotation, translation, factor = _start(source, target, base, scale)
+    for _ in range(ITERATIONS):
+        before = rotation, translation, factor
+        residual = _residuals(source, target, *before)
+        spread = np.maximum(np.median(residual, axis=-1, keepdims=True) / MEDIAN_TO_SCALE, DEGENERATE * size)
+        robust = np.square(np.clip(1.0 - np.square(residual / (TUKEY * spread)), 0.0, None))
+        rotation, translation, factor = _fit(source, target, base * robust, scale)
+        moved = max(
+            np.abs(rotation - before[0]).max(), np.abs(translation - before[1]).max() / max(size, DEGENERATE)
+        )  # the scale cannot change without moving what lies off the origin
+        if moved < TOLERANCE:
+            break
+    return rotation, translation, factor
+
+
+def face_size(vertices: npt.NDArray[np.floating]) -> float:
+    """Size of a set of points (N, 3): their root-mean-square distance from their mean."""
+    centred = np.asarray(vertices, np.float64) - np.mean(vertices, axis=0, dtype=np.float64)
+    return float(np.sqrt(np.square(centred).sum(axis=-1).mean()))
+
+
+def _unmoved(count: int) -> tuple[Array, Array, Array]:
+    return np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.ones(count)
+
+
+def _start(source: Array, target: Array, base: Array, scale: bool) -> tuple[Array, Array, Array]:
+    """Least squares, or the fit to a random triple of points where its median residual is less."""
+    random = np.random.default_rng(0)
+    judges = random.permutation(len(target))[:JUDGES]
+    judged, goal = source[:, judges], target[judges]
+    best = _fit(source, target, np.broadcast_to(base, source.shape[:2]), scale)
+    least = np.median(_residuals(judged, goal, *best), axis=-1)
+    alike = np.ones((len(source), 3))
+    for triple in random.integers(len(target), size=(TRIALS, 3)):
+        trial = _fit(source[:, triple], target[triple], alike, scale, check=False)
+        median = np.median(_residuals(judged, goal, *trial), axis=-1)
+        better = median < least
+        least = np.where(better, median, least)
+        best = tuple(
+            np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old) for new, old in zip(trial, best, strict=True)
+        )  # type: ignore[assignment]
+    return best
+
+
+def _fit(
+    source: Array, target: Array, weights: Array, scale: bool, *, check: bool = True
+) -> tuple[Array, Array, Array]:
+    """Weighted least squares of sources (B, N, 3) to a target (N, 3) with weights (B, N)."""
+    total = weights.sum(axis=-1, keepdims=True)
+    if check and not (total > 0).all():
+        raise FaceDiffError("alignment: no point has any weight; expected at least three that are not on a line")
+    share = (weights / total)[:, None, :]
+    centre, goal = share @ source, share @ target
+    away = source - centre
+    u, spread, vt = np.linalg.svd(((target - goal) * share.swapaxes(1, 2)).swapaxes(1, 2) @ away)
+    if check and (spread[:, 1] <= DEGENERATE * np.maximum(spread[:, 0], np.finfo(float).tiny)).any():
+        raise FaceDiffError(
+            "alignment: the points do not determine a rotation, since fewer than three of them count, or all lie in "
+            "one place or on one line; expected at least three that are not on a line"
+        )
+    proper = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    u[:, :, 2] *= proper[:, None]
+    rotation = u @ vt
+    factor = np.ones(len(source))
+    if scale:
+        variance = (share @ np.square(away)).sum(axis=(1, 2))
+        factor = (spread[:, 0] + spread[:, 1] + proper * spread[:, 2]) / np.maximum(variance, np.finfo(float).tiny)
+    translation = (goal - factor[:, None, None] * (centre @ rotation.swapaxes(1, 2)))[:, 0]
+    return rotation, translation, factor
+
+
+def _residuals(source: Array, target: Array, rotation: Array, translation: Array, factor: Array) -> Array:
+    """Distances (B, N) that are left."""
+    left = source @ (factor[:, None, None] * rotation).swapaxes(1, 2)
+    left += translation[:, None]
+    left -= target
+    return np.sqrt(np.einsum("bni,bni->bn", left, left))
+
+
+def _similarity(rotation: Array, translation: Array, factor: Array) -> Similarity:
+    return Similarity(rotation[0], translation[0], float(factor[0]))
+
+
+def _checked(
+    source: npt.NDArray[np.floating], target: npt.NDArray[np.floating], weights: npt.NDArray[np.floating] | None
+) -> tuple[Array, Array, Array]:
+    points: Array = np.asarray(source, np.float64)
+    goal: Array = np.asarray(target, np.float64)
+    if points.shape != goal.shape or points.ndim != 2 or points.shape[-1] != 3:
+        raise FaceDiffError(
+            f"alignment: source has shape {points.shape} and target {goal.shape}; expected two equal ones (points, 3)"
+        )
+    used: Array = np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
+    if used.shape != points.shape[:1] or (used < 0).any():
+        raise FaceDiffError(
+            f"alignment: weights have shape {used.shape} for {len(points)} points; expected one each, none negative"
+        )
+    if not (np.isfinite(points).all() and np.isfinite(goal).all() and np.isfinite(used).all()):
+        raise FaceDiffError("alignment: a point or a weight is NaN or infinite; leave it out")
+    if np.count_nonzero(used) < 3:
+        raise FaceDiffError("alignment: fewer than three points have weight; expected three that are not on a line")
+    return points, goal, used
+
+
+# Taking the head's rigid motion out of a sequence of faces, for sequences too large to be held in memory twice.
+
+Indices = npt.NDArray[np.int64]
+
+CHUNK_BYTES = 32 * 2**20
+"""Size of the frames that are worked on at a time, as float64; the work needs a few times as much."""
+SAMPLE = 64
+"""Frames, evenly spread, from which a sequence's median face and its stable vertices are found."""
+STILLEST = 0.3
+"""Share of the vertices that counts as stable."""
+ROUNDS = 10
+AGREED = 0.98
+"""Share of the stable vertices that two rounds must have in common to end the search."""
+ANCHORS = 2000
+"""As many vertices, evenly spread over the list, are enough to lay sampled frames onto one another."""
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """What :func:`remove_rigid_motion` found.
+
+    Attributes:
+        frames: (T, V, 3) the frames laid onto the target.
+        rotations: (T, 3, 3) from a frame to the target.
+        translations: (T, 3); frame t comes to lie at ``frames[t] @ rotations[t].T + translations[t]``.
+        residuals: (T,) root-mean-square distance of the stable vertices from the target that is left.
+    """
+
+    frames: npt.NDArray[np.floating]
+    rotations: Array
+    translations: Array
+    residuals: Array
+
+
+def remove_rigid_motion(
+    frames: npt.NDArray[np.floating],
+    target: npt.NDArray[np.floating],
+    stable: Indices | None = None,
+    *,
+    out: npt.NDArray[np.floating] | None = None,
+    chunk_bytes: int = CHUNK_BYTES,
+) -> RigidMotion:
+    """Lay every frame onto the target by rotation and translation, each by a robust fit of the stable vertices.
+
+    Works chunk by chunk: ``frames`` and ``out`` may be memory-mapped and never lie in memory as a whole.
+
+    Args:
+        frames: (T, V, 3) vertices.
+        target: (V, 3) the face to lay them onto.
+        stable: indices of the vertices that the fit looks at; all if None.
+        out: where to write the result, shape (T, V, 3); may be ``frames`` itself. A new array if None.
+        chunk_bytes: how much to take into memory at a time.
+
+    Raises:
+        FaceDiffError: if shapes differ, a frame holds NaN, or the stable vertices do not determine a rotation.
+    """
+    if frames.ndim != 3 or frames.shape[1:] != target.shape or frames.shape[-1] != 3:
+        raise FaceDiffError(
+            f"rigid motion: frames have shape {frames.shape} and the target {target.shape}; "
+            f"expected (frames, vertices, 3) and (vertices, 3)"
+        )
+    if out is None:
+        out = np.empty(frames.shape, frames.dtype)
+    if out.shape != frames.shape:
+        raise FaceDiffError(f"rigid motion: out has shape {out.shape}, expected that of the frames, {frames.shape}")
+    every = np.arange(len(target)) if stable is None else np.asarray(stable)
+    goal = np.asarray(target, np.float64)[every]
+    rotations, translations, residuals = (
+        np.empty((len(frames), 3, 3)),
+        np.empty((len(frames), 3)),
+        np.empty(len(frames)),
+    )
+    for part, chunk in chunks(frames, chunk_bytes):
+        rotation, translation, _ = robust_fit(chunk[:, every], goal)
+        chunk = chunk @ rotation.swapaxes(1, 2)
+        chunk += translation[:, None]
+        out[part] = chunk
+        rotations[part], translations[part] = rotation, translation
+        residuals[part] = np.sqrt(np.square(chunk[:, every] - goal).sum(axis=-1).mean(axis=-1))
+    return RigidMotion(out, rotations, translations, residuals)
+
+
+def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST, sample: int = SAMPLE) -> Indices:
+    """The vertices that move least against one another: skull, forehead, bridge of the nose.
+
+    Frames evenly spread over the sequence are laid onto their median by a robust fit of all vertices; the stillest
+    ones are taken, the frames laid anew onto their median by these only, and so on until the choice hardly changes.
+
+    Args:
+        frames: (T, V, 3) vertices, with or without the head's motion; may be memory-mapped.
+        share: how many of the vertices to take, 0 to 1; at least 10 are taken.
+        sample: how many frames to look at.
+
+    Returns:
+        Sorted vertex indices.
+
+    Raises:
+        FaceDiffError: if a frame that was looked at holds NaN, or its vertices do not determine a rotation.
+    """
+    some = _sample(frames, sample)
+    count = min(some.shape[1], max(10, round(share * some.shape[1])))
+    stable = np.arange(some.shape[1])
+    for _ in range(ROUNDS):
+        laid, median = _laid_onto_median(some, stable)
+        restlessness = np.square(laid - median).sum(axis=-1).mean(axis=0)
+        before, stable = stable, np.sort(np.argsort(restlessness, kind="stable")[:count])
+        if len(np.intersect1d(stable, before)) >= AGREED * len(before):
+            break
+    return stable
+
+
+def median_face(frames: npt.NDArray[np.floating], stable: Indices | None = None, *, sample: int = SAMPLE) -> Array:
+    """The median over frames of every vertex (V, 3), once the head's rigid motion is out; centred at the origin.
+
+    It has the pose of the frame in the middle, and takes the part of a template where there is none.
+
+    Args:
+        frames: (T, V, 3) vertices; may be memory-mapped.
+        stable: vertices that tell the head's motion; all, by a robust fit, if None.
+        sample: how many frames to look at.
+
+    Raises:
+        FaceDiffError: as :func:`stable_vertices`.
+    """
+    some = _sample(frames, sample)
+    _, median = _laid_onto_median(some, np.arange(some.shape[1]) if stable is None else np.asarray(stable))
+    return median - median.mean(axis=0)
+
+
+def chunks(frames: npt.NDArray[np.floating], chunk_bytes: int = CHUNK_BYTES) -> Iterator[tuple[slice, Array]]:
+    """Consecutive pieces of (T, V, 3) as float64 copies, with where they stand.
+
+    Raises:
+        FaceDiffError: naming the frame, if one holds NaN or infinity.
+    """
+    step = max(1, chunk_bytes // (24 * frames.shape[1]))
+    for first in range(0, len(frames), step):
+        chunk = np.array(frames[first : first + step], np.float64)
+        finite = np.isfinite(chunk).all(axis=(1, 2))
+        if not finite.all():
+            raise FaceDiffError(_not_finite(first + int(np.argmin(finite))))
+        yield slice(first, first + len(chunk)), chunk
+
+
+def _not_finite(frame: int) -> str:
+    return f"frame {frame} (counted from 0) holds NaN or infinity; repair or remove it"
+
+
+def _sample(frames: npt.NDArray[np.floating], sample: int) -> Array:
+    """Evenly spread frames, each moved to the origin."""
+    taken = np.unique(np.linspace(0, len(frames) - 1, min(sample, len(frames))).round().astype(int))
+    some = np.array(frames[taken], np.float64)
+    finite = np.isfinite(some).all(axis=(1, 2))
+    if not finite.all():
+        raise FaceDiffError(_not_finite(int(taken[np.argmin(finite)])))
+    return some - some.mean(axis=1, keepdims=True)
+
+
+def _laid_onto_median(some: Array, stable: Indices) -> tuple[Array, Array]:
+    """Frames (S, V, 3) laid onto the middle one, then twice onto their median; and that median (V, 3)."""
+    anchors = stable[np.linspace(0, len(stable) - 1, min(len(stable), ANCHORS)).round().astype(int)]
+    median = some[len(some) // 2]
+    laid = some
+    for near in (False, True, True):
+        rotation, translation, _ = robust_fit(laid[:, anchors], median[anchors], near=near)
+        laid = laid @ rotation.swapaxes(1, 2) + translation[:, None]
+        median = np.median(laid, axis=0)
+    return laid, median

@@ -1,0 +1,23 @@
+"""Models: LightningModules that turn speech into facial motion, and the components that they are made of."""
+
+from typing import TYPE_CHECKING
+
+from facediff.utils.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from facediff.models.base import AnimationModel as AnimationModel
+    from facediff.models.checkpoint import load_model as load_model
+    from facediff.models.dual_path import DualPathDiffusion as DualPathDiffusion
+    from facediff.models.inference import Style as Style
+    from facediff.models.style_content import StyleContentDisentanglement as StyleContentDisentanglement
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "base": "AnimationModel",
+        "checkpoint": "load_model",
+        "dual_path": "DualPathDiffusion",
+        "inference": "Style",
+        "style_content": "StyleContentDisentanglement",
+    },
+)

@@ -1,0 +1,68 @@
+"""A trained model that is to know one person more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from lightning.pytorch.cli import instantiate_module
+from torch import Tensor
+
+from facediff.errors import FaceDiffError
+from facediff.models.base import AnimationModel
+
+Part = Literal["all", "person"]
+"""What is trained: everything, or only what holds identity and style."""
+
+
+def with_extra_identities(model: AnimationModel, identities: list[str]) -> AnimationModel:
+    """The same model with further identities in front of those it knows, each starting as the mean of them all.
+
+    Args:
+        model: a trained model.
+        identities: what its identities shall be; those it has must be their end.
+
+    Raises:
+        FaceDiffError: if the model has other identities.
+    """
+    known = model.identities
+    count = len(identities) - len(known)
+    if count < 0 or identities[count:] != known:
+        raise FaceDiffError(
+            f"the checkpoint knows {', '.join(known)}, which is not the end of {', '.join(identities)}: adapt it with "
+            f"the corpus and the people that it was trained on"
+        )
+    if not count:
+        return model
+    described = {key: value for key, value in model.hparams.items() if not key.startswith("_")}
+    grown: AnimationModel = instantiate_module(type(model), {**described, "identities": identities})
+    before = model.state_dict()
+    grown.load_state_dict({name: grow(before[name], value) for name, value in grown.state_dict().items()})
+    grown.adopt(replace(model.assets, identities=identities))
+    return grown
+
+
+def grow(before: Tensor, after: Tensor) -> Tensor:
+    """``before`` with as many rows as ``after``, the new ones in front and equal to the mean of the old ones."""
+    if before.shape == after.shape:
+        return before
+    if before.shape[1:] != after.shape[1:] or len(before) > len(after):
+        raise FaceDiffError(f"weights of the shape {tuple(before.shape)} cannot take in another identity")
+    mean = before.mean(0, keepdim=True)
+    return torch.cat([mean.expand(len(after) - len(before), *mean.shape[1:]), before])
+
+
+def train_only(model: AnimationModel, part: Part) -> None:
+    """Freeze everything but a part; ``all`` leaves everything as it is.
+
+    Raises:
+        FaceDiffError: if the model has nothing of that part.
+    """
+    if part == "all":
+        return
+    chosen = {id(p) for module in model.personal_modules() for p in module.parameters()}
+    if not chosen:
+        raise FaceDiffError("--train person: the model has neither identity nor style to train; train all of it")
+    for parameter in model.parameters():
+        parameter.requires_grad_(id(parameter) in chosen and parameter.requires_grad)

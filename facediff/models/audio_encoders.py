@@ -1,0 +1,411 @@
+"""A small audio encoder trained from scratch: log-mel spectrogram and convolutions."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.models.layers import frame_mask, interpolate_frames
+from facediff.registry import audio_encoder
+
+if TYPE_CHECKING:
+    from transformers import HubertModel
+
+
+# What every audio encoder is.
+
+SAMPLE_RATE = 16_000
+
+
+class AudioEncoder(nn.Module, ABC):
+    """Speech to one feature per motion frame.
+
+    A clip's feature must not depend on how far it is padded, nor on the clips beside it.
+
+    An encoder whose first part is frozen may let it be computed once per clip and kept on disk: it then overrides
+    :meth:`frozen_key` and :meth:`frozen_features`, and takes their result as ``features`` and ``feature_lengths``,
+    two further arguments of its :meth:`forward` that no other encoder is given.
+
+    An encoder that looks at how loud the speech is takes it through :meth:`standardise`, so that a piece of a long
+    recording is heard as loud as it is in the whole.
+    """
+
+    _level: tuple[float, float] | None = None
+
+    @contextmanager
+    def at_level(self, mean: float, deviation: float) -> Iterator[None]:
+        """Within it, speech is standardised by this mean and standard deviation and not by its own."""
+        before, self._level = self._level, (mean, deviation)
+        try:
+            yield
+        finally:
+            self._level = before
+
+    def standardise(
+        self, audio: Float[Tensor, "batch samples"], lengths: Int[Tensor, " batch"]
+    ) -> Float[Tensor, "batch samples"]:
+        """Speech of zero mean and unit variance, as :func:`standardise` makes it or by the level that is set."""
+        if self._level is None:
+            return standardise(audio, lengths)
+        mean, deviation = self._level
+        return (audio - mean) / deviation * frame_mask(lengths, audio.shape[1])
+
+    def frozen_key(self) -> str | None:
+        """A hash of all that decides :meth:`frozen_features`; None if nothing is frozen, or something is random."""
+        return None
+
+    def frozen_features(
+        self, audio: Float[Tensor, "batch samples"], audio_lengths: Int[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]]:
+        """What the frozen part makes of speech, and each clip's valid steps.
+
+        Raises:
+            NotImplementedError: if the encoder has no frozen part.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no frozen part")
+
+    @abstractmethod
+    def forward(
+        self,
+        audio: Float[Tensor, "batch samples"],
+        audio_lengths: Int[Tensor, " batch"],
+        frame_lengths: Int[Tensor, " batch"],
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Encode.
+
+        Args:
+            audio: waveform at 16 kHz, mono, padded with zeros.
+            audio_lengths: valid samples of each clip.
+            frame_lengths: motion frames of each clip; they span the same time as its samples.
+
+        Returns:
+            features, ``frames = frame_lengths.max()``; zero on padding frames.
+        """
+
+
+class AudioEncoderFactory(Protocol):
+    """Makes an audio encoder once the model's width is known."""
+
+    def __call__(self, *, dim: int) -> AudioEncoder:
+        """Make one with ``dim`` output channels."""
+        ...
+
+
+def standardise(
+    audio: Float[Tensor, "batch samples"], lengths: Int[Tensor, " batch"]
+) -> Float[Tensor, "batch samples"]:
+    """Zero mean and unit variance over each clip's valid samples, zero on padding, as HuBERT's processor does."""
+    mask = frame_mask(lengths, audio.shape[1])
+    count = lengths[:, None].to(audio.dtype)
+    mean = (audio * mask).sum(1, keepdim=True) / count
+    variance = ((audio - mean).square() * mask).sum(1, keepdim=True) / count
+    return (audio - mean) / (variance + 1e-7).sqrt() * mask
+
+
+# Pretrained HuBERT as audio encoder (dual-path style diffusion paper, section 1.2).
+
+# With 40 zeros at either end the convolutions (receptive field 400, stride 320) give one step for every 320
+# samples, each centred in its own stretch of audio.
+EDGE = 40
+
+
+@audio_encoder.register("hubert")
+class HubertEncoder(AudioEncoder):
+    """Pretrained HuBERT; lower layers frozen, upper layers and the projection fine-tuned.
+
+    Clips are encoded one by one, or together where their lengths are equal: HuBERT normalises over time, so padding
+    would change its features. The 50 steps a second are interpolated to the motion's frames. Frozen layers run without
+    dropout, also in training, so that their result can be kept on disk.
+
+    Args:
+        dim: channels of the result; given by the model.
+        source: a name on the Hugging Face hub or a directory that ``from_pretrained`` reads.
+        frozen_layers: Transformer layers kept frozen, together with the convolutions, the feature projection and the
+            position convolution below them; −1 freezes all.
+        spec_augment: mask stretches of the features in training, as the pretrained model's configuration says.
+        layer_drop: probability of skipping a Transformer layer in training.
+        config: the model's configuration as plain data; if given, the weights are not read from ``source`` but left
+            for a checkpoint to fill in. Checkpoints use it, so that they need no access to ``source``.
+
+    Raises:
+        FaceDiffError: if ``source`` cannot be read.
+        MissingExtraError: if transformers is not installed.
+    """
+
+    def __init__(
+        self,
+        *,
+        dim: int,
+        source: str = "facebook/hubert-base-ls960",
+        frozen_layers: int = 2,
+        spec_augment: bool = False,
+        layer_drop: float = 0.0,
+        config: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.hubert = load_hubert(source, config)
+        self.hubert.config.apply_spec_augment = spec_augment
+        self.hubert.config.layerdrop = layer_drop
+        self.frozen_layers = len(self.hubert.encoder.layers) if frozen_layers < 0 else frozen_layers
+        self._frozen = self._freeze(self.frozen_layers)
+        self.train()
+        self.out = nn.Linear(self.hubert.config.hidden_size, dim)
+
+    def checkpoint_init_args(self) -> dict[str, Any]:
+        """What a checkpoint stores in place of a look at ``source``: the configuration as plain data."""
+        return {"config": self.hubert.config.to_dict()}
+
+    def _freeze(self, count: int) -> list[str]:
+        """Freeze what lies below layer ``count``; the names of the frozen modules."""
+        names = ["feature_extractor", "feature_projection"]
+        if count:
+            names += ["encoder.pos_conv_embed", "encoder.dropout", *(f"encoder.layers.{i}" for i in range(count))]
+            if not self._normalises_last or count >= len(self.hubert.encoder.layers):
+                names.append("encoder.layer_norm")
+        for name in names:
+            self.hubert.get_submodule(name).requires_grad_(False)
+        # Else transformers marks what enters the convolutions as differentiable and training goes back through them.
+        self.hubert.feature_extractor._freeze_parameters()
+        # The embedding that SpecAugment writes over masked steps is of no use without SpecAugment.
+        mask = getattr(self.hubert, "masked_spec_embed", None)
+        if mask is not None and not self.hubert.config.apply_spec_augment:
+            mask.requires_grad_(False)
+        return names
+
+    @property
+    def _normalises_last(self) -> bool:
+        """Whether the Transformer's own layer norm comes after its layers (large models) or before them (base)."""
+        return bool(getattr(self.hubert.config, "do_stable_layer_norm", False))
+
+    def train(self, mode: bool = True) -> HubertEncoder:
+        """Training mode for all but the frozen part."""
+        super().train(mode)
+        for name in self._frozen:
+            self.hubert.get_submodule(name).eval()
+        return self
+
+    def frozen_key(self) -> str | None:
+        """A hash of the frozen weights, the configuration and the number of frozen layers."""
+        if self.hubert.config.apply_spec_augment:
+            return None
+        # Where the weights came from, and how they are to be trained, decides nothing.
+        config = {k: v for k, v in self.hubert.config.to_dict().items() if k not in ("_name_or_path", "layerdrop")}
+        digest = hashlib.sha256(json.dumps([self.frozen_layers, EDGE, config], sort_keys=True, default=str).encode())
+        for name in self._frozen:
+            for key, value in sorted(self.hubert.get_submodule(name).state_dict().items()):
+                digest.update(f"{name}.{key}.{value.dtype}".encode())
+                digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+        return digest.hexdigest()
+
+    def frozen_features(
+        self, audio: Float[Tensor, "batch samples"], audio_lengths: Int[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]]:
+        """Hidden states below the first layer that is trained, at 50 steps a second."""
+        return by_length(self.standardise(audio, audio_lengths), audio_lengths, self._lower)
+
+    def _lower(self, wave: Tensor) -> Tensor:
+        """The frozen part: convolutions, projection and the frozen layers."""
+        hidden = self.hubert.feature_projection(self.hubert.feature_extractor(with_edges(wave)).transpose(1, 2))
+        return self._layers(hidden, 0, self.frozen_layers) if self.frozen_layers else hidden
+
+    def _upper(self, hidden: Tensor) -> Tensor:
+        """The part that is trained."""
+        hidden = self._layers(hidden, self.frozen_layers, len(self.hubert.encoder.layers))
+        return self.hubert.encoder.layer_norm(hidden) if self._normalises_last else hidden
+
+    def _layers(self, hidden: Tensor, first: int, last: int) -> Tensor:
+        """Transformer layers ``first`` to ``last``, with what comes before the first of all."""
+        encoder = self.hubert.encoder
+        if first == 0:
+            hidden = hidden + encoder.pos_conv_embed(hidden)
+            hidden = encoder.dropout(hidden if self._normalises_last else encoder.layer_norm(hidden))
+        for layer in encoder.layers[first:last]:
+            if layer.training and self.hubert.config.layerdrop > 0 and torch.rand(()) < self.hubert.config.layerdrop:
+                continue
+            hidden = layer(hidden)
+        return hidden
+
+    def forward(
+        self,
+        audio: Float[Tensor, "batch samples"],
+        audio_lengths: Int[Tensor, " batch"],
+        frame_lengths: Int[Tensor, " batch"],
+        features: Float[Tensor, "batch steps channels"] | None = None,
+        feature_lengths: Int[Tensor, " batch"] | None = None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Encode; see :class:`AudioEncoder`."""
+        if self.hubert.config.apply_spec_augment:
+            hidden, steps = by_length(self.standardise(audio, audio_lengths), audio_lengths, self._whole)
+        else:
+            if features is None or feature_lengths is None:
+                features, feature_lengths = self.frozen_features(audio, audio_lengths)
+            hidden, steps = by_length(features, feature_lengths, self._upper)
+        return interpolate_frames(self.out(hidden), steps, frame_lengths)
+
+    def _whole(self, wave: Tensor) -> Tensor:
+        return self.hubert(with_edges(wave)).last_hidden_state
+
+
+def with_edges(wave: Float[Tensor, "batch samples"]) -> Float[Tensor, "batch padded"]:
+    """Speech with the zeros at either end that make its steps fall where they belong; at least one step long."""
+    return nn.functional.pad(wave, (EDGE, EDGE + max(0, 400 - wave.shape[1] - 2 * EDGE)))
+
+
+def by_length(padded: Tensor, lengths: Tensor, encode: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """Encode clips of equal length together, without their padding; the padded results and their lengths."""
+    parts: dict[int, Tensor] = {}
+    for length in sorted(set(lengths.tolist())):
+        rows = (lengths == length).nonzero().flatten()
+        parts.update(zip(rows.tolist(), encode(padded[rows, :length]), strict=True))
+    ordered = [parts[i] for i in range(len(padded))]
+    steps = torch.tensor([len(part) for part in ordered], device=padded.device)
+    return nn.utils.rnn.pad_sequence(ordered, batch_first=True), steps
+
+
+def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
+    """A HuBERT from a directory, from the hub, or from a plain configuration without weights."""
+    try:
+        from transformers import HubertConfig, HubertModel
+        from transformers.utils import logging
+    except ImportError as error:
+        raise MissingExtraError("transformers", "train", "the hubert audio encoder") from error
+    if config is not None:
+        return HubertModel(HubertConfig.from_dict(config))
+    # A path that does not exist would be taken for a name on the hub and fail with a puzzling message.
+    if (source.startswith((".", "/", "~")) or source.count("/") > 1) and not Path(source).expanduser().is_dir():
+        raise FaceDiffError(
+            f"audio_encoder.source: no directory {source}; expected one with config.json and model.safetensors, "
+            f"or a name on the Hugging Face hub such as facebook/hubert-base-ls960"
+        )
+    bar = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()
+    try:
+        model, info = HubertModel.from_pretrained(
+            os.path.expanduser(source), use_safetensors=None, output_loading_info=True, dtype=torch.float32
+        )
+    except Exception as error:  # a broken file makes safetensors, pickle and transformers raise anything
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise FaceDiffError(
+            f'audio_encoder.source: cannot load HuBERT from "{source}" ({reason}); give a directory '
+            f"that holds config.json and model.safetensors, or go online once to fetch it"
+        ) from error
+    finally:
+        if bar:
+            logging.enable_progress_bar()
+    # The mask embedding is absent from checkpoints that were fine-tuned without SpecAugment; it has no other use.
+    missing = sorted(set(info["missing_keys"]) - {"masked_spec_embed"})
+    if missing:
+        raise FaceDiffError(
+            f'audio_encoder.source: "{source}" holds no complete HuBERT ({len(missing)} weights are missing, '
+            f"the first is {missing[0]}); its config.json and model.safetensors must belong together"
+        )
+    # from_pretrained leaves evaluation mode on, and Lightning trains modules in the mode that it finds them in.
+    return model.train()
+
+
+def mel_filters(n_mels: int, n_fft: int, low: float, high: float) -> Float[Tensor, "mels bins"]:
+    """Triangular filters equally spaced on the mel scale 2595·log10(1 + f/700) (O'Shaughnessy 1987).
+
+    Each filter is scaled to unit area in Hz, so that a flat spectrum gives a flat result.
+    """
+
+    def to_mel(hertz: float) -> float:
+        return 2595.0 * math.log10(1.0 + hertz / 700.0)
+
+    mels = torch.linspace(to_mel(low), to_mel(high), n_mels + 2, dtype=torch.float64)
+    edges = 700.0 * (10.0 ** (mels / 2595.0) - 1.0)
+    bins = torch.arange(n_fft // 2 + 1, dtype=torch.float64) * (SAMPLE_RATE / n_fft)
+    rise = (bins[None] - edges[:-2, None]) / (edges[1:-1] - edges[:-2])[:, None]
+    fall = (edges[2:, None] - bins[None]) / (edges[2:] - edges[1:-1])[:, None]
+    triangles = torch.minimum(rise, fall).clamp_min(0.0)
+    return (triangles * (2.0 / (edges[2:] - edges[:-2]))[:, None]).float()
+
+
+class ConvBlock(nn.Module):
+    """Pre-norm residual block: dilated convolution over time, then a position-wise mix."""
+
+    def __init__(self, dim: int, dilation: int, dropout: float) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(dim)
+        self.conv = nn.Conv1d(dim, dim, kernel_size=5, dilation=dilation, padding=2 * dilation)
+        self.mix = nn.Linear(dim, dim)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """``x`` (batch, steps, dim) and ``mask`` (batch, steps, 1), which keeps padding at zero."""
+        hidden = self.norm(x) * mask
+        hidden = nn.functional.gelu(self.conv(hidden.transpose(1, 2)).transpose(1, 2))
+        return (x + self.dropout(self.mix(hidden))) * mask
+
+
+@audio_encoder.register("mel")
+class MelEncoder(AudioEncoder):
+    """Log-mel spectrogram and residual dilated convolutions, trained from scratch.
+
+    The default where no pretrained weights are at hand. 100 spectra a second are halved to 50 steps a second by a
+    strided convolution and interpolated to the motion's frame rate at the end.
+
+    Args:
+        dim: channels of the result; given by the model.
+        n_mels: mel bands between 60 Hz and 7 600 Hz.
+        hidden_dim: channels of the convolutions.
+        num_layers: residual blocks, with dilations 1, 2, 4, 1, 2, 4 …
+        dropout: dropout in each block.
+    """
+
+    filters: Tensor
+    window: Tensor
+    n_fft = 512
+    hop = 160
+
+    def __init__(
+        self, *, dim: int, n_mels: int = 64, hidden_dim: int = 128, num_layers: int = 4, dropout: float = 0.1
+    ) -> None:
+        super().__init__()
+        self.register_buffer("filters", mel_filters(n_mels, self.n_fft, 60.0, 7600.0), persistent=False)
+        self.register_buffer("window", torch.hann_window(400), persistent=False)
+        self.stem = nn.Conv1d(n_mels, hidden_dim, kernel_size=4, stride=2, padding=1)
+        self.blocks = nn.ModuleList(ConvBlock(hidden_dim, 2 ** (i % 3), dropout) for i in range(num_layers))
+        self.out = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, dim))
+
+    def forward(
+        self,
+        audio: Float[Tensor, "batch samples"],
+        audio_lengths: Int[Tensor, " batch"],
+        frame_lengths: Int[Tensor, " batch"],
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Encode; see :class:`AudioEncoder`."""
+        spectrum, lengths = self._log_mel(self.standardise(audio, audio_lengths), audio_lengths)
+        x = self.stem(spectrum.transpose(1, 2)).transpose(1, 2)
+        lengths = (lengths // 2).clamp_min(1)
+        mask = frame_mask(lengths, x.shape[1])[..., None].to(x.dtype)
+        x = nn.functional.gelu(x) * mask
+        for block in self.blocks:
+            x = block(x, mask)
+        return interpolate_frames(self.out(x), lengths, frame_lengths)
+
+    def _log_mel(self, audio: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+        """Standardised log-mel spectra (batch, steps, mels), zero on padding, and each clip's steps."""
+        # Autocast has no complex numbers: the spectrum is always taken in float32.
+        with torch.autocast(audio.device.type, enabled=False):
+            short = max(0, 2 * self.hop - audio.shape[1])
+            padded = nn.functional.pad(audio.float(), (self.n_fft // 2, self.n_fft // 2 + short))
+            window = nn.functional.pad(self.window, (56, 56))
+            frames = padded.unfold(1, self.n_fft, self.hop) * window
+            power = torch.fft.rfft(frames).abs().square()
+            spectrum = torch.log(power @ self.filters.T + 1e-5)
+        steps = (lengths // self.hop).clamp(min=2)
+        mask = frame_mask(steps, spectrum.shape[1])[..., None]
+        return (spectrum + 2.0) / 4.0 * mask, steps

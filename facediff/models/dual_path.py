@@ -1,0 +1,664 @@
+"""Dual-path style diffusion as a LightningModule."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Protocol
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch
+from facediff.errors import FaceDiffError
+from facediff.models import losses
+from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, MelEncoder
+from facediff.models.base import AnimationModel
+from facediff.models.decoders import Decoder, DecoderFactory, StyleTransformer
+from facediff.models.evaluation import IdentityPolicy
+from facediff.models.folding import Fold, FoldCache
+from facediff.models.fusions import BidirectionalCrossAttention, Fusion, FusionFactory
+from facediff.models.identity_encoders import HierarchicalIdentity, IdentityEncoder, IdentityEncoderFactory
+from facediff.models.inference import ClipNoise, Progress, Window, WindowNoise, WindowOverlap, unchanged
+from facediff.models.layers import frame_mask
+from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoder, MeshEncoderFactory
+from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, Sampler, SamplerFactory, unit_noise
+from facediff.models.style_encoders import StyleEncoder, StyleEncoderFactory, TcnGruTransformer
+from facediff.registry import describe
+
+# Embedding of the diffusion step, computed step by step or as a table of all steps.
+
+
+class StepEmbedding(nn.Module):
+    """t_emb: sinusoids of the diffusion step, then an MLP.
+
+    Args:
+        dim: channels C.
+    """
+
+    frequencies: Tensor
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        half = dim // 2
+        frequencies = torch.exp(-math.log(10_000.0) * torch.arange(half) / half)
+        self.register_buffer("frequencies", frequencies, persistent=False)
+        self.mlp = nn.Sequential(nn.Linear(2 * half, dim), nn.SiLU(), nn.Linear(dim, dim))
+        self._table: Tensor | None = None
+        self._weights: list[Tensor] = []
+
+    def forward(self, step: Int[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
+        """Embed step numbers counted from 0."""
+        angle = step[:, None].float() * self.frequencies
+        return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))
+
+    def table(self, steps: int) -> Float[Tensor, "steps dim"]:
+        """The embeddings of all steps, without gradient; kept until the weights are found changed.
+
+        Args:
+            steps: the process's steps N.
+        """
+        weights = [self.frequencies, *self.mlp.parameters()]
+        # Without inference mode, whose tensors could not be used outside of it later.
+        with torch.inference_mode(False), torch.no_grad(), torch.autocast(self.frequencies.device.type, enabled=False):
+            kept = self._table
+            if kept is None or len(kept) != steps or not all(map(same, weights, self._weights)):
+                kept = self._table = self(torch.arange(steps, device=self.frequencies.device))
+                # The weights themselves are looked at: no counter sees how averaged weights are swapped in and out.
+                self._weights = [weight.detach().clone() for weight in weights]
+        return kept
+
+
+def same(one: Tensor, other: Tensor) -> bool:
+    """Whether two tensors are equal, also in type and place."""
+    return one.dtype == other.dtype and one.device == other.device and torch.equal(one, other)
+
+
+# The network of dual-path style diffusion: conditions once per clip, one denoising pass per step.
+
+TokenForm = Literal["levels", "single"]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What does not change over the denoising steps of a clip.
+
+    Attributes:
+        audio: speech features F_a.
+        style: style tokens, the condition F_s.
+        mask: True on valid frames.
+    """
+
+    audio: Float[Tensor, "batch frames dim"]
+    style: Float[Tensor, "batch tokens dim"]
+    mask: Bool[Tensor, "batch frames"]
+
+    def frames(self, start: int, end: int) -> Conditions:
+        """Those of some of the frames."""
+        return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end])
+
+    def repeated(self, times: int) -> Conditions:
+        """One clip's conditions for several takes of it; nothing is copied."""
+        if times == 1:
+            return self
+        audio, style = (value.expand(times, -1, -1) for value in (self.audio, self.style))
+        return Conditions(audio, style, self.mask.expand(times, -1))
+
+
+@dataclass(frozen=True)
+class PreparedConditions(Conditions):
+    """Conditions with everything else that does not change over the steps; whole, not to be sliced.
+
+    It holds for the weights and the precision in which it was made.
+
+    Attributes:
+        fusion: what the fusion prepared.
+        decoder: what the decoder prepared.
+        steps: the embedding of each step; None if steps are embedded as they come.
+    """
+
+    fusion: object = None
+    decoder: object = None
+    steps: Float[Tensor, "steps dim"] | None = None
+
+
+class StyleTokens(nn.Module):
+    """F_s = Concat(F_id, F_dyn) (eq. 14), presented to the decoder as tokens.
+
+    Attention over a single key is constant, so by default each part of F_s (coarse, mid, fine, dynamic) becomes a
+    token with a projection of its own.
+
+    Args:
+        token_dims: widths of the parts; may be empty, then one learnt token stands for "no condition".
+        dim: channels of a token.
+        form: a token per part (``levels``) or one token for all (``single``).
+    """
+
+    def __init__(self, token_dims: tuple[int, ...], dim: int, form: TokenForm) -> None:
+        super().__init__()
+        if form == "single" and token_dims:
+            token_dims = (sum(token_dims),)
+        self.token_dims = token_dims
+        self.projections = nn.ModuleList(nn.Linear(width, dim) for width in token_dims)
+        self.null = None if token_dims else nn.Parameter(torch.zeros(1, 1, dim))
+
+    def forward(self, style: Float[Tensor, "batch style_dim"]) -> Float[Tensor, "batch tokens dim"]:
+        """Split F_s and project each part."""
+        if self.null is not None:
+            return self.null.expand(len(style), -1, -1)
+        parts = torch.split(style, list(self.token_dims), dim=-1)
+        return torch.stack([p(part) for p, part in zip(self.projections, parts, strict=True)], dim=1)
+
+
+class DualPathNetwork(nn.Module):
+    """Predicts clean motion from noisy motion under speech, identity and style.
+
+    In the denoising loop vertices appear in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V). Outside it
+    ``mesh_encoder`` stands in front of the style encoder (X = Linear(M_ref) in the paper).
+
+    Args:
+        n_vertices: vertices V of the topology.
+        dim: channels C.
+        audio_encoder: speech to F_a.
+        identity_encoder: identity to F_id.
+        mesh_encoder: reference motion to one feature per frame; None without a dynamic style.
+        style_encoder: these features to F_dyn.
+        fusion: F_a and F_m to F_am.
+        decoder: F_fused and style tokens to F_dec.
+        token_form: how F_s is presented to the decoder.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_vertices: int,
+        dim: int,
+        audio_encoder: AudioEncoder,
+        identity_encoder: IdentityEncoder,
+        mesh_encoder: MeshEncoder | None,
+        style_encoder: StyleEncoder,
+        fusion: Fusion,
+        decoder: Decoder,
+        token_form: TokenForm,
+    ) -> None:
+        super().__init__()
+        self.coordinates = 3 * n_vertices
+        self.audio_encoder = audio_encoder
+        self.identity_encoder = identity_encoder
+        self.style_encoder = style_encoder
+        self.style_tokens = StyleTokens(identity_encoder.token_dims + style_encoder.token_dims, dim, token_form)
+        self.embed = nn.Linear(3 * n_vertices, dim)
+        self.mesh_encoder = mesh_encoder
+        self.step_embedding = StepEmbedding(dim)
+        self.fusion = fusion
+        self.fused_norm = nn.LayerNorm(dim)
+        self.decoder = decoder
+        self.unembed = nn.Linear(dim, 3 * n_vertices)
+
+    def conditions(
+        self,
+        audio: Float[Tensor, "batch samples"],
+        audio_lengths: Int[Tensor, " batch"],
+        frame_lengths: Int[Tensor, " batch"],
+        identity: Int[Tensor, " batch"],
+        dynamic_style: Float[Tensor, "batch dynamic_dim"],
+        features: tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]] | None = None,
+    ) -> Conditions:
+        """Everything that is computed once per clip.
+
+        Args:
+            audio: waveforms at 16 kHz.
+            audio_lengths: valid samples.
+            frame_lengths: motion frames wanted.
+            identity: identity indices, −1 for unknown.
+            dynamic_style: F_dyn, as :meth:`dynamic_style` gives it.
+            features: cached result of the audio encoder's frozen part, and its lengths.
+        """
+        encoded = self.audio_encoder(audio, audio_lengths, frame_lengths, *(features or ()))
+        style = torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1)
+        return Conditions(encoded, self.style_tokens(style), frame_mask(frame_lengths, encoded.shape[1]))
+
+    def prepared(self, conditions: Conditions, steps: int | None = None) -> PreparedConditions:
+        """What :meth:`core` would compute anew in each of many steps, computed once.
+
+        To be called on conditions as they will be used, after any slicing, once a clip or window; :meth:`core` gives
+        the same with the result as with the conditions themselves, up to rounding.
+
+        Args:
+            conditions: as :meth:`conditions` gives them, or parts of them.
+            steps: the process's steps N, for a table of their embeddings; none is used if None.
+        """
+        audio, style, mask = conditions.audio, conditions.style, conditions.mask
+        return PreparedConditions(
+            audio,
+            style,
+            mask,
+            fusion=self.fusion.prepare(audio, mask),
+            decoder=self.decoder.prepare(style, mask),
+            steps=None if steps is None else self.step_embedding.table(steps),
+        )
+
+    def dynamic_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch dynamic_dim"]:
+        """F_dyn of scaled reference motion; of width 0 without a dynamic style.
+
+        Args:
+            reference: scaled reference motion.
+            mask: True on valid frames.
+        """
+        if self.mesh_encoder is None:
+            return reference.new_zeros((len(reference), 0))
+        return self.style_encoder(self.mesh_encoder(reference), mask)
+
+    def forward(
+        self,
+        noisy: Float[Tensor, "batch frames coordinates"],
+        step: Int[Tensor, " batch"],
+        conditions: Conditions,
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Predict the clean scaled motion M̂⁰ from Mⁿ."""
+        return self.leave(self.core(self.embed(noisy), step, conditions))
+
+    def leave(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames coordinates"]:
+        """F_dec to the clean scaled motion.
+
+        In mixed precision this map stays in the weights' own type: differences over time of half-precision motion are
+        noise.
+        """
+        with torch.autocast(features.device.type, enabled=False):
+            return self.unembed(features.to(next(self.unembed.parameters()).dtype))
+
+    def core(
+        self, motion: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions
+    ) -> Float[Tensor, "batch frames dim"]:
+        """F_m to F_dec: everything between the two vertex-space maps.
+
+        Args:
+            motion: F_m.
+            step: step numbers counted from 0.
+            conditions: as they are, or :meth:`prepared`.
+        """
+        ready = conditions if isinstance(conditions, PreparedConditions) else PreparedConditions(**vars(conditions))
+        # A component that prepares nothing need not know that others do.
+        known = [() if part is None else (part,) for part in (ready.fusion, ready.decoder)]
+        fused = self.fusion(ready.audio, motion, ready.mask, *known[0])
+        embedded = self.step_embedding(step) if ready.steps is None else ready.steps[step]
+        fused = self.fused_norm(fused + embedded[:, None])  # eq. 13
+        return self.decoder(fused, ready.style, ready.mask, *known[1])
+
+
+# Where the reverse process runs: on vertices, or folded into the width of the model.
+
+SamplingSpace = Literal["folded", "vertices"]
+
+Blend = Callable[[Tensor], Tensor]
+"""From the features that the network gave in a step to those that are used."""
+
+
+class Space(Protocol):
+    """A linear image of motion in which a sampler runs, none the wiser; made anew for every run.
+
+    Attributes:
+        width: numbers in a frame.
+    """
+
+    width: int
+
+    def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
+        """From independent unit Gaussian noise to the image of unit Gaussian noise on vertices."""
+        ...
+
+    def predict(
+        self, state: Float[Tensor, "batch frames width"], step: Int[Tensor, " batch"], conditions: Conditions
+    ) -> Float[Tensor, "batch frames width"]:
+        """The image of the predicted clean motion."""
+        ...
+
+    def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
+        """Scaled motion of the sampler's result."""
+        ...
+
+
+class VertexSpace:
+    """Motion itself; needs nothing of the network or the sampler.
+
+    Args:
+        network: the network.
+        width: coordinates of a frame, 3V.
+        blend: changes the features of every step.
+    """
+
+    def __init__(self, network: DualPathNetwork, width: int, blend: Blend = unchanged) -> None:
+        self.network = network
+        self.width = width
+        self.blend = blend
+
+    def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
+        """Unit noise as it is."""
+        return unit
+
+    def predict(
+        self, state: Float[Tensor, "batch frames width"], step: Int[Tensor, " batch"], conditions: Conditions
+    ) -> Float[Tensor, "batch frames width"]:
+        """M̂⁰."""
+        return self.network.leave(self.blend(self.network.core(self.network.embed(state), step, conditions)))
+
+    def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
+        """The sample as it is."""
+        return sample
+
+
+class FoldedSpace:
+    """y = E x, the noisy motion as the network sees it, without its bias; the same samples at the width's cost.
+
+    The last step of a linear sampler returns the last prediction E M̂⁰, and that is M̂⁰ = U h + b of the features h
+    which the network gave last: they are kept, since y alone does not say where the vertices are.
+
+    Args:
+        network: a network whose ``embed`` and ``unembed`` are linear.
+        fold: their products.
+        blend: changes the features of every step.
+    """
+
+    def __init__(self, network: DualPathNetwork, fold: Fold, blend: Blend = unchanged) -> None:
+        self.network = network
+        self.fold = fold
+        self.blend = blend
+        self.width = len(fold.offset)
+        self._features: Tensor | None = None
+        self._prediction: Tensor | None = None
+
+    def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
+        """Noise with the covariance E Eᵀ, independent over frames; zero where ``unit`` is."""
+        with torch.autocast(unit.device.type, enabled=False):
+            return unit @ self.fold.root
+
+    def predict(
+        self, state: Float[Tensor, "batch frames width"], step: Int[Tensor, " batch"], conditions: Conditions
+    ) -> Float[Tensor, "batch frames width"]:
+        """E M̂⁰ = E U h + E b."""
+        bias = self.network.embed.bias
+        features = self.blend(self.network.core(state if bias is None else state + bias, step, conditions))
+        with torch.autocast(features.device.type, enabled=False):
+            prediction = nn.functional.linear(features.to(state.dtype), self.fold.product, self.fold.offset)
+        self._features, self._prediction = features, prediction
+        return prediction
+
+    def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
+        """U h + b, the only step over the vertices.
+
+        Raises:
+            FaceDiffError: if the sampler did not end at the last prediction.
+        """
+        features, prediction = self._features, self._prediction
+        if (
+            features is None
+            or prediction is None
+            or not torch.allclose(sample, prediction, rtol=1e-3, atol=1e-4, equal_nan=True)
+        ):
+            raise FaceDiffError(
+                "sampler: it says that it is linear, but its last step does not return the last prediction; "
+                "choose --model.sampling_space=vertices"
+            )
+        return self.network.leave(features)
+
+
+def choose_space(
+    network: DualPathNetwork, wanted: SamplingSpace, sampler: Sampler, cache: FoldCache, blend: Blend = unchanged
+) -> Space:
+    """The folded space where it is wanted and exact, else the vertices.
+
+    Args:
+        network: the network; it can be folded if both ends are linear.
+        wanted: the space asked for.
+        sampler: the sampler that will run; it can be folded if it is linear.
+        cache: the network's fold from earlier.
+        blend: changes the features that the network gives in every step.
+    """
+    first, last = network.embed, network.unembed
+    if wanted == "folded" and sampler.linear and isinstance(first, nn.Linear) and isinstance(last, nn.Linear):
+        return FoldedSpace(network, cache.get(first.weight, last.weight, last.bias), blend)
+    return VertexSpace(network, network.coordinates, blend)
+
+
+@registry.model.register("DualPathDiffusion")
+class DualPathDiffusion(AnimationModel):
+    """Personalised speech-driven animation by dual-path style diffusion.
+
+    Speech features, a hierarchical identity embedding and a dynamic style encoder condition a diffusion model over
+    vertex motion. Every part is chosen by name; the ablations of the paper are one override each:
+    ``style_encoder=none``, ``identity_encoder=none``, ``fusion=add``.
+
+    Args:
+        n_vertices: vertices of the topology; taken from the data module on the command line.
+        identities: training identities; taken from the data module on the command line.
+        frame_rate: motion frames a second; taken from the data module on the command line.
+        dim: model width C.
+        audio_encoder: speech to features.
+        identity_encoder: who the face is.
+        mesh_encoder: reference motion to one feature per frame, in front of the style encoder.
+        style_encoder: how the person moves.
+        fusion: where speech meets noisy motion.
+        decoder: to clean motion.
+        sampler: runs the reverse process in validation, test, prediction and animation.
+        sampling_space: where it runs: ``folded`` into ``dim`` dimensions, with the same distribution of motion at a
+            cost per step that does not depend on the vertices, or on the ``vertices`` themselves, for comparison. A
+            sampler or a network that cannot be folded runs on the vertices anyway.
+        diffusion_steps: noising steps N.
+        noise_schedule: schedule of diffusers; ``squaredcos_cap_v2`` is the cosine schedule.
+        motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
+            leaves it as it is.
+        style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
+        identity_dropout: share of training clips whose identity is hidden, so that unknown people can be animated.
+        velocity_weight: λ_vel.
+        acceleration_weight: λ_acc.
+        face_weight: λ_face.
+        learning_rate: AdamW's learning rate.
+        weight_decay: AdamW's weight decay.
+        lr_schedule: constant, or a cosine down to zero at the end of training.
+        warmup_steps: optimiser steps over which the learning rate rises from zero.
+        protocol: the metrics' protocol for validation and test.
+        unseen_identity: as whom people are tested whom the model was not trained on: as nobody known, with their own
+            style (``style_only``), as each training identity in turn with the mean of the scores (``each_seen``), or as
+            themselves, once the model is adapted to them (``adapted``).
+    """
+
+    samples: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        *,
+        n_vertices: int,
+        identities: list[str],
+        frame_rate: float,
+        dim: int = 256,
+        audio_encoder: AudioEncoderFactory = MelEncoder,
+        identity_encoder: IdentityEncoderFactory = HierarchicalIdentity,
+        mesh_encoder: MeshEncoderFactory = LinearMeshEncoder,
+        style_encoder: StyleEncoderFactory = TcnGruTransformer,
+        fusion: FusionFactory = BidirectionalCrossAttention,
+        decoder: DecoderFactory = StyleTransformer,
+        sampler: SamplerFactory = DpmSolverSampler,
+        sampling_space: SamplingSpace = "folded",
+        diffusion_steps: int = 1000,
+        noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
+        motion_scale: Literal["unit", "none"] = "unit",
+        style_tokens: TokenForm = "levels",
+        identity_dropout: float = 0.1,
+        velocity_weight: float = 0.003,
+        acceleration_weight: float = 0.003,
+        face_weight: float = 0.0005,
+        learning_rate: float = 1e-4,
+        weight_decay: float = 0.05,
+        lr_schedule: Literal["constant", "cosine"] = "constant",
+        warmup_steps: int = 0,
+        protocol: str = "paper",
+        unseen_identity: IdentityPolicy = "style_only",
+    ) -> None:
+        arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        super().__init__(
+            n_vertices=n_vertices,
+            identities=identities,
+            frame_rate=frame_rate,
+            learning_rate=learning_rate,
+            weight_decay=weight_decay,
+            lr_schedule=lr_schedule,
+            warmup_steps=warmup_steps,
+            protocol=protocol,
+            motion_scale=motion_scale,
+            unseen_identity=unseen_identity,
+        )
+        self.identity_dropout = identity_dropout
+        self.loss_weights = {
+            "reconstruction": 1.0,
+            "velocity": velocity_weight,
+            "acceleration": acceleration_weight,
+            "face": face_weight,
+        }
+        self.process = NoiseProcess(diffusion_steps, noise_schedule)
+        self.sampler = sampler(process=self.process)
+        self.sampling_space: SamplingSpace = sampling_space
+        self._fold_cache = FoldCache()
+        style = style_encoder(dim=dim)
+        self.network = DualPathNetwork(
+            n_vertices=n_vertices,
+            dim=dim,
+            audio_encoder=audio_encoder(dim=dim),
+            identity_encoder=identity_encoder(dim=dim, n_identities=len(identities)),
+            # Without a dynamic style there is nothing to embed, and no idle weights.
+            mesh_encoder=mesh_encoder(dim=dim, n_vertices=n_vertices) if style.token_dims else None,
+            style_encoder=style,
+            fusion=fusion(dim=dim),
+            decoder=decoder(dim=dim, style_dim=dim),
+            token_form=style_tokens,
+        )
+        for kind in ("audio_encoder", "identity_encoder", "style_encoder", "fusion", "decoder"):
+            arguments[kind] = describe(arguments[kind], getattr(self.network, kind))
+        arguments["mesh_encoder"] = describe(mesh_encoder, self.network.mesh_encoder)
+        arguments["sampler"] = describe(sampler, self.sampler)
+        self.remember(arguments)
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The identity's and the dynamic style's encoders, and how both are presented to the decoder."""
+        network = self.network
+        parts = (network.identity_encoder, network.mesh_encoder, network.style_encoder, network.style_tokens)
+        return [part for part in parts if part is not None]
+
+    @property
+    def speech_encoder(self) -> AudioEncoder:
+        """The audio encoder."""
+        return self.network.audio_encoder
+
+    def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
+        """Sample in another way from now on; checkpoints keep the sampler that the model was made with."""
+        chosen = registry.sampler.get(name) if name is not None else type(self.sampler)
+        options = dict(self.hparams["sampler"]["init_args"]) if name is None else {}
+        if steps is not None:
+            options["steps"] = steps
+        self.sampler = chosen(process=self.process, **options)
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """One draw of step and noise per clip (algorithm 1), then the four losses (eq. 15 to 19)."""
+        motion = batch.motion.flatten(2)
+        step = self.process.draw_steps(len(batch), motion.device, generator)
+        return self.losses_at(batch, step, unit_noise(motion.shape, motion.device, generator))
+
+    def losses_at(
+        self, batch: Batch, step: Int[Tensor, " batch"], noise: Float[Tensor, "batch frames coordinates"]
+    ) -> dict[str, Tensor]:
+        """The losses at given steps with given noise, which is overwritten.
+
+        Args:
+            batch: clips with their true motion.
+            step: each clip's step, counted from 0.
+            noise: unit noise.
+        """
+        network = self.network
+        # As NoiseProcess.add_noise, without further tensors of the motion's size: on a processor, having a new one
+        # takes longer than what is done to it.
+        signal = self.process.signal.to(noise.device)[step][:, None, None]
+        noisy = noise.mul_((1 - signal).sqrt()).addcmul_(batch.motion.flatten(2), signal.sqrt() * self.scale)
+        decoded = network.core(network.embed(noisy), step, self._conditions(batch))
+        return losses.losses_of_linear(
+            decoded,
+            network.unembed.weight,
+            network.unembed.bias,
+            batch.motion,
+            batch.mask,
+            self.assets.regions["upper_face"],
+            self.loss_weights,
+            scale=self.scale,
+        )
+
+    def _conditions(self, batch: Batch) -> Conditions:
+        identity = batch.identity
+        if self.training and self.identity_dropout:
+            hidden = torch.rand(identity.shape, device=identity.device) < self.identity_dropout
+            identity = identity.masked_fill(hidden, -1)
+        return self.network.conditions(
+            batch.audio,
+            batch.audio_lengths,
+            batch.frame_lengths,
+            identity,
+            self.style_of(batch),
+            batch.cached_features,
+        )
+
+    def encode_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """F_dyn of reference motions (eq. 2 to 9); of width 0 if the dynamic path is left out."""
+        return self.network.dynamic_style(reference * self.scale, mask)
+
+    @torch.no_grad()
+    def generate_clips(
+        self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """Algorithm 2 with the model's sampler, in its sampling space; conditions are computed once.
+
+        All noise of a clip follows from the seed and its name: its motion does not depend on the clips beside it.
+        """
+        noise = ClipNoise(batch.names, batch.frame_lengths.tolist(), [seed] * len(batch), self.device)
+        return self._sample(self._conditions(batch), noise, progress=progress)
+
+    @torch.no_grad()
+    def generate_samples(
+        self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None
+    ) -> Float[Tensor, "takes frames vertices 3"]:
+        """The same for several seeds: speech and style are encoded once."""
+        lengths = clip.frame_lengths.tolist() * len(seeds)
+        noise = ClipNoise(clip.names * len(seeds), lengths, seeds, self.device)
+        return self._sample(self._conditions(clip).repeated(len(seeds)), noise, progress=progress)
+
+    @torch.no_grad()
+    def generate_window(
+        self, clip: Batch, window: Window, seeds: Sequence[int], before: list[Tensor] | None
+    ) -> tuple[Float[Tensor, "takes frames vertices 3"], list[Tensor]]:
+        """The same for a window, joined in every denoising step to the window before it."""
+        conditions = self._conditions(clip).frames(window.context, window.context + window.frames)
+        overlap_blend = WindowOverlap(before, window.kept)
+        noise = WindowNoise(clip.names[0], window, seeds, self.device)
+        return self._sample(conditions.repeated(len(seeds)), noise, blend=overlap_blend), overlap_blend.features
+
+    def _sample(
+        self, conditions: Conditions, unit: NoiseSource, *, blend: Blend = unchanged, progress: Progress | None = None
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """Run the sampler; ``unit`` gives unit noise, ``blend`` changes the features of every step."""
+        conditions = self.network.prepared(conditions, self.process.steps)
+        space = choose_space(self.network, self.sampling_space, self.sampler, self._fold_cache, blend)
+        rows, frames = conditions.mask.shape
+
+        def noise(like: Tensor) -> Tensor:
+            return space.noise(unit(like))
+
+        def denoise(state: Tensor, step: int) -> Tensor:
+            steps = torch.full((rows,), step, device=state.device)
+            return space.predict(state, steps, conditions)
+
+        start = noise(torch.empty(rows, frames, space.width, device=self.device, dtype=next(self.parameters()).dtype))
+        sample = self.sampler.run(denoise, start, noise=noise, progress=progress)
+        return (space.motion(sample) / self.scale).view(rows, frames, self.n_vertices, 3)

@@ -1,0 +1,137 @@
+"""Bidirectional cross-attention of the dual-path style diffusion paper, section 1.4 and figure 2."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple, Protocol
+
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from facediff.models.layers import Attention, Rotation, needed_mask
+from facediff.registry import fusion
+
+# What every fusion is.
+
+
+class Fusion(nn.Module, ABC):
+    """Speech features F_a and embedded noisy motion F_m to one sequence F_am."""
+
+    def prepare(self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]) -> object:
+        """What stays the same over the denoising steps, computed once a clip; None if there is nothing.
+
+        A fusion that overrides this takes the result as a fourth, optional argument of ``forward`` and gives the same
+        with it as without, up to rounding. The arguments are those that ``forward`` will get.
+        """
+        return None
+
+    @abstractmethod
+    def forward(
+        self,
+        audio: Float[Tensor, "batch frames dim"],
+        motion: Float[Tensor, "batch frames dim"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Fuse; frames where ``mask`` is False are padding and never influence the others."""
+
+
+class FusionFactory(Protocol):
+    """Makes a fusion once the model's width is known."""
+
+    def __call__(self, *, dim: int) -> Fusion:
+        """Make one for ``dim`` channels."""
+        ...
+
+
+# The plain sum, for the ablation.
+
+
+@fusion.register("add")
+class AddFusion(Fusion):
+    """Plain sum of speech and motion features (ablation of the cross-attention).
+
+    Args:
+        dim: channels; given by the model.
+    """
+
+    def __init__(self, *, dim: int) -> None:
+        super().__init__()
+
+    def forward(
+        self,
+        audio: Float[Tensor, "batch frames dim"],
+        motion: Float[Tensor, "batch frames dim"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Float[Tensor, "batch frames dim"]:
+        """F_am = F_a + F_m."""
+        return audio + motion
+
+
+class FusionConstants(NamedTuple):
+    """What the fusion of a clip does not compute in every step.
+
+    Attributes:
+        query: of the speech, (batch, heads, frames, head_dim).
+        mask: True on valid frames; None if nothing is padded.
+        rotation: rotary positions, if there are any.
+    """
+
+    query: Tensor
+    mask: Tensor | None
+    rotation: Rotation | None
+
+
+@fusion.register("cross_attention")
+class BidirectionalCrossAttention(Fusion):
+    """Speech attends to motion, then motion attends to the enriched speech; their sum is F_am (eq. 12).
+
+    F'_a = F_a + Attn(query F_a, key/value F_m); F'_m = F_m + Attn(query F_m, key/value F'_a), with the inputs of
+    each attention normalised (pre-norm form of figure 2). Both sequences share one time axis, so queries and keys
+    carry rotary positions; without them the attention could not tell one frame's speech from another's.
+
+    Args:
+        dim: channels; given by the model.
+        num_heads: attention heads.
+        rotary: rotary positions in both attentions.
+        dropout: dropout on each attention's result.
+    """
+
+    def __init__(self, *, dim: int, num_heads: int = 4, rotary: bool = True, dropout: float = 0.1) -> None:
+        super().__init__()
+        self.audio_norm = nn.LayerNorm(dim)
+        self.motion_norm = nn.LayerNorm(dim)
+        self.enriched_norm = nn.LayerNorm(dim)
+        self.audio_from_motion = Attention(dim, dim, num_heads, rotary=rotary)
+        self.motion_from_audio = Attention(dim, dim, num_heads, rotary=rotary)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self,
+        audio: Float[Tensor, "batch frames dim"],
+        motion: Float[Tensor, "batch frames dim"],
+        mask: Bool[Tensor, "batch frames"],
+        prepared: FusionConstants | None = None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """F_am = F'_a + F'_m.
+
+        Args:
+            audio: F_a.
+            motion: F_m.
+            mask: True on valid frames.
+            prepared: as :meth:`prepare` gives it.
+        """
+        query, needed, rotation = self._constants(audio, mask) if prepared is None else prepared
+        normed_motion = self.motion_norm(motion)
+        heard = self.audio_from_motion.keys_values(normed_motion, rotation)
+        audio = audio + self.dropout(self.audio_from_motion.attend(query, heard, needed))
+        enriched = self.enriched_norm(audio)
+        motion = motion + self.dropout(self.motion_from_audio(normed_motion, enriched, needed, rotation))
+        return audio + motion
+
+    def prepare(self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]) -> FusionConstants:
+        """The speech asks the same in every step; what it is answered depends on the motion, and so does F'_a."""
+        return self._constants(audio, needed_mask(mask))
+
+    def _constants(self, audio: Tensor, mask: Tensor | None) -> FusionConstants:
+        rotation = self.audio_from_motion.rotation(audio.shape[1])
+        return FusionConstants(self.audio_from_motion.queries(self.audio_norm(audio), rotation), mask, rotation)

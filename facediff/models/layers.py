@@ -1,0 +1,183 @@
+"""Building blocks shared by components: masks, rotary attention, feed-forward."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+Rotation = tuple[Tensor, Tensor]
+"""Cosines and signed sines of a rotary embedding, both (frames, head_dim)."""
+
+
+class KeysValues(NamedTuple):
+    """What an attention makes of its context, both (batch, heads, keys, head_dim)."""
+
+    key: Tensor
+    value: Tensor
+
+
+def frame_mask(lengths: Int[Tensor, " batch"], frames: int) -> Bool[Tensor, "batch frames"]:
+    """True on valid frames, False on padding."""
+    return torch.arange(frames, device=lengths.device)[None, :] < lengths[:, None]
+
+
+def needed_mask(mask: Bool[Tensor, "batch frames"]) -> Bool[Tensor, "batch frames"] | None:
+    """The mask, or None where nothing is padded; it looks at the values, so it waits for the device."""
+    return None if bool(mask.all()) else mask
+
+
+def interpolate_frames(
+    features: Float[Tensor, "batch steps dim"],
+    lengths: Int[Tensor, " batch"],
+    frame_lengths: Int[Tensor, " batch"],
+) -> Float[Tensor, "batch frames dim"]:
+    """Resample each clip's own ``lengths[b]`` feature steps to ``frame_lengths[b]`` frames, linearly in time.
+
+    Steps and frames are cells that tile the same stretch of time, so frame j lies at step
+    (j + ½)·length/frames − ½, held at the ends. Padding neither enters nor is written: frames beyond a clip's
+    own length are zero.
+    """
+    frames = int(frame_lengths.max())
+    position = torch.arange(frames, device=features.device, dtype=torch.float32)
+    ratio = lengths.float() / frame_lengths.float()
+    position = (position[None, :] + 0.5) * ratio[:, None] - 0.5
+    last = (lengths - 1)[:, None].float()
+    position = torch.minimum(position.clamp_min(0.0), last)
+    low = position.floor()
+    weight = (position - low)[..., None].to(features.dtype)
+    high = torch.minimum(low + 1, last)
+
+    def animation(index: Tensor) -> Tensor:
+        return features.gather(1, index.long()[..., None].expand(-1, -1, features.shape[-1]))
+
+    mixed = animation(low) * (1 - weight) + animation(high) * weight
+    return mixed * frame_mask(frame_lengths, frames)[..., None]
+
+
+class RotaryEmbedding(nn.Module):
+    """Rotary position embedding: rotates channel pairs by an angle proportional to the frame number.
+
+    The inner product of a rotated query and a rotated key depends on their distance in frames only
+    (Su et al. 2021, RoFormer, eq. 16 and 34).
+
+    Args:
+        head_dim: channels of one attention head; must be even.
+        base: wavelengths run geometrically from 2π to 2π·base frames.
+    """
+
+    frequencies: Tensor
+
+    def __init__(self, head_dim: int, base: float = 10_000.0) -> None:
+        super().__init__()
+        if head_dim % 2:
+            raise ValueError(f"rotary embedding needs an even number of channels per head, got {head_dim}")
+        exponent = torch.arange(0, head_dim, 2, dtype=torch.float32) / head_dim
+        self.register_buffer("frequencies", base**-exponent, persistent=False)
+
+    def table(self, frames: int) -> Rotation:
+        """What :meth:`forward` needs for ``frames`` frames or fewer."""
+        places = torch.arange(frames, device=self.frequencies.device, dtype=torch.float32)
+        angle = places[:, None] * self.frequencies
+        cos, sin = angle.cos(), angle.sin()
+        return torch.cat([cos, cos], dim=-1), torch.cat([-sin, sin], dim=-1)
+
+    def forward(
+        self, x: Float[Tensor, "batch heads frames head_dim"], table: Rotation | None = None
+    ) -> Float[Tensor, "batch heads frames head_dim"]:
+        """Rotate channel pair (i, i + head_dim/2) of frame t by t·frequency_i.
+
+        Args:
+            x: queries or keys.
+            table: as :meth:`table` gives it, of a rotary embedding like this one; made anew if None.
+        """
+        frames = x.shape[-2]
+        cos, sin = (part[:frames].to(x.dtype) for part in (self.table(frames) if table is None else table))
+        first, second = x.chunk(2, dim=-1)
+        return x * cos + torch.cat([second, first], dim=-1) * sin
+
+
+class Attention(nn.Module):
+    """Multi-head attention from ``dim`` to ``dim`` channels with optional rotary positions.
+
+    Args:
+        dim: channels of the query and of the result.
+        context_dim: channels of keys and values.
+        num_heads: heads; ``dim`` must be a multiple.
+        rotary: rotate queries and keys by their frame number.
+        dropout: dropout on the attention weights in training.
+    """
+
+    def __init__(
+        self, dim: int, context_dim: int, num_heads: int, *, rotary: bool = False, dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        if dim % num_heads:
+            raise ValueError(f"dim {dim} is not a multiple of num_heads {num_heads}")
+        self.num_heads = num_heads
+        self.dropout = dropout
+        self.query = nn.Linear(dim, dim)
+        self.key_value = nn.Linear(context_dim, 2 * dim)
+        self.out = nn.Linear(dim, dim)
+        self.rotary = RotaryEmbedding(dim // num_heads) if rotary else None
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch frames dim"],
+        context: Float[Tensor, "batch keys context_dim"],
+        context_mask: Bool[Tensor, "batch keys"] | None = None,
+        rotation: Rotation | None = None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Attend from ``x`` to the valid positions of ``context``.
+
+        Args:
+            x: what asks.
+            context: what answers.
+            context_mask: True on valid positions; all are if None.
+            rotation: as :meth:`rotation` gives it; made anew if None.
+        """
+        return self.attend(self.queries(x, rotation), self.keys_values(context, rotation), context_mask)
+
+    def rotation(self, frames: int) -> Rotation | None:
+        """The table of rotary positions for so many frames and keys; None without such positions."""
+        return None if self.rotary is None else self.rotary.table(frames)
+
+    def queries(
+        self, x: Float[Tensor, "batch frames dim"], rotation: Rotation | None = None
+    ) -> Float[Tensor, "batch heads frames head_dim"]:
+        """The first part of :meth:`forward`: all that ``x`` is needed for."""
+        query = self._split(self.query(x))
+        return query if self.rotary is None else self.rotary(query, rotation)
+
+    def keys_values(
+        self, context: Float[Tensor, "batch keys context_dim"], rotation: Rotation | None = None
+    ) -> KeysValues:
+        """The second part of :meth:`forward`: all that ``context`` is needed for."""
+        key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
+        return KeysValues(key if self.rotary is None else self.rotary(key, rotation), value)
+
+    def attend(
+        self,
+        query: Float[Tensor, "batch heads frames head_dim"],
+        context: KeysValues,
+        context_mask: Bool[Tensor, "batch keys"] | None = None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """The last part of :meth:`forward`, from what the two before gave."""
+        key, value = context
+        mask = None if context_mask is None else context_mask[:, None, None, :]
+        dropout = self.dropout if self.training else 0.0
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask, dropout_p=dropout)
+        return self.out(mixed.transpose(1, 2).flatten(2))
+
+    def _split(self, x: Tensor) -> Tensor:
+        return x.view(*x.shape[:-1], self.num_heads, -1).transpose(1, 2)
+
+
+class FeedForward(nn.Sequential):
+    """Two linear maps with a GELU between, ``dim`` to ``dim``."""
+
+    def __init__(self, dim: int, hidden_dim: int, dropout: float = 0.0) -> None:
+        super().__init__(nn.Linear(dim, hidden_dim), nn.GELU(), nn.Dropout(dropout), nn.Linear(hidden_dim, dim))

@@ -1,0 +1,270 @@
+"""Spiral convolutions over the mesh with vertex down-sampling between them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, Literal, Protocol
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from facediff.errors import FaceDiffError
+from facediff.registry import mesh_encoder
+
+# What every mesh encoder is, and what it is told about the mesh.
+
+
+class MeshEncoder(nn.Module, ABC):
+    """The vertices of each frame to one feature of ``dim`` channels; frames do not see one another.
+
+    An encoder is made from sizes alone and told about the mesh later, before its first use: weight averaging copies the
+    module before a corpus is known. What it keeps of the mesh are buffers whose shapes follow from the sizes; they are
+    in its state dict, next to the weights that were trained on them, so that a checkpoint means the same wherever and
+    with whichever simplifier it is opened.
+    """
+
+    @property
+    def attached(self) -> bool:
+        """Whether the encoder knows all that it needs of the mesh."""
+        return True
+
+    @property
+    def mesh_options(self) -> dict[str, Any]:
+        """What :func:`facediff.mesh.hierarchy.mesh_hierarchy` is to make for :meth:`attach`."""
+        return {}
+
+    def attach(self, topology: Any) -> None:  # noqa: ANN401, B027 - an encoder that needs no mesh has nothing to do
+        """Take over what follows from the mesh.
+
+        Args:
+            topology: a :class:`facediff.mesh.hierarchy.MeshHierarchy` of :attr:`mesh_options`.
+        """
+
+    @abstractmethod
+    def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
+        """Encode each frame's offsets from the template, in the motion's unit."""
+
+
+class MeshEncoderFactory(Protocol):
+    """Makes a mesh encoder once the model's sizes are known."""
+
+    def __call__(self, *, dim: int, n_vertices: int) -> MeshEncoder:
+        """Make one for features of ``dim`` channels and motion of ``n_vertices`` vertices."""
+        ...
+
+
+def check_vertices(motion: Tensor, n_vertices: int) -> None:
+    """Refuse motion (batch, frames, vertices, 3) on another mesh.
+
+    Raises:
+        ValueError: if the number of vertices is another one; a larger one would be encoded without a complaint.
+    """
+    if motion.shape[2] != n_vertices:
+        raise ValueError(f"motion has {motion.shape[2]} vertices, but the mesh encoder was made for {n_vertices}")
+
+
+# All coordinates of a frame through one linear map.
+
+
+@mesh_encoder.register("linear")
+class LinearMeshEncoder(MeshEncoder):
+    """One linear map of all coordinates of a frame: X = Linear(M_ref) of the dual-path paper, section 1.3.1.
+
+    Args:
+        dim: channels of a frame's feature; given by the model.
+        n_vertices: vertices of the mesh; given by the model.
+    """
+
+    def __init__(self, *, dim: int, n_vertices: int) -> None:
+        super().__init__()
+        self.n_vertices = n_vertices
+        self.map = nn.Linear(3 * n_vertices, dim)
+
+    def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
+        """The feature of each frame."""
+        check_vertices(motion, self.n_vertices)
+        return self.map(motion.flatten(2))
+
+
+class SpiralDown(nn.Module):
+    """Spiral convolution, then vertex down-sampling.
+
+    Gong et al. 2019, SpiralNet++, eq. 1: a vertex's new feature is a linear map of the features along its spiral, one
+    after the other. The convolution is evaluated only at the vertices that the down-sampling takes.
+
+    Args:
+        fine: vertices before the down-sampling.
+        coarse: vertices after it.
+        length: vertices of a spiral.
+        in_channels: channels of a vertex.
+        out_channels: channels of a vertex after it.
+        mean: take the mean of several vertices, each being part of one such mean; else one vertex.
+    """
+
+    table: Tensor
+    rows: Tensor | None
+    weights: Tensor | None
+    map: nn.Linear
+
+    def __init__(
+        self, fine: int, coarse: int, length: int, in_channels: int, out_channels: int, *, mean: bool = False
+    ) -> None:
+        super().__init__()
+        self.sizes = fine, coarse
+        taken = fine if mean else coarse
+        self.register_buffer("table", torch.zeros(taken, length, dtype=torch.int64))
+        self.register_buffer("rows", torch.zeros(taken, dtype=torch.int64) if mean else None)
+        self.register_buffer("weights", torch.zeros(taken) if mean else None)
+        self.map = nn.Linear(length * in_channels, out_channels)
+        nn.init.xavier_uniform_(self.map.weight)
+        nn.init.zeros_(self.map.bias)
+
+    def forward(self, x: Float[Tensor, "frames vertices in_channels"]) -> Float[Tensor, "frames coarse out_channels"]:
+        """Features of the next level's vertices."""
+        around = x.index_select(1, self.table.flatten()).view(len(x), len(self.table), -1)
+        out = self.map(around)
+        if self.rows is None or self.weights is None:
+            return out
+        shares = out * self.weights[:, None]
+        return shares.new_zeros(len(x), self.sizes[1], out.shape[-1]).index_add(1, self.rows, shares)
+
+
+@mesh_encoder.register("spiral")
+class SpiralMeshEncoder(MeshEncoder):
+    """Spiral convolutions with vertex down-sampling and leaky ReLU, then one linear map of all vertices' features.
+
+    Each step is [spiral convolution → down-sampling → leaky ReLU], without normalisation (Chai et al., style-content
+    disentanglement).
+
+    Args:
+        dim: channels of a frame's feature; given by the model.
+        n_vertices: vertices of the mesh; given by the model.
+        channels: channels of a vertex after each step.
+        factor: vertices before a down-sampling to one after it.
+        spiral_length: vertices of a spiral, its centre included.
+        dilation: distance along the spiral between two of them.
+        pooling: whether down-sampling takes one vertex of each group, which leaves a few vertices of the motion unseen,
+            or the mean of the group, which sees all of them and takes five to ten times as long.
+        negative_slope: slope of the leaky ReLU below zero.
+        max_frames: frames to encode at a time in training; what lies between is computed again for the gradient, so
+            that memory grows with this number only. None for all at once, which is faster.
+    """
+
+    steps: Sequence[SpiralDown]
+    map: nn.Linear
+
+    def __init__(
+        self,
+        *,
+        dim: int,
+        n_vertices: int,
+        channels: tuple[int, ...] = (16, 32, 32),
+        factor: int = 4,
+        spiral_length: int = 12,
+        dilation: int = 1,
+        pooling: Literal["select", "mean"] = "select",
+        negative_slope: float = 0.2,
+        max_frames: int | None = None,
+    ) -> None:
+        super().__init__()
+        for name, value in {"factor": factor, "spiral_length": spiral_length, "dilation": dilation}.items():
+            if value < 1:
+                raise ValueError(f"{name} {value}; expected at least 1")
+        if max_frames is not None and max_frames < 1:
+            raise ValueError(f"max_frames {max_frames}; expected at least 1, or None")
+        self.n_vertices = n_vertices
+        self.factor = factor
+        self.spiral_length = spiral_length
+        self.dilation = dilation
+        self.pooling = pooling
+        self.negative_slope = negative_slope
+        self.max_frames = max_frames
+        self._attached = False
+        steps = []
+        width, vertices = 3, n_vertices
+        for wider in channels:
+            fewer = -(-vertices // factor)
+            steps.append(SpiralDown(vertices, fewer, spiral_length, width, wider, mean=pooling == "mean"))
+            width, vertices = wider, fewer
+        self.steps = nn.ModuleList(steps)  # type: ignore[assignment] # behaves as a sequence of what it was given
+        self.map = nn.Linear(vertices * width, dim)
+
+    @property
+    def attached(self) -> bool:
+        """Whether the tables of spirals are there; before, they are zero."""
+        if not self._attached:  # looked up until it is true, since a device is waited for
+            self._attached = not self.steps or bool(self.steps[0].table.any())
+        return self._attached
+
+    @property
+    def mesh_options(self) -> dict[str, Any]:
+        """As many down-samplings as there are steps."""
+        return {
+            "levels": len(self.steps),
+            "factor": self.factor,
+            "spiral_length": self.spiral_length,
+            "dilation": self.dilation,
+            "pooling": self.pooling,
+        }
+
+    def attach(self, topology: Any) -> None:  # noqa: ANN401 - a component does not import the topology's types
+        """Take over the down-samplings, and the spirals of the vertices that each of them takes.
+
+        Args:
+            topology: a mesh hierarchy of :attr:`mesh_options`.
+
+        Raises:
+            FaceDiffError: if it is of another mesh or other options.
+        """
+        sizes = [level.n_vertices for level in topology.levels]
+        expected = [self.n_vertices, *(step.sizes[1] for step in self.steps)]
+        if sizes != expected:
+            raise FaceDiffError(
+                f"mesh encoder: the mesh has {sizes} vertices at its levels; expected {expected}: make the hierarchy "
+                f"with the encoder's mesh_options"
+            )
+        tables = []
+        for step, level in zip(self.steps, topology.levels, strict=False):
+            tables.append(torch.as_tensor(level.spirals, dtype=torch.int64)[torch.as_tensor(level.down.columns)])
+            if tables[-1].shape != step.table.shape:
+                raise FaceDiffError(
+                    f"mesh encoder: the mesh has spirals of the shape {tuple(tables[-1].shape)}; expected "
+                    f"{tuple(step.table.shape)}: make the hierarchy with the encoder's mesh_options"
+                )
+        for step, level, table in zip(self.steps, topology.levels, tables, strict=False):
+            step.table.copy_(table)
+            if step.rows is not None and step.weights is not None:
+                step.rows.copy_(torch.as_tensor(level.down.rows))
+                step.weights.copy_(torch.as_tensor(level.down.weights))
+        # From here on known, also while a weight average that was copied earlier lends its tables of zeros.
+        self._attached = True
+
+    def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
+        """The feature of each frame.
+
+        Raises:
+            FaceDiffError: if the encoder has not been told about the mesh.
+        """
+        check_vertices(motion, self.n_vertices)
+        if not self.attached:
+            raise FaceDiffError("mesh encoder: the mesh is not known yet; attach a hierarchy, or load trained weights")
+        frames = motion.flatten(0, 1)
+        if self.max_frames is None or len(frames) <= self.max_frames:
+            return self.encode(frames).view(*motion.shape[:2], -1)
+        parts = [self._part(part) for part in torch.split(frames, self.max_frames)]
+        return torch.cat(parts).view(*motion.shape[:2], -1)
+
+    def encode(self, x: Float[Tensor, "frames vertices 3"]) -> Float[Tensor, "frames dim"]:
+        """The feature of each frame of one sequence."""
+        for step in self.steps:
+            x = F.leaky_relu(step(x), self.negative_slope)
+        return self.map(x.flatten(1))
+
+    def _part(self, x: Tensor) -> Tensor:
+        # Nothing here is random, so there is no generator's state to keep.
+        part: Tensor = checkpoint(self.encode, x, use_reentrant=False, preserve_rng_state=False)
+        return part

@@ -1,0 +1,5 @@
+"""Style-content disentanglement."""
+
+from facediff.models.style_content.model import StyleContentDisentanglement
+
+__all__ = ["StyleContentDisentanglement"]

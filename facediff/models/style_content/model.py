@@ -1,0 +1,316 @@
+"""Style-content disentanglement as a LightningModule."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch, SpeechMotionDataModule
+from facediff.errors import FaceDiffError
+from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, MelEncoder
+from facediff.models.base import AnimationModel, Schedule
+from facediff.models.evaluation import IdentityPolicy
+from facediff.models.inference import Progress
+from facediff.models.mesh_encoders import MeshEncoderFactory, SpiralMeshEncoder
+from facediff.models.style_content.losses import (
+    Alignments,
+    MotionDistance,
+    Pairing,
+    dynamics_distance,
+    pair_up,
+    relative_distance,
+    relative_style_distance,
+    style_contrast,
+)
+from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
+from facediff.models.style_encoders import LstmStyle, StyleEncoderFactory
+from facediff.registry import describe
+
+SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
+"""Terms that the speech network has as well, by the name ``speech_<term>``."""
+
+
+@registry.model.register("StyleContentDisentanglement")
+class StyleContentDisentanglement(AnimationModel):
+    """Personalised speech-driven animation by style-content disentanglement.
+
+    Spiral convolutions split motion into content and personal style; one decoder turns content and style into motion,
+    whether the content comes from motion or from speech. Chai, Shao, Weng, Zhou, "Personalized Audio-Driven 3D Facial
+    Animation via Style-Content Disentanglement", IEEE TVCG 2024; the method is also described in a published patent
+    document. Ablations are one override each: ``swap_weight=0``, ``cycle_weight=0``, ``aligned_pairs=false``,
+    ``speech_content_weight=0``.
+
+    Args:
+        n_vertices: vertices of the topology; taken from the data module on the command line.
+        identities: training identities; taken from the data module on the command line.
+        frame_rate: motion frames a second; taken from the data module on the command line.
+        dim: channels of speech features and of motion features before the style encoder.
+        content_dim: channels of the content.
+        audio_encoder: speech to features.
+        mesh_encoder: motion to one feature per frame, made once for content and once for style.
+        style_encoder: these features to the style vector.
+        window_seconds: length of the speech window around each frame.
+        speech_layers: encoder layers over the window.
+        speech_heads: attention heads of these.
+        decoder_channels: channels of the decoder's three convolutions.
+        decoder_kernels: their taps.
+        decoder_hidden: channels of its fully connected layers before the coefficients.
+        basis_size: coefficients of its linear basis.
+        basis_start: the basis starts from the principal components of the training motion, or at random.
+        content_scale: ``clip`` takes mean and spread over a clip out of the content of motion, in which a person would
+            be recognised; ``free`` leaves it as it is.
+        motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
+            leaves it as it is.
+        aligned_pairs: where two people say the same sentence, supervise a swap of their styles with the other's
+            reading, aligned in time; else, and everywhere if False, by the encoders' consistency.
+        swap_region: where such a reading supervises.
+        reconstruction_weight: of motion from its own content and style.
+        swap_weight: of motion from its own content and the partner's style.
+        cycle_weight: of swapping twice.
+        swap_dynamics_weight: of the swapped upper face's spread over time against the partner's.
+        speech_weight: factor of the same terms with content from speech.
+        reading_content_weight: pulls the contents of two aligned readings of a sentence together.
+        person_style_weight: pulls the styles of a person's clips together, and those of different people apart.
+        speech_content_weight: pulls content from speech to content from motion.
+        position_weight: of positions within each comparison of motions.
+        velocity_weight: of velocities within it.
+        lip_gap_weight: of the gap between the inner lips within it.
+        upper_face_weight: of the upper face's positions within it, as a share of how much they vary.
+        learning_rate: Adam's learning rate.
+        weight_decay: decoupled weight decay.
+        lr_schedule: constant, or a cosine down to zero at the end of training.
+        warmup_steps: optimiser steps over which the learning rate rises from zero.
+        protocol: the metrics' protocol for validation and test.
+        unseen_identity: as whom people are tested whom the model was not trained on: as nobody known, with their own
+            style (``style_only``), as each training identity in turn with the mean of the scores (``each_seen``), or as
+            themselves, once the model is adapted to them (``adapted``).
+    """
+
+    def __init__(
+        self,
+        *,
+        n_vertices: int,
+        identities: list[str],
+        frame_rate: float,
+        dim: int = 64,
+        content_dim: int = 64,
+        audio_encoder: AudioEncoderFactory = MelEncoder,
+        mesh_encoder: MeshEncoderFactory = SpiralMeshEncoder,
+        style_encoder: StyleEncoderFactory = LstmStyle,
+        window_seconds: float = 0.64,
+        speech_layers: int = 3,
+        speech_heads: int = 4,
+        decoder_channels: Sequence[int] = (64, 128, 256),
+        decoder_kernels: Sequence[int] = (5, 3, 3),
+        decoder_hidden: Sequence[int] = (256, 256, 128),
+        basis_size: int = 50,
+        basis_start: Literal["pca", "random"] = "pca",
+        content_scale: Literal["clip", "free"] = "clip",
+        motion_scale: Literal["unit", "none"] = "unit",
+        aligned_pairs: bool = True,
+        swap_region: Literal["lower_face", "face"] = "lower_face",
+        reconstruction_weight: float = 1.0,
+        swap_weight: float = 3.0,
+        cycle_weight: float = 1.0,
+        swap_dynamics_weight: float = 3.0,
+        speech_weight: float = 2.0,
+        reading_content_weight: float = 5.0,
+        person_style_weight: float = 10.0,
+        speech_content_weight: float = 5.0,
+        position_weight: float = 1.0,
+        velocity_weight: float = 5.0,
+        lip_gap_weight: float = 1.0,
+        upper_face_weight: float = 0.0,
+        learning_rate: float = 1e-4,
+        weight_decay: float = 0.0,
+        lr_schedule: Schedule = "constant",
+        warmup_steps: int = 0,
+        protocol: str = "paper",
+        unseen_identity: IdentityPolicy = "style_only",
+    ) -> None:
+        arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        super().__init__(
+            n_vertices=n_vertices,
+            identities=identities,
+            frame_rate=frame_rate,
+            learning_rate=learning_rate,
+            weight_decay=weight_decay,
+            lr_schedule=lr_schedule,
+            warmup_steps=warmup_steps,
+            protocol=protocol,
+            motion_scale=motion_scale,
+            unseen_identity=unseen_identity,
+        )
+        self.basis_start = basis_start
+        self.aligned_pairs = aligned_pairs
+        self.swap_region = swap_region
+        self.weights = {
+            "reconstruction": reconstruction_weight,
+            "swap": swap_weight,
+            "cycle": cycle_weight,
+            "swap_dynamics": swap_dynamics_weight,
+            "reading_content": reading_content_weight,
+            "person_style": person_style_weight,
+            "speech_content": speech_content_weight,
+        }
+        self.weights |= {f"speech_{term}": speech_weight * self.weights[term] for term in SPOKEN}
+        self.distance = MotionDistance(position_weight, velocity_weight, lip_gap_weight, upper_face_weight)
+        self.readings = Alignments(frame_rate)
+        style = style_encoder(dim=dim)
+        if not style.token_dims:
+            raise FaceDiffError("style_encoder: this model cannot be without a style; choose another, such as lstm")
+        self.network = DisentanglementNetwork(
+            content_encoder=mesh_encoder(dim=content_dim, n_vertices=n_vertices),
+            style_frames=mesh_encoder(dim=dim, n_vertices=n_vertices),
+            style_encoder=style,
+            audio_encoder=audio_encoder(dim=dim),
+            speech_content=WindowedTransformer(
+                in_dim=dim,
+                dim=dim,
+                out_dim=content_dim,
+                window=max(1, round(window_seconds * frame_rate)),
+                num_heads=speech_heads,
+                num_layers=speech_layers,
+            ),
+            decoder=MotionDecoder(
+                n_vertices=n_vertices,
+                content_dim=content_dim,
+                style_dim=sum(style.token_dims),
+                channels=decoder_channels,
+                kernels=decoder_kernels,
+                hidden=decoder_hidden,
+                basis_size=basis_size,
+            ),
+            standardise_content=content_scale == "clip",
+        )
+        made = {"audio_encoder": self.network.audio_encoder, "style_encoder": style}
+        for kind, component in (*made.items(), ("mesh_encoder", self.network.content_encoder)):
+            arguments[kind] = describe(arguments[kind], component)
+        self.remember(arguments)
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The style encoder and the decoder, in whose basis a face's own shapes are."""
+        return [self.network.style_frames, self.network.style_encoder, self.network.decoder]
+
+    @property
+    def speech_encoder(self) -> AudioEncoder:
+        """The audio encoder."""
+        return self.network.audio_encoder
+
+    def setup(self, stage: str) -> None:
+        """Ask for pairs of clips, and let a basis that was never trained start from the training motion."""
+        new = self._assets is None
+        super().setup(stage)
+        data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        if stage == "fit":
+            data.pair_sentences = True
+            if new and self.basis_start == "pca":
+                mean, shapes = data.principal_motion(self.network.decoder.basis.in_features)
+                self.network.decoder.start_from(mean * self.scale, shapes * self.scale)
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Reconstruction, swap and cycle of both networks, and what pulls contents and styles together."""
+        network, motion, mask = self.network, batch.motion * self.scale, batch.mask
+        pairing = self._pair(batch)
+        content, style = network.content(motion, mask), network.style(motion, mask)
+        usual = network.style(batch.reference * self.scale, batch.reference_mask)
+        heard = network.hear(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.cached_features)
+        terms = {
+            "reading_content": relative_distance(content, pairing.of_partner(content), pairing.aligned),
+            "person_style": style_contrast(torch.cat([style, usual]), batch.subjects * 2),
+            "speech_content": relative_distance(content, heard, mask),
+        }
+        for prefix, said, own in (("", content, style), ("speech_", heard, usual)):
+            made = self._branch(batch, motion, pairing, said, own, style)
+            terms |= {f"{prefix}{name}": term for name, term in made.items()}
+        terms["loss"] = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
+        return terms
+
+    def _branch(
+        self, batch: Batch, motion: Tensor, pairing: Pairing, said: Tensor, own: Tensor, style: Tensor
+    ) -> dict[str, Tensor]:
+        """Reconstruction, swap and cycle with content ``said``; ``own`` is the style that must give the motion back."""
+        network, mask = self.network, batch.mask
+        partner = pairing.partner
+        terms = {"reconstruction": self._compare(batch, self._decode(said, own, mask), motion, mask)}
+        apart = partner != torch.arange(len(partner), device=partner.device)
+        if not apart.any():  # nobody to swap with: two thirds of the work saved where one person alone is learnt
+            return {**terms, **dict.fromkeys(("swap", "swap_dynamics", "cycle"), motion.new_zeros(()))}
+        swapped = self._decode(said, style[partner], mask)
+        again, style_again = network.content(swapped, mask), network.style(swapped, mask)
+        terms["swap"] = self._compare(
+            batch, swapped, pairing.of_partner(motion), pairing.aligned, self._supervised_vertices()
+        )
+        free = pairing.unaligned
+        terms["swap"] = terms["swap"] + relative_distance(again, said.detach(), mask & free[:, None])
+        terms["swap"] = terms["swap"] + relative_style_distance(style_again, style[partner].detach(), free)
+        upper = self.assets.regions["upper_face"].to(motion.device)
+        terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], mask, mask[partner], apart, upper)
+        back = self._decode(again, style_again[partner], mask)
+        terms["cycle"] = self._compare(batch, back, motion, mask)
+        return terms
+
+    def _pair(self, batch: Batch) -> Pairing:
+        return pair_up(batch, self.readings if self.aligned_pairs and self.alignment_allowed() else None)
+
+    def alignment_allowed(self) -> bool:
+        """Whether the clips of a training batch are whole: two windows of a sentence need not hold the same words."""
+        return self.training and self._trainer is not None and self.trainer.datamodule.window is None  # type: ignore[attr-defined]
+
+    def _decode(self, content: Tensor, style: Tensor, mask: Bool[Tensor, "batch frames"]) -> Tensor:
+        return self.network.decoder(content, style, mask).view(*content.shape[:2], self.n_vertices, 3)
+
+    def _compare(
+        self, batch: Batch, motion: Tensor, truth: Tensor, mask: Tensor, vertices: Tensor | None = None
+    ) -> Tensor:
+        pairs = self.assets.inner_lip_pairs
+        return self.distance(
+            motion,
+            truth,
+            mask,
+            vertices=vertices,
+            rest=batch.template * self.scale,
+            pairs=None if pairs is None else pairs.to(motion.device),
+            upper=self.assets.regions["upper_face"].to(motion.device) if vertices is None else None,
+        )
+
+    def _supervised_vertices(self) -> Tensor | None:
+        if self.swap_region == "face":
+            return None
+        upper = self.assets.regions["upper_face"]
+        lower = torch.ones(self.n_vertices, dtype=torch.bool)
+        lower[upper] = False
+        return lower.nonzero()[:, 0].to(self.device)
+
+    def encode_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Style vectors of reference motions."""
+        return self.network.style(reference * self.scale, mask)
+
+    def encode_content(
+        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames content_dim"]:
+        """Content of motion: what is said, without who says it; zero on padding."""
+        return self.network.content(motion * self.scale, mask)
+
+    def decode(
+        self,
+        content: Float[Tensor, "batch frames content_dim"],
+        style: Float[Tensor, "batch style_dim"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """Offsets from the template, zero on padding, of content and style that may be of different people."""
+        return self._decode(content, style, mask) / self.scale * mask[..., None, None]
+
+    def generate_clips(
+        self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """Content from the speech, style from the reference; one pass, nothing is drawn."""
+        heard = self.network.hear(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.cached_features)
+        return self.decode(heard, self.style_of(batch), batch.mask)

@@ -1,0 +1,247 @@
+"""The networks of style-content disentanglement: motion to content and style, speech to content, both to motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff.models.audio_encoders import AudioEncoder
+from facediff.models.layers import Attention, FeedForward
+from facediff.models.mesh_encoders import MeshEncoder
+from facediff.models.style_encoders import StyleEncoder
+
+# The decoder that motion and speech share: content and style to motion.
+
+SLOPE = 0.2
+"""Of the leaky ReLU after each layer."""
+
+
+class MotionDecoder(nn.Module):
+    """Causal convolutions over time with the style put beside the features before each, then fully connected layers.
+
+    The sequence is padded with zeros at its front, so that its length is kept and no future frame is seen. The last of
+    the fully connected layers is a trainable linear basis of the vertices.
+
+    Args:
+        n_vertices: vertices V.
+        content_dim: channels of the content.
+        style_dim: channels of the style vector.
+        channels: of the convolutions.
+        kernels: taps of the convolutions.
+        hidden: channels of the fully connected layers before the coefficients.
+        basis_size: coefficients, i.e. shapes of the basis.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_vertices: int,
+        content_dim: int,
+        style_dim: int,
+        channels: Sequence[int] = (64, 128, 256),
+        kernels: Sequence[int] = (5, 3, 3),
+        hidden: Sequence[int] = (256, 256, 128),
+        basis_size: int = 50,
+    ) -> None:
+        super().__init__()
+        if len(channels) != len(kernels):
+            raise ValueError(f"{len(channels)} channels but {len(kernels)} kernels: give one of each per convolution")
+        widths = [content_dim, *channels]
+        self.kernels = list(kernels)
+        self.convolutions = nn.ModuleList(
+            nn.Conv1d(width + style_dim, out, kernel)
+            for width, out, kernel in zip(widths[:-1], channels, kernels, strict=True)
+        )
+        steps = [widths[-1], *hidden]
+        self.connected = nn.Sequential(
+            *(
+                layer
+                for width, out in zip(steps[:-1], hidden, strict=True)
+                for layer in (nn.Linear(width, out), nn.LeakyReLU(SLOPE))
+            ),
+            nn.Linear(steps[-1], basis_size),
+        )
+        self.basis = nn.Linear(basis_size, 3 * n_vertices)
+
+    @property
+    def past_frames(self) -> int:
+        """Frames before a frame that its motion depends on."""
+        return sum(kernel - 1 for kernel in self.kernels)
+
+    def start_from(self, mean: Float[Tensor, " coordinates"], shapes: Float[Tensor, "shapes coordinates"]) -> None:
+        """Let the basis start from principal components, each scaled by its standard deviation.
+
+        Where there are fewer of them than the basis has, the rest stay as they are but small.
+        """
+        with torch.no_grad():
+            self.basis.weight.mul_(0.01)
+            self.basis.weight[:, : len(shapes)] = shapes[: self.basis.in_features].T
+            self.basis.bias.copy_(mean)
+
+    def forward(
+        self,
+        content: Float[Tensor, "batch frames content_dim"],
+        style: Float[Tensor, "batch style_dim"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Motion, flattened to 3V coordinates; what stands on padding frames has no meaning and no effect."""
+        x = content
+        beside = style[:, None].expand(-1, content.shape[1], -1)
+        valid = mask[..., None].to(content.dtype)
+        for conv, kernel in zip(self.convolutions, self.kernels, strict=True):
+            columns = (torch.cat([x, beside], dim=-1) * valid).transpose(1, 2)
+            columns = nn.functional.pad(columns, (kernel - 1, 0))
+            x = nn.functional.leaky_relu(conv(columns).transpose(1, 2), SLOPE)
+        coefficients = self.connected(x)
+        # In mixed precision the last map stays in float32: differences over time of half-precision motion are noise.
+        with torch.autocast(x.device.type, enabled=False):
+            return self.basis(coefficients.float())
+
+
+# Content from speech: a Transformer over a window of speech features around each frame.
+
+
+class WindowedTransformer(nn.Module):
+    """For every frame an encoder over the features around it, and a decoder that asks with the middle one.
+
+    The window of frame t holds frames t − ⌊W/2⌋ … t − ⌊W/2⌋ + W − 1, with zeros past the ends of the clip; the query is
+    the encoded feature of frame t itself (style-content disentanglement, "speech animation network").
+
+    Args:
+        in_dim: channels of the speech features.
+        dim: channels inside.
+        out_dim: channels of the content.
+        window: frames W around each frame.
+        num_heads: attention heads.
+        num_layers: encoder layers; one decoder layer follows.
+        dropout: dropout everywhere.
+    """
+
+    def __init__(
+        self,
+        *,
+        in_dim: int,
+        dim: int = 64,
+        out_dim: int,
+        window: int,
+        num_heads: int = 4,
+        num_layers: int = 3,
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        if window < 1:
+            raise ValueError(f"a window of {window} frames holds nothing; expected at least 1")
+        self.window = window
+        self.before = window // 2
+        self.embed = nn.Linear(in_dim, dim)
+        self.positions = nn.Parameter(torch.randn(window, dim) * 0.02)
+        self.layers = nn.ModuleList(WindowLayer(dim, num_heads, dropout) for _ in range(num_layers))
+        self.query = WindowLayer(dim, num_heads, dropout)
+        self.out = nn.Sequential(nn.LayerNorm(dim), nn.Linear(dim, out_dim))
+
+    def windows(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames window dim"]:
+        """Each frame's neighbours, zeros past the ends."""
+        after = self.window - 1 - self.before
+        padded = nn.functional.pad(features, (0, 0, self.before, after))
+        return padded.unfold(1, self.window, 1).transpose(2, 3)
+
+    def forward(self, features: Float[Tensor, "batch frames in_dim"]) -> Float[Tensor, "batch frames out_dim"]:
+        """Content of every frame; features are zero on padding, which then is like the silence past a clip's end."""
+        batch, frames, _ = features.shape
+        source = self.windows(features).flatten(0, 1)
+        x = self.embed(source) + self.positions
+        for layer in self.layers:
+            x = layer(x, x)
+        middle = x[:, self.before : self.before + 1]
+        return self.out(self.query(middle, x)).view(batch, frames, -1)
+
+
+class WindowLayer(nn.Module):
+    """Pre-norm attention from ``x`` to ``context``, then a feed-forward part."""
+
+    def __init__(self, dim: int, num_heads: int, dropout: float) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(dim)
+        self.attention = Attention(dim, dim, num_heads, dropout=dropout)
+        self.feed_forward = nn.Sequential(nn.LayerNorm(dim), FeedForward(dim, 2 * dim, dropout))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, context: Tensor) -> Tensor:
+        """``x`` (batch, queries, dim), ``context`` (batch, keys, dim)."""
+        x = x + self.dropout(self.attention(self.norm(x), self.norm(context)))
+        return x + self.dropout(self.feed_forward(x))
+
+
+EPSILON = 1e-5
+
+
+class DisentanglementNetwork(nn.Module):
+    """Encoders of content and style, and the one decoder that motion and speech share.
+
+    Args:
+        content_encoder: motion to one feature per frame, E_C.
+        style_frames: motion to one feature per frame, the first half of E_S.
+        style_encoder: these features to one style vector, the second half of E_S.
+        audio_encoder: speech to one feature per frame.
+        speech_content: features of speech to content.
+        decoder: content and style to motion, D.
+        standardise_content: take mean and spread over a clip's time out of the content of motion.
+    """
+
+    def __init__(
+        self,
+        *,
+        content_encoder: MeshEncoder,
+        style_frames: MeshEncoder,
+        style_encoder: StyleEncoder,
+        audio_encoder: AudioEncoder,
+        speech_content: WindowedTransformer,
+        decoder: MotionDecoder,
+        standardise_content: bool,
+    ) -> None:
+        super().__init__()
+        self.content_encoder = content_encoder
+        self.style_frames = style_frames
+        self.style_encoder = style_encoder
+        self.audio_encoder = audio_encoder
+        self.speech_content = speech_content
+        self.decoder = decoder
+        self.standardise_content = standardise_content
+
+    def content(
+        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames content_dim"]:
+        """Content of motion; zero on padding."""
+        content = self.content_encoder(motion) * mask[..., None]
+        if not self.standardise_content:
+            return content
+        valid = mask[..., None].to(content.dtype)
+        count = valid.sum(1, keepdim=True).clamp_min(1)
+        centred = (content - content.sum(1, keepdim=True) / count) * valid
+        return centred / (centred.square().sum(1, keepdim=True) / count + EPSILON).sqrt()
+
+    def style(
+        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Style vector of a motion."""
+        return self.style_encoder(self.style_frames(motion), mask)
+
+    def hear(
+        self,
+        audio: Float[Tensor, "batch samples"],
+        audio_lengths: Int[Tensor, " batch"],
+        frame_lengths: Int[Tensor, " batch"],
+        features: tuple[Tensor, Tensor] | None = None,
+    ) -> Float[Tensor, "batch frames content_dim"]:
+        """Content of speech.
+
+        Args:
+            audio: waveforms at 16 kHz.
+            audio_lengths: valid samples.
+            frame_lengths: motion frames wanted.
+            features: cached result of the audio encoder's frozen part, and its lengths.
+        """
+        return self.speech_content(self.audio_encoder(audio, audio_lengths, frame_lengths, *(features or ())))

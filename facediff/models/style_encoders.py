@@ -1,0 +1,240 @@
+"""The dynamic style encoder of the dual-path style diffusion paper, section 1.3.1."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Literal, Protocol
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn.utils.parametrizations import weight_norm
+from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
+
+from facediff.models.layers import Attention, FeedForward, interpolate_frames
+from facediff.registry import style_encoder
+
+# What every style encoder is.
+
+
+class StyleEncoder(nn.Module, ABC):
+    """A reference motion, embedded to ``dim`` channels per frame, to one dynamic style feature F_dyn.
+
+    Attributes:
+        token_dims: how F_dyn splits into style tokens; its sum is the width of F_dyn. Empty where the encoder
+            contributes nothing.
+    """
+
+    token_dims: tuple[int, ...]
+
+    @abstractmethod
+    def forward(
+        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Encode; frames where ``mask`` is False are padding and never count."""
+
+
+class StyleEncoderFactory(Protocol):
+    """Makes a style encoder once the model's width is known."""
+
+    def __call__(self, *, dim: int) -> StyleEncoder:
+        """Make one for references embedded to ``dim`` channels."""
+        ...
+
+
+# A causal recurrent style encoder: the last state of an LSTM over the frames.
+
+
+@style_encoder.register("lstm")
+class LstmStyle(StyleEncoder):
+    """Last state of an LSTM that reads the frames in order (Chai et al., style-content disentanglement).
+
+    Args:
+        dim: channels of a frame; given by the model.
+        style_dim: channels of the style.
+        num_layers: recurrent layers.
+        pooling: the ``last`` state, as in the published work, or the ``mean`` of the states over all frames, which
+            forgets less of a long reference.
+    """
+
+    def __init__(
+        self, *, dim: int, style_dim: int = 32, num_layers: int = 1, pooling: Literal["last", "mean"] = "last"
+    ) -> None:
+        super().__init__()
+        self.lstm = nn.LSTM(dim, style_dim, num_layers, batch_first=True)
+        self.pooling = pooling
+        self.token_dims = (style_dim,)
+
+    def forward(
+        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """The state after each clip's last frame."""
+        states = self.states(reference, mask)
+        if self.pooling == "mean":
+            return (states * mask[..., None]).sum(1) / mask.sum(1)[:, None].clamp_min(1)
+        last = mask.sum(1) - 1
+        return states[torch.arange(len(states), device=states.device), last]
+
+    def states(
+        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames style_dim"]:
+        """The state after each frame: it depends on that frame and those before it alone."""
+        # Padding comes after all valid frames; zeros keep what is not finite there out of the gradient.
+        states: Tensor = self.lstm(reference.masked_fill(~mask[..., None], 0.0))[0]
+        return states
+
+
+# The dynamic style path left out, for the ablation.
+
+
+@style_encoder.register("none")
+class NoStyle(StyleEncoder):
+    """No dynamic style condition (ablation).
+
+    Args:
+        dim: the model's channels; given by the model.
+    """
+
+    def __init__(self, *, dim: int) -> None:
+        super().__init__()
+        self.token_dims = ()
+
+    def forward(
+        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """A feature of width zero."""
+        return reference.new_zeros((reference.shape[0], 0))
+
+
+class TemporalBlock(nn.Module):
+    """Residual block of two dilated convolutions over time (Bai et al. 2018, figure 1b).
+
+    Args:
+        dim: channels.
+        dilation: distance in frames between the taps of a kernel.
+        kernel_size: taps.
+        causal: look into the past only, as Bai et al. do; else centre the kernel.
+        dropout: dropout after each convolution.
+    """
+
+    def __init__(self, dim: int, dilation: int, kernel_size: int, *, causal: bool, dropout: float) -> None:
+        super().__init__()
+        reach = dilation * (kernel_size - 1)
+        self.padding = (reach, 0) if causal else (reach // 2, reach - reach // 2)
+        self.first = weight_norm(nn.Conv1d(dim, dim, kernel_size, dilation=dilation))
+        self.second = weight_norm(nn.Conv1d(dim, dim, kernel_size, dilation=dilation))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """``x`` (batch, frames, dim), ``mask`` (batch, frames, 1); padding is zero before each convolution."""
+        hidden = x
+        for conv in (self.first, self.second):
+            columns = nn.functional.pad((hidden * mask).transpose(1, 2), self.padding)
+            hidden = self.dropout(torch.relu(conv(columns).transpose(1, 2)))
+        return torch.relu(x + hidden)
+
+
+class EncoderLayer(nn.Module):
+    """Pre-norm Transformer encoder layer."""
+
+    def __init__(self, dim: int, num_heads: int, dropout: float) -> None:
+        super().__init__()
+        self.attention_norm = nn.LayerNorm(dim)
+        self.attention = Attention(dim, dim, num_heads, dropout=dropout)
+        self.feed_forward_norm = nn.LayerNorm(dim)
+        self.feed_forward = FeedForward(dim, 4 * dim, dropout)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """``x`` (batch, frames, dim), ``mask`` (batch, frames)."""
+        normed = self.attention_norm(x)
+        x = x + self.dropout(self.attention(normed, normed, mask))
+        return x + self.dropout(self.feed_forward(self.feed_forward_norm(x)))
+
+
+class AttentionPooling(nn.Module):
+    """One vector from a sequence: γ_t = softmax_t(w_aᵀ tanh(W₁ f_t + b₁)), s = Σ_t γ_t f_t (eq. 7 and 8)."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(dim, dim)
+        self.score = nn.Linear(dim, 1, bias=False)
+
+    def weights(
+        self, features: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames"]:
+        """γ: sums to one over each clip's frames and is exactly zero on padding."""
+        score = self.score(torch.tanh(self.hidden(features))).squeeze(-1)
+        return score.masked_fill(~mask, -torch.inf).softmax(-1)
+
+    def forward(
+        self, features: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch dim"]:
+        """The weighted mean s."""
+        return torch.einsum("bt,btc->bc", self.weights(features, mask), features)
+
+
+@style_encoder.register("tcn_gru_transformer")
+class TcnGruTransformer(StyleEncoder):
+    """Five dilated TCN branches, Bi-GRU, Pre-Norm Transformer, attention pooling, MLP (eq. 2 to 9).
+
+    The learnt position embedding P serves references of any length: it is a table of ``n_positions`` rows that is
+    interpolated to each clip's own number of frames, so a row stands for a relative place in the clip.
+
+    Args:
+        dim: channels; given by the model. Must be even.
+        dilations: dilation of each parallel TCN branch.
+        kernel_size: taps of the TCN convolutions.
+        causal: causal convolutions as in Bai et al. 2018; else centred ones.
+        num_layers: Transformer layers (the paper's L).
+        num_heads: attention heads.
+        n_positions: rows of the position embedding.
+        dropout: dropout everywhere.
+    """
+
+    def __init__(
+        self,
+        *,
+        dim: int,
+        dilations: tuple[int, ...] = (1, 2, 4, 8, 16),
+        kernel_size: int = 3,
+        causal: bool = True,
+        num_layers: int = 2,
+        num_heads: int = 4,
+        n_positions: int = 64,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        if dim % 2:
+            raise ValueError(f"dim must be even for the bidirectional GRU, got {dim}")
+        self.branches = nn.ModuleList(
+            TemporalBlock(dim, d, kernel_size, causal=causal, dropout=dropout) for d in dilations
+        )
+        self.gru = nn.GRU(dim, dim // 2, batch_first=True, bidirectional=True)
+        self.positions = nn.Parameter(torch.randn(n_positions, dim) * 0.02)
+        self.layers = nn.ModuleList(EncoderLayer(dim, num_heads, dropout) for _ in range(num_layers))
+        self.norm = nn.LayerNorm(dim)
+        self.pooling = AttentionPooling(dim)
+        self.mlp = nn.Sequential(nn.Linear(dim, dim), nn.GELU(), nn.Linear(dim, dim))
+        self.token_dims = (dim,)
+
+    def forward(
+        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """F_dyn of each clip."""
+        features = self.features(reference, mask)
+        return self.mlp(self.pooling(features, mask))
+
+    def features(self, reference: Tensor, mask: Tensor) -> Tensor:
+        """F_attn (batch, frames, dim), eq. 2 to 6."""
+        column = mask[..., None].to(reference.dtype)
+        lengths = mask.sum(1)
+        x = torch.stack([branch(reference, column) for branch in self.branches]).mean(0)
+        packed = pack_padded_sequence(x, lengths.cpu(), batch_first=True, enforce_sorted=False)
+        x, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=mask.shape[1])
+        rows = torch.full_like(lengths, self.positions.shape[0])
+        positions = interpolate_frames(self.positions.expand(len(lengths), -1, -1), rows, lengths)
+        x = x + nn.functional.pad(positions, (0, 0, 0, mask.shape[1] - positions.shape[1]))
+        for layer in self.layers:
+            x = layer(x, mask)
+        return self.norm(x)

@@ -1,0 +1,37 @@
+"""Packages whose public names are imported when they are first used.
+
+``facediff.models`` imports Lightning, ``facediff.data`` too: seconds that a wrong option or ``--help`` must not cost.
+Depends on the standard library only.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Mapping
+
+
+def lazy_names(
+    package: str, modules: Mapping[str, str]
+) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
+    """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names are loaded on first use (PEP 562).
+
+    Args:
+        package: the package's ``__name__``.
+        modules: for each module of the package, its public names, separated by spaces.
+
+    Example:
+        >>> __getattr__, __dir__, __all__ = lazy_names("facediff.mesh", {"mesh": "Mesh read_mesh"})
+        >>> __all__
+        ['Mesh', 'read_mesh']
+    """
+    owner = {name: f"{package}.{module}" for module, names in modules.items() for name in names.split()}
+
+    def get(name: str) -> object:
+        if name not in owner:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(owner[name]), name)
+        setattr(sys.modules[package], name, value)  # found directly from now on
+        return value
+
+    return get, lambda: sorted({*owner, *vars(sys.modules[package])}), sorted(owner)

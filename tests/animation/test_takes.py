@@ -1,0 +1,232 @@
+"""A take survives its file; what does not fit together is refused with one sentence."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.animation import Animation, metres_per_unit, read_animation, read_archive, write_archive
+from facediff.animation.files import Surroundings
+from facediff.errors import FaceDiffError
+
+
+@pytest.fixture
+def animation() -> Animation:
+    rng = np.random.default_rng(0)
+    template = rng.normal(size=(6, 3)).astype(np.float32)
+    return Animation(
+        name="hello",
+        vertices=template + rng.normal(0, 0.1, (5, 6, 3)).astype(np.float32),
+        template=template,
+        frame_rate=25.0,
+        faces=np.array([[0, 1, 2], [3, 4, 5]], np.int32),
+        unit="mm",
+        speech=np.linspace(-1, 1, 3300, dtype=np.float32),
+        colours=rng.integers(0, 255, (6, 3)).astype(np.uint8),
+        regions={"lips": np.array([1, 2])},
+        inner_lip_pairs=np.array([[0, 1]]),
+        metadata={"identity": "Zoë"},
+    )
+
+
+def test_an_archive_gives_back_every_field_without_pickle(animation: Animation, tmp_path: Path) -> None:
+    write_archive(tmp_path / "a.npz", animation)
+    back = read_archive(tmp_path / "a.npz")
+    for name, value in vars(animation).items():
+        if name == "regions":
+            assert back.regions.keys() == value.keys()
+            assert np.array_equal(back.regions["lips"], value["lips"])
+        elif isinstance(value, np.ndarray):
+            assert np.array_equal(getattr(back, name), value)
+        else:
+            assert getattr(back, name) == value
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
+        assert set(archive.files) >= {"vertices", "template", "faces", "speech", "about", "region_lips"}
+
+
+def test_the_sound_is_as_long_as_the_picture(animation: Animation) -> None:
+    sound = animation.sound()
+    assert sound is not None
+    assert len(sound) == 3200
+    assert np.array_equal(sound, animation.speech[:3200])  # type: ignore[index]
+    longer = replace(animation, speech=animation.speech[:100]).sound()  # type: ignore[index]
+    assert longer is not None
+    assert len(longer) == 3200
+    assert not longer[100:].any()
+
+
+def test_a_bare_array_needs_a_frame_rate_and_may_be_flat(animation: Animation, tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", animation.vertices.reshape(5, -1))
+    with pytest.raises(FaceDiffError, match="--frame-rate"):
+        read_animation(tmp_path / "x.npy")
+    read = read_animation(tmp_path / "x.npy", Surroundings(frame_rate=30, template=animation.template))
+    assert np.array_equal(read.vertices, animation.vertices)
+    assert np.array_equal(
+        read_animation(tmp_path / "x.npy", Surroundings(frame_rate=30)).template, animation.vertices[0]
+    )
+
+
+def test_options_go_before_what_an_archive_says(animation: Animation, tmp_path: Path) -> None:
+    write_archive(tmp_path / "a.npz", animation)
+    read = read_animation(tmp_path / "a.npz", Surroundings(frame_rate=60, regions={"jaw": np.array([0])}))
+    assert read.frame_rate == 60
+    assert set(read.regions) == {"lips", "jaw"}
+    assert read.unit == "mm"
+
+
+def test_what_is_lent_never_goes_before_a_file(animation: Animation, tmp_path: Path) -> None:
+    lent = Surroundings(
+        template=animation.template + 1,
+        faces=animation.triangles[:1],
+        frame_rate=60,
+        unit="m",
+        regions={"lips": np.array([5]), "jaw": np.array([0])},
+        inner_lip_pairs=np.array([[3, 4]]),
+    )
+    write_archive(tmp_path / "a.npz", replace(animation, inner_lip_pairs=None))
+    read = read_animation(tmp_path / "a.npz", None, lent)
+    assert np.array_equal(read.template, animation.template)
+    assert np.array_equal(read.triangles, animation.triangles)
+    assert (read.frame_rate, read.unit) == (25, "mm")
+    assert read.inner_lip_pairs is not None
+    assert read.inner_lip_pairs.tolist() == [[3, 4]]
+    assert {name: indices.tolist() for name, indices in read.regions.items()} == {"lips": [1, 2], "jaw": [0]}
+    np.save(tmp_path / "x.npy", animation.vertices)
+    bare = read_animation(tmp_path / "x.npy", Surroundings(unit="cm"), lent)
+    assert np.array_equal(bare.template, animation.template + 1)
+    assert (bare.frame_rate, bare.unit) == (60, "cm")
+    other = replace(lent, template=np.zeros((9, 3), np.float32), inner_lip_pairs=np.array([[7, 8]]))
+    assert read_animation(tmp_path / "a.npz", None, other).inner_lip_pairs is None  # of another topology
+    told = read_animation(tmp_path / "x.npy", Surroundings(template=animation.template), other)
+    assert (told.faces, told.frame_rate, told.regions) == (None, 60, {})
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"vertices": np.zeros((0, 6, 3), np.float32)}, "holds no frames"),
+        ({"vertices": np.zeros((5, 7, 3), np.float32)}, "has 7 vertices and its template 6"),
+        ({"vertices": np.zeros((5, 18), np.float32)}, "expected (frames, vertices, 3)"),
+        ({"faces": np.array([[0, 1, 6]], np.int32)}, "name vertex 6 of 6"),
+        ({"frame_rate": 0.0}, "frame rate 0 is impossible"),
+        ({"unit": "parsec"}, 'unit "parsec"'),
+        ({"unit": "normalised (about 0 mm)"}, "above 0"),
+        ({"unit": "about 1.2.3 mm"}, "above 0"),
+        ({"sample_rate": 0}, "sample rate 0 is impossible"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(animation: Animation, change: dict[str, object], sentence: str) -> None:
+    with pytest.raises(FaceDiffError) as caught:
+        replace(animation, **change)  # type: ignore[arg-type]
+    assert sentence in str(caught.value)
+    assert "hello" in str(caught.value) or "unit" in change
+
+
+def test_motion_that_is_not_finite_is_never_written(animation: Animation, tmp_path: Path) -> None:
+    vertices = animation.vertices.copy()
+    vertices[3, 2, 1] = np.nan
+    with pytest.raises(FaceDiffError, match="frame 3 holds NaN"):
+        write_archive(tmp_path / "a.npz", replace(animation, vertices=vertices))
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_that_are_no_takes(tmp_path: Path) -> None:
+    (tmp_path / "a.npz").write_text("no")
+    with pytest.raises(FaceDiffError, match="not a readable .npz"):
+        read_archive(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", x=np.zeros(3))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "b.npz").read_bytes()[:-30])
+    with pytest.raises(FaceDiffError, match="not a readable .npz"):
+        read_archive(tmp_path / "cut.npz")
+    with pytest.raises(FaceDiffError, match="has no vertices, template, about"):
+        read_archive(tmp_path / "b.npz")
+    np.save(tmp_path / "c.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    with pytest.raises(FaceDiffError, match="not a readable NumPy array"):
+        read_animation(tmp_path / "c.npy")
+    np.save(tmp_path / "plain.npy", np.zeros((2, 6, 3), np.float32))
+    whole = (tmp_path / "plain.npy").read_bytes()
+    for header in (whole.replace(b"}", b"{"), whole.replace(b"(2,", b"(02")):  # a NumPy header is Python
+        (tmp_path / "d.npy").write_bytes(header)
+        with pytest.raises(FaceDiffError, match="not a readable NumPy array"):
+            read_animation(tmp_path / "d.npy")
+    (tmp_path / "plain.npy").rename(tmp_path / "plain.npz")
+    with pytest.raises(FaceDiffError, match="not a readable .npz"):
+        read_archive(tmp_path / "plain.npz")
+    (tmp_path / "b.npz").rename(tmp_path / "b.npy")
+    with pytest.raises(FaceDiffError, match="name it .npz"):
+        read_animation(tmp_path / "b.npy")
+    for name, shape in (("flat", (4, 0)), ("deep", (4, 0, 3))):
+        np.save(tmp_path / f"{name}.npy", np.zeros(shape, np.float32))
+        with pytest.raises(FaceDiffError, match="holds no vertices"):
+            read_animation(tmp_path / f"{name}.npy")
+    with zipfile.ZipFile(tmp_path / "words.npz", "w") as archive:
+        archive.writestr("vertices", "no numbers")
+    with pytest.raises(FaceDiffError, match="vertices is no array"):
+        read_archive(tmp_path / "words.npz")
+    np.savez_compressed(tmp_path / "spoilt.npz", vertices=np.arange(3000.0).reshape(10, 100, 3))
+    spoilt = bytearray((tmp_path / "spoilt.npz").read_bytes())
+    spoilt[100:200] = bytes(100)
+    (tmp_path / "spoilt.npz").write_bytes(spoilt)
+    with pytest.raises(FaceDiffError, match="not a readable .npz"):
+        read_archive(tmp_path / "spoilt.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "sentence"),
+    [
+        ("vertices", np.zeros((5, 6, 3), int), "its vertices are int64 of shape (5, 6, 3); expected floating point"),
+        ("template", np.float32(1), "its template are float32 of shape (); expected"),
+        ("faces", np.zeros((2, 4), np.int32), "expected whole numbers (triangles, 3)"),
+        ("faces", np.zeros((2, 3)), "expected whole numbers (triangles, 3)"),
+        ("speech", np.zeros((9, 2), np.float32), "expected floating point (samples,)"),
+        ("colours", np.zeros((6, 3)), "expected bytes (vertices, 3)"),
+        ("inner_lip_pairs", np.array([[0, 6]]), "its inner_lip_pairs names vertices other than 0 to 5"),
+        ("region_lips", np.array([-1]), "its lips names vertices other than 0 to 5"),
+        ("region_lips", np.array([0.5]), "its lips names vertices other than 0 to 5"),
+    ],
+)
+def test_an_archive_that_others_made_is_looked_at(
+    animation: Animation, tmp_path: Path, name: str, wrong: np.ndarray, sentence: str
+) -> None:
+    write_archive(tmp_path / "a.npz", animation)
+    with np.load(tmp_path / "a.npz") as archive:
+        held = dict(archive)
+    np.savez(tmp_path / "a.npz", **{**held, name: wrong})
+    with pytest.raises(FaceDiffError) as caught:
+        read_archive(tmp_path / "a.npz")
+    assert sentence in str(caught.value)
+    assert "a.npz" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [("m", 1.0), ("mm", 0.001), ("0.5", 0.5), ("normalised (the root of its area is 1, about 185 mm)", 0.185)],
+)
+def test_units(unit: str, metres: float) -> None:
+    assert metres_per_unit(unit) == pytest.approx(metres)
+
+
+def test_a_motion_larger_than_memory_is_read_without_holding_it(tmp_path: Path) -> None:
+    """In a process of its own, since memory is counted per process: 600 MB are looked at twice."""
+    made = np.lib.format.open_memmap(tmp_path / "large.npy", "w+", np.float32, (2500, 20_000, 3))
+    made[2499, 0, 0] = 1
+    del made
+    program = f"""
+import resource, numpy as np
+from facediff.takes import Animation
+from facediff.takes.reading import read_vertices
+vertices = read_vertices(__import__("pathlib").Path({str(tmp_path / "large.npy")!r}))
+take = Animation("large", vertices, np.zeros((20_000, 3), np.float32), 25.0)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+take.refuse_not_finite()
+assert sum(float(frame[0, 0]) for frame in take.frames()) == 1
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 200

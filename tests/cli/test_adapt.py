@@ -1,0 +1,218 @@
+"""``facediff adapt`` and ``facediff style``: a checkpoint that knows one person more, a style as a vector."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from facediff.cli.app import main
+from facediff.data import collate
+from facediff.data.prepare.runner import write_templates
+from facediff.models import load_model
+from facediff.models.adaptation import grow
+from facediff.models.checkpoint import read_checkpoint
+from facediff.utils.pickles import load_pickle
+from tests.fakes.tiny import Tiny
+
+FAST = ["--epochs", "3", "--accelerator", "cpu", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def adapted(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The miniature dual-path checkpoint, adapted to the unseen C."""
+    path = tmp_path_factory.mktemp("adapted") / "C.ckpt"
+    words = ["--checkpoint", str(checkpoint), "--person", "C", "-o", str(path), "--learning-rate", "1e-3"]
+    assert main(["adapt", *words, *FAST]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def second(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint of the second model by the command line."""
+    folder = tmp_path_factory.mktemp("second")
+    words = ["--config", "configs/experiment/puppet_style_content.yaml", "--data=tests.fakes.tiny.Tiny"]
+    words += [f"--data.root={tiny_root}", "--trainer.max_epochs=1", "--trainer.check_val_every_n_epoch=1"]
+    words += ["--model.dim=16", "--model.speech_layers=1", "--model.mesh_encoder.spiral_length=5"]
+    words += ["--trainer.enable_progress_bar=false", f"--trainer.logger.save_dir={folder}"]
+    assert main(["fit", *words]) == 0
+    (path,) = folder.rglob("best.ckpt")
+    return path
+
+
+def error_of_c(path: Path, tiny: Tiny) -> float:
+    """Mean squared error of C's test clips, conditioned on C where C is known."""
+    model, total = load_model(path), 0.0
+    dataset = tiny.dataset("test_b")
+    for index in range(len(dataset)):
+        sample = dataset[index]
+        sample.identity = model.assets.identity_index("C")
+        with torch.inference_mode():
+            total += float((model.generate(collate([sample]))[0] - sample.motion).square().mean())
+    return total
+
+
+def test_the_newcomer_comes_first_and_everybody_else_stays(adapted: Path, checkpoint: Path) -> None:
+    before, after = load_model(checkpoint), load_model(adapted)
+    assert after.identities == ["C", *before.identities]
+    assert after.assets.identity_index("C") == 0
+    assert after.assets.motion_scale == before.assets.motion_scale
+    table = after.network.identity_encoder.coarse.weight
+    assert len(table) == len(before.network.identity_encoder.coarse.weight) + 1
+
+
+def test_what_is_known_of_others_becomes_the_newcomers_start() -> None:
+    before = torch.randn(3, 4)
+    after = grow(before, torch.empty(4, 4))
+    torch.testing.assert_close(after[0], before.mean(0))
+    assert torch.equal(after[1:], before)
+    assert grow(before, torch.empty(3, 4)) is before
+
+
+def test_adapting_helps(adapted: Path, checkpoint: Path, tiny: Tiny, tmp_path: Path) -> None:
+    """More epochs than the fixture's, so that a model of one epoch has something to gain."""
+    path = tmp_path / "more.ckpt"
+    words = ["--checkpoint", str(checkpoint), "--person", "C", "-o", str(path), "--learning-rate", "3e-3"]
+    assert main(["adapt", *words, *FAST, "--epochs", "30"]) == 0
+    assert error_of_c(path, tiny) < 0.8 * error_of_c(checkpoint, tiny)
+
+
+def test_the_newcomer_is_tested_and_animated_by_name(
+    adapted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--model.unseen_identity=adapted", "--trainer.accelerator=cpu", f"--trainer.logger.save_dir={tmp_path}"]
+    assert main(["test", "--ckpt_path", str(adapted), *words]) == 0
+    soundfile.write(tmp_path / "speech.wav", np.random.default_rng(0).normal(0, 0.1, 16_000), 16_000)
+    out = tmp_path / "speech.npy"
+    words = ["--checkpoint", str(adapted), "--identity", "C", "-o", str(out), "--quiet"]
+    assert main(["animate", str(tmp_path / "speech.wav"), *words]) == 0
+    assert "identity C" in capsys.readouterr().out
+    assert np.load(out).shape == (25, 24, 3)
+
+
+def test_train_person_leaves_the_rest_alone(checkpoint: Path, tmp_path: Path) -> None:
+    path = tmp_path / "C.ckpt"
+    words = ["--checkpoint", str(checkpoint), "--person", "C", "-o", str(path), "--train", "person"]
+    assert main(["adapt", *words, *FAST]) == 0
+    before, after = load_model(checkpoint).state_dict(), load_model(path).state_dict()
+    personal = ("network.identity_encoder", "network.mesh_encoder", "network.style_encoder", "network.style_tokens")
+    moved = {name for name in before if before[name].shape == after[name].shape}
+    moved = {name for name in moved if not torch.equal(before[name], after[name])}
+    assert moved
+    assert all(name.startswith(personal) for name in moved)
+    assert all(p.requires_grad for p in load_model(path).parameters())
+
+
+def test_joint_training_uses_the_corpus_too(checkpoint: Path, tmp_path: Path) -> None:
+    path = tmp_path / "C.ckpt"
+    words = ["--checkpoint", str(checkpoint), "--person", "C", "-o", str(path), "--mode", "joint"]
+    assert main(["adapt", *words, *FAST, "--epochs", "1"]) == 0
+    told = read_checkpoint(path)["datamodule_hyper_parameters"]
+    assert (told["extra_identities"], told["train_identities"]) == (["C"], None)
+
+
+def test_the_second_system_adapts_too(second: Path, tmp_path: Path) -> None:
+    path = tmp_path / "C.ckpt"
+    assert main(["adapt", "--checkpoint", str(second), "--person", "C", "-o", str(path), *FAST]) == 0
+    assert load_model(path).identities[0] == "C"
+
+
+@pytest.mark.parametrize("which", ["checkpoint", "second"])
+def test_a_style_vector_does_what_its_clip_does(
+    which: str, request: pytest.FixtureRequest, tmp_path: Path, fit: Callable[..., int]
+) -> None:
+    path: Path = request.getfixturevalue(which)
+    soundfile.write(tmp_path / "speech.wav", np.random.default_rng(0).normal(0, 0.1, 16_000), 16_000)
+    vector = tmp_path / "B.npy"
+    assert main(["style", "extract", "B_e02", "--checkpoint", str(path), "-o", str(vector)]) == 0
+    assert np.load(vector).ndim == 1
+    made = []
+    for style in ("B_e02", str(vector)):
+        out = tmp_path / "out.npy"
+        words = ["--checkpoint", str(path), "--style", style, "-o", str(out), "--quiet"]
+        assert main(["animate", str(tmp_path / "speech.wav"), *words]) == 0
+        made.append(np.load(out))
+    np.testing.assert_allclose(made[0], made[1], atol=1e-5)
+
+
+def test_the_mean_of_several_clips(second: Path, tmp_path: Path) -> None:
+    for name, clips in (("a", ["B_e01"]), ("b", ["B_e02"]), ("both", ["B_e01", "B_e02"])):
+        words = ["--checkpoint", str(second), "-o", str(tmp_path / f"{name}.npy")]
+        assert main(["style", "extract", *clips, *words]) == 0
+    one, two, both = (np.load(tmp_path / f"{name}.npy") for name in ("a", "b", "both"))
+    np.testing.assert_allclose(both, (one + two) / 2, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--person", "A"], "the checkpoint knows A"),
+        (["--person", "nobody"], "neither a person's folder nor a subject"),
+        (["--person", "C", "-o", "out.pt"], "ends in .ckpt"),
+        (["--person", "C", "--epochs", "0"], "--epochs 0"),
+        (["--person", "C", "--data-root", "nowhere"], "nowhere"),
+    ],
+)
+def test_what_cannot_work_is_said_before_training(
+    words: list[str],
+    said: str,
+    checkpoint: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["adapt", "--checkpoint", str(checkpoint), "-o", "out.ckpt", *words]) == 2
+    assert said in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_vector_of_another_model_is_refused(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "other.npy", np.zeros(7, np.float32))
+    soundfile.write(tmp_path / "speech.wav", np.random.default_rng(0).normal(0, 0.1, 16_000), 16_000)
+    words = ["--checkpoint", str(checkpoint), "--style", str(tmp_path / "other.npy"), "-o", str(tmp_path / "o.npy")]
+    assert main(["animate", str(tmp_path / "speech.wav"), *words]) == 2
+    assert "holds 7 numbers" in capsys.readouterr().err
+
+
+def person_folder(corpus: Path, root: Path, subject: str = "C", name: str = "Maria") -> Path:
+    """The clips of a subject of the miniature corpus, as `facediff data import-person` lays out a person's."""
+    for folder in ("wav", "vertices_npy"):
+        (root / folder).mkdir(parents=True)
+    rows = ["clip,subject,sentence,split"]
+    for number, source in enumerate(sorted((corpus / "vertices_npy").glob(f"{subject}_*.npy")), 1):
+        clip = f"{name}_s{number:02d}"
+        shutil.copy(source, root / "vertices_npy" / f"{clip}.npy")
+        shutil.copy(corpus / "wav" / f"{source.stem}.wav", root / "wav" / f"{clip}.wav")
+        rows.append(f"{clip},{name},s{number:02d},{'test' if number == 7 else 'train'}")
+    (root / "clips.csv").write_text("\n".join(rows) + "\n")
+    template = load_pickle(corpus / "templates.pkl")[subject]
+    write_templates(root / "templates.pkl", {name: template})
+    (root / "manifest.json").write_text(json.dumps({"corpus": "person", "person": name, "frame_rate": 25}))
+    return root
+
+
+def test_a_persons_folder_is_learnt_by_name(checkpoint: Path, tiny_root: Path, tmp_path: Path) -> None:
+    """And a second person after the first; the folders are named in the checkpoint, so that it is tested as ever."""
+    folder = person_folder(tiny_root, tmp_path / "maria")
+    first, second = tmp_path / "first.ckpt", tmp_path / "second.ckpt"
+    assert main(["adapt", "--checkpoint", str(checkpoint), "--person", str(folder), "-o", str(first), *FAST]) == 0
+    model = load_model(first)
+    assert model.identities == ["Maria", "A", "B"]
+    assert "Maria" in model.assets.templates
+    assert model.default_style("Maria").clip.startswith("Maria_")
+    words = ["--trainer.accelerator=cpu", f"--trainer.logger.save_dir={tmp_path}"]
+    assert main(["test", "--ckpt_path", str(first), *words]) == 0
+    (table,) = tmp_path.rglob("test_sequences.csv")
+    assert "Maria_s07" in table.read_text()
+    other = person_folder(tiny_root, tmp_path / "eve", name="Eve")
+    assert main(["adapt", "--checkpoint", str(first), "--person", str(other), "-o", str(second), *FAST]) == 0
+    assert load_model(second).identities == ["Eve", "Maria", "A", "B"]

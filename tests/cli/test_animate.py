@@ -1,0 +1,450 @@
+"""Speech in, animation out; bad input gets one sentence and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from facediff.animation import read_archive
+from facediff.cli.app import main
+from facediff.data.audio import read_speech
+from facediff.mesh import read_mesh
+from facediff.models import load_model
+
+
+@pytest.fixture
+def speech(tmp_path: Path) -> Path:
+    path = tmp_path / "speech.wav"
+    time = np.arange(22050) / 22050
+    soundfile.write(path, np.stack([0.3 * np.sin(2 * np.pi * 200 * time)] * 2, 1), 22050)
+    return path
+
+
+def animate(*words: object) -> int:
+    return main(["animate", *map(str, words), "--quiet"])
+
+
+def test_npy_holds_absolute_vertices_and_repeats_bit_for_bit(speech: Path, checkpoint: Path, tmp_path: Path) -> None:
+    outputs = [tmp_path / "new" / f"{i}.npy" for i in range(3)]
+    for path, seed in zip(outputs, (5, 5, 6), strict=True):
+        assert animate(speech, "--checkpoint", checkpoint, "-o", path, "--seed", seed, "--identity", "B") == 0
+    first, second, third = map(np.load, outputs)
+    assert first.shape == (25, 24, 3)
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, third)
+    template = load_model(checkpoint).assets.templates["B"].numpy()
+    assert np.abs(first - template).max() < 0.2
+
+
+def test_mp4_has_every_frame_and_the_speech(speech: Path, checkpoint: Path, tmp_path: Path) -> None:
+    path = tmp_path / "out.mp4"
+    assert animate(speech, "--checkpoint", checkpoint, "-o", path, "--size", 64) == 0
+    with av.open(str(path)) as video:
+        assert sum(1 for _ in video.decode(video=0)) == 25
+    with av.open(str(path)) as video:
+        sound = np.concatenate([frame.to_ndarray().ravel() for frame in video.decode(audio=0)])
+    assert np.abs(sound).max() > 0.1
+
+
+def test_sampler_steps_and_style_are_chosen(speech: Path, checkpoint: Path, tiny_root: Path, tmp_path: Path) -> None:
+    def made(*words: object) -> np.ndarray:
+        assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "x.npy", *words) == 0
+        return np.load(tmp_path / "x.npy")
+
+    plain = made()
+    assert not np.array_equal(plain, made("--sampler", "ddpm", "--steps", 4))
+    assert not np.array_equal(plain, made("--steps", 5))
+    by_name = made("--style", "B_e02")
+    by_file = made("--style", tiny_root / "vertices_npy" / "B_e02.npy")
+    assert not np.array_equal(plain, by_name)
+    assert np.array_equal(by_name, by_file)
+
+
+def write(path: Path, samples: np.ndarray, rate: int = 16000) -> Path:
+    soundfile.write(path, samples, rate)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda folder: folder / "missing.wav", "no such sound file"),
+        (lambda folder: (folder / "empty.wav").touch() or folder / "empty.wav", "is empty"),
+        (lambda folder: (folder / "t.wav").write_text("hello " * 99) and folder / "t.wav", "not a readable sound file"),
+        (lambda folder: write(folder / "silent.wav", np.zeros(16000)), "only silence"),
+        (lambda folder: write(folder / "short.wav", np.ones(1600) * 0.5), "lasts 0.10 s"),
+    ],
+    ids=["missing", "empty", "text", "silence", "short"],
+)
+def test_bad_speech(
+    make: object, sentence: str, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    speech = make(tmp_path)  # type: ignore[operator]
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "out" / "x.npy") == 2
+    message = capsys.readouterr().err
+    assert sentence in message
+    assert len(message.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def bad_reference(folder: Path) -> Path:
+    np.save(folder / "other.npy", np.zeros((9, 31, 3), np.float32))
+    return folder / "other.npy"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--identity", "Zoe"], 'there is no "Zoe"; the checkpoint knows A, B, C'),
+        (["--style", "other.npy"], "has shape (9, 31, 3); the checkpoint's faces have 24 vertices"),
+        (["--style", "A_e99"], "no clip of that name"),
+        (["--style", "none.npy"], "no such file"),
+        (["--style", "archive.npy"], "holds no array of numbers"),
+        (["--style", "words.npy"], "holds no array of numbers"),
+        (["--style", "far.npy"], "so it must be another person's"),
+        (["--sampler", "dim"], 'there is no sampler "dim": did you mean "ddim"?'),
+        (["--steps", "0"], "sampler.steps: 0 is impossible"),
+        (["--device", "cuda:7"], "not usable on this machine"),
+        (["--checkpoint", "text.ckpt"], "not a checkpoint that can be loaded safely"),
+        (["-o", "x.gif"], 'there is no format ".gif"'),
+        (["--max-seconds", "0.5"], "lasts 1 s, more than --max-seconds 0.5"),
+        (["--window", "0.1"], "too few frames"),
+        (["--seed", "-1"], "--seed -1: expected 0 or more"),
+        (["--seed", "9" * 20], "and less than"),
+        (["--takes", "0"], "--takes 0: expected 1 or more"),
+        (["--correspondence", "m.npz"], "give --target-mesh as well"),
+        (["--target-mesh", "none.obj"], "no such file"),
+        (["--expressiveness", "chin=2"], "chin"),
+        (["--blinks"], "--blinks: needs to know where lids and eyeballs are"),
+        (["-o", "x.csv"], "shapes"),
+        (["-o", "text.ckpt/x.npy"], "cannot be written"),
+    ],
+)
+def test_bad_options(
+    words: list[str],
+    sentence: str,
+    speech: Path,
+    checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    bad_reference(tmp_path)
+    np.savez(tmp_path / "archive", a=np.zeros(3))
+    (tmp_path / "archive.npz").rename(tmp_path / "archive.npy")
+    np.save(tmp_path / "words.npy", np.array(["a", "b"]))
+    np.save(tmp_path / "far.npy", np.full((9, 24, 3), 0.5, np.float32))
+    (tmp_path / "text.ckpt").write_text("no checkpoint")
+    before = sorted(tmp_path.rglob("*"))
+    assert animate(speech, "--checkpoint", checkpoint, "-o", "x.npy", *words) == 2
+    message = capsys.readouterr().err
+    assert sentence in message
+    assert len(message.splitlines()) == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_checkpoint_of_another_topology_says_so(
+    checkpoint: Path, tmp_path: Path, speech: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    loaded = torch.load(checkpoint, weights_only=True)
+    assets = loaded["facediff_assets"]
+    assets["templates"] = {name: value[:20] for name, value in assets["templates"].items()}
+    torch.save(loaded, tmp_path / "other.ckpt")
+    assert animate(speech, "--checkpoint", tmp_path / "other.ckpt", "-o", tmp_path / "x.npy") == 2
+    assert "vertices are {24} in the model and {20} in the corpus" in capsys.readouterr().err
+
+
+def test_a_style_from_another_folder_comes_with_its_template_and_frame_rate(
+    speech: Path, checkpoint: Path, tiny_root: Path, tmp_path: Path
+) -> None:
+    """The same motion of the same face, moved away in space and stored at twice the frame rate, is the same style."""
+    person = tmp_path / "ada"
+    (person / "vertices_npy").mkdir(parents=True)
+    templates = pickle.loads((tiny_root / "templates.pkl").read_bytes())  # noqa: S301 - written by the fake
+    motion = np.load(tiny_root / "vertices_npy" / "A_e02.npy").reshape(-1, 24, 3)
+    (person / "templates.pkl").write_bytes(pickle.dumps({"Ada": templates["A"] + 5.0}))
+    np.save(person / "vertices_npy" / "Ada_s01.npy", np.repeat(motion + 5.0, 2, axis=0))
+    (person / "manifest.json").write_text('{"person": "Ada", "frame_rate": 50}')
+
+    def made(style: str) -> np.ndarray:
+        assert animate(speech, "--checkpoint", checkpoint, "--style", style, "-o", tmp_path / "out.npy") == 0
+        return np.load(tmp_path / "out.npy")
+
+    # Coordinates around 5 hold a millionth part less than those around 0.
+    np.testing.assert_allclose(made(str(person / "vertices_npy" / "Ada_s01.npy")), made("A_e02"), rtol=0, atol=1e-5)
+    (person / "manifest.json").write_text('{"person": "Ada", "frame_rate": 30}')
+    style = person / "vertices_npy" / "Ada_s01.npy"
+    assert animate(speech, "--checkpoint", checkpoint, "--style", style, "-o", tmp_path / "out.npy") == 2
+
+
+def test_several_takes_differ_and_stand_side_by_side_or_in_files_of_their_own(
+    speech: Path, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "t.npy", "--takes", 2, "--seed", 5) == 0
+    first, second = (np.load(tmp_path / f"t_take{i}.npy") for i in (1, 2))
+    assert not np.array_equal(first, second)
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "five.npy", "--seed", 5) == 0
+    np.testing.assert_allclose(first, np.load(tmp_path / "five.npy"), rtol=0, atol=1e-5)
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "t.mp4", "--takes", 2, "--size", 64) == 0
+    with av.open(str(tmp_path / "t.mp4")) as video:
+        assert video.streams.video[0].width == 128
+    assert "25 frames, identity A" in capsys.readouterr().out
+
+
+def test_a_take_says_how_it_was_made(speech: Path, checkpoint: Path, tmp_path: Path) -> None:
+    path = tmp_path / "t.npz"
+    words = ["--expressiveness", "1.5", "--sway", "3", "--style", "A_e02:1,B_e02:3"]
+    assert animate(speech, "--checkpoint", checkpoint, "-o", path, *words) == 0
+    animation = read_archive(path)
+    assert animation.metadata["corpus"] == "tiny (synthetic)"
+    assert animation.metadata["style"] == "0.25 A_e02 + 0.75 B_e02"
+    assert "head sway" in animation.metadata["procedural"]
+    assert "1.5" in animation.metadata["directed"]
+    assert animation.frame_rate == 25
+    assert animation.unit == "m"
+    assert animation.inner_lip_pairs is not None
+    assert animation.speech is not None
+    assert len(animation.speech) == 16000
+
+
+def test_half_precision_is_near_and_its_vertices_are_not_rounded(
+    speech: Path, checkpoint: Path, tmp_path: Path
+) -> None:
+    made = []
+    for precision in ("32", "bf16"):
+        path = tmp_path / f"{precision}.npz"
+        assert animate(speech, "--checkpoint", checkpoint, "-o", path, "--precision", precision) == 0
+        made.append(read_archive(path))
+    full, half = (animation.vertices - animation.template for animation in made)
+    assert 0 < np.abs(full - half).max() < 0.1 * np.abs(full).max()
+    assert half.dtype == np.float32
+    # Numbers of bfloat16 have 16 bits of nought at their end.
+    assert (half.view(np.uint32) & 0xFFFF).any()
+    assert made[1].metadata["precision"] == "bfloat16 and float32"
+
+
+def test_long_speech_goes_to_disk_window_by_window(checkpoint: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    speech = write(tmp_path / "long.wav", 0.1 * rng.normal(size=16000 * 13))
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "out" / "long.npy", "--seed", 2) == 0
+    made = np.load(tmp_path / "out" / "long.npy")
+    model = load_model(checkpoint)
+    expected = model.animate(torch.from_numpy(read_speech(speech)), subject="A", seed=2).vertices.numpy()
+    assert made.shape == (325, 24, 3)
+    np.testing.assert_array_equal(made, expected)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["long.npy"]
+
+
+def test_speech_of_just_about_ten_seconds_is_made_as_the_system_makes_it(checkpoint: Path, tmp_path: Path) -> None:
+    speech = write(tmp_path / "s.wav", 0.1 * np.random.default_rng(0).normal(size=160_100))  # 250 frames and a bit
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "s.npy") == 0
+    expected = load_model(checkpoint).animate(torch.from_numpy(read_speech(speech)), subject="A").vertices.numpy()
+    np.testing.assert_array_equal(np.load(tmp_path / "s.npy"), expected)
+
+
+def test_a_recording_is_not_replaced(
+    checkpoint: Path, speech: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A video is a recording too, and has the suffix of an animation."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    videos = [folder / "a.mp4", folder / "b.mp4"]
+    assert animate(speech, "--checkpoint", checkpoint, "-o", videos[0], "--size", 32) == 0
+    videos[1].write_bytes(videos[0].read_bytes())
+    before = [path.read_bytes() for path in videos]
+    capsys.readouterr()
+    for words in ([videos[0], "-o", videos[0]], [*videos, "-o", folder]):
+        assert animate(*words, "--checkpoint", checkpoint) == 2
+        assert "a.mp4 is itself a recording and would be replaced" in capsys.readouterr().err
+    assert [path.read_bytes() for path in videos] == before
+    assert sorted(folder.iterdir()) == videos
+
+
+def pcm(seconds: float) -> bytes:
+    samples = 3000 * np.random.default_rng(0).normal(size=round(16000 * seconds))
+    return samples.clip(-32767, 32767).astype("<i2").tobytes()
+
+
+def stream_words(checkpoint: Path, output: object) -> list[str]:
+    words = ["animate", "-", "--stream", "--checkpoint", str(checkpoint), "-o", str(output)]
+    return [sys.executable, "-m", "facediff", *words]
+
+
+def streamed(samples: bytes, checkpoint: Path, output: Path, *words: str) -> int:
+    """The command in this process, with samples from a file as its standard input."""
+    source = output.with_suffix(".pcm")
+    source.write_bytes(samples)
+    with source.open() as stdin, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdin", stdin)
+        status = main([*stream_words(checkpoint, output)[3:], *words])
+    source.unlink()
+    return status
+
+
+def test_half_precision_is_the_same_for_a_stream(checkpoint: Path, tmp_path: Path) -> None:
+    """The style is encoded in it as well."""
+    speech = tmp_path / "s.wav"
+    soundfile.write(speech, np.frombuffer(pcm(10.5), "<i2"), 16000)
+    half = ["--precision", "bf16"]
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "file.npy", *half) == 0
+    assert streamed(pcm(10.5), checkpoint, tmp_path / "stream.npy", *half) == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "stream.npy"), np.load(tmp_path / "file.npy"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_ctrl_c_ends_the_speech_and_what_was_said_is_kept(checkpoint: Path, tmp_path: Path) -> None:
+    """A microphone has no other end."""
+    words = stream_words(checkpoint, tmp_path / "live.npy")
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        assert b"look-ahead" in process.stderr.readline()
+        process.stdin.write(pcm(2))
+        process.stdin.flush()
+        time.sleep(1)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+        assert b"2.00 s of speech" in process.stderr.read()
+    assert np.load(tmp_path / "live.npy").shape == (50, 24, 3)
+    assert [path.name for path in tmp_path.iterdir()] == ["live.npy"]
+
+
+def test_a_renderer_that_ends_ends_the_stream(checkpoint: Path) -> None:
+    with subprocess.Popen(
+        stream_words(checkpoint, "-"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        process.stdout = None
+        _, told = process.communicate(pcm(6))
+    assert process.returncode == 141
+    assert len(told.splitlines()) == 1  # the look-ahead
+
+
+@pytest.mark.parametrize("rate", ["16000", "44100"])
+def test_a_stream_of_nothing(rate: str, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert streamed(b"", checkpoint, tmp_path / "x.npy", "--rate", rate) == 2
+    assert "ended before any sample came" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_closed_standard_input(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    assert main(stream_words(checkpoint, "x.npy")[3:]) == 2
+    assert "standard input is closed" in capsys.readouterr().err
+
+
+def test_a_microphone_gives_what_the_file_gives(checkpoint: Path, tmp_path: Path) -> None:
+    """A real pipe: the file's samples, a few at a time."""
+    samples = (0.1 * np.random.default_rng(0).normal(size=16000 * 11)).clip(-1, 1)
+    speech = write(tmp_path / "speech.wav", samples)
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "file.npy") == 0
+    pcm = soundfile.read(speech, dtype="int16")[0].astype("<i2").tobytes()
+    words = [sys.executable, "-m", "facediff", "animate", "-", "--stream", "--checkpoint", str(checkpoint), "-o"]
+    with subprocess.Popen(
+        [*words, "-"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert b"look-ahead 4.50 s" in process.stderr.readline()
+        process.stdin.write(pcm[: 2 * 16000 * 6])
+        process.stdin.flush()
+        # Two windows of 4 s, 1 s shared, are certain after 6 s but for what they share: a frame comes before the end.
+        early = process.stdout.read(75 * 24 * 12)
+        process.stdin.write(pcm[2 * 16000 * 6 :])
+        process.stdin.close()
+        late = process.stdout.read()
+        assert process.wait(60) == 0
+        assert b"real-time factor" in process.stderr.read()
+    streamed = np.frombuffer(early + late, "<f4").reshape(-1, 24, 3)
+    np.testing.assert_array_equal(streamed, np.load(tmp_path / "file.npy"))
+    odd = subprocess.run([*words, str(tmp_path / "s.npy"), "--rate", "22050"], input=pcm[:66151], capture_output=True)
+    assert odd.returncode == 0, odd.stderr
+    assert np.load(tmp_path / "s.npy").shape == (round(33075 / 22050 * 25), 24, 3)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["x.wav", "--stream", "-o", "x.npy"], "give - in place of x.wav"),
+        (["-", "--stream", "-o", "x.mp4"], "a stream is written as .npy"),
+        (["-", "--stream", "-o", "x.npy", "--sway"], "--sway: needs the whole performance"),
+        (["-", "--stream", "-o", "x.npy", "--takes", "2"], "--takes: needs the whole performance"),
+        (["-", "--stream", "-o", "x.npy", "--rate", "16"], "--rate 16"),
+        (["-", "--stream", "-o", "x.npy", "--seed", "-1"], "--seed -1: expected 0 or more"),
+        (["-", "-o", "x.npy"], "add --stream"),
+    ],
+)
+def test_streams_that_cannot_be(
+    words: list[str], sentence: str, checkpoint: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["animate", *words, "--checkpoint", str(checkpoint)]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_a_file_sent_as_samples_is_noticed(checkpoint: Path, speech: Path, tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "facediff", "animate", "-", "--stream", "--checkpoint", str(checkpoint)]
+    done = subprocess.run([*words, "-o", str(tmp_path / "x.npy")], input=speech.read_bytes(), capture_output=True)
+    assert done.returncode == 2
+    assert b"holds a sound file, not samples" in done.stderr
+    assert not (tmp_path / "x.npy").exists()
+
+
+def test_a_folder_of_recordings(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One bad recording does not stop the others, and what is there is not made again."""
+    (tmp_path / "in").mkdir()
+    rng = np.random.default_rng(1)
+    for name in ("a", "b"):
+        write(tmp_path / "in" / f"{name}.wav", 0.1 * rng.normal(size=16000))
+    (tmp_path / "in" / "c.wav").write_text("no sound")
+    words = [tmp_path / "in", "--checkpoint", checkpoint, "-o", tmp_path / "out", "--suffix", ".npz", "--workers", "1"]
+    assert animate(*words) == 1
+    told = capsys.readouterr()
+    assert "not a readable sound file" in told.out + told.err
+    assert {path.name for path in (tmp_path / "out").glob("*.npz")} == {"a.npz", "b.npz"}
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.npz")}
+    write(tmp_path / "in" / "c.wav", 0.1 * rng.normal(size=16000))
+    assert animate(*words) == 0
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
+    assert (tmp_path / "out" / "c.npz").is_file()
+    assert animate(*words[:-4], "--suffix", ".obj") == 2
+    assert "a batch writes one file for each recording" in capsys.readouterr().err
+
+
+def test_takes_are_carried_to_another_mesh_by_one_correspondence(
+    speech: Path, checkpoint: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import facediff.editing.correspondence
+
+    found = []
+    correspond = facediff.editing.correspondence.correspond
+    monkeypatch.setattr(
+        facediff.editing.correspondence, "correspond", lambda *a, **k: found.append(1) or correspond(*a, **k)
+    )
+    words = ["--takes", 2, "--target-mesh", tiny_root / "tiny.ply"]
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "t.npy", *words) == 0
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "own.npy", "--takes", 2) == 0
+    assert len(found) == 1
+    template = load_model(checkpoint).assets.templates["A"].numpy()
+    rest = read_mesh(tiny_root / "tiny.ply").vertices
+    for animation in (1, 2):
+        carried, own = np.load(tmp_path / f"t_take{animation}.npy"), np.load(tmp_path / f"own_take{animation}.npy")
+        moved, wanted = carried - rest, own - template
+        # The same topology of nearly the same face: nearly the same motion, and another one for each take.
+        assert np.abs(moved - wanted).max() < 0.25 * np.abs(wanted).max()
+    assert not np.array_equal(np.load(tmp_path / "t_take1.npy"), np.load(tmp_path / "t_take2.npy"))

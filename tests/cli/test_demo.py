@@ -1,0 +1,41 @@
+"""The demo from end to end."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from facediff.callbacks.outputs import METHOD_NAMES
+
+
+def run_demo(folder: Path, *words: str) -> dict[tuple[str, str], float]:
+    """The LVE of each split and method that the demo prints and writes."""
+    done = subprocess.run(
+        [sys.executable, "-m", "facediff", "demo", "-o", str(folder / "demo"), *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=folder,
+        env={**os.environ, "FACEDIFF_CACHE": str(folder / "cache")},
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "SYNTHETIC corpus puppet" in done.stdout
+    assert all(name in done.stdout for name in METHOD_NAMES.values())
+    for file in ("truth_and_prediction_test_a.mp4", "truth_and_prediction_test_b.mp4", "puppet.ckpt"):
+        assert (folder / "demo" / file).stat().st_size > 10_000
+    with (folder / "demo" / "test_scores.csv").open() as stream:
+        return {(row["split"], row["method"]): float(row["lve"]) for row in csv.DictReader(stream)}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_demo_learns_to_speak(tmp_path: Path) -> None:
+    lve = run_demo(tmp_path)
+    assert lve["test_a", "model"] <= 0.5 * lve["test_a", "still"]
+    assert lve["test_a", "model"] <= 0.6 * lve["test_a", "shuffled"]
+    assert lve["test_b", "model"] < lve["test_b", "still"]

@@ -1,0 +1,271 @@
+"""``facediff figure`` from words to files, and what it says where something does not fit."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pickle
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from facediff.cli.app import main
+from facediff.cli.figure import FIGURES as KNOWN
+from facediff.cli.figure import gather, named_folders, parser
+from facediff.errors import FaceDiffError
+from tests.fakes.tiny import VERTICES
+
+ROOT = Path(__file__).parents[2]
+TINY = ["--topology", "tests.fakes.tiny.Tiny"]
+SMALL = ["--width", "85", "--dpi", "80"]
+FIGURES = ("frames", "heatmap", "error", "lips", "training")
+PHONEMES = "start,end,ipa,viseme\n0,0.10,,SIL\n0.10,0.20,m,PP\n0.20,0.30,ˈɑː,AA\n0.30,0.9,f,FF\n"
+
+
+@pytest.fixture
+def corpus(tiny_root: Path, tmp_path: Path) -> Path:
+    root = shutil.copytree(tiny_root, tmp_path / "corpus")
+    (root / "phonemes").mkdir()
+    for clip in ("A_e06", "A_e07"):
+        (root / "phonemes" / f"{clip}.csv").write_text(PHONEMES, encoding="utf-8")
+    for name, moved in (("ours", 0.001), ("theirs", 0.004)):
+        (tmp_path / name).mkdir()
+        for clip in ("A_e06", "A_e07"):
+            truth = np.load(root / "vertices_npy" / f"{clip}.npy")
+            np.save(tmp_path / name / f"{clip}_condition_A.npy", truth + np.float32(moved))
+    (tmp_path / "run").mkdir()
+    rows = [f"{step},{step},{1 / (step + 1)}" for step in range(30)]
+    (tmp_path / "run" / "metrics.csv").write_text("\n".join(["epoch,step,train/loss", *rows]))
+    return root
+
+
+def words(figure: str, corpus: Path, *more: str) -> list[str]:
+    folder = corpus.parent
+    files = [str(folder / "ours"), str(corpus), "--method", f"other={folder / 'theirs'}", *TINY]
+    given = {
+        "frames": [*files, "--phonemes", "m", "ɑː"],
+        "heatmap": files,
+        "error": files,
+        "lips": files,
+        "training": [f"one={folder / 'run'}", f"two={folder / 'run' / 'metrics.csv'}"],
+    }[figure]
+    return ["figure", figure, *given, *SMALL, *([] if "-o" in more else ["-o", str(folder / "figure.png")]), *more]
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_every_figure(figure: str, corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words(figure, corpus)) == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert told.out == f"written: {corpus.parent / 'figure.png'}\n"
+    with Image.open(corpus.parent / "figure.png") as picture:
+        assert picture.size[0] == round(85 / 25.4 * 80)
+
+
+def test_in_a_process_of_its_own(corpus: Path, tmp_path: Path) -> None:
+    given = words("frames", corpus, "--close-up", "-o", "out/figure.pdf")
+    run = subprocess.run(
+        [sys.executable, "-W", "error", "-m", "facediff", *given],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert (run.returncode, run.stdout) == (0, "written: out/figure.pdf\n"), run.stderr
+    assert (tmp_path / "out" / "figure.pdf").read_bytes().startswith(b"%PDF")
+
+
+def options(corpus: Path, *more: str) -> argparse.Namespace:
+    """The options as the command has them, for `gather`."""
+    return parser("frames").parse_args([str(corpus.parent / "ours"), str(corpus), "-o", "a.png", *more])
+
+
+def test_what_lies_beside_the_files_is_found(corpus: Path) -> None:
+    material = gather(options(corpus, *TINY))
+    assert (material.n_vertices, material.rate, material.truth_stride) == (VERTICES, 25.0, 1)
+    assert (material.unit, material.remark, material.corpus) == ("m", "tiny: synthetic corpus", corpus)
+    assert material.names == ["truth", "ours"]
+    assert material.choose() == ["A_e06", "A_e07"]
+    assert material.faces is not None
+    assert set(material.templates) == {"A", "B", "C"}
+
+
+def test_a_truth_of_twice_the_frame_rate(corpus: Path) -> None:
+    (corpus / "manifest.json").write_text('{"frame_rate": 50, "unit": "cm"}')
+    material = gather(options(corpus, *TINY))
+    assert (material.rate, material.truth_stride, material.unit) == (25.0, 2, "cm")
+    assert gather(options(corpus, *TINY, "--frame-rate", "50")).truth_stride == 1
+    assert gather(options(corpus, *TINY, "--truth-stride", "3")).truth_stride == 3
+    with pytest.raises(FaceDiffError, match="no whole multiple"):
+        gather(options(corpus, *TINY, "--frame-rate", "30"))
+
+
+def test_folders_that_are_no_corpus(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Plain folders and files given by hand do as well as a corpus."""
+    truth, mesh = tmp_path / "plain", tmp_path / "face.obj"
+    shutil.copytree(corpus / "vertices_npy", truth)
+    trimesh.load(corpus / "tiny.ply", process=False).export(mesh)
+    base = ["figure", "frames", str(tmp_path / "ours"), str(truth), "--clip", "A_e06", *SMALL]
+    base += ["-o", str(tmp_path / "a.png"), "--times", "0.1"]
+    assert main(base) == 2
+    assert "give --mesh" in capsys.readouterr().err
+    assert main([*base, "--mesh", str(mesh)]) == 2
+    assert "give --frame-rate" in capsys.readouterr().err
+    assert main([*base, "--mesh", str(mesh), "--frame-rate", "25"]) == 0
+    given = ["--templates", str(corpus / "templates.pkl"), "--mesh", str(mesh)]
+    assert main(["figure", "heatmap", str(tmp_path / "ours"), str(truth), "-o", str(tmp_path / "b.png"), *given]) == 0
+    lips = ["figure", "lips", str(tmp_path / "ours"), str(truth), "-o", str(tmp_path / "c.svg"), "--frame-rate", "25"]
+    assert main([*lips, "--lip-pairs", "0-6,1-7"]) == 0
+    assert "note: there is no sound of A_e06; give --audio" in capsys.readouterr().out
+    table, sound = corpus / "phonemes" / "A_e06.csv", corpus / "wav" / "A_e06.wav"
+    assert main([*lips, "--lip-pairs", "0-6", "--phoneme-file", str(table), "--audio", str(sound)]) == 0
+    text = (tmp_path / "c.svg").read_text(encoding="utf-8")
+    assert "ɑː" in text
+    assert "sound" in text
+
+
+def test_lengths_that_differ_are_noted(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = corpus.parent / "ours" / "A_e06_condition_A.npy"
+    np.save(path, np.load(path)[:9])
+    assert main(words("lips", corpus)) == 0
+    told = capsys.readouterr().out
+    assert "note: A_e06: lengths differ (truth 24, ours 9, other 24 frames): cut to the first 9" in told
+    assert main(words("frames", corpus, "--clip", "A_e06", "--phonemes", "f")) == 2
+    assert "ours lasts from 0 to 0.36 s" in capsys.readouterr().err
+
+
+def test_values_that_cannot_be_drawn_are_noted(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = corpus.parent / "run" / "metrics.csv"
+    table.write_text("epoch,step,train/loss\n0,0,nan\n0,1,inf\n0,2,-1\n0,3,2\n")
+    assert main(words("training", corpus)) == 0
+    told = capsys.readouterr().out
+    assert "note: one: 2 of 4 values of train/loss are NaN or infinity and not drawn\n" in told
+    assert main(words("training", corpus, "--log")) == 0
+    told = capsys.readouterr().out
+    assert "note: two: 3 of 4 values of train/loss are NaN, infinity or not above 0 and not drawn\n" in told
+
+
+WRONG = {
+    "unknown figure": (["figure", "frame"], 'did you mean "frames"'),
+    "unknown suffix": (["error", "-o", "a.jpg"], "expected one of .png, .pdf, .svg"),
+    "unknown clip": (["frames", "--clip", "A_e66"], 'did you mean "A_e06"'),
+    "unknown clips": (["heatmap", "--clips", "A_e06", "nobody"], 'no clip "nobody"'),
+    "clip without prediction": (["lips", "--clip", "B_e01"], 'ours has no prediction of clip "B_e01"'),
+    "phoneme not spoken": (["frames", "--phonemes", "z"], '"z": not spoken in clip A_e06: known are m, ɑː, f'),
+    "times and phonemes": (["frames", "--times", "0.1"], "either --times or --phonemes"),
+    "mesh of another topology": (["error", "--mesh", "{other}"], "has 4 vertices, the motion 24"),
+    "mesh not there": (["error", "--mesh", "gone.ply"], "no such mesh file"),
+    "unknown topology": (["error", "--topology", "biwy"], 'did you mean "biwi"'),
+    "wrong topology": (["error", "--topology", "biwi"], "expected"),
+    "method named twice": (["error", "--method", "ours={ours}"], 'already one called "ours"'),
+    "method without folder": (["error", "--method", "x=gone"], "gone: no such folder"),
+    "method called truth": (["error", "--method", "truth={ours}"], 'cannot be called "truth"'),
+    "condition not there": (["error", "--identity", "B"], "under the condition B"),
+    "scale without extent": (["error", "--highest-mean", "0"], "above 0"),
+    "width": (["error", "--width", "5"], "--width 5"),
+    "too many pixels": (["error", "--width", "30", "--dpi", "50"], "raise --width or --dpi"),
+    "pairs": (["lips", "--lip-pairs", "3-900"], "--lip-pairs 3-900"),
+    "span": (["lips", "--span", "3", "1"], "--span 3 1"),
+    "span without a frame": (["lips", "--span", "0.03", "0.05"], "the middle of no frame lies in it"),
+    "audio": (["lips", "--audio", "gone.wav"], "gone.wav: no such sound file"),
+    "phoneme file": (["lips", "--phoneme-file", "gone.csv"], "gone.csv: not readable as phonemes"),
+    "rate": (["lips", "--frame-rate", "-3"], "--frame-rate -3"),
+    "rate of zero": (["error", "--frame-rate", "0"], "--frame-rate 0"),
+    "truth not there": (["figure", "error", "ours", "gone", "-o", "a.png"], "gone: no such folder"),
+    "truth without files": (["figure", "error", "ours", "run", "-o", "a.png"], "run: holds no .npy file"),
+    "stride": (["lips", "--truth-stride", "0"], "--truth-stride 0"),
+    "run": (["figure", "training", "gone", "-o", "a.png"], "metrics.csv: no such file"),
+    "scalar": (["training", "--scalar", "train/los"], 'did you mean "train/loss"'),
+    "smoothing": (["training", "--smooth", "1"], "--smooth 1"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_does_not_fit_is_one_sentence(
+    case: str, corpus: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(corpus.parent)
+    other = corpus.parent / "other.ply"
+    trimesh.Trimesh(np.eye(4)[:, :3], [[0, 1, 2], [1, 2, 3]], process=False).export(other)
+    (figure, *more), message = WRONG[case]
+    more = [word.format(other=other, ours=corpus.parent / "ours") for word in more]
+    given = [figure, *more] if figure == "figure" else words(figure, corpus, *more)
+    before = sorted(corpus.parent.rglob("*"))
+    assert main(given) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("facediff: error: ")
+    assert message in told.err
+    assert told.err.count("\n") == 1
+    assert sorted(corpus.parent.rglob("*")) == before
+
+
+def test_missing_pieces_of_a_corpus(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (corpus / "regions" / "inner_lip_pairs.txt").unlink()
+    shutil.rmtree(corpus / "phonemes")
+    (corpus / "templates.pkl").write_bytes(pickle.dumps({"B": np.zeros((VERTICES, 3))}))
+    for figure, message in (
+        ("lips", "inner_lip_pairs.txt: no such file; give --lip-pairs"),
+        ("frames", "give --phoneme-file"),
+        ("heatmap", "no template of A, needed by clip A_e06; there are templates of B"),
+    ):
+        assert main(words(figure, corpus)) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_the_built_in_corpus_by_name(
+    corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from facediff.data.puppet import cache_root
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
+    given = ["figure", "error", "ours", "puppet", *TINY, *SMALL, "-o", "a.png"]
+    assert main(given) == 2
+    assert "`facediff demo` makes it" in capsys.readouterr().err
+    cache_root(0).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copytree(corpus, cache_root(0))
+    assert main(given) == 0
+
+
+def test_folders_by_name(tmp_path: Path) -> None:
+    (tmp_path / "a=b").mkdir()
+    found = named_folders([f"{tmp_path}/a=b", "x=y=z"], lambda path: path.name)
+    assert found == {"a=b": tmp_path / "a=b", "x": Path("y=z")}
+    for word in ("=y", "x="):
+        with pytest.raises(FaceDiffError, match="NAME=FOLDER"):
+            named_folders([word], lambda path: path.name)
+
+
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["figure"]) == 2
+    assert main(["figure", "--help"]) == 0
+    told = capsys.readouterr().out
+    assert all(f"  {name} " in told for name in FIGURES)
+    for name in FIGURES:
+        with pytest.raises(SystemExit) as stop:
+            main(["figure", name, "--help"])
+        assert stop.value.code == 0
+        assert "--output" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/figures.md"])
+def test_documented_commands_parse(page: str) -> None:
+    lines = re.findall(
+        r"^(?:\$ )?facediff figure (?!FIGURE)(.*)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert len(lines) >= 3
+    for line in lines:
+        figure, *rest = shlex.split(line)
+        assert parser(figure).parse_args(rest).output
+    if page != "README.md":
+        assert {shlex.split(line)[0] for line in lines} == set(KNOWN)

@@ -1,0 +1,297 @@
+"""fit, validate, test and predict from the command line."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from facediff.cli.app import main
+from facediff.models import load_model
+from tests.cli.conftest import SMALL
+
+Fit = Callable[..., int]
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def test_a_decoder_is_swapped_by_name(fitted: Path, checkpoint: Path) -> None:
+    config = yaml.safe_load((fitted / "config.yaml").read_text())
+    decoder = config["model"]["init_args"]["decoder"]
+    assert decoder["class_path"] == "facediff.registry.decoder.gru"
+    assert decoder["init_args"]["num_layers"] == 1
+    assert type(load_model(checkpoint).network.decoder).__name__ == "gru"
+    assert (fitted / "metrics.csv").is_file()
+
+
+def test_a_checkpoint_of_the_command_line_is_plain_data(checkpoint: Path) -> None:
+    loaded = torch.load(checkpoint, weights_only=True)
+    assert loaded["hyper_parameters"]["identities"] == ["A", "B"]
+    assert "current_model_state" in loaded
+
+
+def test_a_saved_config_runs_again(fitted: Path, fit: Fit, tmp_path: Path) -> None:
+    status = fit(f"--trainer.logger.save_dir={tmp_path}", config=str(fitted / "config.yaml"))
+    assert status == 0
+    again = yaml.safe_load((tmp_path / "puppet" / "version_0" / "config.yaml").read_text())
+    first = yaml.safe_load((fitted / "config.yaml").read_text())
+    assert again["model"] == first["model"]
+    assert again["data"] == first["data"]
+
+
+def test_test_takes_everything_from_the_checkpoint(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false"]) == 0
+    assert "protocol paper" in capsys.readouterr().out
+    assert len(list(tmp_path.glob("runs/test/version_0/test_scores.csv"))) == 1
+
+
+def test_a_config_of_the_users_is_not_overwritten(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run without a logger has no folder of its own to write its config to."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.yaml").write_text("mine")
+    words = ["validate", f"--ckpt_path={checkpoint}", "--trainer.enable_progress_bar=false", "--trainer.logger=false"]
+    assert main(words) == 0
+    assert (tmp_path / "config.yaml").read_text() == "mine"
+    assert main([*words, "--trainer.default_root_dir=there"]) == 0
+    assert "seed_everything" in (tmp_path / "there" / "config.yaml").read_text()
+
+
+def test_predict_writes_files(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["predict", f"--ckpt_path={checkpoint}", "--trainer.enable_progress_bar=false", "--model.sampler.steps=1"]
+    assert main(words) == 0
+    files = sorted(tmp_path.glob("runs/predict/version_0/predictions/*.npy"))
+    assert [f.name for f in files] == [f"{s}_e0{n}_condition_{s}.npy" for s in "AB" for n in (6, 7)]
+    assert np.load(files[0]).shape[1] == 72
+
+
+def test_flags_that_would_change_a_checkpoints_model_are_refused(
+    checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["test", "--ckpt_path", str(checkpoint), "--model.dim=32"]) == 2
+    assert "decides the model" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("ignore:The dirpath has changed")
+def test_training_resumes(fit: Fit, checkpoint: Path, tmp_path: Path) -> None:
+    words = [f"--trainer.logger.save_dir={tmp_path}", "--model.decoder=gru", "--model.decoder.num_layers=1"]
+    assert fit(*words, f"--ckpt_path={checkpoint}", "--trainer.max_epochs=2") == 0
+    resumed = torch.load(tmp_path / "puppet/version_0/checkpoints/last.ckpt", weights_only=True)
+    assert resumed["epoch"] == 1
+    assert resumed["global_step"] == 2 * torch.load(checkpoint, weights_only=True)["global_step"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--model.decoder=grru"], 'there is no decoder "grru": did you mean "gru"? known are gru'),
+        (["--model.fusion=cross"], 'there is no fusion "cross"'),
+        (["--model.audio_encoder=hubret"], 'did you mean "hubert"?'),
+        (["--model=DualPathDifusion"], 'did you mean "DualPathDiffusion"?'),
+        (["--data=Pupet"], 'did you mean "Puppet"?'),
+    ],
+)
+def test_a_wrong_name_lists_the_right_ones(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", "--config", "configs/experiment/puppet.yaml", *words])
+    assert stop.value.code == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_an_error_is_short_and_says_where_to_look(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit", "--config", "configs/experiment/puppet.yaml", "--model.decoder.num_layer=2"])
+    message = capsys.readouterr().err
+    assert "num_layer" in message
+    assert "--model.decoder.help=NAME" in message
+    assert len(message.splitlines()) < 15
+
+
+def test_scoring_without_a_checkpoint_says_what_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["test"]) == 2
+    assert "needs --ckpt_path" in capsys.readouterr().err
+
+
+def test_a_missing_hubert_is_one_sentence(fit: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = [f"--model.audio_encoder.source={tmp_path}/none", f"--trainer.logger.save_dir={tmp_path}"]
+    assert fit("--model.audio_encoder=hubert", *missing) == 2
+    assert f"no directory {tmp_path}/none" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_help_of_a_component(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", "--config", "configs/experiment/puppet.yaml", "--model.decoder.help=gru"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert "num_layers" in text
+    assert "style_dim" not in text
+
+
+def print_config(*words: str, capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", *words, "--print_config"])
+    assert stop.value.code == 0
+    return yaml.safe_load(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    "words", [["--model.sampler=ddpm", "--model.decoder=gru"], ["--model.sampler", "ddpm", "--model.decoder", "gru"]]
+)
+def test_a_component_chosen_by_name_starts_from_its_own_defaults(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--config", "configs/experiment/puppet.yaml", *words, "--model.decoder.dropout=0.3"]
+    model = print_config(*words, capsys=capsys)["model"]["init_args"]  # type: ignore[index]
+    assert model["sampler"]["init_args"] == {"steps": None}
+    assert model["decoder"]["init_args"] == {"num_layers": 2, "bidirectional": True, "dropout": 0.3}
+
+
+@pytest.mark.parametrize("config", sorted(path.name for path in (CONFIGS / "experiment").glob("*.yaml")))
+def test_every_shipped_experiment_is_parsed(config: str, capsys: pytest.CaptureFixture[str]) -> None:
+    printed = print_config("--config", f"configs/experiment/{config}", capsys=capsys)
+    assert printed["model"]["init_args"]["dim"]  # type: ignore[index]
+
+
+def test_configs_are_short() -> None:
+    assert all(len(path.read_text().splitlines()) <= 30 for path in CONFIGS.rglob("*.yaml"))
+
+
+def test_sub_configs_and_interpolation_with_a_flag_over_a_file(
+    fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "decoder.yaml").write_text("class_path: gru\ninit_args: {num_layers: 3}\n")
+    (tmp_path / "mine.yaml").write_text(
+        "model:\n  class_path: DualPathDiffusion\n  init_args:\n    decoder: decoder.yaml\n"
+        "    warmup_steps: ${trainer.max_epochs}\ndata: Puppet\ntrainer: {max_epochs: 7, accelerator: cpu}\n"
+    )
+    assert fit("--trainer.max_epochs=2", config=str(tmp_path / "mine.yaml")) == 0
+    (made,) = tmp_path.glob("runs/fit/version_0/checkpoints/*.ckpt")
+    hparams = torch.load(made, weights_only=True)["hyper_parameters"]
+    assert hparams["decoder"]["init_args"]["num_layers"] == 3
+    # The file says 7; the flag must win also where its value is interpolated.
+    assert hparams["warmup_steps"] == 2
+
+
+def test_wandb_offline_asks_nothing(fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("wandb")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    logger = ["--config", "configs/logger/wandb.yaml"]
+    assert fit(*logger) == 0
+    assert len(list(tmp_path.glob("runs/wandb/offline-run-*/*.wandb"))) == 1
+    assert (tmp_path / "runs/experiment/version_0/checkpoints/best.ckpt").exists()
+
+
+def test_two_processes_train_together(tiny_root: Path, tmp_path: Path) -> None:
+    words = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--data.batch_size=2", *SMALL]
+    ddp = ["--trainer.accelerator=cpu", "--trainer.devices=2", "--trainer.strategy=ddp"]
+    out = [f"--trainer.logger.save_dir={tmp_path}"]
+    done = subprocess.run(
+        [sys.executable, "-m", "facediff", "fit", "--config", "configs/experiment/puppet.yaml", *words, *ddp, *out],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "world_size: 2" in done.stdout + done.stderr or "MEMBER: 2/2" in done.stdout + done.stderr
+    run = tmp_path / "puppet" / "version_0" / "checkpoints"
+    # Eight training clips, two clips a batch, two processes: two steps.
+    assert torch.load(run / "last.ckpt", weights_only=True)["global_step"] == 2
+    load_model(run / "best.ckpt")
+
+
+def test_three_processes_score_as_one_does(
+    checkpoint: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four clips of test A and two of test B: neither number fits three processes, and one of them gets no clip.
+
+    With the sampler that adds noise all the way: it must not depend on which clips share a batch.
+    """
+    words = ["test", "--ckpt_path", str(checkpoint), "--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}"]
+    words += ["--model.sampler=ddpm", "--model.sampler.steps=3", "--trainer.enable_progress_bar=false"]
+    ddp = ["--trainer.accelerator=cpu", "--trainer.devices=3", "--trainer.strategy=ddp"]
+    (tmp_path / "one").mkdir()
+    (tmp_path / "three").mkdir()
+    monkeypatch.chdir(tmp_path / "one")
+    assert main([*words, "--data.batch_size=3"]) == 0
+    done = subprocess.run(
+        [sys.executable, "-m", "facediff", *words, *ddp, "--data.batch_size=2"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path / "three",
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"},
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    for name in ("test_scores.csv", "test_sequences.csv"):
+        (mine,) = (tmp_path / "one").rglob(name)
+        (theirs,) = (tmp_path / "three").rglob(name)
+        one, three = (list(csv.DictReader(path.read_text().splitlines())) for path in (mine, theirs))
+        # Two splits by three methods; four clips of test A and two of test B, each with three methods.
+        assert len(one) == len(three) == {"test_scores.csv": 6, "test_sequences.csv": 18}[name]
+        for row, other in zip(one, three, strict=True):
+            for column, value in row.items():
+                if column in ("mve", "lve", "fdd"):
+                    assert float(other[column]) == pytest.approx(float(value), rel=1e-5)
+                else:
+                    assert other[column] == value
+
+
+def test_the_rows_of_the_sequences_add_up_to_the_scores(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false"]) == 0
+    tables = {}
+    for name in ("test_scores.csv", "test_sequences.csv"):
+        (path,) = tmp_path.rglob(name)
+        tables[name] = list(csv.DictReader(path.read_text().splitlines()))
+    for total in tables["test_scores.csv"]:
+        keys = ("split", "method")
+        rows = [row for row in tables["test_sequences.csv"] if all(row[key] == total[key] for key in keys)]
+        frames = np.array([int(row["frames"]) for row in rows])
+        assert frames.sum() == int(total["frames"])
+        for name in ("mve", "lve"):
+            values = np.array([float(row[name]) for row in rows])
+            assert (values * frames).sum() / frames.sum() == pytest.approx(float(total[name]), rel=1e-9)
+        assert np.mean([float(row["fdd"]) for row in rows]) == pytest.approx(float(total["fdd"]), rel=1e-9)
+
+
+def test_wandb_gets_the_sequences_and_the_protocol(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wandb = pytest.importorskip("wandb")
+    monkeypatch.chdir(tmp_path)
+    wandb.finish()  # another test's run in this process
+    logged: dict[str, object] = {}
+    original = wandb.Table
+
+    class Spy(original):  # type: ignore[misc,valid-type]
+        def __init__(self, columns: list[str], data: list[list[object]], **options: object) -> None:
+            logged.update(columns=columns, rows=len(data))
+            super().__init__(columns=columns, data=data, **options)
+
+    monkeypatch.setattr(wandb, "Table", Spy)
+    logger = ["--trainer.logger=lightning.pytorch.loggers.WandbLogger", f"--trainer.logger.save_dir={tmp_path}"]
+    words = ["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false", *logger]
+    assert main(words) == 0
+    wandb.finish()
+    columns = ["split", "method", "clip", "identity", "frames", "mve", "lve", "fdd", "audio", "error"]
+    assert logged == {"columns": columns, "rows": 18}

@@ -1,0 +1,183 @@
+"""The words of --style: one style, mixtures, motions of people whom the checkpoint does not know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from facediff import registry
+from facediff.animation import Animation, write_archive
+from facediff.data import Reference
+from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion, Style
+from facediff.models.styles import Weighted, read_style, read_styles, split_styles, style_paths
+from tests.fakes.tiny import Tiny
+
+
+@pytest.fixture
+def model(tiny: Tiny, make_model: Callable[..., DualPathDiffusion]) -> DualPathDiffusion:
+    tiny.setup("fit")
+    made = make_model()
+    made.adopt(tiny.assets().with_motion_scale(50.0))
+    return made.eval()
+
+
+def vector(style: Reference | Style, model: DualPathDiffusion) -> np.ndarray:
+    if isinstance(style, Style):
+        return style.vector.numpy()
+    motion = style.motion.float()[None]
+    with torch.inference_mode():
+        return model.encode_style(motion, torch.ones(motion.shape[:2], dtype=torch.bool))[0].numpy()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("F1_e03", [("F1_e03", None)]),
+        ("a.npy:0.3,b.npy:0.7", [("a.npy", 0.3), ("b.npy", 0.7)]),
+        (r"C:\ann\x.npy", [(r"C:\ann\x.npy", None)]),
+        (r"C:\ann\x.npy:-.5,D:/y.npy:1.5e0", [(r"C:\ann\x.npy", -0.5), ("D:/y.npy", 1.5)]),
+        ("take:2.npy, other.npz : 2", [("take:2.npy", None), ("other.npz", 2.0)]),
+        ("a,b,c", [("a", None), ("b", None), ("c", None)]),
+    ],
+)
+def test_weights_are_read_from_the_right(words: str, expected: list[tuple[str, float | None]]) -> None:
+    assert split_styles(words) == [Weighted(*pair) for pair in expected]
+
+
+def test_what_is_a_file_or_a_clip_as_a_whole_is_one_style(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "one, two.npy").touch()
+    assert split_styles("one, two.npy") == [Weighted("one, two.npy", None)]
+    assert split_styles("A:7", ["A:7"]) == [Weighted("A:7", None)]
+    assert split_styles("A:7") == [Weighted("A", 7.0)]
+    assert style_paths("one, two.npy") == [Path("one, two.npy")]
+    assert style_paths("F1_e03:0.5,none.npy:0.5") == []
+    assert style_paths(None) == []
+
+
+def test_a_mixture_is_the_weighted_mean_of_style_vectors(
+    model: DualPathDiffusion, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clips = {name: reference.clip for name, reference in model.assets.references.items()}
+    a, b = (vector(model.assets.references[name], model) for name in ("A", "B"))
+    own = np.linspace(-1, 1, len(a), dtype=np.float32)
+    np.save(tmp_path / "own.npy", own)
+
+    mixed = read_styles(f"{clips['A']}:0.25,{clips['B']}:0.5,{tmp_path / 'own.npy'}:0.25", "A", model)
+    assert isinstance(mixed, Style)
+    np.testing.assert_allclose(mixed.vector, 0.25 * a + 0.5 * b + 0.25 * own, atol=1e-5)
+    assert mixed.name == f"0.25 {clips['A']} + 0.5 {clips['B']} + 0.25 own"
+    assert not capsys.readouterr().out
+    beyond = read_styles(f"{clips['A']}:3,{clips['B']}:-1", "A", model)
+    np.testing.assert_allclose(vector(beyond, model), 1.5 * a - 0.5 * b, atol=1e-5)
+    assert capsys.readouterr().out == "note: --style: weights are divided by their sum: 1.5, -0.5\n"
+    alike = read_styles(f"{clips['A']},{clips['B']}", "A", model)
+    np.testing.assert_allclose(vector(alike, model), (a + b) / 2, atol=1e-5)
+    speech = torch.randn(16_000, generator=torch.Generator().manual_seed(0)) * 0.1
+    assert torch.isfinite(model.animate(speech, subject="A", style=beyond).vertices).all()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("A_e01:1,B_e01:-1", "whose sum is not 0"),
+        ("A_e01:inf,B_e01:1", "expected finite weights"),
+        ("A_e01:0.3,B_e01", "give every style a weight"),
+        ("A_e01:0.3", "one style alone cannot be weighted"),
+        ("A_e01:0.3,", "expected names or files with weights"),
+        (":0.3,A_e01:1", "expected names or files with weights"),
+        ("A_e01:0.5,nobody.npy:0.5", "--style nobody.npy: no such file"),
+    ],
+)
+def test_words_that_make_no_style(words: str, sentence: str, model: DualPathDiffusion) -> None:
+    with pytest.raises(FaceDiffError) as caught:
+        read_styles(words, "A", model)
+    assert sentence in str(caught.value)
+
+
+def test_a_checkpoint_without_a_style_says_so(tiny: Tiny, make_model: Callable[..., DualPathDiffusion]) -> None:
+    tiny.setup("fit")
+    model = make_model(style_encoder=registry.style_encoder.none)
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    with pytest.raises(FaceDiffError, match="trained without a dynamic style"):
+        read_styles("A_e01", "A", model)
+
+
+@pytest.fixture
+def unseen(model: DualPathDiffusion, tmp_path: Path) -> tuple[Path, np.ndarray, np.ndarray]:
+    """B's motion on a face that nobody knows: file, template, offsets."""
+    offsets = model.assets.references["B"].motion.float().numpy()
+    face = np.asarray(model.assets.templates["B"]) * [1.2, 0.9, 1.0] + [0.3, -0.2, 0.1]
+    np.save(tmp_path / "zoe.npy", (face + offsets).astype(np.float32))
+    return tmp_path / "zoe.npy", face, offsets
+
+
+@pytest.mark.parametrize("suffix", ["npy", "ply", "obj"])
+def test_a_stranger_lends_a_style_by_a_template_of_their_own(
+    suffix: str, unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, tmp_path: Path
+) -> None:
+    path, face, offsets = unseen
+    with pytest.raises(FaceDiffError, match="give that person's neutral face with --style-template"):
+        read_styles(str(path), "A", model)
+    template = tmp_path / f"neutral.{suffix}"
+    if suffix == "npy":
+        np.save(template, face)
+    else:
+        trimesh.Trimesh(face, [[0, 1, 6], [22, 23, 17]], process=False).export(template)
+    style = read_styles(str(path), "A", model, template=template)
+    assert isinstance(style, Reference)
+    np.testing.assert_allclose(style.motion, offsets, atol=2e-6)
+    other = model.assets.references["A"].clip
+    mixed = read_styles(f"{other}:0.5,{path}:0.5", "A", model, template=template)
+    halves = 0.5 * vector(model.assets.references["A"], model) + 0.5 * vector(style, model)
+    np.testing.assert_allclose(vector(mixed, model), halves, atol=1e-5)
+
+
+def test_a_take_brings_its_template_unit_and_frame_rate(
+    unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, tmp_path: Path
+) -> None:
+    _, face, offsets = unseen
+    twice = np.repeat(face + offsets, 2, axis=0) * 1000
+    animation = Animation("zoe", twice.astype(np.float32), (face * 1000).astype(np.float32), 50.0, unit="mm")
+    write_archive(tmp_path / "zoe.npz", animation)
+    style = read_style(str(tmp_path / "zoe.npz"), "A", model)
+    assert isinstance(style, Reference)
+    np.testing.assert_allclose(style.motion, offsets, atol=2e-6)
+    write_archive(tmp_path / "slow.npz", replace(animation, frame_rate=30.0))
+    with pytest.raises(FaceDiffError, match="has 30 frames a second, the checkpoint 25"):
+        read_style(str(tmp_path / "slow.npz"), "A", model)
+    moving = twice + 40.0 * np.sin(np.arange(len(twice)))[:, None, None]
+    write_archive(tmp_path / "moving.npz", replace(animation, vertices=moving.astype(np.float32)))
+    with pytest.raises(FaceDiffError, match="does not lie on its template: the head moves"):
+        read_style(str(tmp_path / "moving.npz"), "A", model)
+
+
+def test_the_median_stands_for_a_template_with_a_note(
+    unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, face, offsets = unseen
+    style = read_style(str(path), "A", model, template="median")
+    assert isinstance(style, Reference)
+    np.testing.assert_allclose(style.motion, offsets - np.median(offsets, axis=0), atol=2e-6)
+    assert "the median of its" in capsys.readouterr().out
+
+
+def test_templates_that_do_not_fit(
+    unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, tmp_path: Path
+) -> None:
+    path, face, _ = unseen
+    np.save(tmp_path / "small.npy", face[:20])
+    with pytest.raises(FaceDiffError, match=r"small.npy: has shape \(20, 3\); expected the neutral face of 24 finite"):
+        read_style(str(path), "A", model, template=tmp_path / "small.npy")
+    np.save(tmp_path / "far.npy", face + 1.0)
+    with pytest.raises(FaceDiffError, match="does not lie on its template"):
+        read_style(str(path), "A", model, template=tmp_path / "far.npy")
+    with pytest.raises(FaceDiffError, match="no such mesh file"):
+        read_style(str(path), "A", model, template=tmp_path / "none.obj")

@@ -1,0 +1,338 @@
+"""Every flaw, planted alone into a sound corpus, has its own finding; the sound corpus has none."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import trimesh
+
+from facediff.cli.data import check_run
+from tests.data.check.planting import (
+    CLIP,
+    FRAMES,
+    Bomb,
+    add_stranger,
+    change,
+    change_sound,
+    change_templates,
+    cut_bytes,
+    motion,
+    remove_training_clips,
+    set_rows,
+    silent_header,
+    sound,
+    swap_for_archive,
+    swap_for_broken_link,
+    swap_for_folder,
+    swap_for_pipe,
+    wide,
+    write_manifest,
+    write_region,
+)
+from tests.fakes.tiny import VERTICES, write_tiny
+
+
+@pytest.fixture(scope="module")
+def sound_corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("doctor") / "tiny")
+
+
+@pytest.fixture
+def root(sound_corpus: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(sound_corpus, tmp_path / "tiny")
+
+
+def examined(root: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict]:
+    """Exit status and report of the command."""
+    status = check_run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--json", *options])
+    return status, json.loads(capsys.readouterr().out)
+
+
+Plant = Callable[[Path], object]
+ERRORS: list[tuple[str, Plant, set[str], str]] = [
+    ("motion cut short", lambda r: cut_bytes(motion(r), 100), {"motion_unreadable"}, "cut short"),
+    ("motion of text", lambda r: motion(r).write_text("no motion\n" * 20), {"motion_unreadable"}, "not a readable"),
+    ("motion of no bytes", lambda r: motion(r).write_bytes(b""), {"motion_unreadable"}, "not a readable"),
+    ("motion header only", lambda r: motion(r).write_bytes(motion(r).read_bytes()[:60]), {"motion_unreadable"}, "copy"),
+    ("motion is a folder", lambda r: swap_for_folder(motion(r)), {"motion_unreadable"}, "no regular file"),
+    ("motion is a pipe", lambda r: swap_for_pipe(motion(r)), {"motion_unreadable"}, "no regular file"),
+    ("motion links nowhere", lambda r: swap_for_broken_link(motion(r)), {"motion_unreadable"}, "no regular file"),
+    ("motion is an archive", lambda r: swap_for_archive(motion(r)), {"motion_unreadable"}, "archive"),
+    ("motion of whole numbers", lambda r: change(motion(r), lambda a: a.astype(int)), {"motion_dtype"}, "int64"),
+    ("motion without frames", lambda r: change(motion(r), lambda a: a[:0]), {"motion_empty"}, "no frame"),
+    (
+        "one clip of another topology",
+        lambda r: change(motion(r), wide),
+        {"motion_shape", "mixed_vertex_counts"},
+        f"{VERTICES + 6} vertices",
+    ),
+    ("motion of no vertices", lambda r: change(motion(r), lambda a: a[:, :71]), {"motion_shape"}, "(26, 71)"),
+    (
+        "NaN frames",
+        lambda r: change(motion(r), lambda a: set_rows(a, [5, 9], np.nan)),
+        {"motion_not_finite"},
+        f"2 of {FRAMES} frames hold NaN or infinity, the first is frame 5",
+    ),
+    (
+        "infinite frame beyond the first chunk",
+        lambda r: change(motion(r), lambda a: set_rows(a, [20], np.inf)),
+        {"motion_not_finite"},
+        "1 of 26 frames hold NaN or infinity, the first is frame 20",
+    ),
+    ("still motion", lambda r: change(motion(r), lambda a: a[:1].repeat(FRAMES, 0)), {"motion_still"}, "never moves"),
+    (
+        "millimetres",
+        lambda r: change(motion(r), lambda a: 1000 * a),
+        {"motion_far_from_template"},
+        "times as large",
+    ),
+    (
+        "head motion",
+        lambda r: change(motion(r), lambda a: a + np.float32(0.04)),
+        {"motion_far_from_template"},
+        "head motion",
+    ),
+    (
+        "motion copied",
+        lambda r: shutil.copy(motion(r), motion(r, "B_e07")),
+        {"motion_copied"},
+        "vertices_npy/B_e07.npy",
+    ),
+    ("sound of no bytes", lambda r: sound(r).write_bytes(b""), {"sound_empty"}, "empty"),
+    ("sound of text", lambda r: sound(r).write_text("no sound\n" * 20), {"sound_unreadable"}, "not a readable"),
+    ("sound is a pipe", lambda r: swap_for_pipe(sound(r)), {"sound_unreadable"}, "no regular file"),
+    ("sound cut short", silent_header, {"sound_truncated"}, "20000 bytes are missing"),
+    ("silence", lambda r: change_sound(sound(r), np.zeros_like), {"sound_silent"}, "silent"),
+    (
+        "NaN in sound",
+        lambda r: change_sound(sound(r), lambda s: np.where(np.arange(len(s)) == 9, np.nan, s), "FLOAT"),
+        {"sound_not_finite"},
+        "not finite",
+    ),
+    ("speech of another clip", lambda r: change_sound(sound(r), lambda s: s[:6000]), {"length"}, "do not belong"),
+    (
+        "subject without template",
+        lambda r: change_templates(r, lambda t: t.pop("B") is None or t),
+        {"template_missing"},
+        "no template of B, needed by 7 clips",
+    ),
+    ("no templates", lambda r: (r / "templates.pkl").unlink(), {"templates_unreadable"}, "no such file"),
+    ("templates of text", lambda r: (r / "templates.pkl").write_text("x"), {"templates_unreadable"}, "not a pickle"),
+    ("templates in a list", lambda r: change_templates(r, lambda t: list(t)), {"templates_unreadable"}, "got list"),
+    (
+        "NaN in a template",
+        lambda r: change_templates(r, lambda t: t["A"].__setitem__((3, 1), np.nan)),
+        {"template_broken"},
+        "NaN or infinity in 1 vertex",
+    ),
+    (
+        "template of another topology",
+        lambda r: change_templates(r, lambda t: t.update(A=t["A"][:20])),
+        {"template_broken"},
+        "shape (20, 3), expected (24, 3)",
+    ),
+    (
+        "template of words",
+        lambda r: change_templates(r, lambda t: t.update(A="face")),
+        {"template_broken"},
+        "no array of numbers",
+    ),
+    ("mesh of text", lambda r: (r / "tiny.ply").write_text("ply\n"), {"mesh_broken"}, "not a readable mesh"),
+    (
+        "mesh of another topology",
+        lambda r: trimesh.creation.box().export(r / "tiny.ply"),
+        {"mesh_broken"},
+        "has 8 vertices, expected 24",
+    ),
+    ("no region", lambda r: (r / "regions" / "lve.txt").unlink(), {"region_missing"}, "data.lips=all"),
+    ("region index too high", lambda r: write_region(r, "1, 2, 24"), {"region_broken"}, "the index 24"),
+    ("region of words", lambda r: write_region(r, "1, two"), {"region_broken"}, "'two'"),
+    (
+        "lip pair too high",
+        lambda r: (r / "regions" / "inner_lip_pairs.txt").write_text("0, 24\n"),
+        {"region_broken"},
+        "0 to 23",
+    ),
+    ("table without clips", lambda r: (r / "clips.csv").write_text("a,b\n1,2\n"), {"clips_table"}, "no column clip"),
+    (
+        "table of bytes",
+        lambda r: (r / "clips.csv").write_bytes(b"\xff\xfe" * 9),
+        {"clips_table"},
+        "save it as CSV UTF-8",
+    ),
+    ("no training clip", remove_training_clips, {"no_training_clip"}, "nothing can be trained"),
+    (
+        "manifest of text",
+        lambda r: (r / "manifest.json").write_text("{"),
+        {"manifest_unreadable"},
+        "not readable as JSON",
+    ),
+    (
+        "manifest too deep",
+        lambda r: (r / "manifest.json").write_text("[" * 10**5),
+        {"manifest_unreadable"},
+        "not readable as JSON",
+    ),
+    ("manifest of a list", lambda r: (r / "manifest.json").write_text("[]"), {"manifest_unreadable"}, "no JSON object"),
+    ("odd frame rate", lambda r: write_manifest(r, frame_rate=26), {"frame_rate"}, "26, which is no whole multiple"),
+    ("frame rate of words", lambda r: write_manifest(r, frame_rate="fast"), {"frame_rate"}, "expected frames a second"),
+    (
+        "twice the frame rate",
+        lambda r: write_manifest(r, frame_rate=50),
+        {"frame_rate"},
+        "about 25 motion frames for each second of speech, but manifest.json says 50",
+    ),
+    (
+        "file of the manifest missing",
+        lambda r: write_manifest(r, files={"gone.txt": {"bytes": 1, "sha256": ""}}),
+        {"file_missing"},
+        "not there",
+    ),
+    (
+        "file changed, size kept",
+        lambda r: write_manifest(r, files={"clips.csv": {"bytes": (r / "clips.csv").stat().st_size, "sha256": "0"}}),
+        {"file_changed"},
+        "not what was written",
+    ),
+    (
+        "manifest names a file outside",
+        lambda r: write_manifest(r, files={"../x": {"bytes": 1, "sha256": ""}, "/etc/hosts": {}, "clips.csv": 1}),
+        {"manifest_entry"},
+        "no entry of a file below",
+    ),
+    ("unfinished", lambda r: (r / "prepare.json").write_text("{}"), {"unfinished"}, "has not ended"),
+]
+HARMLESS: list[tuple[str, Plant, set[str], str]] = [
+    ("half precision", lambda r: change(motion(r), lambda a: a.astype("f2")), {"motion_dtype"}, "half precision"),
+    ("speech too short", lambda r: change_sound(sound(r), lambda s: s[:-3200]), {"speech_shorter"}, "with silence"),
+    (
+        "speech too long",
+        lambda r: change_sound(sound(r), lambda s: np.concatenate([s, s[:3200]])),
+        {"speech_longer"},
+        "left out",
+    ),
+    ("sound copied", lambda r: shutil.copy(sound(r), sound(r, "B_e07")), {"sound_copied"}, "wav/B_e07.wav"),
+    ("wav without npy", lambda r: motion(r).unlink(), {"motion_missing"}, "speech without motion"),
+    ("npy without wav", lambda r: sound(r).unlink(), {"sound_missing"}, "motion without speech"),
+    ("a stranger", add_stranger, {"unknown_subject"}, "no split of tiny knows (Z)"),
+    ("no mesh", lambda r: (r / "tiny.ply").unlink(), {"mesh_missing"}, "templates/tiny.ply"),
+    ("leftover", lambda r: (r / "wav" / ".A_e01.partial-7.wav").write_text(""), {"leftover"}, "half-written"),
+    ("failed clips", lambda r: write_manifest(r, failed={"A_e09": "no sound"}), {"prepare_failed"}, "A_e09: no sound"),
+    ("raw data incomplete", lambda r: write_manifest(r, missing={"A_e09": "?"}), {"prepare_missing"}, "A_e09"),
+    ("stray file", lambda r: (r / "wav" / "A_e01.mp3").write_text(""), {"stray_file"}, "wav/A_e01.mp3"),
+    ("index named twice", lambda r: write_region(r, "1,2,2"), {"region_repeats"}, "1 index of lips"),
+    (
+        "44.1 kHz stereo",
+        lambda r: soundfile.write(sound(r), np.random.default_rng(0).uniform(-0.5, 0.5, (45864, 2)), 44100),
+        {"sound_form"},
+        "1 file with 44 100 Hz, 2 channels",
+    ),
+]
+
+
+def ids(cases: list[tuple[str, Plant, set[str], str]]) -> list[str]:
+    return [case[0] for case in cases]
+
+
+def test_a_sound_corpus_has_no_finding(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for options in ((), ("--quick",)):
+        status, report = examined(root, capsys, *options)
+        assert (status, report["sound"], report["findings"]) == (0, True, [])
+
+
+@pytest.mark.parametrize(("name", "plant", "kinds", "words"), ERRORS, ids=ids(ERRORS))
+def test_a_flaw_makes_a_corpus_not_sound(
+    root: Path, capsys: pytest.CaptureFixture[str], name: str, plant: Plant, kinds: set[str], words: str
+) -> None:
+    plant(root)
+    status, report = examined(root, capsys)
+    assert {finding["kind"] for finding in report["findings"]} == kinds
+    assert {finding["severity"] for finding in report["findings"]} == {"error"}
+    assert any(words in finding["message"] for finding in report["findings"]), report["findings"]
+    assert (status, report["sound"]) == (1, False)
+
+
+@pytest.mark.parametrize(("name", "plant", "kinds", "words"), HARMLESS, ids=ids(HARMLESS))
+def test_a_blemish_leaves_a_corpus_sound(
+    root: Path, capsys: pytest.CaptureFixture[str], name: str, plant: Plant, kinds: set[str], words: str
+) -> None:
+    plant(root)
+    status, report = examined(root, capsys)
+    assert {finding["kind"] for finding in report["findings"]} == kinds
+    assert {finding["severity"] for finding in report["findings"]} <= {"warning", "note"}
+    assert any(words in finding["message"] for finding in report["findings"]), report["findings"]
+    assert (status, report["sound"]) == (0, True)
+
+
+@pytest.mark.parametrize("file", ["templates.pkl", f"vertices_npy/{CLIP}.npy"])
+def test_a_pickle_that_would_run_code_is_told_and_does_not_run(
+    root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, file: str
+) -> None:
+    monkeypatch.chdir(root.parent)
+    (root / file).write_bytes(pickle.dumps({"A": Bomb()}))
+    status, report = examined(root, capsys)
+    assert status == 1
+    assert [finding["where"] for finding in report["findings"]] == [file]
+    np.save(root / file, np.array([Bomb()], object)) if file.endswith(".npy") else None
+    assert examined(root, capsys)[0] == 1
+    assert not (root.parent / "bomb-went-off").exists()
+
+
+def test_quick_reads_no_content(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change(motion(root), lambda a: set_rows(a, [5], np.nan))
+    shutil.copy(motion(root, "B_e06"), motion(root, "B_e07"))
+    assert examined(root, capsys, "--quick")[0] == 0
+    assert examined(root, capsys)[0] == 1
+    cut_bytes(motion(root), 100)
+    assert examined(root, capsys, "--quick")[0] == 1
+
+
+def test_a_wav_from_a_pipe_is_whole(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Programs that write to a pipe leave the largest number where the size belongs."""
+    data = sound(root).read_bytes()
+    place = data.index(b"data") + 4
+    sound(root).write_bytes(data[:place] + struct.pack("<I", 0xFFFFFFFF) + data[place + 4 :])
+    assert examined(root, capsys)[1]["findings"] == []
+
+
+def test_damaged_headers_of_all_sorts_are_told(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No byte of a header of motion or sound, set to anything, ends the check."""
+    rng = np.random.default_rng(3)
+    for path in (motion(root), sound(root)):
+        data = bytearray(path.read_bytes())
+        for _ in range(40):
+            hurt = bytearray(data)
+            for place in rng.integers(0, 128 if path.suffix == ".npy" else 44, 3):
+                hurt[place] = rng.integers(256)
+            path.write_bytes(hurt)
+            status, report = examined(root, capsys, "--quick")
+            assert status == (0 if report["sound"] else 1)
+        path.write_bytes(data)
+    assert examined(root, capsys)[0] == 0
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"frame_rate": 1e-320, "person": "A"},
+        {"frame_rate": float("inf"), "person": "A", "n_vertices": 24},
+        {"frame_rate": float("nan"), "n_vertices": True, "corpus": ["tiny"]},
+        {"person": "A", "frame_rate": 25, "n_vertices": 10**30},
+        {"corpus": {"a": 1}, "files": {"a\0b": {}, "x" * 5000: {"bytes": 1}}},
+        {"files": {"wav": {"bytes": 4096}, "clips.csv": {"bytes": [], "sha256": {}}}},
+        {"files": [], "failed": 3, "missing": [1], "facediff": {}, "unit": [], "frame_rate": False},
+    ],
+)
+def test_no_manifest_ends_the_check(root: Path, capsys: pytest.CaptureFixture[str], fields: dict[str, object]) -> None:
+    write_manifest(root, **fields)
+    for options in ([], ["--json"], ["--corpus", "tests.fakes.tiny.Tiny"]):
+        assert check_run("data check", [str(root), "--quiet", *options]) in (0, 1)
+        assert capsys.readouterr().out.strip()

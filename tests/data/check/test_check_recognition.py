@@ -1,0 +1,209 @@
+"""What a folder is; what preparing has recorded; how the report reads."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.cli.data import check_run
+from facediff.data.check import check, text
+from facediff.errors import FaceDiffError
+from tests.data.check.small import kinds, message, rows
+from tests.fakes import biwi
+
+
+@pytest.mark.parametrize(("folder", "corpus"), [("biwi", "biwi"), ("vocaset", "vocaset"), ("mead", "mead3d")])
+def test_a_corpus_is_recognised(copies: Path, folder: str, corpus: str) -> None:
+    root = copies / folder
+    assert check(root, quick=True).corpus == corpus  # by its names and vertices
+    for name in ("vertices_npy", "vertex"):
+        shutil.rmtree(root / name, ignore_errors=True)
+    assert check(root, quick=True).corpus == corpus  # by its names alone
+    (root / "manifest.json").write_text('{"corpus": "vocaset"}')
+    assert check(root, quick=True).corpus == "vocaset"  # by what the manifest says
+
+
+def test_a_corpus_named_by_its_short_name(fakes: Path) -> None:
+    report = check(fakes / "biwi", "biwi", quick=True)
+    assert report.corpus == "biwi"
+    assert report.n_vertices == biwi.VERTICES  # of two data modules for BIWI, the one that fits
+    with pytest.raises(FaceDiffError, match='there is no "vocasett": did you mean "vocaset"'):
+        check(fakes / "biwi", "vocasett")
+    for wrong in (
+        "facediff.data.biwi.Nothing",
+        "nowhere.Biwi",
+        "pathlib.Path",
+        "..",
+        "facediff.data.SpeechMotionDataModule",
+    ):
+        with pytest.raises(FaceDiffError, match="--corpus"):
+            check(fakes / "biwi", wrong)
+
+
+def test_a_data_module_in_the_working_folder(
+    fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place not in ("", str(tmp_path))])
+    lines = ["from facediff.data import Biwi", "class Mine(Biwi):", "    n_vertices = 64", "    corpus_name = 'mine'"]
+    Path("corpus_in_working_folder.py").write_text("\n".join(lines))
+    arguments = [str(fakes / "biwi"), "--corpus", "corpus_in_working_folder.Mine", "--quick", "--json"]
+    assert check_run("data check", arguments) == 0
+    assert json.loads(capsys.readouterr().out)["corpus"] == "mine"
+
+
+def test_a_manifest_cannot_have_code_imported(copies: Path) -> None:
+    (copies / "probe.py").write_text("raise SystemExit('imported')")
+    (copies / "tiny" / "manifest.json").write_text('{"corpus": "probe.Biwi"}')
+    assert check(copies / "tiny", quick=True).corpus in ("tiny", None)
+
+
+def write_raw(folder: Path, files: list[str]) -> Path:
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_bytes(b"\0" * 64)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("files", "corpus"),
+    [
+        (["faces/F1/e01/frame_001.vl", "rigid_scans/F1.obj"], "biwi"),
+        (["BIWI/faces/F1/01/frame_001.vl"], "biwi"),
+        (["data_verts.npy", "subj_seq_to_idx.pkl", "templates.pkl"], "vocaset"),
+        (["trainingdata/data_verts.npy"], "vocaset"),
+        (["M003/front/happy/level_1/001/shape_pose_cam.hdf5"], "mead3d"),
+        (["EMICA-MEAD_flame2020/M003/front/happy/level_1/001/shape_pose_cam.hdf5"], "mead3d"),
+        (["param/M003_001_0_0.npy", "wav/M003_001_0_0.wav"], "mead3d"),
+    ],
+)
+def test_a_raw_distribution_is_recognised(tmp_path: Path, files: list[str], corpus: str) -> None:
+    report = check(write_raw(tmp_path / "raw", files))
+    assert (report.raw, report.corpus, report.sound) == (corpus, None, False)
+    assert kinds(report) == ["raw"]
+    assert f"facediff data prepare {corpus} " in message(report, "raw")
+    assert "raw distribution of" in text(report)
+
+
+def test_a_preparation_that_has_not_ended(copies: Path) -> None:
+    root = copies / "biwi"
+    (root / "prepare.json").write_text(json.dumps({"corpus": "biwi", "options": {}}))
+    report = check(root, quick=True)
+    assert kinds(report) == ["unfinished"]
+    assert "run the same `facediff data prepare biwi RAW" in message(report, "unfinished")
+    assert report.manifest["ended"] is False
+    for name in ("vertices_npy", "wav"):
+        shutil.rmtree(root / name)
+    assert check(root).corpus == "biwi"  # before the first clip was written
+
+
+@pytest.mark.parametrize("files", [[], ["wav/hello.wav", "vertices_npy/hello.npy"], ["a/b.txt"]])
+def test_a_folder_that_is_nothing_known(tmp_path: Path, capsys: pytest.CaptureFixture[str], files: list[str]) -> None:
+    root = write_raw(tmp_path / "x", files)
+    root.mkdir(exist_ok=True)
+    assert check_run("data check", [str(root), "--quiet"]) == 1
+    out = capsys.readouterr().out
+    assert "not recognised" in out
+    assert "--corpus" in out
+    assert ("frame_*.vl" in out) == (len(files) < 2)
+
+
+def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="no such folder"):
+        check_run("data check", [str(tmp_path / "nowhere")])
+    with pytest.raises(FaceDiffError, match="--workers"):
+        check_run("data check", [str(tmp_path), "--workers", "0"])
+
+
+def test_a_persons_folder(copies: Path) -> None:
+    """As ``facediff data import-person`` writes it: the vertices and splits are in its own files."""
+    root = copies / "tiny"
+    for path in [*root.glob("wav/[BC]*"), *root.glob("vertices_npy/[BC]*")]:
+        path.unlink()
+    shutil.rmtree(root / "regions")
+    (root / "tiny.ply").unlink()
+    splits = ["train", "train", "train", "train", "val", "test", "test"]
+    lines = [f"A_e{i:02d},A,e{i:02d},{split}" for i, split in enumerate(splits, 1)]
+    (root / "clips.csv").write_text("\n".join(["clip,subject,sentence,split", *lines]))
+    manifest = {"corpus": "person", "person": "A", "frame_rate": 25.0, "n_vertices": 24}
+    (root / "manifest.json").write_text(json.dumps(manifest))
+    report = check(root)
+    assert (report.corpus, report.data_module, report.findings) == ("person", None, [])
+    assert {split: row[3] for (_, split), row in rows(report).items()} == {
+        "train": 14 + 16 + 18 + 20,
+        "val": 22,
+        "test_a": 24 + 26,
+    }
+    (root / "manifest.json").write_text(json.dumps({**manifest, "frame_rate": None}))
+    assert kinds(check(root)) == ["manifest_unreadable"]
+
+
+def test_the_manifest_of_preparing_is_held_against_the_files(copies: Path) -> None:
+    root = copies / "tiny"
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    described = {
+        path.relative_to(root).as_posix(): {
+            "bytes": path.stat().st_size,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        }
+        for path in files
+    }
+    (root / "manifest.json").write_text(json.dumps({"facediff": "1.2", "corpus": "tiny", "files": described}))
+    report = check(root, "tests.fakes.tiny.Tiny")
+    assert (report.findings, report.manifest["facediff"]) == ([], "1.2")
+    path = root / "vertices_npy" / "A_e01.npy"
+    array = np.load(path)
+    array[3, 3] += 1e-4
+    np.save(path, array)
+    assert check(root, "tests.fakes.tiny.Tiny", quick=True).findings == []  # of equal size
+    assert check(root, "tests.fakes.tiny.Tiny").manifest["changed"] == ["vertices_npy/A_e01.npy"]
+    path.write_bytes(path.read_bytes() + b"\0")
+    assert check(root, "tests.fakes.tiny.Tiny", quick=True).manifest["changed"] == ["vertices_npy/A_e01.npy"]
+
+
+def test_the_table_groups_equal_findings_and_names_the_first(copies: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = copies / "tiny"
+    for path in sorted((root / "vertices_npy").iterdir())[:9]:
+        array = np.load(path)
+        array[2] = np.nan
+        np.save(path, array)
+    assert check_run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--quiet"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    (error,) = [line for line in lines if line.startswith("ERROR")]
+    assert error.startswith("ERROR    9 times motion_not_finite, the first: vertices_npy/A_e01.npy: 1 of 14 frames")
+    assert lines[lines.index(error) + 1].strip() == (
+        "also vertices_npy/A_e02.npy, vertices_npy/A_e03.npy, vertices_npy/A_e04.npy and 5 more"
+    )
+    assert lines[-1] == "not sound: 9 errors"
+    train = next(line for line in lines if line.startswith("train "))
+    assert train.split() == ["train", "-", "8", "-", "140", "5.6"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file names of any bytes")
+def test_names_that_would_steer_a_terminal_are_spelled_out(copies: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = copies / "tiny"
+    (root / "wav" / "a\x1b[2Jb.wav").write_bytes(b"")
+    (root / "wav" / "\x07c.mp3").write_bytes(b"")
+    (root / "wav" / os.fsdecode(b"\xff_e01.wav")).write_bytes(b"")
+    for options in ([], ["--json"]):
+        assert check_run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--quiet", *options]) in (0, 1)
+        out = capsys.readouterr().out
+        assert "\x1b" not in out
+        assert "\x07" not in out
+        out.encode()
+
+
+def test_several_processes_find_the_same(copies: Path) -> None:
+    root = copies / "tiny"
+    (root / "vertices_npy" / "B_e03.npy").write_bytes(b"")
+    alone = check(root, "tests.fakes.tiny.Tiny", workers=1).state()
+    together = check(root, "tests.fakes.tiny.Tiny", workers=2).state()
+    assert alone == together
+    assert alone["sound"] is False

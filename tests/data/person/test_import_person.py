@@ -1,0 +1,477 @@
+"""A person's video reconstruction becomes a corpus entry: through real files, against what is known of the person."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from facediff.cli.app import main
+from facediff.cli.data import import_person_run
+from facediff.data.corpus import Corpus, read_manifest
+from facediff.errors import FaceDiffError
+from facediff.utils.pickles import load_pickle
+from tests.fakes.person import (
+    FRAMES,
+    RATE,
+    VERTICES,
+    Array,
+    Person,
+    face,
+    grid_faces,
+    lower_face,
+    motion,
+    person,
+    speech,
+    write_auxiliary,
+    write_objs,
+    write_plys,
+    write_speech,
+)
+
+MICRON = 1e-6
+
+
+@pytest.fixture(scope="module")
+def known() -> Person:
+    return person()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory, known: Person) -> Path:
+    """The auxiliary corpus, the sound, and the motion as one array."""
+    folder = tmp_path_factory.mktemp("files")
+    write_auxiliary(folder / "corpus")
+    write_speech(folder / "sound.wav", FRAMES / RATE)
+    np.save(folder / "motion.npy", known.seen.astype(np.float32))
+    np.save(folder / "neutral.npy", 1000 * face().astype(np.float32) + [0, 0, 90])
+    return folder
+
+
+def words(files: Path, motion: str, out: Path, *more: str) -> list[str]:
+    given = [str(files / motion), "--audio", str(files / "sound.wav"), "--name", "Target", "--frame-rate", "30"]
+    return [*given, "--corpus", str(files / "corpus"), "-o", str(out), "--clip-seconds", "2", "--quiet", *more]
+
+
+def imported(out: Path) -> Array:
+    """All clips in one."""
+    parts = [np.load(path) for path in sorted((out / "vertices_npy").glob("*.npy"))]
+    return np.concatenate(parts).reshape(-1, VERTICES, 3)
+
+
+@pytest.fixture(scope="module")
+def entry(files: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("out") / "deep" / "target"
+    assert import_person_run("data", words(files, "motion.npy", out)) == 0
+    return out
+
+
+def test_the_motion_is_the_known_one_in_the_corpus_s_coordinates(entry: Path, known: Person) -> None:
+    made = imported(entry)
+    assert made.shape == known.truth.shape
+    assert np.abs(made - known.truth).max() < MICRON
+    template = load_pickle(entry / "templates.pkl")["Target"]
+    assert template.dtype == np.float32
+    calm = np.setdiff1d(np.arange(VERTICES), known.restless)
+    assert np.abs(template - face())[calm].max() < MICRON
+
+
+def test_the_report_tells_what_was_removed(entry: Path, known: Person) -> None:
+    report = read_manifest(entry)["report"]
+    mean = known.rotations.mean(0)
+    u, _, vt = np.linalg.svd(mean)
+    traces = np.trace(known.rotations @ (u @ vt).T, axis1=1, axis2=2)
+    angles = np.degrees(np.arccos((traces - 1) / 2))
+    assert angles.max() > 10
+    assert report["rotation_max"] == pytest.approx(angles.max(), abs=1e-3)
+    assert report["rotation_rms"] == pytest.approx(np.sqrt((angles**2).mean()), abs=1e-3)
+    # The head's centre is that of its stable vertices, which lie within a face's breadth of the model's origin.
+    assert report["translation_max"] > 0.02
+    assert report["scale"] == pytest.approx(0.001, abs=1e-15)
+    assert report["measured_scale"] == pytest.approx(0.001, rel=1e-5)
+    assert report["frames"] == report["frames_written"] == FRAMES
+    assert report["seconds"] == pytest.approx(8)
+    assert report["jitter"] < MICRON
+    assert report["topology_residual"] < 0.05
+    assert report["warnings"] == []
+    still = (np.array(report["template_frames"]) / RATE) % 2
+    assert ((still > 1) & (still < 2)).all()  # every other second is silent
+    assert len(still) == round(0.05 * FRAMES)
+
+
+def test_translation_removed_is_that_of_the_head(files: Path, tmp_path: Path, known: Person) -> None:
+    """Without rotation, every point of the head moves by the same known amount."""
+    np.save(tmp_path / "motion.npy", 1000 * known.truth + known.places[:, None])
+    arguments = words(files, "motion.npy", tmp_path / "out")
+    arguments[0] = str(tmp_path / "motion.npy")
+    assert import_person_run("data", arguments) == 0
+    report = read_manifest(tmp_path / "out")["report"]
+    away = np.linalg.norm(known.places - known.places.mean(0), axis=1) / 1000
+    assert report["translation_max"] == pytest.approx(away.max(), rel=1e-4)
+    assert report["translation_rms"] == pytest.approx(np.sqrt((away**2).mean()), rel=1e-4)
+    assert report["rotation_max"] < 1e-3
+
+
+def test_the_entry_is_an_ordinary_corpus(entry: Path, files: Path) -> None:
+    corpus = Corpus(files / "corpus", VERTICES, RATE, people=[entry])
+    clips = [clip for clip in corpus.clips.values() if clip.subject == "Target"]
+    assert [clip.name for clip in clips] == ["Target_s01", "Target_s02", "Target_s03", "Target_s04"]
+    offset, samples = 0, speech(FRAMES / RATE)
+    for clip in clips:
+        offsets = corpus.read_motion(clip)
+        true = motion(np.arange(offset, offset + len(offsets)) / RATE) - face()
+        moving = lower_face()
+        assert np.sqrt(((offsets.numpy() - true)[:, moving] ** 2).mean()) < 4e-3  # the restless 2 % are in it
+        audio = corpus.read_audio(clip, 0, len(offsets)).numpy()
+        first = round(offset * 16000 / RATE)
+        assert np.abs(audio - samples[first : first + len(audio)]).max() < 2e-3
+        info = soundfile.info(entry / "wav" / f"{clip.name}.wav")
+        assert (info.samplerate, info.channels, info.subtype) == (16000, 1, "PCM_16")
+        assert info.frames == pytest.approx(len(offsets) * 16000 / RATE, abs=1)
+        offset += len(offsets)
+    assert offset == FRAMES
+
+
+def test_clips_are_cut_in_pauses_and_split_by_order(entry: Path) -> None:
+    with (entry / "clips.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [list(row.values()) for row in rows] == [
+        ["Target_s01", "Target", "s01", "train"],
+        ["Target_s02", "Target", "s02", "train"],
+        ["Target_s03", "Target", "s03", "val"],
+        ["Target_s04", "Target", "s04", "test"],
+    ]
+    lengths = [len(np.load(entry / "vertices_npy" / f"{row['clip']}.npy", mmap_mode="r")) for row in rows]
+    for cut in np.cumsum(lengths)[:-1] / RATE:
+        assert cut % 2 > 1, "in a silent second"
+    assert min(lengths) >= RATE
+
+
+def test_the_manifest_describes_every_file(entry: Path) -> None:
+    manifest = json.loads((entry / "manifest.json").read_text())
+    assert {key: manifest[key] for key in ("corpus", "person", "frame_rate", "n_vertices", "unit")} == {
+        "corpus": "person",
+        "person": "Target",
+        "frame_rate": 30.0,
+        "n_vertices": VERTICES,
+        "unit": "m",
+    }
+    there = {path.relative_to(entry).as_posix() for path in entry.rglob("*") if path.is_file()}
+    assert set(manifest["files"]) == there - {"manifest.json"}
+    for name, facts in manifest["files"].items():
+        data = (entry / name).read_bytes()
+        assert facts == {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    assert [path.name for path in entry.parent.iterdir()] == ["target"]
+
+
+@pytest.mark.parametrize("form", ["obj", "ply", "flat", "double"])
+def test_every_form_of_motion_gives_the_same(
+    files: Path, tmp_path: Path, known: Person, entry: Path, form: str
+) -> None:
+    frames = known.seen[:90]
+    if form in ("obj", "ply"):
+        (write_objs if form == "obj" else write_plys)(tmp_path / "motion", frames)
+    else:
+        np.save(tmp_path / "motion", frames if form == "double" else frames.reshape(90, -1).astype(np.float32))
+    path = tmp_path / ("motion" if form in ("obj", "ply") else "motion.npy")
+    write_speech(tmp_path / "sound.wav", 3)
+    arguments = words(files, "motion.npy", tmp_path / "out", "--audio", str(tmp_path / "sound.wav"))
+    assert import_person_run("data", [str(path), *arguments[1:]]) == 0
+    assert np.abs(imported(tmp_path / "out") - known.truth[:90]).max() < MICRON
+    report = read_manifest(tmp_path / "out")["report"]
+    assert report["faces_compared"] == (form in ("obj", "ply"))
+    assert report["splits"] == {"train": 2}
+
+
+def test_another_frame_rate_is_resampled(files: Path, tmp_path: Path, known: Person) -> None:
+    corpus = write_auxiliary(tmp_path / "corpus", rate=25.0, manifest=False)
+    out = tmp_path / "out"
+    arguments = words(files, "motion.npy", out, "--corpus", str(corpus), "--corpus-frame-rate", "25")
+    assert import_person_run("data", arguments) == 0
+    made = imported(out)
+    assert made.shape == (200, VERTICES, 3)
+    calm = np.setdiff1d(np.arange(VERTICES), known.restless)
+    true = motion(np.arange(200) / 25)
+    assert np.abs(made - true)[20:-20, calm].max() < 5e-5  # 0.05 mm of some 15 mm
+    manifest = read_manifest(out)
+    assert (manifest["frame_rate"], manifest["unit"]) == (25.0, None)
+
+
+def test_template_and_stable_vertices_may_be_given(files: Path, tmp_path: Path, known: Person) -> None:
+    """The template lies elsewhere than the motion, with another pose; the motion is laid onto it."""
+    still = str(files / "corpus" / "regions" / "still.txt")
+    out = tmp_path / "out"
+    given = ["--template", str(files / "neutral.npy"), "--stable", still]
+    assert import_person_run("data", words(files, "motion.npy", out, *given)) == 0
+    report = read_manifest(out)["report"]
+    assert (report["template_frames"], report["stable_vertices"]) == ([], int((~lower_face()).sum()))
+    assert report["template_source"].endswith("neutral.npy")
+    assert np.abs(load_pickle(out / "templates.pkl")["Target"] - face()).max() < MICRON
+    assert np.abs(imported(out) - known.truth).max() < MICRON
+
+
+def test_a_person_s_size_is_kept_and_another_unit_is_not(files: Path, tmp_path: Path, known: Person) -> None:
+    """A head one tenth larger stays larger; a unit that is no power of ten is measured; a scale given is used."""
+    factors = {}
+    for name, factor, more in (("big", 1.1, []), ("odd", 3.7, []), ("told", 3.7, ["--scale", "0.0005"])):
+        np.save(tmp_path / f"{name}.npy", factor * known.seen[:90])
+        write_speech(tmp_path / "sound.wav", 3)
+        arguments = words(files, "motion.npy", tmp_path / name, "--audio", str(tmp_path / "sound.wav"), *more)
+        assert import_person_run("data", [str(tmp_path / f"{name}.npy"), *arguments[1:]]) == 0
+        made = imported(tmp_path / name)
+        factors[name] = np.ptp(made[0, :, 1]) / np.ptp(known.truth[0, :, 1])
+    assert factors == pytest.approx({"big": 1.1, "odd": 1.0, "told": 3.7 * 0.5}, rel=1e-4)
+
+
+def test_missing_frames_are_filled_and_told(
+    files: Path, tmp_path: Path, known: Person, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_objs(tmp_path / "motion", known.seen[:90])
+    for number in (20, 21, 50):
+        (folder / f"frame_{number}.obj").unlink()
+    write_speech(tmp_path / "sound.wav", 3)
+    arguments = words(files, "motion.npy", tmp_path / "out", "--audio", str(tmp_path / "sound.wav"))
+    assert import_person_run("data", [str(folder), *arguments[1:]]) == 0
+    assert "note: 3 missing frames filled from their neighbours: 19-20, 49" in capsys.readouterr().out
+    made = imported(tmp_path / "out")
+    there = np.setdiff1d(np.arange(90), [19, 20, 49])
+    assert np.abs(made - known.truth[:90])[there].max() < MICRON
+    calm = np.setdiff1d(np.arange(VERTICES), known.restless)
+    assert np.abs(made - known.truth[:90])[49][calm].max() < 5e-4  # a straight line through half a millimetre
+
+
+def test_what_is_printed(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_speech(tmp_path / "sound.wav", FRAMES / RATE - 0.5)
+    out = tmp_path / "out"
+    assert import_person_run("data", words(files, "motion.npy", out, "--audio", str(tmp_path / "sound.wav"))) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"{out}: Target"
+    text = "\n".join(lines)
+    for part in ("240 frames at 30 frames/s, 8.00 s", "rotation removed", "scale                0.001", " m RMS"):
+        assert part in text
+    assert "sound is 0.50 s shorter" in text
+    assert lines[-1].startswith("warning: the motion lasts 8.00 s (240 frames at 30/s) and the sound 7.50 s")
+    assert len(imported(out)) == 225
+
+
+def test_the_command_line_leads_here(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = words(files, "motion.npy", tmp_path / "out")
+    assert main(["data", "import-person", *arguments]) == 0
+    assert main(["data", "import-person", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error == f"facediff: error: {tmp_path / 'out'}: is not empty; choose a new folder, or remove this one\n"
+
+
+def nothing_left(folder: Path) -> bool:
+    return not [path for path in folder.rglob("*") if "partial" in path.name or path.name == "out"]
+
+
+def damaged(known: Person, kind: str) -> Array:
+    frames = known.seen[:90].copy()
+    random = np.random.default_rng(0)
+    if kind == "permuted":
+        frames = frames[:, random.permutation(VERTICES)]
+    elif kind == "rows swapped":
+        order = np.arange(VERTICES).reshape(20, 18)[::-1].ravel()
+        frames = frames[:, order]
+    elif kind == "mirrored":
+        frames = frames * [-1, 1, 1]
+    elif kind == "nan":
+        frames[41, 7, 2] = np.nan
+    elif kind == "still":
+        frames = np.repeat(frames[:1], 90, 0)
+    elif kind == "one vertex less":
+        frames = frames[:, 1:]
+    elif kind == "short":
+        frames = frames[:20]
+    elif kind == "whole numbers":
+        return frames.astype(int)  # type: ignore[no-any-return]
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("kind", "sentence"),
+    [
+        ("permuted", r"motion\.npy: its face does not lie on those of .*corpus"),
+        ("rows swapped", r"motion\.npy: its face does not lie on those of .*corpus"),
+        ("mirrored", r"motion\.npy: its face does not lie on those of .*corpus"),
+        ("nan", r"motion\.npy: frame 41 \(counted from 0\) holds NaN"),
+        ("still", r"motion\.npy: the motion holds none"),
+        ("one vertex less", r"motion\.npy: has shape \(90, 359, 3\); expected \(frames, 360, 3\)"),
+        ("short", r"the motion lasts 0\.67 s .* and the sound 3\.00 s; expected the same stretch"),
+        ("whole numbers", r"motion\.npy: holds int64 \(90, 360, 3\); expected floating-point"),
+    ],
+)
+def test_a_flawed_array_gets_one_sentence(files: Path, tmp_path: Path, known: Person, kind: str, sentence: str) -> None:
+    np.save(tmp_path / "motion.npy", damaged(known, kind))
+    write_speech(tmp_path / "sound.wav", 3)
+    arguments = words(files, "motion.npy", tmp_path / "out", "--audio", str(tmp_path / "sound.wav"))
+    with pytest.raises(FaceDiffError, match=sentence):
+        import_person_run("data", [str(tmp_path / "motion.npy"), *arguments[1:]])
+    assert nothing_left(tmp_path)
+
+
+def break_folder(folder: Path, flaw: str) -> None:
+    first, other = folder / "frame_1.obj", folder / "frame_33.obj"
+    lines = other.read_text().splitlines()
+    if flaw == "mixed counts":
+        other.write_text("\n".join([*lines, "v 1 2 3"]))
+    elif flaw == "all too many":
+        for path in folder.iterdir():
+            path.write_text(path.read_text() + "v 1 2 3\n")
+    elif flaw == "other faces":
+        other.write_text("\n".join([*lines[:-1], "f 1 2 40"]))
+    elif flaw == "all other faces":
+        for path in folder.iterdir():
+            path.write_text(path.read_text() + "f 1 2 40\n")
+    elif flaw == "nan":
+        other.write_text(other.read_text().replace(lines[2], "v nan 1 2"))
+    elif flaw == "cut short":
+        other.write_bytes(other.read_bytes()[:4444])
+    elif flaw == "no mesh":
+        other.write_bytes(b"\x00\xff" * 500)
+    elif flaw == "words":
+        other.write_text("\n".join(line.replace("v ", "v x") if line[:2] == "v " else line for line in lines))
+    elif flaw == "duplicate":
+        (folder / "frame_0033.obj").write_bytes(other.read_bytes())
+    elif flaw == "stranger":
+        (folder / "neutral.obj").write_bytes(other.read_bytes())
+    elif flaw == "two videos":
+        for path in list(folder.iterdir())[:5]:
+            path.rename(folder / f"take2_{path.name}")
+        for path in list(folder.glob("frame*")):
+            path.rename(folder / f"take1_{path.name}")
+    elif flaw == "gap":
+        for number in range(40, 60):
+            (folder / f"frame_{number}.obj").unlink()
+    elif flaw == "empty":
+        for path in folder.iterdir():
+            path.unlink()
+        (folder / "readme.txt").write_text("nothing here")
+    elif flaw == "face beyond":
+        first.write_text(first.read_text() + "f 1 2 4000\n")
+
+
+@pytest.mark.parametrize(
+    ("flaw", "sentence"),
+    [
+        ("mixed counts", r"frame_33\.obj: has 361 vertices, but frame_1\.obj has 360"),
+        ("all too many", r"frame_1\.obj: has 361 vertices, but the corpus has 360"),
+        ("other faces", r"frame_33\.obj: its faces differ from those of frame_1\.obj"),
+        ("all other faces", r"motion: 1 triangles are not those of the mesh in .*corpus"),
+        ("nan", r"frame_33\.obj: holds NaN"),
+        ("cut short", r"frame_33\.obj: (has \d+ vertices|not a readable OBJ mesh)"),
+        ("no mesh", r"frame_33\.obj: holds no vertices"),
+        ("words", r"frame_33\.obj: (not a readable OBJ mesh|holds no vertices)"),
+        ("duplicate", r"frame_\d+\.obj and frame_\d+\.obj are both frame 33"),
+        ("stranger", r"named in different ways"),
+        ("two videos", r"differ in more than one number"),
+        ("gap", r"20 frames are missing between frame_39\.obj and frame_60\.obj"),
+        ("empty", r"motion: holds no mesh files"),
+        ("face beyond", r"frame_1\.obj: a face names a vertex that is not there"),
+    ],
+)
+def test_a_flawed_folder_gets_one_sentence(
+    files: Path, tmp_path: Path, known: Person, flaw: str, sentence: str
+) -> None:
+    folder = write_objs(tmp_path / "motion", known.seen[:90])
+    break_folder(folder, flaw)
+    write_speech(tmp_path / "sound.wav", 3)
+    arguments = words(files, "motion.npy", tmp_path / "out", "--audio", str(tmp_path / "sound.wav"))
+    with pytest.raises(FaceDiffError, match=sentence):
+        import_person_run("data", [str(folder), *arguments[1:]])
+    assert nothing_left(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--name", "my_name"], "--name 'my_name': expected letters, digits and dashes"),
+        (["--name", "../up"], "expected letters"),
+        (["--name", "anna"], "has a person of that name already"),
+        (["--frame-rate", "0"], "--frame-rate 0: expected a positive number"),
+        (["--frame-rate", "60"], "expected the same stretch of video; check --frame-rate"),
+        (["--frame-rate", "nan"], "--frame-rate nan: expected a positive number"),
+        (["--scale", "-1"], "--scale -1: expected a positive number"),
+        (["--clip-seconds", "0.2"], "--clip-seconds 0.2: expected at least 1"),
+        (["--corpus-frame-rate", "25"], r"--corpus-frame-rate 25: .*manifest\.json says 30"),
+        (["--corpus", "{tmp}/none"], "--corpus .*none: no such folder"),
+        (["--corpus", "{tmp}/bare"], r"bare/templates\.pkl: no such file"),
+        (["--audio", "{tmp}/none.wav"], r"none\.wav: no such sound file"),
+        (["--audio", "{tmp}/silent.wav"], r"silent\.wav: holds only silence"),
+        (["--template", "{tmp}/none.npy"], r"none\.npy: not a readable NumPy array"),
+        (["--template", "{tmp}/small.npy"], r"small\.npy: has shape \(4, 3\)"),
+        (["--template", "{tmp}/metres.npy"], r"metres\.npy: is 0\.001 times as large as the faces of the motion"),
+        (["--template", "{tmp}/other.npy"], r"other\.npy: (is|does not lie)"),
+        (["--template", "{tmp}/zeros.npy"], r"zeros\.npy: alignment: the points do not determine a rotation"),
+        (["--template", "{tmp}/face.stl"], r"face\.stl: not a template that is known"),
+        (["--stable", "{tmp}/none.txt"], r"--stable .*none\.txt: no such file"),
+        (["--stable", "{tmp}/beyond.txt"], r"beyond\.txt: .*360"),
+        (["--stable", "{tmp}/line.txt"], r"line\.txt: names 2 vertices; expected at least 10"),
+        (["--flame", "{tmp}/model.pkl"], "holds no FLAME parameters; leave --flame away"),
+        (["-o", "{tmp}/full"], "full: is not empty"),
+        (["-o", "{tmp}/silent.wav"], r"silent\.wav: is a file"),
+        (["-o", "{tmp}/silent.wav/out"], "cannot be written"),
+    ],
+)
+def test_a_wrong_option_gets_one_sentence(files: Path, tmp_path: Path, options: list[str], sentence: str) -> None:
+    (tmp_path / "bare").mkdir()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("mine")
+    soundfile.write(tmp_path / "silent.wav", np.zeros(16000 * 8), 16000)
+    np.save(tmp_path / "small.npy", np.zeros((4, 3)))
+    np.save(tmp_path / "metres.npy", face())
+    np.save(tmp_path / "zeros.npy", np.zeros((VERTICES, 3)))
+    np.save(tmp_path / "other.npy", 1000 * face()[::-1])
+    (tmp_path / "beyond.txt").write_text("1, 2, 360")
+    (tmp_path / "line.txt").write_text("5, 6")
+    more = [option.format(tmp=tmp_path) for option in options]
+    with pytest.raises(FaceDiffError, match=sentence):
+        import_person_run("data", words(files, "motion.npy", tmp_path / "out", *more))
+    assert nothing_left(tmp_path)
+    assert (tmp_path / "full" / "thesis.txt").read_text() == "mine"
+
+
+def test_the_corpus_s_frame_rate_must_be_known(files: Path, tmp_path: Path) -> None:
+    corpus = write_auxiliary(tmp_path / "corpus", manifest=False)
+    with pytest.raises(FaceDiffError, match="add --corpus-frame-rate"):
+        import_person_run("data", words(files, "motion.npy", tmp_path / "out", "--corpus", str(corpus)))
+
+
+def test_an_empty_folder_may_be_the_output(files: Path, tmp_path: Path) -> None:
+    (tmp_path / "target").mkdir()
+    assert import_person_run("data", words(files, "motion.npy", tmp_path / "target")) == 0
+    assert (tmp_path / "target" / "manifest.json").is_file()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
+def test_an_interruption_or_a_full_disk_leaves_nothing(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("facediff.data.person.importer.write_templates", stop)
+    expected = KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else FaceDiffError
+    with pytest.raises(expected, match=None if expected is KeyboardInterrupt else "No space left on device"):
+        import_person_run("data", words(files, "motion.npy", tmp_path / "new" / "out"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_faces_of_a_ply_template_are_compared(files: Path, tmp_path: Path, known: Person) -> None:
+    write_plys(tmp_path / "frames", 1000 * face()[None])
+    (tmp_path / "frames" / "000000.ply").rename(tmp_path / "face.ply")
+    out = tmp_path / "out"
+    assert import_person_run("data", words(files, "motion.npy", out, "--template", str(tmp_path / "face.ply"))) == 0
+    flipped = [f"f {a} {b} {c}" for a, b, c in grid_faces()[:, [0, 1, 2]]]  # counted from 0: every triangle is shifted
+    points = [f"v {x} {y} {z}" for x, y, z in 1000 * face()]
+    (tmp_path / "face.obj").write_text("\n".join([*points, *flipped[1:]]))
+    with pytest.raises(FaceDiffError, match=r"face\.obj: \d+ triangles are not those"):
+        import_person_run(
+            "data", words(files, "motion.npy", tmp_path / "out2", "--template", str(tmp_path / "face.obj"))
+        )

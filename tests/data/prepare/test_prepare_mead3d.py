@@ -1,0 +1,493 @@
+"""3DMEAD from its raw distributions: parameters to vertices, the sound, whose shape a face has, what may be wrong."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from facediff.cli import data as command
+from facediff.data import Mead3D
+from facediff.data.audio import read_speech
+from facediff.data.prepare import mead3d
+from facediff.data.prepare.mead3d import find_recordings, find_sounds
+from facediff.data.prepare.motion import read_parameters
+from facediff.data.prepare.runner import Report, prepare
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.mesh.flame import Flame
+from facediff.mesh.mesh import read_mesh
+from facediff.utils.pickles import load_pickle
+from tests.fakes.flame import VERTICES, flame_arrays, write_flame
+from tests.fakes.mead3d import (
+    CLIPS,
+    EMOTIONS,
+    emote_folder,
+    frames_of,
+    parameters_of,
+    speech_of,
+    write_hdf5,
+    write_mead3d,
+    write_raw_emote,
+    write_raw_probtalk3d,
+    write_wav,
+)
+from tests.fakes.vocaset import flame_masks, python2_pickle
+
+PAIR = ("M003_001_0_0", "M003_002_0_0")
+CLIP = PAIR[0]
+Parts = dict[str, np.ndarray]
+
+
+class MiniMead(Mead3D):
+    n_vertices = VERTICES
+
+
+@pytest.fixture(scope="module")
+def flame(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_flame(tmp_path_factory.mktemp("flame") / "generic_model.pkl")
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    """Two clips of one speaker, of different lengths."""
+    return write_raw_emote(tmp_path / "raw", clips=PAIR, audio="wav")
+
+
+def prepared(raw: Path, flame: Path, out: str = "out", **options: object) -> tuple[Path, Report]:
+    target = raw.parent / out
+    return target, prepare(mead3d.plan(raw, flame=flame, **options), target, workers=1)  # type: ignore[arg-type]
+
+
+def hdf5(raw: Path, name: str = CLIP) -> Path:
+    return raw / "EMICA-MEAD_flame2020" / emote_folder(name) / "shape_pose_cam.hdf5"
+
+
+def problem(raw: Path, flame: Path) -> str:
+    """Why the first of the two clips fails; the second does not."""
+    report = prepared(raw, flame)[1]
+    assert list(report.failed) == [CLIP]
+    assert list(report.clips) == [PAIR[1]]
+    return report.failed[CLIP]
+
+
+def motion_of(out: Path, name: str) -> np.ndarray:
+    return np.load(out / "vertices_npy" / f"{name}.npy").reshape(-1, VERTICES, 3)
+
+
+def mean_shape(subject: str, clips: tuple[str, ...] = CLIPS) -> np.ndarray:
+    """Mean over all frames of all clips: longer clips weigh more."""
+    frames = [parameters_of(name)["shape"] for name in clips if name.startswith(subject)]
+    return np.concatenate(frames).astype(np.float64).mean(0)
+
+
+def test_vertices_are_the_models_for_the_parameters_on_disk(tmp_path: Path, flame: Path) -> None:
+    out, report = prepared(write_raw_emote(tmp_path / "raw", audio="wav"), flame)
+    model = Flame.read(flame)
+    assert sorted(report.clips) == sorted(CLIPS)
+    assert not report.failed
+    templates = load_pickle(out / "templates.pkl")
+    assert sorted(templates) == ["M003", "M032", "M037", "W009", "W040"]
+    for subject, template in templates.items():
+        directions = flame_arrays()["shapedirs"][..., :300]
+        np.testing.assert_allclose(template, model.template + directions @ mean_shape(subject), atol=1e-12)
+    for name in CLIPS:
+        parts = parameters_of(name)
+        stored = np.load(out / "vertices_npy" / f"{name}.npy")
+        assert stored.dtype == np.float32
+        assert stored.shape == (frames_of(name), 3 * VERTICES) == (report.clips[name], 3 * VERTICES)
+        expected = model.vertices(mean_shape(name[:4]), parts["exp"], parts["jaw"]).astype(np.float32)
+        np.testing.assert_allclose(stored.reshape(-1, VERTICES, 3), expected, rtol=0, atol=1e-7)
+
+
+def test_a_clips_offsets_are_motion_alone_unless_its_own_shape_is_asked_for(raw: Path, flame: Path) -> None:
+    """Without expression and with the jaw at rest, nothing moves; with the clip's own shape, the face differs."""
+    for name in PAIR:
+        still = {**parameters_of(name), "exp": np.zeros((5, 100)), "jaw": np.zeros((5, 3))}
+        write_hdf5(hdf5(raw, name), {**still, "shape": still["shape"][:5]})
+    out, _ = prepared(raw, flame)
+    own, _ = prepared(raw, flame, "own", shape="clip")
+    template = load_pickle(out / "templates.pkl")["M003"]
+    np.testing.assert_array_equal(load_pickle(own / "templates.pkl")["M003"], template)
+    directions = flame_arrays()["shapedirs"][..., :300]
+    shapes = {name: parameters_of(name)["shape"][:5].astype(np.float64).mean(0) for name in PAIR}
+    both = sum(shapes.values()) / 2
+    for name in PAIR:
+        np.testing.assert_allclose(motion_of(out, name), template.astype(np.float32)[None].repeat(5, 0), atol=1e-7)
+        difference = directions @ (shapes[name] - both)
+        assert np.abs(difference).max() > 1e-4
+        np.testing.assert_allclose(motion_of(own, name) - template, difference[None].repeat(5, 0), atol=1e-7)
+
+
+def test_all_forms_give_the_same_corpus(tmp_path: Path, flame: Path) -> None:
+    """EMOTE's files, older ones by hickle, and ProbTalk3D's arrays: equal parameters, equal bytes."""
+    clips = CLIPS[::4]
+    raws = [
+        write_raw_emote(tmp_path / "flat", clips=clips, audio="wav"),
+        write_raw_emote(tmp_path / "hickle", clips=clips, audio="wav", form="hickle"),
+        write_raw_probtalk3d(tmp_path / "probtalk3d", clips=clips),
+    ]
+    outs = [prepared(raw, flame, f"out{i}")[0] for i, raw in enumerate(raws)]
+    first, *others = [
+        {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()} for out in outs
+    ]
+    assert {f"wav/{name}.wav" for name in clips} < set(first)
+    for other in others:
+        assert {name for name in first if first[name] != other.get(name)} <= {"manifest.json"}
+        assert set(other) == set(first)
+
+
+@pytest.mark.parametrize("form", ["flat", "hickle", "array"])
+def test_parameters_of_single_files(form: str, tmp_path: Path) -> None:
+    parts = parameters_of(CLIP)
+    if form == "array":
+        file = write_raw_probtalk3d(tmp_path / "raw", clips=PAIR) / "param" / f"{CLIP}.npy"
+    else:
+        file = hdf5(write_raw_emote(tmp_path / "raw", clips=PAIR, form=form, audio="none"))  # type: ignore[arg-type]
+    found = read_parameters(file)
+    np.testing.assert_allclose(found.shape, parts["shape"].astype(np.float64).mean(0), rtol=1e-12)
+    np.testing.assert_array_equal(found.expression, parts["exp"])
+    np.testing.assert_array_equal(found.jaw, parts["jaw"])
+    assert found.shape.dtype == found.expression.dtype == found.jaw.dtype == np.float64
+
+
+def test_fewer_coefficients_and_other_batches(raw: Path, flame: Path) -> None:
+    """Fifty expressions, a hundred shapes, a shape given once for the whole clip; the rest is zero."""
+    parts = parameters_of(CLIP)
+    write_hdf5(hdf5(raw), {"shape": parts["shape"][:1, :100], "exp": parts["exp"][:, :50], "jaw": parts["jaw"]})
+    out, report = prepared(raw, flame, shape="clip")
+    assert not report.failed
+    full = np.zeros((len(parts["exp"]), 100))
+    full[:, :50] = parts["exp"][:, :50]
+    shape = np.concatenate([parts["shape"][0, :100], np.zeros(200)])
+    expected = Flame.read(flame).vertices(shape, full, parts["jaw"])
+    np.testing.assert_allclose(motion_of(out, CLIP), expected, atol=1e-7)
+
+
+def test_what_is_written_beside_the_clips(tmp_path: Path, flame: Path) -> None:
+    raw = write_raw_emote(tmp_path / "raw", audio="wav")
+    (raw / "FLAME_masks.pkl").write_bytes(python2_pickle(flame_masks(VERTICES)))
+    out, report = prepared(raw, flame)
+    rows = list(csv.DictReader((out / "clips.csv").read_text().splitlines()))
+    assert [row["clip"] for row in rows] == sorted(CLIPS)
+    for row in rows:
+        subject, number, emotion, intensity = row["clip"].split("_")
+        word = EMOTIONS[int(emotion)]
+        assert row["subject"] == subject
+        assert (row["emotion"], row["intensity"]) == (word, str(int(intensity) + 1))
+        assert row["sentence"] == f"{word}_{number}"
+    mesh = read_mesh(out / "FLAME.ply")
+    np.testing.assert_array_equal(mesh.faces, flame_arrays()["f"])
+    np.testing.assert_allclose(mesh.vertices, flame_arrays()["v_template"], atol=1e-7)
+    assert (out / "FLAME_masks.pkl").is_file()
+    assert not any(key.startswith("regions") for key in report.missing)
+    data = MiniMead(root=str(out), split="identity")
+    assert {clip.attributes["emotion"] for clip in data.clips("test_b")} == {"neutral", "contempt"}
+    assert sorted(data.assets().templates) == sorted({name[:4] for name in CLIPS})
+
+
+def test_masks_beside_the_model_and_regions_of_ones_own(raw: Path, flame: Path, tmp_path: Path) -> None:
+    model = shutil.copy(flame, tmp_path / "model.pkl")
+    (tmp_path / "FLAME_masks.pkl").write_bytes(python2_pickle(flame_masks(VERTICES)))
+    assert (prepared(raw, Path(model), "a")[0] / "FLAME_masks.pkl").is_file()
+    (tmp_path / "lists").mkdir()
+    (tmp_path / "lists" / "lve.txt").write_text("1,2")
+    out, report = prepared(raw, flame, "b", regions=tmp_path / "lists")
+    assert (out / "regions" / "lve.txt").read_text() == "1,2"
+    assert {"regions/fdd.txt", "FLAME_masks.pkl"} <= set(report.missing)
+    assert "regions/lve.txt" not in report.missing
+
+
+def test_the_fake_of_the_prepared_layout_serves_both_splits(tmp_path: Path) -> None:
+    root = write_mead3d(tmp_path / "mead3d")
+    by_sentence = MiniMead(root=str(root), split="sentence")
+    assert all(by_sentence.clips(split) for split in ("train", "val", "test_a"))
+    assert not by_sentence.clips("test_b")
+    by_identity = MiniMead(root=str(root), split="identity")
+    assert all(by_identity.clips(split) for split in ("train", "val", "test_b"))
+    for data in (by_sentence, by_identity):
+        for split in ("train", *data.test_splits):
+            for sample in data.dataset(split):
+                assert sample.reference_name != sample.name
+
+
+def test_the_sound_of_meads_own_files(tmp_path: Path, flame: Path) -> None:
+    """AAC loses a little, but nothing may be shifted: 20 ms are half a frame."""
+    raw = write_raw_emote(tmp_path / "raw", clips=PAIR, audio="m4a")
+    out, report = prepared(raw, flame)
+    assert not report.failed
+    for name in PAIR:
+        found, info = read_speech(out / "wav" / f"{name}.wav"), soundfile.info(out / "wav" / f"{name}.wav")
+        assert (info.samplerate, info.channels, info.subtype) == (16_000, 1, "PCM_16")
+        expected = speech_of(name, 16_000)
+        assert 0 <= len(found) - len(expected) < 0.04 * 16_000
+        shifts = range(-320, 321)
+        padded = np.pad(expected, 400)
+        scores = [found[: len(expected)] @ padded[400 + s : 400 + s + len(expected)] for s in shifts]
+        assert abs(list(shifts)[int(np.argmax(scores))]) <= 16
+
+
+def test_sound_is_found_wherever_it_may_lie(tmp_path: Path) -> None:
+    tone = np.zeros(100)
+    places = {
+        "raw": f"MEAD/{emote_folder(CLIP, 'audio')}.wav",
+        "no_audio": f"{CLIP[:4]}/neutral/level_1/001.flac",
+        "flat": f"wav/{CLIP}.wav",
+        "deep": f"a/b/c/{CLIP}.wav",
+    }
+    for root, place in places.items():
+        path = tmp_path / root / place
+        path.parent.mkdir(parents=True)
+        soundfile.write(path, tone, 16_000)
+        assert find_sounds(tmp_path / root) == {CLIP: path}
+    # What is converted already comes before MEAD's own.
+    (tmp_path / "raw" / "MEAD" / emote_folder(CLIP, "audio")).with_suffix(".m4a").write_bytes(b"x")
+    assert find_sounds(tmp_path / "raw")[CLIP].suffix == ".wav"
+    # Neither other files nor MEAD's other cameras are sound.
+    (tmp_path / "raw" / "MEAD" / emote_folder(CLIP, "audio")).with_suffix(".txt").write_bytes(b"x")
+    video = tmp_path / "video" / emote_folder(CLIP, "video/left_30").replace("001", "002.mp4")
+    write_wav(video.with_suffix(".wav"), tone)
+    assert find_sounds(tmp_path / "video") == {}
+
+
+def test_sound_from_another_folder(tmp_path: Path, flame: Path) -> None:
+    raw = write_raw_emote(tmp_path / "raw", clips=PAIR, audio="wav")
+    (raw / "MEAD").rename(tmp_path / "elsewhere")
+    with pytest.raises(FaceDiffError, match=r"no clip of 3DMEAD can be prepared .*--audio says where"):
+        prepared(raw, flame)
+    out, report = prepared(raw, flame, audio=tmp_path / "elsewhere")
+    assert sorted(report.clips) == list(PAIR)
+    np.testing.assert_allclose(
+        read_speech(out / "wav" / f"{CLIP}.wav")[1000:5000], speech_of(CLIP, 16_000)[1000:5000], atol=1e-3
+    )
+
+
+def test_options_of_the_command_line(tmp_path: Path, flame: Path) -> None:
+    raw = write_raw_emote(tmp_path / "raw", audio="wav")
+    words = ["mead3d", str(raw), str(tmp_path / "out"), "--dtype", "float64", "--quiet", "--flame", str(flame)]
+    words += ["--shape", "clip", "--subjects", "M003, W040", "--audio", str(raw / "MEAD")]
+    plan = command.make_plan(command.parser().parse_args(words))
+    assert {job.name[:4] for job in plan.jobs} == {"M003", "W040"}
+    assert plan.options["dtype"] == "float64"
+    assert plan.options["shape"] == "clip"
+    assert plan.options["subjects"] == ["M003", "W040"]
+    assert (plan.corpus, plan.frame_rate, plan.unit, plan.n_vertices) == ("mead3d", 25.0, "m", VERTICES)
+    assert all(job.frames == frames_of(job.name) for job in plan.jobs)
+    report = prepare(plan, tmp_path / "out", workers=1, quiet=True)
+    assert motion_of(tmp_path / "out", CLIP).dtype == np.float64
+    assert sorted(report.clips) == sorted(name for name in CLIPS if name[:4] in ("M003", "W040"))
+
+
+def test_several_processes_write_the_same(raw: Path, flame: Path) -> None:
+    one, _ = prepared(raw, flame)
+    two = raw.parent / "two"
+    assert not prepare(mead3d.plan(raw, flame=flame), two, workers=2, quiet=True).failed
+    for path in one.rglob("*.npy"):
+        assert (two / path.relative_to(one)).read_bytes() == path.read_bytes()
+
+
+def test_speakers_that_are_not_there_are_named(raw: Path, flame: Path) -> None:
+    report = prepared(raw, flame)[1]
+    absent = [key for key in report.missing if len(key) == 4]
+    assert len(absent) == 46
+    assert "M003" not in absent
+    assert "M003" in mead3d.plan(raw, flame=flame, subjects=["M003"]).options["subjects"]
+    assert not [key for key in mead3d.plan(raw, flame=flame, subjects=["M003"]).missing if len(key) == 4]
+    with pytest.raises(FaceDiffError, match=r'--subjects: the raw folder has no "M03": did you mean "M003"'):
+        mead3d.plan(raw, flame=flame, subjects=["M03"])
+    with pytest.raises(FaceDiffError, match="--subjects: names nobody"):
+        mead3d.plan(raw, flame=flame, subjects=[])
+
+
+def test_a_speaker_of_no_split_is_prepared_and_noted(tmp_path: Path, flame: Path) -> None:
+    raw = write_raw_emote(tmp_path / "raw", clips=["M777_001_0_0"], audio="wav")
+    _, report = prepared(raw, flame)
+    assert list(report.clips) == ["M777_001_0_0"]
+    assert any("M777" in note for note in report.notes)
+
+
+def test_a_clip_without_sound_or_without_parameters_is_missing(raw: Path, flame: Path) -> None:
+    next((raw / "MEAD").rglob("002.wav")).unlink()
+    extra = hdf5(raw, "M003_005_0_0")
+    extra.parent.mkdir(parents=True)
+    _, report = prepared(raw, flame)
+    assert list(report.clips) == [CLIP]
+    assert "expected its sound, M003_002_0_0.wav or M003/audio/neutral/level_1/002.m4a" in report.missing[PAIR[1]]
+    assert report.missing["M003_005_0_0"] == f"expected {extra}"
+
+
+FRAMES = frames_of(CLIP)
+
+
+def with_nan(key: str) -> Parts:
+    parts = parameters_of(CLIP)
+    parts[key][3, 1] = np.nan
+    return parts
+
+
+def without(key: str) -> Parts:
+    return {name: value for name, value in parameters_of(CLIP).items() if name != key}
+
+
+def cut(key: str) -> Parts:
+    parts = parameters_of(CLIP)
+    return {**parts, key: parts[key][:-2]}
+
+
+@pytest.mark.parametrize("form", ["flat", "hickle"])
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (without("jaw"), r"has no jaw \(it has exp, shape\); expected shape, exp and jaw"),
+        (without("exp"), r"has no exp"),
+        (with_nan("exp"), r"frame 3 \(counted from 0\) of exp holds NaN or infinity"),
+        (with_nan("jaw"), r"frame 3 \(counted from 0\) of jaw holds NaN"),
+        (with_nan("shape"), r"frame 3 \(counted from 0\) of shape holds NaN"),
+        (cut("jaw"), rf"frames do not agree \({FRAMES} of shape, {FRAMES} of exp, {FRAMES - 2} of jaw\)"),
+        (cut("shape"), r"frames do not agree"),
+        ({**without("jaw"), "jaw": np.zeros((FRAMES, 6))}, r"jaw.* has shape \(1, \d+, 6\); expected \(1, frames, 3\)"),
+        (
+            {**without("exp"), "exp": np.zeros((FRAMES, 101))},
+            r"exp.* has shape .*101\); expected \(1, frames, up to 100\)",
+        ),
+        ({key: value[:0] for key, value in parameters_of(CLIP).items()}, r"with at least one frame"),
+        ({**without("exp"), "exp": np.full((FRAMES, 3), b"text")}, r"exp.* holds no numbers"),
+    ],
+)
+def test_wrong_parameters_cost_one_clip_and_say_why(
+    parts: Parts, message: str, form: str, raw: Path, flame: Path
+) -> None:
+    write_hdf5(hdf5(raw), parts, form)  # type: ignore[arg-type]
+    said = problem(raw, flame)
+    assert said.startswith(str(hdf5(raw)))
+    with pytest.raises(FaceDiffError, match=message):
+        raise FaceDiffError(said)
+
+
+def test_a_truncated_file_costs_one_clip(raw: Path, flame: Path) -> None:
+    content = hdf5(raw).read_bytes()
+    hdf5(raw).write_bytes(content[: len(content) // 2])
+    said = problem(raw, flame)
+    assert said.startswith(f"{hdf5(raw)}: not a readable HDF5 file, perhaps truncated")
+
+
+def test_a_file_that_points_to_other_files_is_refused(raw: Path, tmp_path: Path) -> None:
+    import h5py
+
+    parts = parameters_of(CLIP)
+    write_hdf5(tmp_path / "other.hdf5", parts)
+    with h5py.File(hdf5(raw), "w") as file:
+        file["exp"] = h5py.ExternalLink(str(tmp_path / "other.hdf5"), "exp")
+        file["shape"], file["jaw"] = parts["shape"], parts["jaw"]
+    with pytest.raises(FaceDiffError, match="exp lies in another file"):
+        read_parameters(hdf5(raw))
+    (tmp_path / "secret").write_bytes(parts["exp"].astype("<f4").tobytes())
+    with h5py.File(hdf5(raw), "w") as file:
+        outside = [(str(tmp_path / "secret"), 0, h5py.h5f.UNLIMITED)]
+        file.create_dataset("exp", parts["exp"].shape, "<f4", external=outside)
+        file["shape"], file["jaw"] = parts["shape"], parts["jaw"]
+    with pytest.raises(FaceDiffError, match="exp lies in another file"):
+        read_parameters(hdf5(raw))
+    with h5py.File(hdf5(raw), "w") as file:
+        file.create_dataset("exp", (1, 10**9, 100), "<f4", chunks=(1, 64, 100))
+        file["shape"], file["jaw"] = parts["shape"], parts["jaw"]
+    with pytest.raises(FaceDiffError, match="expected at most 1000000 frames"):
+        read_parameters(hdf5(raw))
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (
+            np.zeros((1, 9, 400), np.float32),
+            r"holds float32 \(1, 9, 400\); expected floats of shape \(1, frames, 403\)",
+        ),
+        (np.zeros((2, 9, 403), np.float32), r"has shape \(2, 9, 403\); expected \(1, frames, "),
+        (np.zeros((1, 0, 403), np.float32), r"at least one frame"),
+        (np.zeros((1, 9, 403), np.int64), r"holds int64"),
+        (np.full((1, 9, 403), np.inf, np.float32), r"frame 0 \(counted from 0\) of shape holds NaN or infinity"),
+    ],
+)
+def test_wrong_arrays_of_probtalk3d(array: np.ndarray, message: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "clip.npy", array)
+    with pytest.raises(FaceDiffError, match=rf"clip\.npy: .*{message}"):
+        read_parameters(tmp_path / "clip.npy")
+
+
+def test_files_that_are_no_parameters(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match=r"clip\.npy: no such file; expected FLAME parameters"):
+        read_parameters(tmp_path / "clip.npy")
+    np.save(tmp_path / "clip.npy", np.array([{}], object))
+    with pytest.raises(FaceDiffError, match=r"clip\.npy: not a readable NumPy array"):
+        read_parameters(tmp_path / "clip.npy")
+    np.savez(tmp_path / "clip.npz", a=np.zeros(3))
+    (tmp_path / "clip.npz").replace(tmp_path / "clip.npy")
+    with pytest.raises(FaceDiffError, match=r"clip\.npy: holds an archive"):
+        read_parameters(tmp_path / "clip.npy")
+
+
+def test_without_h5py_the_extra_is_named(raw: Path, flame: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(MissingExtraError, match=r'"h5py".*facediff\[prepare\]'):
+        mead3d.plan(raw, flame=flame)
+
+
+def test_unusable_sound_costs_one_clip(raw: Path, flame: Path) -> None:
+    next((raw / "MEAD").rglob("001.wav")).write_bytes(b"RIFF")
+    assert "001.wav: not a readable sound file" in problem(raw, flame)
+
+
+def test_folders_that_are_none(tmp_path: Path, flame: Path, raw: Path) -> None:
+    with pytest.raises(FaceDiffError, match=r"nowhere: no such folder"):
+        mead3d.plan(tmp_path / "nowhere", flame=flame)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FaceDiffError, match=r"empty: holds no reconstructions of MEAD; expected <speaker>/front/"):
+        mead3d.plan(tmp_path / "empty", flame=flame)
+    with pytest.raises(FaceDiffError, match=r"generic_model\.pkl: no such file"):
+        mead3d.plan(raw, flame=tmp_path / "generic_model.pkl")
+    with pytest.raises(FaceDiffError, match=r"nowhere: no such folder"):
+        mead3d.plan(raw, flame=flame, audio=tmp_path / "nowhere")
+    shutil.copytree(raw / "EMICA-MEAD_flame2020", raw / "EMICA_mead_mp_lr_mse_15")
+    with pytest.raises(FaceDiffError, match="holds reconstructions in .*EMICA-MEAD_flame2020 and in .*; give one of"):
+        find_recordings(raw)
+
+
+@pytest.mark.parametrize("depth", ["", "EMICA-MEAD_flame2020"])
+def test_the_raw_folder_may_be_given_at_any_depth(depth: str, raw: Path) -> None:
+    deep = raw.parent / "processed" / "reconstructions"
+    deep.mkdir(parents=True)
+    (raw / "EMICA-MEAD_flame2020").rename(deep / "EMICA-MEAD_flame2020")
+    found = find_recordings(deep / depth if depth else raw.parent)
+    assert [recording.name for recording in found.recordings] == list(PAIR)
+    assert found.base == deep / "EMICA-MEAD_flame2020"
+
+
+def test_a_repaired_clip_is_written_by_a_second_run_but_shapes_are_never_mixed(raw: Path, flame: Path) -> None:
+    """The repaired clip changes the speaker's mean shape, so that the clip that is there has another."""
+    whole = hdf5(raw).read_bytes()
+    hdf5(raw).write_bytes(b"")
+    out, report = prepared(raw, flame)
+    assert list(report.failed) == [CLIP]
+    hdf5(raw).write_bytes(whole)
+    with pytest.raises(FaceDiffError, match=r"mean shape has changed; remove vertices_npy/M003_\* there"):
+        prepared(raw, flame)
+    for path in out.glob("vertices_npy/M003_*"):
+        path.unlink()
+    assert sorted(prepared(raw, flame)[1].clips) == list(PAIR)
+    fresh, _ = prepared(raw, flame, "fresh")
+    for path in fresh.rglob("*.npy"):
+        assert (out / path.relative_to(fresh)).read_bytes() == path.read_bytes()
+
+
+def test_a_folder_is_not_continued_with_another_model_or_shape(raw: Path, flame: Path, tmp_path: Path) -> None:
+    prepared(raw, flame)
+    with pytest.raises(FaceDiffError, match="--flame was a model with SHA-256"):
+        prepared(raw, write_flame(tmp_path / "other.pkl", seed=1))
+    with pytest.raises(FaceDiffError, match="--shape was subject and is clip"):
+        prepared(raw, flame, shape="clip")
+    moved = shutil.copy(flame, tmp_path / "moved.pkl")
+    assert prepared(raw, Path(moved))[1].written == 0

@@ -1,0 +1,412 @@
+"""Preparing in general: kills, resumption, refusals, the manifest."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import functools
+import hashlib
+import importlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import namedtuple
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from facediff.cli.data import CORPORA, grouped, make_plan, own_options, prepare_parser, prepare_run
+from facediff.data.prepare import biwi, runner
+from facediff.data.prepare.runner import Job, Plan, prepare, write_motion, write_speech, write_templates
+from facediff.errors import FaceDiffError, MissingExtraError
+from tests.fakes.biwi import vl_bytes, write_raw_biwi
+
+CLIPS = ["A_e01", "A_e02", "B_e01"]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder, hidden ones too."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def write_toy(name: str, frames: int, out: Path) -> int:
+    motion = np.full((frames, 2, 3), frames, np.float64) + np.arange(6).reshape(2, 3)
+    write_motion(out / "vertices_npy" / f"{name}.npy", motion)
+    write_speech(out / "wav" / f"{name}.wav", np.linspace(-0.5, 0.5, 640 * frames))
+    return frames
+
+
+def raising(error: Exception, out: Path) -> int:
+    raise error
+
+
+def write_toy_templates(out: Path) -> list[str]:
+    write_templates(out / "templates.pkl", {"A": np.zeros((2, 3))})
+    return ["templates.pkl"]
+
+
+def toy_plan(
+    works: dict[str, Callable[[Path], int]] | None = None, options: dict[str, object] | None = None, **facts: object
+) -> Plan:
+    works = works or {name: partial(write_toy, name, 3 + i) for i, name in enumerate(CLIPS)}
+    jobs = [Job(name, work, 3) for name, work in works.items()]
+    return Plan("toy", 25.0, "m", 2, options or {"dtype": "float32"}, jobs, write_toy_templates, **facts)  # type: ignore[arg-type]
+
+
+def test_the_manifest_says_what_is_there(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    report = prepare(toy_plan(missing={"C": "expected C"}, notes=["look"]), out, workers=1)
+    assert report.sound
+    assert report.written == 3
+    manifest = json.loads((out / "manifest.json").read_text())
+    files = contents(out)
+    assert set(files) == {"manifest.json", *manifest["files"]}
+    for name, facts in manifest["files"].items():
+        assert facts == {"bytes": len(files[name]), "sha256": hashlib.sha256(files[name]).hexdigest()}
+    assert manifest["clips"] == {"A_e01": 3, "A_e02": 4, "B_e01": 5} == report.clips
+    total = sum(len(data) for name, data in files.items() if name != "manifest.json")
+    assert manifest["totals"] == {"clips": 3, "frames": 12, "seconds": 0.48, "bytes": total}
+    facts = {"corpus": "toy", "frame_rate": 25.0, "unit": "m", "n_vertices": 2, "options": {"dtype": "float32"}}
+    assert {name: manifest[name] for name in facts} == facts
+    assert manifest["missing"] == {"C": "expected C"}
+    assert manifest["notes"] == ["look"]
+    assert manifest["failed"] == {}
+
+
+def test_a_second_run_changes_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    prepare(toy_plan(), out, workers=1)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    report = prepare(toy_plan(), out, workers=1)
+    assert report.written == 0
+    assert report.clips == {"A_e01": 3, "A_e02": 4, "B_e01": 5}
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*") if path != out} == {
+        path: stamp for path, stamp in before.items() if path != out
+    }
+
+
+@pytest.mark.parametrize("flaw", ["npy cut", "npy gone", "wav empty", "wav gone", "templates gone", "other type"])
+def test_what_is_damaged_is_written_again(tmp_path: Path, flaw: str) -> None:
+    out = tmp_path / "out"
+    prepare(toy_plan(), out, workers=1)
+    whole = contents(out)
+    motion, speech = out / "vertices_npy" / "A_e02.npy", out / "wav" / "A_e02.wav"
+    if flaw == "npy cut":
+        motion.write_bytes(motion.read_bytes()[:-5])
+    elif flaw == "other type":
+        np.save(motion, np.load(motion).astype("f8"))
+    elif flaw == "wav empty":
+        speech.write_bytes(b"")
+    else:
+        {"npy gone": motion, "wav gone": speech, "templates gone": out / "templates.pkl"}[flaw].unlink()
+    report = prepare(toy_plan(), out, workers=1)
+    assert report.written == (0 if flaw == "templates gone" else 1)
+    assert contents(out) == whole
+
+
+def test_a_failing_clip_does_not_stop_the_others_and_can_be_repaired(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    works = {name: partial(write_toy, name, 3 + i) for i, name in enumerate(CLIPS)}
+    report = prepare(toy_plan({**works, "A_e02": partial(raising, FaceDiffError("x.vl: bad"))}), out, workers=1)
+    assert not report.sound
+    assert report.failed == {"A_e02": "x.vl: bad"}
+    assert set(report.clips) == {"A_e01", "B_e01"}
+    assert json.loads((out / "manifest.json").read_text())["failed"] == {"A_e02": "x.vl: bad"}
+    repaired = prepare(toy_plan(works), out, workers=1)
+    assert repaired.sound
+    assert repaired.written == 1
+    prepare(toy_plan(works), tmp_path / "at once", workers=1)
+    assert contents(out) == contents(tmp_path / "at once")
+
+
+def test_damaged_files_of_a_clip_that_fails_do_not_stay(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    prepare(toy_plan(), out, workers=1)
+    (out / "vertices_npy" / "A_e02.npy").write_bytes(b"half")
+    works = {name: partial(write_toy, name, 3 + i) for i, name in enumerate(CLIPS)}
+    report = prepare(toy_plan({**works, "A_e02": partial(raising, FaceDiffError("x.vl: bad"))}), out, workers=1)
+    assert list(report.failed) == ["A_e02"]
+    assert not list(out.rglob("*A_e02*"))
+
+
+def full_disk() -> FaceDiffError:
+    error = FaceDiffError("out: cannot be written (No space left on device)")
+    error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
+    return error
+
+
+@pytest.mark.parametrize("error", [full_disk(), MissingExtraError("av", "prepare", "reading flv")])
+def test_what_would_fail_every_clip_stops_the_run(tmp_path: Path, error: FaceDiffError) -> None:
+    out = tmp_path / "out"
+    plan = toy_plan({"A_e01": partial(raising, error), "A_e02": partial(write_toy, "A_e02", 3)})
+    with pytest.raises(FaceDiffError, match="No space left|facediff\\[prepare\\]"):
+        prepare(plan, out, workers=1)
+    assert (out / "prepare.json").is_file()
+    assert not (out / "vertices_npy" / "A_e02.npy").exists()
+    assert not (out / "manifest.json").exists()
+
+
+def test_a_programming_error_is_no_failed_clip(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError) as caught:
+        prepare(toy_plan({"A_e01": partial(raising, ZeroDivisionError("oops"))}), tmp_path / "out", workers=1)
+    assert caught.value.__notes__ == ["while preparing clip A_e01"]
+
+
+def test_other_options_are_refused(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    prepare(toy_plan(options={"dtype": "float32", "subjects": ["A", "B"]}), out, workers=1)
+    before = contents(out)
+    with pytest.raises(FaceDiffError, match=r"--dtype was float32 and is float64; --subjects was A B and is A\)"):
+        prepare(toy_plan(options={"dtype": "float64", "subjects": ["A"]}), out, workers=1)
+    assert contents(out) == before
+
+
+def test_another_version_may_look_but_not_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    prepare(toy_plan(), out, workers=1)
+    monkeypatch.setattr("facediff.data.prepare.runner.version", lambda: "99.0")
+    assert prepare(toy_plan(), out, workers=1).written == 0
+    (out / "wav" / "A_e01.wav").unlink()
+    with pytest.raises(FaceDiffError, match=r"facediff was .* and is 99\.0"):
+        prepare(toy_plan(), out, workers=1)
+
+
+def test_foreign_folders_and_strays_are_refused(tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    (other / "wav").mkdir(parents=True)
+    with pytest.raises(FaceDiffError, match=r"other: holds other files \(wav\)"):
+        prepare(toy_plan(), other, workers=1)
+    assert [path.name for path in other.iterdir()] == ["wav"]
+    out = tmp_path / "out"
+    prepare(toy_plan(), out, workers=1)
+    with pytest.raises(FaceDiffError, match=r"A_e02\.npy: is no clip of the raw folder"):
+        prepare(toy_plan({"A_e01": partial(write_toy, "A_e01", 3)}), out, workers=1)
+
+
+@pytest.mark.parametrize(("where", "sentence"), [("file", "is a file"), ("file/out", "cannot be written")])
+def test_a_folder_that_cannot_be_written_gets_one_sentence(tmp_path: Path, where: str, sentence: str) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FaceDiffError, match=sentence):
+        prepare(toy_plan(), tmp_path / where, workers=1)
+
+
+def test_two_runs_do_not_meet_in_one_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    with (out / ".prepare.lock").open("w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        with pytest.raises(FaceDiffError, match="another `facediff data prepare` is at work"):
+            prepare(toy_plan(), out, workers=1)
+        assert (out / ".prepare.lock").exists()
+    assert prepare(toy_plan(), out, workers=1).sound  # a lock file that nobody holds is nothing
+
+
+def test_a_disk_that_is_too_small_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    # 9 frames of 2 vertices in float32, and 640 samples of 16 bit for each.
+    needed = 9 * (2 * 3 * 4 + 640 * 2)
+    usage = namedtuple("usage", "free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(needed - 1))
+    with pytest.raises(FaceDiffError, match="GB are needed"):
+        prepare(toy_plan(), out, workers=1)
+    assert not out.exists()
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(needed))
+    assert prepare(toy_plan(), out, workers=1).sound
+
+
+@pytest.mark.parametrize("name", ["../../x_e01", "/etc/x_e01", "a/b_e01", ".hidden_e01", "", "x\n_e01"])
+def test_names_cannot_leave_the_folder(name: str) -> None:
+    with pytest.raises(FaceDiffError, match="clip name"):
+        Job(name, partial(write_toy, name, 3))
+
+
+def test_speech_of_16_bit_goes_through_unchanged_and_loud_speech_is_clipped(tmp_path: Path) -> None:
+    samples = np.arange(-32768, 32768, 7).astype(np.int16)
+    write_speech(tmp_path / "a.wav", samples.astype(np.float32) / 32768)
+    read, rate = soundfile.read(tmp_path / "a.wav", dtype="int16")
+    assert rate == 16000
+    assert np.array_equal(read, samples)
+    write_speech(tmp_path / "b.wav", np.array([1.5, -1.5, 0.0], np.float32))
+    assert soundfile.read(tmp_path / "b.wav", dtype="int16")[0].tolist() == [32767, -32768, 0]
+
+
+def test_motion_that_is_not_finite_is_not_written(tmp_path: Path) -> None:
+    motion = np.zeros((4, 2, 3), np.float32)
+    motion[2, 1, 0] = np.inf
+    with pytest.raises(FaceDiffError, match=r"a: frame 2 \(counted from 0\)"):
+        write_motion(tmp_path / "a.npy", motion)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
+    raw = write_raw_biwi(tmp_path / "raw")
+    (raw / "faces" / "F2" / "e02" / "frame_003.vl").write_bytes(b"\0" * 7)
+    reports = [prepare(biwi.plan(raw), tmp_path / str(workers), workers=workers, quiet=True) for workers in (1, 3)]
+    assert list(reports[0].failed) == ["F2_e02"]
+    assert "frame_003.vl" in reports[0].failed["F2_e02"]
+    assert reports[0].failed == reports[1].failed
+    assert contents(tmp_path / "1") == contents(tmp_path / "3")
+
+
+PROGRAM = """
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from facediff.prepare import biwi, runner
+from slow import slow
+if __name__ == "__main__":
+    plan = biwi.plan(Path(sys.argv[1]))
+    jobs = [replace(job, work=partial(slow, job.work)) for job in plan.jobs]
+    try:
+        runner.prepare(replace(plan, jobs=jobs), Path(sys.argv[2]), workers=2, quiet=True)
+    except KeyboardInterrupt:
+        sys.exit(130)
+"""
+SLOW = """
+import os, time
+def slow(work, out):
+    (out.parent / f"pid-{os.getpid()}").touch()
+    frames = work(out)
+    time.sleep(0.6)  # so that the signal comes long before the end, however busy the machine is
+    return frames
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_stopped_run_is_taken_up_and_ends_as_if_nothing_had_happened(tmp_path: Path, how: signal.Signals) -> None:
+    raw, out = write_raw_biwi(tmp_path / "raw", sentences=[f"e{i:02d}" for i in range(1, 12)]), tmp_path / "out"
+    (tmp_path / "program.py").write_text(PROGRAM)
+    (tmp_path / "slow.py").write_text(SLOW)
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "program.py"), str(raw), str(out)],
+        env={**os.environ, "PYTHONPATH": f"{Path(__file__).parents[2]}:{tmp_path}"},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 60
+    while len(list(out.glob("wav/[FM]*.wav"))) < 4:
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    # Ctrl-C reaches every process of the terminal; the kill reaches the first only, and the workers must notice.
+    os.killpg(process.pid, how) if how == signal.SIGINT else process.kill()
+    assert "Traceback" not in process.communicate(timeout=30)[1]
+    assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
+    workers = [int(path.name.partition("-")[2]) for path in tmp_path.glob("pid-*")]
+    assert len(workers) == 2
+    while any(Path(f"/proc/{pid}").exists() for pid in workers):
+        assert time.monotonic() < deadline, "a worker has outlived the run"
+        time.sleep(0.02)
+    kept = len(list(out.glob("wav/[FM]*.wav")))
+    assert 4 <= kept < 33
+    assert (out / "prepare.json").is_file()
+    assert not (out / "manifest.json").exists()
+    (out / "vertices_npy" / ".F1_e01.partial-4711.npy").write_bytes(b"half")
+    report = prepare(biwi.plan(raw), out, workers=1)
+    assert 0 < report.written <= 33 - kept + 2
+    prepare(biwi.plan(raw), tmp_path / "at once", workers=1)
+    assert contents(out) == contents(tmp_path / "at once")
+
+
+def test_the_command_says_what_came_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    raw = write_raw_biwi(tmp_path / "raw", regions=False)
+    frame = raw / "faces" / "M3" / "e33" / "frame_002.vl"
+    frame.write_bytes(vl_bytes(np.zeros((3, 3))))
+    arguments = ["biwi", str(raw), str(tmp_path / "out"), "--subjects", "F2,M3", "--workers", "1"]
+    assert prepare_run("prepare", arguments) == 1
+    shown = capsys.readouterr().out
+    assert "7 clips" in shown
+    assert "7 written now" in shown
+    assert f"M3_e33: {frame}: has 40 bytes" in shown
+    assert "regions/lve.txt: expected in a folder given by --regions" in shown
+    assert "F2_e03 … F2_e40 (36 in all): expected frames in" in shown
+    shutil.rmtree(frame.parent)
+    shutil.copytree(raw / "faces" / "M3" / "e37", frame.parent)
+    assert prepare_run("prepare", arguments) == 0
+    assert "1 written now" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("out", ["raw", "raw/prepared", "raw/../raw"])
+def test_the_command_does_not_write_into_the_raw_folder(tmp_path: Path, out: str) -> None:
+    raw = write_raw_biwi(tmp_path / "raw", subjects=["F2"], sentences=["e01"])
+    before = contents(raw)
+    with pytest.raises(FaceDiffError, match="lies in the raw folder"):
+        prepare_run("prepare", ["biwi", str(raw), str(tmp_path / out)])
+    assert contents(raw) == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["biwy", "a", "b"],
+        ["biwi", "a"],
+        ["biwi", "a", "b", "--dtype", "float16"],
+        ["vocaset", "a", "b", "--frame-rate", "25"],
+    ],
+)
+def test_wrong_words_end_with_usage(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        prepare_run("prepare", arguments)
+    assert stop.value.code == 2
+
+
+def test_lines_for_the_screen_are_grouped_by_subject_and_reason() -> None:
+    entries = {"F1_e01": "expected a/e01", "F1_e02": "expected a/e02", "F1_e03": "expected b/e03", "x.ply": "no"}
+    assert grouped(entries) == ["F1_e01 … F1_e02 (2 in all): expected a/e01", "F1_e03: expected b/e03", "x.ply: no"]
+
+
+def test_workers_must_be_positive(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="--workers: is 0"):
+        prepare(toy_plan(), tmp_path / "out", workers=0)
+    assert runner.processors() >= 1
+
+
+@pytest.mark.parametrize("corpus", CORPORA)
+def test_every_option_of_a_corpus_is_explained_and_reaches_its_plan(corpus: str, tmp_path: Path) -> None:
+    module = importlib.import_module(f"facediff.data.prepare.{corpus}")
+    (choose,) = (action for action in prepare_parser()._actions if action.dest == "corpus")
+    actions = {action.dest: action for action in choose.choices[corpus]._actions}  # type: ignore[index, call-overload]
+    own = own_options(module.plan)
+    assert {option.name for option in own} <= set(actions)
+    for option in own:
+        assert len(actions[option.name].help) > 10
+        assert actions[option.name].default == (None if option.default is option.empty else option.default)
+
+
+def test_options_are_read_by_their_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = {}
+    monkeypatch.setattr(biwi, "plan", with_signature_of(biwi.plan, seen))
+    words = ["biwi", "r", "o", "--subjects", "F2,F3", "--regions", "lists", "--dtype", "float64"]
+    make_plan(prepare_parser().parse_args(words))
+    expected = {"normalise": "codetalker", "dtype": "float64", "subjects": ["F2", "F3"], "regions": Path("lists")}
+    assert seen == {"raw": Path("r"), **expected}
+
+
+def with_signature_of(plan: Callable[..., Plan], seen: dict[str, object]) -> Callable[..., Plan]:
+    @functools.wraps(plan)
+    def record(raw: Path, **options: object) -> Plan:
+        seen.update(raw=raw, **options)
+        return toy_plan()
+
+    return record
+
+
+def test_equal_templates_give_equal_bytes_wherever_their_arrays_come_from(tmp_path: Path) -> None:
+    """NumPy may hand out several instances of one dtype, and a pickle tells them apart."""
+    faces = {"A": np.ones((2, 3), np.float32), "B": np.zeros((2, 3), np.float32)}
+    other = {**faces, "B": np.zeros((2, 3), np.dtype(np.float32).newbyteorder("<"))}
+    assert other["B"].dtype is not faces["B"].dtype
+    write_templates(tmp_path / "one.pkl", faces)
+    write_templates(tmp_path / "two.pkl", other)
+    assert (tmp_path / "one.pkl").read_bytes() == (tmp_path / "two.pkl").read_bytes()

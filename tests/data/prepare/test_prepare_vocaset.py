@@ -1,0 +1,302 @@
+"""VOCASET from its raw distribution: rows to clips, 60 to 30 frames a second, the sound, and what may be wrong."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from facediff.cli.data import prepare_run
+from facediff.data.prepare import vocaset
+from facediff.data.prepare.runner import Report, prepare
+from facediff.data.prepare.vocaset import halved, read_samples
+from facediff.errors import FaceDiffError
+from facediff.utils.pickles import load_pickle
+from tests.fakes.vocaset import (
+    CLIPS,
+    RATE,
+    TRAIN,
+    VERTICES,
+    flame_masks,
+    frames_of,
+    motion_of,
+    python2_pickle,
+    speech_of,
+    template_of,
+    write_raw_vocaset,
+)
+
+NAMES = sorted(f"{subject}_{sentence}" for subject, sentences in CLIPS.items() for sentence in sentences)
+CLIP = f"{TRAIN}_sentence01"
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    """One sentence of one person, 25 frames."""
+    return write_raw_vocaset(tmp_path / "raw", clips={TRAIN: ["sentence01"]}, frames=25)
+
+
+def prepared(raw: Path, **options: object) -> tuple[Path, Report]:
+    out = raw.parent / "out"
+    return out, prepare(vocaset.plan(raw, **options), out, workers=1)  # type: ignore[arg-type]
+
+
+def problem(raw: Path) -> str:
+    """Why the one clip fails."""
+    report = prepared(raw)[1]
+    assert list(report.failed) == [CLIP]
+    return report.failed[CLIP]
+
+
+def change(path: Path, key: str, value: object) -> None:
+    """Replace what a raw pickle says of the one clip, or of the one person."""
+    content = load_pickle(path)
+    if path.name == "templates.pkl":
+        content[TRAIN] = value
+    elif key:
+        content[TRAIN]["sentence01"][key] = value
+    else:
+        content[TRAIN]["sentence01"] = value
+    path.write_bytes(pickle.dumps(content))
+
+
+def test_every_second_frame_is_taken_and_nothing_else_is_done(tmp_path: Path) -> None:
+    out, report = prepared(write_raw_vocaset(tmp_path / "raw"))
+    assert sorted(report.clips) == NAMES
+    for subject, sentences in CLIPS.items():
+        for sentence in sentences:
+            motion = np.load(out / "vertices_npy" / f"{subject}_{sentence}.npy")
+            expected = motion_of(subject, sentence, frames_of(subject, sentence))[::2]
+            assert motion.dtype == np.float32
+            assert np.array_equal(motion, expected.reshape(len(expected), -1))
+            assert report.clips[f"{subject}_{sentence}"] == len(expected)
+
+
+def test_all_60_frames_a_second_can_be_kept(raw: Path) -> None:
+    out, report = prepared(raw, frame_rate=60, dtype="float64")
+    motion = np.load(out / "vertices_npy" / f"{CLIP}.npy")
+    assert motion.dtype == np.float64
+    assert np.array_equal(motion, motion_of(TRAIN, "sentence01", 25).reshape(25, -1))
+    assert report.totals["seconds"] == pytest.approx(25 / 60, abs=1e-3)
+    assert '"frame_rate": 60.0' in (out / "manifest.json").read_text()
+
+
+def test_filtering_removes_what_would_alias_and_keeps_the_rest() -> None:
+    time = np.arange(241) / 60
+    slow, fast = np.sin(2 * np.pi * 4 * time), np.sin(2 * np.pi * 23 * time)
+    motion = np.zeros((241, 2, 3))
+    motion[:, 0, 0], motion[:, 1, 1] = slow, fast
+    plain, filtered = halved(motion, "every_second"), halved(motion, "filtered")
+    inner = slice(20, 100)
+    np.testing.assert_allclose(filtered[inner, 0, 0], slow[::2][inner], atol=2e-3)
+    assert np.abs(filtered[inner, 1, 1]).max() < 2e-3
+    assert np.abs(plain[inner, 1, 1]).max() > 0.9
+    assert filtered.shape == (120, 2, 3)
+
+
+def test_the_filtered_option_reaches_the_files(raw: Path) -> None:
+    out, report = prepared(raw, decimate="filtered")
+    assert report.sound
+    motion = np.load(out / "vertices_npy" / f"{CLIP}.npy").reshape(-1, VERTICES, 3)
+    plain = motion_of(TRAIN, "sentence01", 25)[::2]
+    assert abs(len(motion) - len(plain)) <= 1
+    assert 0 < np.abs(motion[:12] - plain[:12]).max() < 0.003
+
+
+def test_speech_is_resampled_to_16_khz(raw: Path) -> None:
+    out, _ = prepared(raw)
+    samples, rate = soundfile.read(out / "wav" / f"{CLIP}.wav")
+    assert rate == 16000
+    assert len(samples) == pytest.approx(25 / 60 * 16000, abs=1)
+    speech = speech_of(TRAIN, "sentence01", 25) / 32768
+    expected = np.interp(np.arange(len(samples)) / 16000, np.arange(len(speech)) / RATE, speech)
+    assert np.abs(samples - expected)[200:-200].max() < 0.01
+
+
+@pytest.mark.parametrize(("samples", "frames"), [(20 / 60 * RATE, 20), (RATE, 25)])
+def test_as_many_frames_are_used_as_both_motion_and_sound_have(raw: Path, samples: float, frames: int) -> None:
+    change(raw / "raw_audio_fixed.pkl", "audio", np.ones(round(samples), np.int16))
+    out, _ = prepared(raw, frame_rate=60)
+    assert len(np.load(out / "vertices_npy" / f"{CLIP}.npy")) == frames
+
+
+RAMP = np.linspace(-20000, 20000, 500).astype(np.int16)
+
+
+@pytest.mark.parametrize(
+    "audio",
+    [
+        RAMP,
+        RAMP.astype(np.int64),
+        RAMP.astype(np.int32)[None],
+        RAMP.tolist(),
+        RAMP.astype(np.float64),
+        RAMP / 32768,
+        np.stack([RAMP, RAMP]),
+        np.stack([RAMP, RAMP], 1),
+    ],
+    ids=["int16", "int64", "row", "list", "float of 16 bit", "float", "channels first", "channels last"],
+)
+def test_sound_of_any_type_means_the_same(audio: object) -> None:
+    samples, rate = read_samples({"audio": audio, "sample_rate": np.int64(22050)}, "A sentence01")
+    assert rate == 22050
+    mono = samples if samples.ndim == 1 else samples.mean(1)
+    np.testing.assert_allclose(mono, RAMP / 32768, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        (np.ones(9, np.int16), 'expected a dict with "audio" and "sample_rate"'),
+        ({"audio": RAMP}, 'expected a dict with "audio" and "sample_rate"'),
+        ({"audio": RAMP, "sample_rate": 0}, "sample rate 0"),
+        ({"audio": RAMP, "sample_rate": "fast"}, "no array of numbers with a rate"),
+        ({"audio": np.zeros(0, np.int16), "sample_rate": RATE}, "has shape (0,)"),
+        ({"audio": RAMP.astype(np.uint8), "sample_rate": RATE}, "type uint8"),
+        ({"audio": np.ones((9, 9)), "sample_rate": RATE}, "has shape (9, 9)"),
+        (
+            {"audio": np.array([1, 100_000]), "sample_rate": RATE},
+            "a sample of its sound in raw_audio_fixed.pkl is 100000",
+        ),
+    ],
+)
+def test_sound_that_is_none_of_these(raw: Path, entry: object, sentence: str) -> None:
+    change(raw / "raw_audio_fixed.pkl", "", entry)
+    said = problem(raw)
+    assert f"{TRAIN} sentence01" in said
+    assert sentence in said
+
+
+def test_sound_that_is_not_finite(raw: Path) -> None:
+    change(raw / "raw_audio_fixed.pkl", "audio", np.array([0.1, np.nan] * 5000))
+    assert "not finite" in problem(raw)
+
+
+@pytest.mark.parametrize("row", [25, -1])
+def test_a_row_that_is_not_there(raw: Path, row: int) -> None:
+    change(raw / "subj_seq_to_idx.pkl", "", {**{i: i for i in range(7)}, 7: row})
+    assert (
+        f"sentence01: frame 7 is row {row} in subj_seq_to_idx.pkl, but {raw / 'data_verts.npy'} has 25 rows"
+        in problem(raw)
+    )
+
+
+def test_a_row_that_is_not_finite(raw: Path) -> None:
+    row = load_pickle(raw / "subj_seq_to_idx.pkl")[TRAIN]["sentence01"][6]
+    rows = np.load(raw / "data_verts.npy")
+    rows[row, 3, 1] = np.nan
+    np.save(raw / "data_verts.npy", rows)
+    assert f"frame 6, row {row} of {raw / 'data_verts.npy'}, holds NaN" in problem(raw)
+
+
+def test_frames_are_in_the_order_of_their_numbers_and_gaps_are_told(raw: Path) -> None:
+    change(raw / "subj_seq_to_idx.pkl", "", {4: 9, 0: 3, 2: 7, 1: 5})
+    out, report = prepared(raw, frame_rate=60)
+    motion = np.load(out / "vertices_npy" / f"{CLIP}.npy")
+    assert np.array_equal(motion, np.load(raw / "data_verts.npy")[[3, 5, 7, 9]].reshape(4, -1))
+    assert any(CLIP in note and "leaves out some of the frames up to 4" in note for note in report.notes)
+
+
+def test_pairs_that_do_not_exist_are_counted(tmp_path: Path) -> None:
+    raw = write_raw_vocaset(tmp_path / "raw")
+    audio = load_pickle(raw / "raw_audio_fixed.pkl")
+    del audio[TRAIN]["sentence02"]
+    (raw / "raw_audio_fixed.pkl").write_bytes(pickle.dumps(audio))
+    templates = load_pickle(raw / "templates.pkl")
+    gone = sorted(CLIPS)[-1]
+    del templates[gone]
+    (raw / "templates.pkl").write_bytes(pickle.dumps(templates))
+    _, report = prepared(raw)
+    assert report.sound
+    assert f"{TRAIN}_sentence02" not in report.clips
+    assert report.missing[f"{TRAIN}_sentence02"].startswith("not in raw_audio_fixed.pkl;")
+    assert report.missing[f"{TRAIN}_sentence03"].startswith("not in subj_seq_to_idx.pkl nor in raw_audio_fixed.pkl;")
+    assert "templates.pkl; no clip of" in report.missing[f"template of {gone}"]
+    assert not any(gone in name for name in report.clips)
+    complete = sum(map(len, CLIPS.values())) - 1 - len(CLIPS[gone])
+    assert len(report.clips) == complete
+    assert len([name for name in report.missing if "_TA_" in name]) == 40 * (len(CLIPS) - 1) - complete
+
+
+@pytest.mark.parametrize("file", ["subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl"])
+def test_a_pickle_that_would_run_code_does_not(raw: Path, monkeypatch: pytest.MonkeyPatch, file: str) -> None:
+    class Bomb:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return os.mkdir, ("bomb-went-off",)
+
+    monkeypatch.chdir(raw)
+    (raw / file).write_bytes(pickle.dumps({TRAIN: Bomb()}, 2))
+    with pytest.raises(FaceDiffError, match=rf"{file}: not a pickle of plain NumPy arrays"):
+        prepared(raw)
+    assert not (raw / "bomb-went-off").exists()
+    assert not (raw.parent / "out").exists()
+
+
+@pytest.mark.parametrize("file", ["data_verts.npy", "subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl"])
+def test_a_file_that_is_missing_or_truncated_is_named(raw: Path, file: str) -> None:
+    whole = (raw / file).read_bytes()
+    (raw / file).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FaceDiffError, match=f"{file}: not a "):
+        prepared(raw)
+    (raw / file).unlink()
+    with pytest.raises(FaceDiffError, match=rf"{file}: no such file; expected data_verts\.npy"):
+        prepared(raw)
+
+
+@pytest.mark.parametrize("content", [[1], {TRAIN: 3}])
+def test_pickles_of_another_shape(raw: Path, content: object) -> None:
+    (raw / "subj_seq_to_idx.pkl").write_bytes(pickle.dumps(content))
+    with pytest.raises(FaceDiffError, match=r"subj_seq_to_idx\.pkl: expected a dict from subject"):
+        prepared(raw)
+
+
+def test_mixed_vertex_counts(raw: Path) -> None:
+    change(raw / "templates.pkl", "", template_of(TRAIN)[:-8])
+    with pytest.raises(FaceDiffError, match=rf"templates\.pkl: the template of {TRAIN} has shape \(72, 3\)"):
+        prepared(raw)
+
+
+def test_names_from_pickles_cannot_leave_the_folder(raw: Path) -> None:
+    for name in ("subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl"):
+        content = load_pickle(raw / name)
+        content["../../evil"] = content.pop(TRAIN)
+        (raw / name).write_bytes(pickle.dumps(content))
+    with pytest.raises(FaceDiffError, match=r'clip name "\.\./\.\./evil_sentence01"'):
+        prepared(raw)
+
+
+def test_mesh_masks_and_regions_are_copied_if_they_are_there(raw: Path, tmp_path: Path) -> None:
+    out, report = prepared(raw)
+    for name in ("FLAME_sample.ply", "FLAME_masks.pkl", "regions/lve.txt", "regions/fdd.txt"):
+        assert (out / name).read_bytes() == (raw / name).read_bytes()
+        assert name not in report.missing
+    bare = write_raw_vocaset(tmp_path / "bare" / "trainingdata", clips={TRAIN: ["sentence01"]}, frames=9, extras=False)
+    report = prepare(vocaset.plan(bare.parent), tmp_path / "bare out", workers=1)
+    assert report.clips == {CLIP: 5}  # frames 0, 2, 4, 6, 8
+    assert "VOCA repository" in report.missing["FLAME_sample.ply"]
+    assert "flame.is.tue.mpg.de" in report.missing["FLAME_masks.pkl"]
+    assert "regions/lve.txt" in report.missing
+
+
+def test_the_command_line(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = raw.parent / "out"
+    assert prepare_run("prepare", ["vocaset", str(raw), str(out), "--frame-rate", "60", "--workers", "1"]) == 0
+    assert "1 clips, 25 frames" in capsys.readouterr().out
+    with pytest.raises(FaceDiffError, match="--frame-rate was 60 and is 30"):
+        prepare_run("prepare", ["vocaset", str(raw), str(out), "--workers", "1"])
+
+
+def test_the_fake_pickles_are_python_2s(raw: Path) -> None:
+    data = (raw / "raw_audio_fixed.pkl").read_bytes()
+    assert data.startswith(b"\x80\x02}")
+    assert b"cnumpy.core.multiarray\n_reconstruct" in data
+    assert b"_codecs" not in data
+    with pytest.raises(UnicodeDecodeError):
+        pickle.loads(data)  # noqa: S301 - as it is with the real file: an encoding must be given
+    masks = pickle.loads(python2_pickle(flame_masks()), encoding="latin1")  # noqa: S301 - just written here
+    assert masks["lips"].dtype == np.int64
+    assert len(masks["lips"]) > len(set(masks["lips"]))

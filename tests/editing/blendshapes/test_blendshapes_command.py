@@ -1,0 +1,183 @@
+"""``facediff blendshapes``: from the puppet's shapes to a table and back, and what it says when something is wrong."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.animation import Animation, write_archive
+from facediff.cli.app import main
+from facediff.cli.blendshapes import puppet_shapes
+from facediff.editing.shapes import ARKIT, read_shapes
+from facediff.mesh import read_mesh
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("shapes") / "puppet"
+    assert main(["blendshapes", "--write-puppet-shapes", str(made)]) == 0
+    return made
+
+
+@pytest.fixture(scope="module")
+def known() -> dict[str, np.ndarray]:
+    frames = np.arange(12)
+    return {
+        "jawOpen": 0.5 + 0.4 * np.sin(frames / 2),
+        "eyeBlinkLeft": (frames % 5 == 0) * 1.0,
+        "mouthPucker": frames / 15,
+    }
+
+
+@pytest.fixture(scope="module")
+def animation(folder: Path, known: dict[str, np.ndarray]) -> Animation:
+    mesh = read_mesh(folder / "neutral.obj")
+    moved = sum(
+        (read_mesh(folder / f"{name}.obj").vertices - mesh.vertices) * weights[:, None, None]
+        for name, weights in known.items()
+    )
+    return Animation(
+        "a", (mesh.vertices + moved).astype(np.float32), mesh.vertices.astype(np.float32), 25.0, faces=mesh.faces
+    )
+
+
+@pytest.fixture
+def archive(animation: Animation, tmp_path: Path) -> Path:
+    write_archive(tmp_path / "take.npz", animation)
+    return tmp_path / "take.npz"
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_the_puppets_shapes_are_arkits(folder: Path) -> None:
+    neutral, faces, shapes = puppet_shapes()
+    made = read_shapes(folder, neutral)
+    assert set(made.names) == set(shapes) < set(ARKIT)
+    assert len(made.names) == 34
+    assert made.still == made.extra == ()
+    assert np.array_equal(read_mesh(folder / "neutral.obj").faces, faces)
+    # Left shapes move the left half only (x points to the face's left), and mirror the right ones.
+    left, right = (made.deltas[made.names.index(f"mouthSmile{side}")] for side in ("Left", "Right"))
+    assert np.abs(left[neutral[:, 0] < -0.0051]).max() < 1e-8
+    assert np.abs(right[neutral[:, 0] > 0.0051]).max() < 1e-8
+    assert np.abs(left).max() == pytest.approx(np.abs(right).max(), rel=1e-3)
+
+
+def test_a_table_of_known_weights(
+    folder: Path, archive: Path, known: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "weights.csv"
+    words = ["blendshapes", str(archive), "-o", str(out), "--shapes", str(folder), "--smoothness", "0"]
+    assert main([*words, "--show", str(tmp_path / "check.png")]) == 0
+    table = rows(out)
+    for name, weights in known.items():
+        assert [float(row[name[0].upper() + name[1:]]) for row in table] == pytest.approx(weights, abs=1e-3)
+    assert [row["Timecode"] for row in table[:2]] == ["00:00:00:00.000", "00:00:00:01.000"]
+    said = capsys.readouterr().out
+    assert "absent, so that their weights are 0 and say nothing (18)" in said
+    assert "residual: median" in said
+    assert (tmp_path / "check.png").read_bytes()[:4] == b"\x89PNG"
+    assert json.loads((tmp_path / "weights.json").read_text())["absent"]
+
+
+def test_a_plain_table_within_other_bounds(folder: Path, archive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "weights.csv"
+    words = ["blendshapes", str(archive), "-o", str(out), "--shapes", str(folder), "--plain", "--bounds", "0", "0.5"]
+    assert main([*words, "--symmetry", "0.1"]) == 0
+    table = np.genfromtxt(out, delimiter=",", names=True)
+    assert table["jawOpen"].max() == pytest.approx(0.5)
+    assert table["residual_max_mm"].max() > 1
+
+
+def test_shapes_of_another_topology_are_carried(
+    folder: Path, archive: Path, known: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The shapes' vertices in another order are another topology."""
+    order = np.random.default_rng(0).permutation(1008)
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in ("neutral", *known):
+        mesh = read_mesh(folder / f"{name}.obj")
+        points = "".join(f"v {x:.9f} {y:.9f} {z:.9f}\n" for x, y, z in 100 * mesh.vertices[order])
+        triangles = "".join(f"f {a} {b} {c}\n" for a, b, c in np.argsort(order)[mesh.faces] + 1)
+        (other / f"{name}.obj").write_text(points + triangles)
+    out = tmp_path / "weights.csv"
+    words = ["blendshapes", str(archive), "-o", str(out), "--shapes", str(other), "--smoothness", "0"]
+    assert main(words) == 2
+    assert "another order" in capsys.readouterr().err
+    assert not out.exists()
+    assert main([*words, "--carry"]) == 0
+    table = rows(out)
+    for name, weights in known.items():
+        assert [float(row[name[0].upper() + name[1:]]) for row in table] == pytest.approx(weights, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["take.npz", "-o", "w.csv"], "--shapes: is missing"),
+        (["take.npz", "--shapes", "shapes"], "-o: is missing"),
+        (["-o", "w.csv", "--shapes", "shapes"], "TAKE: is missing"),
+        (["take.npz", "-o", "w.txt", "--shapes", "shapes"], "expected a table .csv"),
+        (["take.npz", "-o", "w.csv", "--shapes", "absent"], "absent: no such folder"),
+        (["absent.npz", "-o", "w.csv", "--shapes", "shapes"], "absent.npz: no such file"),
+        (["nan.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "frame 1 holds NaN"),
+        (["empty.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "holds no frames"),
+        (["small.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "1008 vertices and the take's"),
+        (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--bounds", "1", "0"], "bounds 1 to 0"),
+        (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--show", "a.jpg"], "expected a picture .png"),
+        (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--region", "lips"], "has no regions"),
+        (["take.npz", "-o", "mine.csv", "--shapes", "shapes"], "mine.json: is a file that facediff did not write"),
+        (["bare.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25", "--show", "a.png"], "without a mesh"),
+        (["take.npz", "--write-puppet-shapes", "new"], "leave the take away"),
+        (["--write-puppet-shapes", "shapes"], "is there already"),
+        (["--write-puppet-shapes", "new", "--identity", "F9"], 'no speaker "F9"; known are'),
+    ],
+)
+def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
+    words: list[str],
+    says: str,
+    folder: Path,
+    archive: Path,
+    animation: Animation,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "shapes").symlink_to(folder)
+    spoilt = animation.vertices[:3].copy()
+    spoilt[1, 2] = np.nan
+    for name, array in (
+        ("nan", spoilt),
+        ("empty", animation.vertices[:0]),
+        ("small", animation.vertices[:, :99]),
+        ("bare", animation.vertices),
+    ):
+        np.save(tmp_path / f"{name}.npy", array)
+    (tmp_path / "mine.json").write_text("{}")
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.chdir(tmp_path)
+    assert main(["blendshapes", *words]) == 2
+    said = capsys.readouterr().err
+    assert says in said
+    assert said.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / "mine.json").read_text() == "{}"
+
+
+def test_the_command_runs_as_a_program(folder: Path, archive: Path, tmp_path: Path) -> None:
+    words = ["blendshapes", str(archive), "-o", str(tmp_path / "w.csv"), "--shapes", str(folder)]
+    run = subprocess.run(
+        [sys.executable, "-W", "error", "-m", "facediff", *words], capture_output=True, text=True, timeout=120
+    )
+    assert run.returncode == 0, run.stderr
+    assert "w.csv: 12 frames, 34 shapes" in run.stdout

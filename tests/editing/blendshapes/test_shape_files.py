@@ -1,0 +1,211 @@
+"""Shapes from folders and glb files: names, units, axes and everything that may be wrong with them."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from facediff.editing.shapes import ShapeSet, read_shapes
+from facediff.errors import FaceDiffError
+from tests.fakes.glb_targets import glb_with_targets, pack
+
+RNG = np.random.default_rng(0)
+GRID = np.array([[x, y, 0.3 * np.sin(2 * x) * np.cos(y)] for y in range(6) for x in range(6)]) * 0.03
+FACES = np.array(
+    [
+        f
+        for y in range(5)
+        for x in range(5)
+        for f in ((6 * y + x, 6 * y + x + 1, 6 * y + x + 7), (6 * y + x, 6 * y + x + 7, 6 * y + x + 6))
+    ]
+)
+DELTAS = {name: RNG.normal(0, 0.004, GRID.shape) for name in ("jawOpen", "EyeBlink_L", "browInnerUp", "fancy")}
+NAMES = ("eyeBlinkLeft", "browInnerUp", "fancy", "jawOpen")  # files in the order of their names
+
+
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray = FACES) -> None:
+    lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray = FACES) -> None:
+    head = [f"element vertex {len(vertices)}", *(f"property double {axis}" for axis in "xyz")]
+    head += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    rows = [" ".join(f"{value:.9f}" for value in row) for row in vertices] + [f"3 {a} {b} {c}" for a, b, c in faces]
+    path.write_text("\n".join(["ply", "format ascii 1.0", *head, "end_header", *rows]) + "\n")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_obj(tmp_path / "Neutral.obj", GRID)
+    for name, delta in DELTAS.items():
+        write_obj(tmp_path / f"{name}.obj", GRID + delta)
+    (tmp_path / "notes.txt").write_text("not a mesh")
+    return tmp_path
+
+
+def check(made: ShapeSet, deltas: dict[str, np.ndarray] = DELTAS) -> None:
+    known = {"EyeBlink_L": "eyeBlinkLeft"}
+    assert set(made.names) == {known.get(name, name) for name in deltas}
+    for name, delta in deltas.items():
+        assert made.deltas[made.names.index(known.get(name, name))] == pytest.approx(delta, rel=1e-6, abs=2e-8)
+
+
+def test_a_folder_of_obj(folder: Path) -> None:
+    made = read_shapes(folder, GRID.astype(np.float32))
+    check(made)
+    assert made.names == NAMES
+    assert made.extra == ("fancy",)
+    assert len(made.absent) == 49
+    assert any("fancy" in note for note in made.notes)
+
+
+def test_a_folder_of_ply(tmp_path: Path) -> None:
+    write_ply(tmp_path / "basis.ply", GRID)
+    for name, delta in DELTAS.items():
+        write_ply(tmp_path / f"{name}.ply", GRID + delta)
+    check(read_shapes(tmp_path, GRID))
+
+
+def test_shapes_in_another_unit_and_with_z_up_are_laid_onto_the_template(folder: Path) -> None:
+    turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
+    for name, delta in {"Neutral": 0 * GRID, **DELTAS}.items():
+        write_obj(folder / f"{name}.obj", 100 * (GRID + delta) @ turn.T + 7)
+    made = read_shapes(folder, GRID)
+    check(made)
+    assert any("turned by 90°" in note for note in made.notes)
+    assert any("scaled by 0.01" in note for note in made.notes)
+
+
+def test_another_persons_shapes_of_the_same_topology_are_taken_as_they_are(folder: Path) -> None:
+    """A head that is a tenth larger does not scale the movements."""
+    check(read_shapes(folder, 1.1 * GRID))
+
+
+def test_without_a_neutral_face_the_template_is_it(tmp_path: Path) -> None:
+    deltas = {f"shape{k}": np.where(np.arange(36)[:, None] % 9 == k, RNG.normal(0, 0.01, (36, 3)), 0) for k in range(9)}
+    for name, delta in deltas.items():
+        write_obj(tmp_path / f"{name}.obj", GRID + delta)
+    made = read_shapes(tmp_path, GRID)
+    check(made, deltas)
+    assert any("no neutral face" in note for note in made.notes)
+    with pytest.raises(FaceDiffError, match="add the face at rest that they were made from as neutral.obj"):
+        read_shapes(tmp_path, GRID + 0.005 * np.sin(100 * GRID[:, :1]))
+
+
+def test_wrong_folders_are_one_sentence(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="no such folder"):
+        read_shapes(tmp_path / "absent", GRID)
+    with pytest.raises(FaceDiffError, match=r"Neutral.obj: has 36 vertices and the take's template 35.*--carry"):
+        read_shapes(folder, GRID[:35])
+    with pytest.raises(FaceDiffError, match="another order"):
+        read_shapes(folder, RNG.permutation(GRID))
+    write_obj(folder / "jaw_open.obj", GRID)
+    with pytest.raises(FaceDiffError, match='"jawOpen" and "jaw_open" are both jawOpen'):
+        read_shapes(folder, GRID)
+    (folder / "jaw_open.obj").unlink()
+    write_obj(folder / "basis.obj", GRID)
+    with pytest.raises(FaceDiffError, match="both the face at rest"):
+        read_shapes(folder, GRID)
+
+
+def test_shapes_that_differ_among_themselves_are_refused(folder: Path) -> None:
+    write_obj(folder / "fancy.obj", GRID[:30], FACES[:40])
+    with pytest.raises(FaceDiffError, match=r"fancy.obj: has 30 vertices and Neutral.obj 36"):
+        read_shapes(folder, GRID)
+    write_obj(folder / "fancy.obj", GRID, FACES[::-1])
+    with pytest.raises(FaceDiffError, match="its triangles are not those of Neutral.obj"):
+        read_shapes(folder, GRID)
+    broken = GRID.copy()
+    broken[3, 1] = np.nan
+    write_obj(folder / "fancy.obj", broken)
+    with pytest.raises(FaceDiffError, match=r"fancy.obj: holds NaN"):
+        read_shapes(folder, GRID)
+    for file in folder.glob("*.obj"):
+        file.unlink()
+    with pytest.raises(FaceDiffError, match="holds no shapes"):
+        read_shapes(folder, GRID)
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_targets_of_a_glb(tmp_path: Path, sparse: bool) -> None:
+    deltas = {name: np.where(RNG.uniform(size=(36, 1)) < 0.5, delta, 0.0) for name, delta in DELTAS.items()}
+    (tmp_path / "a.glb").write_bytes(pack(*glb_with_targets(GRID, FACES, deltas, sparse=sparse)))
+    check(read_shapes(tmp_path / "a.glb", GRID), deltas)
+    # glTF is in metres: a template in centimetres takes shapes a hundred times as large.
+    made = read_shapes(tmp_path / "a.glb", 100 * GRID, "cm")
+    check(made, {name: 100 * delta for name, delta in deltas.items()})
+
+
+def test_parts_of_one_mesh_are_put_together(tmp_path: Path) -> None:
+    gltf, binary = glb_with_targets(GRID, FACES, DELTAS)
+    gltf["meshes"][0]["primitives"] *= 2
+    (tmp_path / "a.glb").write_bytes(pack(gltf, binary))
+    made = read_shapes(tmp_path / "a.glb", np.concatenate([GRID, GRID]))
+    assert made.deltas[:, :36] == pytest.approx(made.deltas[:, 36:])
+
+
+def edited(change: dict[tuple[str | int, ...], Any]) -> bytes:
+    gltf, binary = glb_with_targets(GRID, FACES, DELTAS, sparse=True)
+    gltf = copy.deepcopy(gltf)
+    for path, value in change.items():
+        at: Any = gltf
+        for step in path[:-1]:
+            at = at[step]
+        at[path[-1]] = value
+    return pack(gltf, binary)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {("accessors", 0, "count"): 10**9},
+        {("accessors", 0, "count"): -1},
+        {("accessors", 0, "count"): 1.5},
+        {("accessors", 0, "byteOffset"): -8},
+        {("accessors", 0, "bufferView"): -1},
+        {("accessors", 0, "componentType"): 5122},
+        {("accessors", 2, "count"): 10**12},
+        {("accessors", 2, "sparse", "count"): 10**9},
+        {("accessors", 2, "sparse", "indices", "bufferView"): 99},
+        {("bufferViews", 0, "byteLength"): 10**9},
+        {("bufferViews", 0, "byteOffset"): 10**9},
+        {("bufferViews", 0, "byteStride"): 1},
+        {("bufferViews", 0, "buffer"): 1},
+        {("buffers", 0): {"uri": "other.bin", "byteLength": 9}},
+        {("meshes", 0, "extras", "targetNames"): ["one"]},
+        {("meshes", 0, "primitives", 0, "targets"): []},
+        {("meshes", 0, "primitives", 0, "mode"): 1},
+        {("meshes", 0, "primitives", 0, "indices"): 0},
+        {("extensionsRequired",): ["KHR_draco_mesh_compression"]},
+        {("meshes",): {}},
+        {("accessors",): None},
+    ],
+)
+def test_damaged_glbs_are_one_sentence(tmp_path: Path, change: dict[tuple[str | int, ...], Any]) -> None:
+    (tmp_path / "a.glb").write_bytes(edited(change))
+    with pytest.raises(FaceDiffError, match=r"a\.glb: .*(export|not a readable glb)"):
+        read_shapes(tmp_path / "a.glb", GRID)
+
+
+def test_no_bytes_of_a_glb_do_more_than_fail(tmp_path: Path) -> None:
+    """Cut anywhere, or with bytes of the JSON changed, a file is read or refused, and nothing else."""
+    whole = edited({})
+    file = tmp_path / "a.glb"
+    for length in range(0, len(whole), 97):
+        file.write_bytes(whole[:length])
+        with pytest.raises(FaceDiffError, match="a.glb"):
+            read_shapes(file, GRID)
+    for _ in range(300):
+        spoilt = bytearray(whole)
+        for place in RNG.integers(12, len(whole) // 2, 3):
+            spoilt[place] = RNG.choice(bytearray(b'0123456789-,:"[]{}e\xff'))
+        file.write_bytes(spoilt)
+        try:
+            read_shapes(file, GRID)
+        except FaceDiffError as error:
+            assert "a.glb" in str(error)  # noqa: PT017 - most of these files are refused, some are not

@@ -1,0 +1,235 @@
+"""From the command line's words to a directed take; where a topology's eyes are, from any of the files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.animation import Animation
+from facediff.cli.options import add_directing_options, check_directing, directed
+from facediff.editing.expressiveness import scale_regions
+from facediff.editing.eyes_files import puppet_eyes, read_eyes
+from facediff.editing.procedural import Eyes, add_blinks, add_gaze, add_sway
+from facediff.errors import FaceDiffError
+from facediff.synthetic.face import build_face
+
+
+def parsed(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seed", type=int, default=0)
+    add_directing_options(parser)
+    return parser.parse_args(list(words))
+
+
+def test_nothing_is_on_by_default(make_animation: Callable[..., Animation]) -> None:
+    animation = make_animation(3)
+    assert directed(animation, parsed()) is animation
+
+
+def test_all_options_in_their_order(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
+    animation = make_animation(200, jaw_open=0.4, lids_close=0.1)
+    args = parsed("--expressiveness", "upper_face=1.5", "--blinks", "20", "--gaze", "--sway", "3", "--seed", "7")
+    check_directing(args)
+    made = directed(animation, args)
+    by_hand = scale_regions(animation, {"upper_face": 1.5}, eyes)
+    by_hand = add_blinks(add_gaze(by_hand, eyes, degrees=4, seed=7), eyes, rate=20, seed=7)
+    by_hand = add_sway(by_hand, degrees=3, seed=7)
+    np.testing.assert_allclose(made.vertices, by_hand.vertices, atol=1e-6)
+    assert (
+        made.metadata
+        == by_hand.metadata
+        == {
+            "identity": "F1",
+            "directed": "expressiveness (upper_face 1.5)",
+            "procedural": "gaze (4 degrees, seed 7); blinks (20 a minute, seed 7); head sway (3 degrees, seed 7)",
+        }
+    )
+    own = directed(animation, parsed("--blinks", "--directing-seed", "3", "--seed", "7"))
+    assert own.metadata["procedural"] == "blinks (17 a minute, seed 3)"
+    assert directed(animation, parsed("--sway"), seed=9).metadata["procedural"] == "head sway (2 degrees, seed 9)"
+    with pytest.raises(FaceDiffError, match="F1: its head sways already"):
+        directed(made, parsed("--blinks"))
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--expressiveness", "a lot"], "--expressiveness a lot: expected a factor"),
+        (["--blinks", "0"], "--blinks 0: expected blinks a minute"),
+        (["--blinks", "speech.wav"], "--blinks speech.wav: expected a number"),
+        (["--gaze", "50"], "--gaze 50: expected degrees"),
+        (["--sway", "0"], "--sway 0: expected degrees"),
+        (["--eyes", "none.json"], "--eyes none.json: no such file"),
+        (["--directing-seed", "-1"], "--directing-seed -1: expected 0 or more"),
+    ],
+)
+def test_words_are_checked_before_anything_is_made(words: list[str], sentence: str) -> None:
+    with pytest.raises(FaceDiffError) as caught:
+        check_directing(parsed(*words))
+    assert sentence in str(caught.value)
+
+
+def test_a_topology_without_known_eyes_says_what_to_give(make_animation: Callable[..., Animation]) -> None:
+    animation = replace(make_animation(2), faces=None)
+    for option in ("--blinks", "--gaze"):
+        with pytest.raises(
+            FaceDiffError, match=f"{option}: needs to know where lids and eyeballs are.*give --eyes FILE"
+        ):
+            directed(animation, parsed(option))
+    assert (
+        directed(animation, parsed("--sway", "--expressiveness", "1.2")).metadata["procedural"].startswith("head sway")
+    )
+
+
+def test_the_puppets_own_eyes(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
+    animation = make_animation(1)
+    found = puppet_eyes(animation.template, animation.faces)
+    assert found is not None
+    assert found.closing is not None
+    np.testing.assert_allclose(found.closing, eyes.closing, atol=1e-6)
+    assert {frozenset(ball.tolist()) for ball in found.eyeballs} == {frozenset(b.tolist()) for b in eyes.eyeballs}
+    assert puppet_eyes(animation.template, None) is None
+    assert puppet_eyes(animation.template[:9], animation.faces) is None
+    assert puppet_eyes(animation.template, animation.triangles[::-1]) is None
+
+
+def lid_gap(vertices: np.ndarray) -> float:
+    ring = build_face().groups["eye_0"]
+    return float((vertices[ring[1:8], 1] - vertices[ring[9:][::-1], 1]).max())
+
+
+def test_lids_of_anybody_else_on_the_puppets_mesh_shut_by_their_edges(make_animation: Callable[..., Animation]) -> None:
+    animation = make_animation(1)
+    face = animation.template * np.array([1.3, 1.15, 1.1], np.float32)
+    found = puppet_eyes(face, animation.faces)
+    assert found is not None
+    assert found.closing is not None
+    shut = face + found.closing
+    assert lid_gap(face) > 0.009
+    assert abs(lid_gap(shut)) < 0.0003
+    assert not found.closing[np.concatenate(found.eyeballs)].any()
+    assert not found.closing[animation.regions["lips"]].any()
+    mirror = build_face().mirror
+    np.testing.assert_allclose(found.closing[mirror] * [-1, 1, 1], found.closing, atol=2e-4)
+
+
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    lines = [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in vertices]
+    path.write_text("\n".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces)]) + "\n")
+
+
+@pytest.fixture
+def eyes_folder(make_animation: Callable[..., Animation], eyes: Eyes, tmp_path: Path) -> Path:
+    """Blink shapes in centimetres, masks as FLAME's file has them, and lists of edges."""
+    animation, mesh = make_animation(1), build_face()
+    assert eyes.closing is not None
+    left = animation.template[:, 0] > 0
+    write_obj(tmp_path / "neutral.obj", 100 * animation.template, animation.triangles)
+    for name, side in (("eyeBlinkLeft", left), ("eyeBlinkRight", ~left)):
+        write_obj(
+            tmp_path / f"{name}.obj", 100 * (animation.template + side[:, None] * eyes.closing), animation.triangles
+        )
+        np.save(tmp_path / f"{name}.npy", side[:, None] * eyes.closing)
+    masks = dict(zip(("left_eyeball", "right_eyeball"), eyes.eyeballs, strict=True))
+    (tmp_path / "masks.pkl").write_bytes(pickle.dumps(masks))
+    ring = mesh.groups["eye_0"]
+    upper, lower = ring[:9], ring[[0, *range(15, 7, -1)]]
+    (tmp_path / "upper.txt").write_text(", ".join(map(str, upper)))
+    told = {
+        "shapes": {
+            "neutral": "neutral.obj",
+            "blinks": ["eyeBlinkLeft.obj", "eyeBlinkRight.obj"],
+            "eyeballs": ["masks.pkl:left_eyeball", "masks.pkl:right_eyeball"],
+        },
+        "ways": {"blinks": ["eyeBlinkLeft.npy", "eyeBlinkRight.npy"], "eyeballs": [eyes.eyeballs[0].tolist()]},
+        "edges": {
+            "lids": [
+                {"upper": "upper.txt", "lower": lower.tolist()},
+                {"upper": mesh.mirror[upper].tolist(), "lower": mesh.mirror[lower][::-1].tolist()},
+            ],
+            "eyeballs": ["masks.pkl:left_eyeball", "masks.pkl:right_eyeball"],
+        },
+    }
+    for name, content in told.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    arrays = {"closing": eyes.closing, "eyeball_left": eyes.eyeballs[0], "eyeball_right": eyes.eyeballs[1]}
+    np.savez(tmp_path / "packed.npz", **arrays)
+    np.savez(tmp_path / "large.npz", **{**arrays, "closing": 1000 * eyes.closing, "neutral": 1000 * animation.template})
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["shapes.json", "ways.json", "packed.npz", "large.npz"])
+def test_eyes_from_files_shut_as_the_rig_does(
+    name: str, eyes_folder: Path, make_animation: Callable[..., Animation], eyes: Eyes
+) -> None:
+    animation = replace(make_animation(200), faces=None)
+    found = read_eyes(eyes_folder / name, animation.template)
+    assert found.closing is not None
+    np.testing.assert_allclose(found.closing, eyes.closing, atol=1e-6)
+    assert np.array_equal(np.sort(found.eyeballs[0]), np.sort(eyes.eyeballs[0]))
+    made = directed(animation, parsed("--blinks", "--gaze", "--eyes", str(eyes_folder / name)))
+    expected = directed(make_animation(200), parsed("--blinks"))
+    lids = np.linalg.norm(eyes.closing, axis=1) > 0  # type: ignore[arg-type]
+    assert np.abs(made.vertices - expected.vertices)[:, lids].max() < 1e-3
+
+
+def test_eyes_from_the_lids_edges_alone(eyes_folder: Path, make_animation: Callable[..., Animation]) -> None:
+    animation = make_animation(1)
+    found = read_eyes(eyes_folder / "edges.json", animation.template)
+    assert found.closing is not None
+    assert abs(lid_gap(animation.template + found.closing)) < 0.0005
+    assert abs(lid_gap((animation.template + found.closing)[build_face().mirror] * [-1, 1, 1])) < 0.0005
+    assert np.linalg.norm(found.closing, axis=1).max() < 0.015
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("no json", "not a readable JSON file"),
+        ("[1]", "expected an object with neutral, blinks, lids, eyeballs"),
+        ('{"eyes": []}', 'not "eyes"'),
+        ("{}", "says nothing of lids or eyeballs"),
+        ('{"blinks": ["eyeBlinkLeft.obj"]}', 'give the open one as "neutral" as well'),
+        ('{"blinks": ["none.obj"], "neutral": "neutral.obj"}', "no such mesh file"),
+        ('{"eyeballs": [[1, 2, 99999]]}', "vertex indices from 0 to 1007"),
+        ('{"eyeballs": [[1, 2]]}', "an eyeball of less than four vertices"),
+        ('{"eyeballs": ["masks.pkl:left_eye"]}', 'has no mask "left_eye": did you mean "left_eyeball"'),
+        ('{"lids": [{"upper": [1, 2, 3]}]}', 'expected "lids" as a list'),
+        ('{"lids": [[1, 2], [3]]}', 'expected "lids" as a list'),
+    ],
+)
+def test_files_that_say_nothing_useful(
+    content: str, sentence: str, eyes_folder: Path, make_animation: Callable[..., Animation]
+) -> None:
+    path = eyes_folder / "bad.json"
+    path.write_text(content)
+    with pytest.raises(FaceDiffError) as caught:
+        read_eyes(path, make_animation(1).template)
+    assert sentence in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_blinks_in_another_unit_and_of_another_topology(
+    eyes_folder: Path, make_animation: Callable[..., Animation], eyes: Eyes
+) -> None:
+    template = make_animation(1).template
+    assert eyes.closing is not None
+    np.savez(eyes_folder / "mm.npz", closing=1000 * eyes.closing)
+    with pytest.raises(FaceDiffError, match="moves a lid by"):
+        read_eyes(eyes_folder / "mm.npz", template)
+    np.savez(eyes_folder / "lids_only.npz", closing=eyes.closing)
+    with pytest.raises(FaceDiffError, match=r"has shape \(1008, 3\); the face has \(900, 3\)"):
+        read_eyes(eyes_folder / "lids_only.npz", template[:900])
+    animation = make_animation(2)
+    with pytest.raises(FaceDiffError, match="--gaze: --eyes .* does not say which vertices are the eyeballs"):
+        directed(animation, parsed("--gaze", "--eyes", str(eyes_folder / "lids_only.npz")))
+    np.savez(eyes_folder / "balls_only.npz", eyeball=eyes.eyeballs[0])
+    with pytest.raises(FaceDiffError, match="does not say how the lids shut"):
+        directed(animation, parsed("--blinks", "--eyes", str(eyes_folder / "balls_only.npz")))

@@ -1,0 +1,117 @@
+"""Motion grows or shrinks region by region, exactly in a region, smoothly between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from facediff.animation import Animation
+from facediff.editing.expressiveness import FALL_OFF, read_factors, region_factors, scale_regions
+from facediff.editing.procedural import Eyes
+from facediff.errors import FaceDiffError
+
+
+def test_one_factor_scales_every_offset(make_animation: Callable[..., Animation]) -> None:
+    animation = make_animation(5, jaw_open=np.linspace(0, 1, 5), outer_brow_up=0.5)
+    scaled = scale_regions(animation, {"all": 1.7})
+    np.testing.assert_allclose(
+        scaled.vertices - animation.template, 1.7 * (animation.vertices - animation.template), atol=1e-7
+    )
+    assert scaled.metadata == {"identity": "F1", "directed": "expressiveness (all 1.7)"}
+    assert animation.metadata == {"identity": "F1"}
+    same = scale_regions(animation, {"all": 1.0, "lips": 1.0})
+    np.testing.assert_allclose(same.vertices, animation.vertices, atol=1e-7)
+
+
+def test_a_region_gets_its_own_factor_and_what_is_far_the_rest(make_animation: Callable[..., Animation]) -> None:
+    animation = make_animation(2, jaw_open=0.7, inner_brow_up=1.0, lids_close=0.2)
+    factors = {"upper_face": 1.5, "lips": 0.5, "all": 1.1}
+    scaled = scale_regions(animation, factors)
+    before, after = (t.vertices[1] - t.template for t in (animation, scaled))
+    np.testing.assert_allclose(after[animation.regions["lips"]], 0.5 * before[animation.regions["lips"]], atol=1e-7)
+    np.testing.assert_allclose(
+        after[animation.regions["upper_face"]], 1.5 * before[animation.regions["upper_face"]], atol=1e-7
+    )
+    size = np.linalg.norm(np.ptp(animation.template, axis=0))
+    both = np.concatenate([animation.regions["lips"], animation.regions["upper_face"]])
+    far = np.linalg.norm(animation.template[:, None] - animation.template[both], axis=-1).min(1) > FALL_OFF * size
+    assert far.sum() > 200
+    np.testing.assert_allclose(after[far], 1.1 * before[far], atol=1e-7)
+
+
+def test_a_region_without_vertices_changes_nothing(make_animation: Callable[..., Animation]) -> None:
+    animation = make_animation(2, jaw_open=0.7)
+    bare = replace(animation, regions={**animation.regions, "upper_face": np.zeros(0, np.int64)})
+    np.testing.assert_allclose(scale_regions(bare, {"upper_face": 3.0}).vertices, animation.vertices, atol=1e-7)
+
+
+@pytest.mark.parametrize("factors", [{"lips": 4.0}, {"upper_face": 3.0, "lips": 0.0}, {"upper_face": 2.0, "all": 0.5}])
+def test_neighbours_differ_by_no_more_than_the_bound(
+    factors: dict[str, float], make_animation: Callable[..., Animation]
+) -> None:
+    """1.5 |f − g| |x − y| / width between two vertices, wherever one region meets the rest."""
+    animation = make_animation(1)
+    width = FALL_OFF * float(np.linalg.norm(np.ptp(animation.template.astype(float), axis=0)))
+    factor = region_factors(animation.template, animation.regions, factors)
+    edges = np.concatenate(
+        [animation.triangles[:, [0, 1]], animation.triangles[:, [1, 2]], animation.triangles[:, [2, 0]]]
+    )
+    length = np.linalg.norm(animation.template[edges[:, 0]] - animation.template[edges[:, 1]], axis=-1)
+    values = [*factors.values(), 1.0]
+    bound = 1.5 * (max(values) - min(values)) * length / width
+    jump = np.abs(factor[edges[:, 0]] - factor[edges[:, 1]])
+    assert (jump <= bound + 1e-6).all()
+    assert jump.max() > 0.1
+    assert factor.min() >= min(values) - 1e-9
+    assert factor.max() <= max(values) + 1e-9
+
+
+def test_neighbouring_regions_blend_without_a_step() -> None:
+    """Two regions that share a border on a fine line: no step, a mean at the border, own values far from it."""
+    line = np.stack([np.linspace(0, 10, 2001), np.zeros(2001), np.zeros(2001)], axis=1)
+    halves = {"left": np.arange(1001), "right": np.arange(1001, 2001)}
+    factor = region_factors(line, halves, {"left": 2.0, "right": 0.5}, fall_off=1.0)
+    assert np.abs(np.diff(factor)).max() < 0.01
+    assert factor[1000] == pytest.approx(1.25, abs=0.01)
+    np.testing.assert_allclose(factor[[0, 700, 1300, 2000]], [2.0, 2.0, 0.5, 0.5])
+    overlapping = {"one": np.arange(2001), "two": np.arange(2001)}
+    np.testing.assert_allclose(region_factors(line, overlapping, {"one": 2.0, "two": 1.0}), 1.5)
+
+
+def test_a_blink_stays_a_blink_where_the_lids_are_known(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
+    shut = make_animation(1, lids_close=1.0, inner_brow_up=0.8)
+    brows = make_animation(1, inner_brow_up=0.8)
+    blind, seeing = (scale_regions(shut, {"all": 2.0}, known) for known in (None, eyes))
+    lids, closing = eyes.lids()
+    strong = np.linalg.norm(closing, axis=1) > 0.5 * np.linalg.norm(closing, axis=1).max()
+    reference = 2 * (brows.vertices[0] - brows.template)[lids] + closing
+    ours = (seeing.vertices[0] - seeing.template)[lids]
+    np.testing.assert_allclose(ours[strong], reference[strong], atol=3e-4)
+    np.testing.assert_allclose((blind.vertices[0] - blind.template)[lids], reference + closing, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "factors"),
+    [
+        ("1.2", {"all": 1.2}),
+        ("upper_face=1.5, lips=0.9", {"upper_face": 1.5, "lips": 0.9}),
+        ("lips=2,1.1", {"lips": 2.0, "all": 1.1}),
+    ],
+)
+def test_words(words: str, factors: dict[str, float]) -> None:
+    assert read_factors(words) == factors
+
+
+@pytest.mark.parametrize("words", ["", "much", "lips=", "=2", "lips=-1", "nan", "lips=5", "lips=1,lips=2", "1,all=2"])
+def test_words_that_are_no_factors(words: str) -> None:
+    with pytest.raises(FaceDiffError, match="--expressiveness"):
+        read_factors(words)
+
+
+def test_an_unknown_region_lists_the_known(make_animation: Callable[..., Animation]) -> None:
+    animation = replace(make_animation(1), name="hello")
+    with pytest.raises(FaceDiffError, match='hello: has no region "lip" to scale: did you mean "lips"'):
+        scale_regions(animation, {"lip": 2.0})

@@ -1,0 +1,133 @@
+"""``facediff retarget``: a take on another mesh, the map kept and used again, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from facediff.animation import Animation, read_archive, write_archive
+from facediff.cli.app import main
+from facediff.cli.options import carried
+
+TARGET = ("--target-mesh", "face.obj")
+
+
+@pytest.fixture
+def animation(tmp_path: Path) -> Animation:
+    """An egg with a bump that moves, as an archive in the folder."""
+    mesh = trimesh.creation.icosphere(3)
+    rest = np.array(mesh.vertices) * [0.08, 0.12, 0.1]
+    bump = np.exp(-np.square((rest - [0, -0.04, 0.09]) / 0.05).sum(axis=1))
+    vertices = rest + np.array([0.0, 1.0, 0.4])[:, None, None] * bump[:, None] * [0.0, -0.02, 0.01]
+    animation = Animation(
+        "egg", vertices.astype(np.float32), rest.astype(np.float32), 30.0, faces=np.array(mesh.faces, np.int32)
+    )
+    write_archive(tmp_path / "take.npz", animation)
+    return animation
+
+
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture
+def face(tmp_path: Path, animation: Animation) -> Path:
+    """The egg with fewer vertices, in millimetres."""
+    mesh = trimesh.creation.icosphere(2)
+    write_obj(tmp_path / "face.obj", np.array(mesh.vertices) * [80, 120, 100], np.array(mesh.faces))
+    return tmp_path / "face.obj"
+
+
+def test_a_take_on_another_mesh(
+    animation: Animation,
+    face: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["retarget", "take.npz", "--target-mesh", "face.obj", "--correspondence", "map.npz"]
+    assert main([*words, "-o", "out.npz", "--show", "check.png"]) == 0
+    made = read_archive(tmp_path / "out.npz")
+    # A coarser ball's vertices are some of the finer one's: the truth is known there.
+    away = np.linalg.norm(made.template[:, None] / 1000 - animation.template[None], axis=2)
+    truth = (animation.vertices - animation.template)[:, away.argmin(axis=1)] * 1000
+    found = made.vertices - made.template
+    assert np.square(found - truth).sum() < 0.02**2 * np.square(truth).sum()
+    assert made.unit == "mm"
+    said = capsys.readouterr().out
+    assert "642 vertices to 162" in said
+    assert "unit mm" in said
+    assert (tmp_path / "check.png").read_bytes()[:4] == b"\x89PNG"
+    # The map is used again, gives the same, and is left as it was.
+    kept = (tmp_path / "map.npz").read_bytes()
+    assert main([*words, "-o", "again.npz"]) == 0
+    assert np.array_equal(read_archive(tmp_path / "again.npz").vertices, made.vertices)
+    assert (tmp_path / "map.npz").read_bytes() == kept
+    assert np.array_equal(carried(animation, face, tmp_path / "map.npz").vertices, made.vertices)
+    assert np.array_equal(carried(animation, face).vertices, made.vertices)
+
+
+def test_a_reordered_mesh_is_told(
+    animation: Animation,
+    face: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["retarget", "take.npz", "--target-mesh", "face.obj", "--correspondence", "map.npz", "-o"]
+    assert main([*words, "out.npz"]) == 0
+    mesh = trimesh.creation.icosphere(2)
+    order = np.random.default_rng(0).permutation(len(mesh.vertices))
+    write_obj(face, np.array(mesh.vertices)[order] * [80, 120, 100], np.argsort(order)[mesh.faces])
+    assert main([*words, "other.npz"]) == 2
+    said = capsys.readouterr().err
+    assert "face.obj: " in said
+    assert "reordered" in said
+    assert not (tmp_path / "other.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["take.npz", "--target-mesh", "absent.obj", "-o", "o.npz"], "absent.obj"),
+        (["take.npz", "--target-mesh", "flat.obj", "-o", "o.npz"], "flat.obj: target mesh: 3 vertices"),
+        (["take.npz", "--target-mesh", "face.obj", "-o", "o.xyz"], 'no format ".xyz"'),
+        (["take.npz", "--target-mesh", "face.obj", "-o", "o.csv"], "weights need shapes; write .npz"),
+        (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--correspondence", "m.txt"], "ends in .npz"),
+        (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--correspondence", "take.npz"], "no correspondence"),
+        (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--landmarks", "absent.csv"], "absent.csv"),
+        (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--show", "p.gif"], "expected a picture .png"),
+        (["nan.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "frame 0 holds NaN"),
+        (["bare.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "error: bare: comes without"),
+        (
+            ["take.npz", *TARGET, "-o", "o.npz", "--landmarks", "l.csv", "--correspondence", "take.npz"],
+            "would be used without them",
+        ),
+    ],
+)
+def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
+    words: list[str],
+    says: str,
+    animation: Animation,
+    face: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    np.save(tmp_path / "bare.npy", animation.vertices)
+    np.save(tmp_path / "nan.npy", np.full((2, 642, 3), np.nan, np.float32))
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "l.csv").write_text("1,1\n")
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.chdir(tmp_path)
+    assert main(["retarget", *words]) == 2
+    said = capsys.readouterr().err
+    assert says in said
+    assert said.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before

@@ -1,0 +1,125 @@
+"""`facediff view`: files and options to a page, or one sentence and nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+import webbrowser
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from facediff.animation import write_archive
+from facediff.cli.app import main
+from tests.fakes.clicks import FRAMES, clicks
+
+
+def facts(page: Path) -> dict[str, Any]:
+    found = re.search(r'id="facts">(.*?)</script>', page.read_text())
+    assert found
+    read: dict[str, Any] = json.loads(found[1])
+    return read
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    write_archive(tmp_path / "guess.npz", clicks(name="guess", lower=3))
+    np.save(tmp_path / "true.npy", clicks().vertices.reshape(FRAMES, -1))
+    return tmp_path
+
+
+def test_a_bare_truth_borrows_the_mesh_and_stands_first(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = files / "page.html"
+    assert main(["view", str(files / "guess.npz"), "--truth", str(files / "true.npy"), "-o", str(page)]) == 0
+    read = facts(page)
+    assert [animation["name"] for animation in read["takes"]] == ["true", "guess"]
+    assert read["truth"] == 0
+    assert read["heat"]["highest"] in (3, 4)
+    assert read["frameRate"] == 25
+    assert read["takes"][0]["opening"] is not None
+    assert read["sound"] is not None
+    assert re.search(r"page.html: 75 frames of 2 take\(s\), 0\.\d MB", capsys.readouterr().out)
+
+
+def test_a_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
+    files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The checkpoint's first face is not the archive's; whoever names an identity wants that one's."""
+    own = clicks()
+    faces = {"first": own.template + 50, "second": own.template + 100}
+    assets = SimpleNamespace(
+        template=lambda name: torch.from_numpy(faces[name]),
+        identities=("first", "second"),
+        faces=own.triangles,
+        frame_rate=50.0,
+        unit="cm",
+        colours=None,
+        regions={},
+        inner_lip_pairs=None,
+    )
+    monkeypatch.setattr("facediff.cli.options.assets_of", lambda path: assets)
+    page, words = files / "page.html", ["--checkpoint", "c.ckpt", "-o", str(files / "page.html")]
+    assert main(["view", str(files / "guess.npz"), *words]) == 0
+    assert facts(page)["frameRate"] == 25
+    assert facts(page)["takes"][0]["centre"] == [0, 0, -2.5]
+    assert main(["view", str(files / "true.npy"), *words]) == 0
+    assert facts(page)["frameRate"] == 50
+    assert facts(page)["takes"][0]["centre"] == [500, 500, 475]
+    assert main(["view", str(files / "guess.npz"), "--identity", "second", *words]) == 0
+    assert facts(page)["takes"][0]["centre"] == [100, 100, 97.5]
+
+
+def test_takes_of_one_recording_are_told_apart_by_their_files(files: Path) -> None:
+    write_archive(files / "other.npz", clicks(name="guess", lower=5))
+    page = files / "page.html"
+    assert main(["view", str(files / "guess.npz"), str(files / "other.npz"), "-o", str(page)]) == 0
+    assert [animation["name"] for animation in facts(page)["takes"]] == ["guess", "other"]
+
+
+def test_labels_the_shortest_and_the_browser(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    short = replace(clicks(), vertices=clicks().vertices[:40])
+    write_archive(files / "short.npz", short)
+    page = files / "page.html"
+    words = ["view", str(files / "guess.npz"), str(files / "short.npz"), "-o", str(page), "--open", "--shortest"]
+    assert main([*words, "--labels", "Ä <b>", "two"]) == 0
+    assert [animation["name"] for animation in facts(page)["takes"]] == ["Ä <b>", "two"]
+    assert facts(page)["frames"] == 40
+    assert opened == [page.resolve().as_uri()]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["guess.npz", "-o", "page.mp4"], 'unknown suffix ".mp4"; expected .html'),
+        (["guess.npz", "-o", "page.html", "--max-mb", "0.01"], "more than the limit of 0.01 MB"),
+        (["guess.npz", "-o", "page.html", "--max-mb", "-1"], "expected a number above 0"),
+        (["guess.npz", "-o", "page.html", "--labels", "a", "b"], "2 names for 1 panels"),
+        (["missing.npz", "-o", "page.html"], "missing.npz: no such file"),
+        (["true.npy", "-o", "page.html"], "does not say its frame rate"),
+        (["guess.npz", "empty.npy", "-o", "page.html"], "empty.npy: holds no frames"),
+        (["guess.npz", "nan.npy", "-o", "page.html"], "nan: frame 3 holds NaN"),
+        (["guess.npz", "short.npy", "-o", "page.html"], "short: has 9 frames and guess 75"),
+    ],
+)
+def test_what_cannot_be_done_is_one_sentence_and_no_page(
+    files: Path, words: list[str], told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(files)
+    vertices = clicks().vertices
+    np.save("empty.npy", vertices[:0])
+    np.save("short.npy", vertices[:9])
+    vertices[3, 0, 0] = np.nan
+    np.save("nan.npy", vertices)
+    before = sorted(files.iterdir())
+    assert main(["view", *words]) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert sorted(files.iterdir()) == before

@@ -1,0 +1,408 @@
+"""The FLAME layer against figures found by hand and a slow computation written out from the papers; its model files."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from facediff.errors import FaceDiffError
+from facediff.mesh.flame import CHUNK, Flame, FlameArrays, plain_array, read_flame_arrays, rotations
+from tests.fakes.flame import (
+    chumpy_array,
+    chumpy_reordered,
+    compressed,
+    flame_arrays,
+    foreign,
+    model_pickle,
+    write_flame,
+)
+
+RNG = np.random.default_rng(3)
+
+
+def by_definition(
+    content: dict[str, np.ndarray], shape: np.ndarray, expression: np.ndarray, jaw: np.ndarray
+) -> np.ndarray:
+    """One frame (V, 3), vertex by vertex, with 4 × 4 transforms of all five joints (SMPL, eqs. 1 to 10)."""
+    coefficients = np.zeros(400)
+    coefficients[: len(shape)] = shape
+    coefficients[300 : 300 + len(expression)] = expression
+    count = len(content["v_template"])
+    shaped = np.zeros((count, 3))
+    for v in range(count):
+        for axis in range(3):
+            terms = [content["shapedirs"][v, axis, n] * coefficients[n] for n in range(400)]
+            shaped[v, axis] = content["v_template"][v, axis] + sum(terms)
+    joints = content["J_regressor"] @ shaped
+    pose = np.zeros((5, 3))
+    pose[2] = jaw
+    turns = [turn_by_definition(vector) for vector in pose]
+    feature = np.concatenate([(turn - np.eye(3)).ravel() for turn in turns[1:]])
+    posed = shaped + content["posedirs"] @ feature
+    parents = [-1, *content["kintree_table"][0, 1:].astype(int)]
+    chain: list[np.ndarray] = []
+    for k, parent in enumerate(parents):
+        local = np.eye(4)
+        local[:3, :3] = turns[k]
+        local[:3, 3] = joints[k] - (joints[parent] if parent >= 0 else 0)
+        chain.append(local if parent < 0 else chain[parent] @ local)
+    result = np.zeros((count, 3))
+    for v in range(count):
+        for k in range(5):
+            rest = np.eye(4)
+            rest[:3, 3] = -joints[k]
+            result[v] += content["weights"][v, k] * (chain[k] @ rest @ np.append(posed[v], 1))[:3]
+    return result
+
+
+def turn_by_definition(vector: np.ndarray) -> np.ndarray:
+    """The matrix exponential of the cross product's matrix, as a power series."""
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    term, total = np.eye(3), np.eye(3)
+    for n in range(1, 60):
+        term = term @ cross / n
+        total = total + term
+    return total
+
+
+def layer(content: dict[str, np.ndarray]) -> Flame:
+    parents = np.array([-1, *content["kintree_table"][0, 1:].astype(int)])
+    names = ("v_template", "shapedirs", "posedirs", "J_regressor", None, "weights", "f")
+    return Flame(FlameArrays(*(parents if name is None else content[name] for name in names)))
+
+
+def tiny_rig(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    """Six vertices. Vertex 0 is the jaw's joint, 1 to 4 hang on the jaw wholly, half, a quarter and not at all."""
+    template = np.array([[0, 1, 0], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [5, 5, 5]], float)
+    jaw = np.array([0, 1, 0.5, 0.25, 0, 0])
+    weights = np.zeros((6, 5))
+    weights[:, 2], weights[:, 1] = jaw, 1 - jaw
+    regressor = np.zeros((5, 6))
+    regressor[[0, 1, 3, 4], 5] = regressor[2, 0] = 1
+    return {
+        "v_template": template,
+        "shapedirs": np.zeros((6, 3, 400)),
+        "posedirs": np.zeros((6, 3, 36)),
+        "J_regressor": regressor,
+        "kintree_table": np.array([[2**32 - 1, 0, 1, 1, 1], [0, 1, 2, 3, 4]]),
+        "weights": weights,
+        "f": np.array([[0, 1, 2], [3, 4, 5]]),
+        **changes,
+    }
+
+
+QUARTER = np.array([[np.pi / 2, 0, 0]])
+NOTHING = np.zeros((1, 0))
+
+
+def test_the_jaw_opened_by_a_right_angle_about_x() -> None:
+    """Relative to the joint (0, 1, 0), (0, 0, 2) becomes (0, −2, 0); in part, the point lies between the two."""
+    opened = layer(tiny_rig()).vertices(np.zeros(0), NOTHING, QUARTER)[0]
+    by_hand = [[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0.5, 1.5], [0, 1, 2], [5, 5, 5]]
+    np.testing.assert_allclose(opened, by_hand, atol=1e-12)
+
+
+def test_the_pose_correctives_of_the_jaw_are_added_before_the_turn() -> None:
+    """R − I has −1 at (1, 1), (1, 2), (2, 2) and 1 at (2, 1): entries 4, 5, 8 and 7 of the jaw's nine."""
+    correctives = np.zeros((6, 3, 36))
+    correctives[1, 0, 9 + 4] = 1  # −1 along x
+    correctives[1, 1, 9 + 7] = 10  # 10 along y, which the turn makes z
+    correctives[4, 2, 9 + 5] = 100  # −100 along z, at a vertex that does not turn
+    correctives[:, :, :9] = correctives[:, :, 18:] = 1e6  # of the joints that stay
+    opened = layer(tiny_rig(posedirs=correctives)).vertices(np.zeros(0), NOTHING, QUARTER)[0]
+    np.testing.assert_allclose(opened[1], [-1, -1, 10], atol=1e-12)
+    np.testing.assert_allclose(opened[4], [0, 1, -98], atol=1e-12)
+
+
+def test_shape_and_expression_move_the_joint() -> None:
+    """The first coefficient of each lifts everything by 3 and 4: the face opens as before, seven higher."""
+    directions = np.zeros((6, 3, 400))
+    directions[:, 1, 0], directions[:, 1, 300] = 3, 4
+    opened = layer(tiny_rig(shapedirs=directions)).vertices(np.ones(1), np.ones((1, 1)), QUARTER)[0]
+    np.testing.assert_allclose(opened[1], [0, 6, 0], atol=1e-12)
+
+
+def test_what_hangs_on_the_jaw_turns_with_it() -> None:
+    content = tiny_rig(kintree_table=np.array([[2**32 - 1, 0, 1, 2, 3], [0, 1, 2, 3, 4]]))
+    content["weights"][4] = [0, 0, 0, 0, 1]  # a joint whose parent's parent is the jaw
+    opened = layer(content).vertices(np.zeros(0), NOTHING, QUARTER)[0]
+    np.testing.assert_allclose(opened[4], [0, -1, 0], atol=1e-12)
+    np.testing.assert_allclose(opened, by_definition(content, np.zeros(0), np.zeros(0), QUARTER[0]), atol=1e-12)
+
+
+def test_any_parameters_agree_with_the_definition() -> None:
+    content = flame_arrays(16)
+    shape, jaw = RNG.normal(0, 2, 300), RNG.normal(0, 0.7, (3, 3))
+    expression = RNG.normal(0, 2, (3, 100))
+    found = layer(content).vertices(shape, expression, jaw)
+    assert found.dtype == np.float64
+    for frame, face in enumerate(found):
+        np.testing.assert_allclose(face, by_definition(content, shape, expression[frame], jaw[frame]), atol=1e-13)
+
+
+def test_a_long_clip_is_the_same_frame_by_frame() -> None:
+    """Frames are computed in chunks; a frame must not depend on the others."""
+    model = layer(flame_arrays(16))
+    frames = 2 * CHUNK + 3
+    shape, expression, jaw = RNG.normal(size=40), RNG.normal(size=(frames, 50)), RNG.normal(size=(frames, 3))
+    together = model.vertices(shape, expression, jaw)
+    alone = [model.vertices(shape, expression[t : t + 1], jaw[t : t + 1])[0] for t in range(frames)]
+    np.testing.assert_allclose(together, alone, atol=1e-14)
+    assert model.vertices(shape, expression[:0], jaw[:0]).shape == (0, 16, 3)
+
+
+def test_zero_parameters_give_the_template_exactly() -> None:
+    content = flame_arrays()
+    model = layer(content)
+    np.testing.assert_array_equal(
+        model.vertices(np.zeros(300), np.zeros((2, 100)), np.zeros((2, 3)))[1], model.template
+    )
+    np.testing.assert_array_equal(model.template, content["v_template"])
+    np.testing.assert_array_equal(model.faces, content["f"])
+    assert model.n_vertices == 80
+
+
+def test_shape_and_expression_are_linear_at_rest() -> None:
+    model, still = layer(flame_arrays()), np.zeros((1, 3))
+    shape, other, expression = RNG.normal(size=300), RNG.normal(size=300), RNG.normal(size=(1, 100))
+
+    def offset(shape: np.ndarray, expression: np.ndarray) -> np.ndarray:
+        return model.vertices(shape, expression, still)[0] - model.template
+
+    both = offset(2 * shape - other, 3 * expression)
+    zero = np.zeros((1, 100))
+    separate = 2 * offset(shape, zero) - offset(other, zero) + 3 * offset(np.zeros(300), expression)
+    np.testing.assert_allclose(both, separate, atol=1e-14)
+    np.testing.assert_allclose(model.shaped(shape), model.vertices(shape, zero, still)[0], atol=1e-15)
+
+
+def test_coefficients_that_are_left_out_are_zero() -> None:
+    model = layer(flame_arrays())
+    shape, expression, jaw = np.zeros(300), np.zeros((4, 100)), RNG.normal(size=(4, 3))
+    shape[:7], expression[:, :50] = 1, 0.5
+    full = model.vertices(shape, expression, jaw)
+    np.testing.assert_allclose(model.vertices(shape[:7], expression[:, :50], jaw), full, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("shape", "expression", "jaw", "message"),
+    [
+        ((301,), (2, 100), (2, 3), r"shape coefficients have shape \(301,\); expected \(up to 300,\)"),
+        ((2, 300), (2, 100), (2, 3), r"shape coefficients have shape \(2, 300\)"),
+        ((300,), (2, 101), (2, 3), r"expression coefficients have shape \(2, 101\); expected \(frames, up to 100\)"),
+        ((300,), (2, 100), (3, 3), r"jaw has shape \(3, 3\) and expression \(2, 100\)"),
+        ((300,), (2, 100), (2, 2), r"jaw has shape \(2, 2\)"),
+        ((300,), (2, 100), (2, 6), r"jaw coefficients have shape \(2, 6\)"),
+    ],
+)
+def test_wrong_parameters_are_told(
+    shape: tuple[int, ...], expression: tuple[int, ...], jaw: tuple[int, ...], message: str
+) -> None:
+    with pytest.raises(FaceDiffError, match=message):
+        layer(tiny_rig()).vertices(np.zeros(shape), np.zeros(expression), np.zeros(jaw))
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.floats(-6, 6), min_size=3, max_size=3))
+def test_rotations_are_rotations(vector: list[float]) -> None:
+    axis = np.array(vector)
+    (turn,) = rotations(axis[None])
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    np.testing.assert_allclose(turn @ axis, axis, atol=1e-11)
+    np.testing.assert_allclose(np.trace(turn), 1 + 2 * np.cos(np.linalg.norm(axis)), atol=1e-12)
+    np.testing.assert_allclose(turn, turn_by_definition(axis), atol=1e-9)
+
+
+def test_tiny_rotations_are_exact() -> None:
+    np.testing.assert_array_equal(rotations(np.zeros((1, 3)))[0], np.eye(3))
+    (turn,) = rotations(np.array([[0, 0, 1e-9]]))
+    np.testing.assert_allclose(turn - np.eye(3), [[0, -1e-9, 0], [1e-9, 0, 0], [0, 0, 0]], atol=1e-17)
+
+
+@pytest.mark.parametrize("form", ["2020", "2023", "npz"])
+def test_model_files_are_read(form: str, tmp_path: Path) -> None:
+    path = write_flame(tmp_path / f"model.{'npz' if form == 'npz' else 'pkl'}", form=form, seed=5)  # type: ignore[arg-type]
+    expected = flame_arrays(seed=5)
+    arrays = read_flame_arrays(path)
+    np.testing.assert_array_equal(arrays.directions, expected["shapedirs"])
+    np.testing.assert_array_equal(arrays.pose_directions, expected["posedirs"])
+    np.testing.assert_array_equal(arrays.joint_regressor, expected["J_regressor"])
+    np.testing.assert_array_equal(arrays.weights, expected["weights"])
+    np.testing.assert_array_equal(arrays.parents, [-1, 0, 1, 1, 1])
+    parameters = RNG.normal(size=300), RNG.normal(size=(2, 100)), RNG.normal(size=(2, 3))
+    np.testing.assert_allclose(
+        Flame.read(path).vertices(*parameters), layer(expected).vertices(*parameters), atol=1e-14
+    )
+
+
+def test_the_fake_names_what_real_files_name(tmp_path: Path) -> None:
+    """And nothing that could answer to these names is installed for the test."""
+    content = write_flame(tmp_path / "generic_model.pkl").read_bytes()
+    for name in (b"cchumpy.ch\nCh\n", b"cscipy.sparse.csc\ncsc_matrix\n", b"cnumpy.core.multiarray\n_reconstruct\n"):
+        assert name in content
+    assert b"cscipy.sparse._csc\ncsc_matrix\n" in write_flame(tmp_path / "2023.pkl", form="2023").read_bytes()
+    assert not any(name.split(".")[0] == "chumpy" for name in sys.modules)
+
+
+@pytest.mark.parametrize("module", ["scipy.sparse.csc", "scipy.sparse._csc", "scipy.sparse.csr", "scipy.sparse._csr"])
+@pytest.mark.parametrize("protocol", [0, 1, 2, 4])
+def test_sparse_matrices_of_any_release_and_protocol(module: str, protocol: int, tmp_path: Path) -> None:
+    dense = flame_arrays()["J_regressor"]
+    kind = f"{module[-3:]}_{'array' if '_' in module else 'matrix'}"
+    stored = {**flame_arrays(), "J_regressor": compressed(dense, module, kind)}
+    (tmp_path / "m.pkl").write_bytes(model_pickle(stored, python=3, protocol=protocol))
+    np.testing.assert_array_equal(read_flame_arrays(tmp_path / "m.pkl").joint_regressor, dense)
+
+
+def test_coordinate_matrices(tmp_path: Path) -> None:
+    dense = flame_arrays()["J_regressor"]
+    row, column = np.nonzero(dense)
+    places = {"_shape": dense.shape, "data": dense[row, column], "row": row, "col": column}
+    content = {**flame_arrays(), "J_regressor": foreign("scipy.sparse.coo", "coo_matrix", places)}
+    (tmp_path / "m.pkl").write_bytes(model_pickle(content))
+    np.testing.assert_array_equal(read_flame_arrays(tmp_path / "m.pkl").joint_regressor, dense)
+
+
+def test_chumpy_objects_that_reorder(tmp_path: Path) -> None:
+    """A selection of the columns of a longer basis, reshaped; weights that were turned round."""
+    content = flame_arrays()
+    longer = np.concatenate([content["shapedirs"], RNG.normal(size=(80, 3, 5))], axis=2)
+    chosen = np.arange(longer.size).reshape(longer.shape)[:, :, :400]
+    select = chumpy_reordered(
+        "Select", chumpy_array(longer), idxs=chosen.ravel(), preferred_shape=np.array([80, 3, 400])
+    )
+    flat = chumpy_array(content["posedirs"].reshape(-1))
+    stored = {
+        **content,
+        "shapedirs": select,
+        "posedirs": chumpy_reordered("Reshape", flat, newshape=(80, 3, 36)),
+        "weights": chumpy_reordered("transpose", chumpy_array(content["weights"].T), axes=None),
+    }
+    (tmp_path / "m.pkl").write_bytes(model_pickle(stored))
+    arrays = read_flame_arrays(tmp_path / "m.pkl")
+    np.testing.assert_array_equal(arrays.directions, content["shapedirs"])
+    np.testing.assert_array_equal(arrays.pose_directions, content["posedirs"])
+    np.testing.assert_array_equal(arrays.weights, content["weights"])
+
+
+def self_containing() -> object:
+    made = chumpy_array(np.zeros(1))
+    made.__dict__["x"] = made
+    return made
+
+
+BAD = flame_arrays()
+COUNT = len(BAD["weights"])
+REGRESSOR = "scipy.sparse.csc", "csc_matrix"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"weights": None}, "has no weights, so it is no FLAME model"),
+        ({"v_template": BAD["v_template"].ravel()}, r"v_template has shape \(240,\), expected \(any, 3\)"),
+        ({"shapedirs": BAD["shapedirs"][..., :100]}, r"shapedirs has shape \(80, 3, 100\), expected \(80, 3, 400\)"),
+        ({"posedirs": BAD["posedirs"][:7]}, r"posedirs has shape \(7, 3, 36\), expected \(80, 3, 36\)"),
+        ({"J_regressor": BAD["J_regressor"][:, :9]}, r"J_regressor has shape \(5, 9\), expected \(5, 80\)"),
+        ({"J_regressor": compressed(BAD["J_regressor"].T)}, r"J_regressor has shape \(80, 5\), expected 5 rows"),
+        ({"J_regressor": foreign(*REGRESSOR, {"_shape": (5, COUNT)})}, "J_regressor is a damaged scipy.sparse.csc"),
+        ({"J_regressor": foreign(*REGRESSOR, {"_shape": (5, 10**12)})}, "expected 5 rows"),
+        ({"J_regressor": foreign("scipy.sparse.bsr", "bsr_matrix", {})}, "scipy.sparse.bsr.bsr_matrix, which is not"),
+        ({"kintree_table": np.array([[-1, 0, 3, 1, 1], [0, 1, 2, 3, 4]])}, r"has the parents \[-1, 0, 3, 1, 1\]"),
+        ({"weights": np.ones((COUNT, 5))}, "weights of a vertex do not add up to 1"),
+        ({"weights": np.full((COUNT, 5), np.nan)}, "weights holds NaN or infinity"),
+        ({"f": np.array([[0, 1, COUNT]])}, "f names vertices that are not there"),
+        ({"f": np.zeros((0, 3))}, r"f has shape \(0, 3\)"),
+        ({"shapedirs": "none"}, "shapedirs holds str, expected an array of numbers"),
+        ({"v_template": chumpy_array("text")}, "v_template holds str"),  # type: ignore[arg-type]
+        (
+            {"v_template": foreign("chumpy.ch_ops", "add", {"a": 1, "b": 2})},
+            "chumpy.ch_ops.add, which is not understood",
+        ),
+        ({"v_template": chumpy_reordered("Tile", BAD["v_template"], reps=2)}, "damaged chumpy.reordering.Tile"),
+        ({"v_template": self_containing()}, "chumpy.ch.Ch, which is not understood"),
+    ],
+)
+def test_what_is_no_model_is_told_in_a_sentence(change: dict[str, object], message: str, tmp_path: Path) -> None:
+    content = {key: value for key, value in {**BAD, **change}.items() if value is not None}
+    (tmp_path / "m.pkl").write_bytes(model_pickle(content))
+    with pytest.raises(FaceDiffError, match=rf"m\.pkl: .*{message}"):
+        Flame.read(tmp_path / "m.pkl")
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    for name in ("m.npz", "m.pkl"):
+        with pytest.raises(FaceDiffError, match=rf"{name}: no such file; expected generic_model\.pkl of FLAME 2020"):
+            Flame.read(tmp_path / name)
+    (tmp_path / "m.npz").write_bytes(b"PK\x03\x04 cut off")
+    with pytest.raises(FaceDiffError, match=r"m\.npz: not a readable \.npz"):
+        Flame.read(tmp_path / "m.npz")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "array.npy").rename(tmp_path / "m.npz")
+    with pytest.raises(FaceDiffError, match=r"m\.npz: not a readable \.npz"):
+        Flame.read(tmp_path / "m.npz")
+    np.savez(tmp_path / "m.npz", **{**flame_arrays(), "weights": np.array([{}], object)})
+    with pytest.raises(FaceDiffError, match=r"m\.npz: not a readable \.npz of plain arrays"):
+        Flame.read(tmp_path / "m.npz")
+    (tmp_path / "list.pkl").write_bytes(pickle.dumps([1]))
+    with pytest.raises(FaceDiffError, match=r"list\.pkl: holds a list, no FLAME model"):
+        Flame.read(tmp_path / "list.pkl")
+
+
+class Bomb:
+    """Makes a folder when unpickled by Python's own unpickler."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_a_hostile_model_is_refused_and_does_not_run(protocol: int, tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    hostile = pickle.dumps({**flame_arrays(8), "weights": Bomb(mark)}, protocol)
+    (tmp_path / "m.pkl").write_bytes(hostile)
+    with pytest.raises(FaceDiffError, match=r"m\.pkl: not a pickle of plain NumPy arrays \(it asks for posix\.mkdir\)"):
+        Flame.read(tmp_path / "m.pkl")
+    assert not mark.exists()
+    pickle.loads(hostile)  # noqa: S301 - it would have run
+    assert mark.exists()
+
+
+def test_names_within_the_known_packages_do_nothing_either(tmp_path: Path) -> None:
+    """A real package of that name is not even imported, wherever it lies on the path."""
+    (tmp_path / "chumpy").mkdir()
+    (tmp_path / "chumpy" / "__init__.py").write_text("import os\nos.mkdir('mark')\n")
+    (tmp_path / "chumpy" / "ch.py").write_text("class Ch: pass\n")
+    write_flame(tmp_path / "m.pkl")
+    program = """
+        import sys
+        from pathlib import Path
+        sys.path.insert(0, ".")
+        from facediff.topology.flame import Flame
+        assert Flame.read(Path("m.pkl")).n_vertices == 80
+        assert not any(name.startswith("chumpy") for name in sys.modules)
+    """
+    run = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert run.returncode == 0, run.stderr
+    assert not (tmp_path / "mark").exists()
+
+
+def test_plain_arrays_pass_as_they_are() -> None:
+    values = np.arange(3, dtype=np.uint32)
+    assert plain_array(values, "f") is values

@@ -1,0 +1,120 @@
+"""What the method asks of the decoders and of the fusion beside what holds for every component."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.models.decoders import GruDecoder, StyleTransformer
+from facediff.models.fusions import AddFusion, BidirectionalCrossAttention
+
+DIM, FRAMES = 16, 12
+
+
+def reach(function: Callable[[Tensor], Tensor], frames: int = FRAMES) -> Tensor:
+    """Which output frame (row) depends on which input frame (column)."""
+    x = torch.randn(1, frames, DIM, requires_grad=True)
+    out = function(x)
+    rows = [torch.autograd.grad(out[0, t].square().sum(), x, retain_graph=True)[0][0] for t in range(frames)]
+    return torch.stack(rows).abs().sum(-1) > 0
+
+
+@pytest.fixture(params=[GruDecoder, StyleTransformer])
+def decoder(request: pytest.FixtureRequest) -> nn.Module:
+    torch.manual_seed(0)
+    made: nn.Module = request.param(dim=DIM, style_dim=6, num_layers=1).eval()
+    return made
+
+
+MASK = torch.ones(1, FRAMES, dtype=torch.bool)
+STYLE = torch.randn(1, 3, 6, generator=torch.Generator().manual_seed(0))
+
+
+def test_every_frame_sees_past_and_future(decoder: nn.Module) -> None:
+    assert reach(lambda x: decoder(x, STYLE, MASK)).all()
+
+
+def test_a_one_way_gru_sees_the_past_only() -> None:
+    one_way = GruDecoder(dim=DIM, style_dim=6, num_layers=1, bidirectional=False).eval()
+    seen = reach(lambda x: one_way(x, STYLE, MASK))
+    assert torch.equal(seen, torch.ones(FRAMES, FRAMES).tril().bool())
+
+
+def test_padding_is_never_seen(decoder: nn.Module) -> None:
+    mask = torch.arange(FRAMES)[None] < 8
+    assert not reach(lambda x: decoder(x, STYLE, mask))[:8, 8:].any()
+
+
+def test_style_changes_every_frame(decoder: nn.Module) -> None:
+    x = torch.randn(1, FRAMES, DIM)
+    changed = (decoder(x, STYLE, MASK) - decoder(x, 1 - STYLE, MASK)).abs().amax(-1)
+    assert (changed > 1e-4).all()
+
+
+def test_one_style_token_is_enough(decoder: nn.Module) -> None:
+    assert torch.isfinite(decoder(torch.randn(1, FRAMES, DIM), STYLE[:, :1], MASK)).all()
+
+
+def test_the_order_of_style_tokens_does_not_matter(decoder: nn.Module) -> None:
+    x = torch.randn(1, FRAMES, DIM)
+    torch.testing.assert_close(decoder(x, STYLE.flip(1), MASK), decoder(x, STYLE, MASK), rtol=0, atol=1e-5)
+
+
+def test_odd_widths_are_refused() -> None:
+    with pytest.raises(ValueError, match="even for a bidirectional gru decoder, got 5"):
+        GruDecoder(dim=5, style_dim=2)
+
+
+def test_add_is_the_plain_sum() -> None:
+    audio, motion = torch.randn(1, FRAMES, DIM), torch.randn(1, FRAMES, DIM)
+    assert torch.equal(AddFusion(dim=DIM)(audio, motion, MASK), audio + motion)
+
+
+def test_cross_attention_follows_equation_12() -> None:
+    """F'_a from (F_a, F_m), F'_m from (F_m, F'_a), F_am their sum, with residuals and pre-norm."""
+    torch.manual_seed(0)
+    fusion = BidirectionalCrossAttention(dim=DIM, num_heads=2, rotary=False).eval()
+    audio, motion = torch.randn(1, FRAMES, DIM), torch.randn(1, FRAMES, DIM)
+
+    def attend(part: nn.Module, query: Tensor, source: Tensor) -> Tensor:
+        key, value = part.key_value(source).chunk(2, -1)
+        heads = (t[0].unflatten(-1, (2, -1)).transpose(0, 1) for t in (part.query(query), key, value))
+        q, k, v = heads
+        mixed = (q @ k.mT / (DIM // 2) ** 0.5).softmax(-1) @ v
+        return part.out(mixed.transpose(0, 1).flatten(1))[None]
+
+    quiet = fusion.motion_norm(motion)
+    rich = audio + attend(fusion.audio_from_motion, fusion.audio_norm(audio), quiet)
+    moved = motion + attend(fusion.motion_from_audio, quiet, fusion.enriched_norm(rich))
+    torch.testing.assert_close(fusion(audio, motion, MASK), rich + moved, rtol=0, atol=1e-5)
+
+
+def test_motion_of_a_frame_can_hear_any_other_frame() -> None:
+    torch.manual_seed(0)
+    fusion = BidirectionalCrossAttention(dim=DIM).eval()
+    other = torch.randn(1, FRAMES, DIM)
+    assert reach(lambda x: fusion(x, other, MASK)).all()
+    assert reach(lambda x: fusion(other, x, MASK)).all()
+
+
+@pytest.mark.parametrize("part", [(kind, n) for kind in ("fusion", "decoder") for n in registry.KINDS[kind].names()])
+@pytest.mark.parametrize("clips", [(0, 1, 2, 3), (3,)], ids=["padded", "whole"])
+def test_what_is_prepared_changes_nothing(
+    part: tuple[str, str],
+    clips: tuple[int, ...],
+    make: Callable[..., nn.Module],
+    call: Callable[..., tuple[Tensor, ...]],
+) -> None:
+    """Every registered fusion and decoder, over several steps with one preparation."""
+    module = make(*part).eval()
+    first, second, mask = call(part[0], clips)
+    constant, moving = (first, second) if part[0] == "fusion" else (second, first)
+    prepared = module.prepare(constant, mask)
+    for scale in (1.0, 3.0) if prepared is not None else ():
+        inputs = (first, scale * moving) if part[0] == "fusion" else (scale * moving, second)
+        out, expected = module(*inputs, mask, prepared), module(*inputs, mask)
+        torch.testing.assert_close(out[mask], expected[mask], rtol=0, atol=1e-5)

@@ -1,0 +1,178 @@
+"""The dual-path model: conditions, losses, sampling, ablations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+
+from facediff import registry
+from facediff.data import collate
+from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion, losses
+from tests.fakes.tiny import Tiny
+
+Make = Callable[..., DualPathDiffusion]
+
+
+@pytest.fixture
+def model(make_model: Make, tiny: Tiny) -> DualPathDiffusion:
+    made = make_model()
+    made.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    return made.eval()
+
+
+def test_the_loss_is_the_weighted_sum_of_eq_15(model: DualPathDiffusion, tiny: Tiny) -> None:
+    batch = collate([tiny.dataset("val")[0]])
+    terms = model.losses(batch, torch.Generator().manual_seed(0))
+    expected = terms["reconstruction"] + 0.003 * (terms["velocity"] + terms["acceleration"]) + 0.0005 * terms["face"]
+    torch.testing.assert_close(terms["loss"], expected)
+
+
+def test_the_loss_of_a_clip_does_not_depend_on_its_padding(model: DualPathDiffusion, tiny: Tiny) -> None:
+    dataset = tiny.dataset("train")
+    short, long = dataset[0], dataset[7]
+    alone, together = collate([short]), collate([short, long])
+    frames = len(short.motion)
+    noise = torch.randn(1, frames, 72)
+    clean = alone.motion.flatten(2) * model.scale
+    step = torch.tensor([20])
+    noisy = model.process.add_noise(clean, noise, step)
+    padded = torch.randn(2, together.motion.shape[1], 72)
+    padded[:1, :frames] = noisy
+    first = model.network(noisy, step, model._conditions(alone))
+    second = model.network(padded, step.expand(2), model._conditions(together))
+    torch.testing.assert_close(second[:1, :frames], first, atol=1e-4, rtol=1e-4)
+    for loss in (losses.reconstruction_loss, losses.velocity_loss, losses.acceleration_loss):
+        truth = clean.view(1, frames, 24, 3)
+        one = loss(first.view(1, frames, 24, 3), truth, alone.mask)
+        longer = torch.nn.functional.pad(truth, (0, 0, 0, 0, 0, 9))
+        guess = torch.nn.functional.pad(first.view(1, frames, 24, 3), (0, 0, 0, 0, 0, 9), value=7.0)
+        torch.testing.assert_close(loss(guess, longer, torch.arange(frames + 9)[None] < frames), one)
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        {},
+        {"style_encoder": registry.style_encoder.none},
+        {"identity_encoder": registry.identity_encoder.none},
+        {"fusion": registry.fusion.add},
+        {"style_tokens": "single"},
+        {"decoder": registry.decoder.gru},
+        {"style_encoder": registry.style_encoder.none, "identity_encoder": registry.identity_encoder.none},
+    ],
+    ids=["full", "no_style", "no_identity", "add", "single_token", "gru", "no_condition"],
+)
+def test_every_trainable_parameter_gets_a_gradient(make_model: Make, tiny: Tiny, override: dict[str, object]) -> None:
+    model = make_model(**override)
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    dataset = tiny.dataset("train")
+    model.losses(collate([dataset[0], dataset[5]]))["loss"].backward()
+    missing = [name for name, p in model.named_parameters() if p.requires_grad and p.grad is None]
+    # With a single style token softmax over one key is constant, so its key half of the projection stays zero,
+    # but it is still reached.
+    assert missing == []
+
+
+def test_ablations_leave_their_part_out(make_model: Make) -> None:
+    full, bare = make_model(), make_model(style_encoder=registry.style_encoder.none)
+    assert len(full.network.style_tokens.projections) == 4
+    assert len(bare.network.style_tokens.projections) == 3
+    assert bare.network.mesh_encoder is None
+    assert len(make_model(style_tokens="single").network.style_tokens.projections) == 1
+
+
+def test_conditions_are_computed_once_and_not_per_step(
+    model: DualPathDiffusion, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+    for kind in ("audio_encoder", "style_encoder", "identity_encoder", "fusion"):
+        module = getattr(model.network, kind)
+        original = module.forward
+
+        def counted(*args: object, kind: str = kind, original: Callable[..., object] = original) -> object:
+            calls.append(kind)
+            return original(*args)
+
+        monkeypatch.setattr(module, "forward", counted)
+    model.generate(collate([tiny.dataset("val")[0]]))
+    assert [calls.count(k) for k in ("audio_encoder", "style_encoder", "identity_encoder", "fusion")] == [1, 1, 1, 3]
+
+
+def test_a_style_reference_and_an_identity_matter(model: DualPathDiffusion, tiny: Tiny) -> None:
+    batch = collate([tiny.dataset("val")[0]])
+
+    def motion(**changes: object) -> torch.Tensor:
+        with torch.inference_mode():
+            return model.generate(replace(batch, **changes), seed=3)
+
+    assert torch.equal(motion(), motion())
+    assert not torch.allclose(motion(), motion(reference=2 * batch.reference))
+    assert not torch.allclose(motion(), motion(identity=1 - batch.identity))
+    assert not torch.allclose(motion(), motion(audio=batch.audio.flip(1)))
+    # The truth itself is never looked at.
+    assert torch.equal(motion(), motion(motion=torch.randn_like(batch.motion)))
+
+
+def test_scale_none_leaves_the_motion_as_it_is(make_model: Make, tiny: Tiny) -> None:
+    model = make_model(motion_scale="none")
+    model.adopt(tiny.assets())
+    assert model.scale == 1.0
+    untrained = make_model()
+    untrained.adopt(tiny.assets())
+    with pytest.raises(FaceDiffError, match="never been trained"):
+        _ = untrained.scale
+
+
+def test_a_tiny_model_overfits_one_clip(make_model: Make, tiny: Tiny) -> None:
+    model = make_model(
+        dim=32,
+        identity_dropout=0.0,
+        audio_encoder=partial(registry.audio_encoder.mel, hidden_dim=32, num_layers=2, dropout=0.0),
+        decoder=partial(registry.decoder.style_transformer, num_layers=2, dropout=0.0),
+        fusion=partial(registry.fusion.cross_attention, dropout=0.0),
+        style_encoder=partial(registry.style_encoder.tcn_gru_transformer, num_layers=1, dropout=0.0),
+        sampler=partial(registry.sampler.ddim, steps=10),
+    )
+    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    batch = collate([tiny.dataset("val")[0]] * 8)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
+    torch.manual_seed(0)
+    for _ in range(200):
+        optimizer.zero_grad()
+        model.losses(batch)["loss"].backward()
+        optimizer.step()
+    with torch.inference_mode():
+        motion = model.eval().generate(batch, seed=0)
+    error = (motion - batch.motion).square().mean() / batch.motion.square().mean()
+    assert error < 0.05
+
+
+def test_animate_is_seeded_and_knows_unseen_people(model: DualPathDiffusion) -> None:
+    speech = torch.randn(16_000)
+    first = model.animate(speech, subject="A", seed=1)
+    assert first.vertices.shape == (25, 24, 3)
+    assert torch.equal(first.vertices, model.animate(speech, subject="A", seed=1).vertices)
+    assert not torch.equal(first.vertices, model.animate(speech, subject="A", seed=2).vertices)
+    assert model.animate(speech, subject="C").identity == "unknown"
+    with pytest.raises(FaceDiffError, match='there is no "Z"; the checkpoint knows A, B, C'):
+        model.animate(speech, subject="Z")
+
+
+def test_other_steps_keep_the_samplers_other_options(make_model: Make) -> None:
+    model = make_model(sampler=partial(registry.sampler.ddim, steps=3, eta=0.7))
+    model.choose_sampler(steps=9)
+    assert (model.sampler.steps, model.sampler.eta) == (9, 0.7)
+    model.choose_sampler("dpm_solver")
+    assert (type(model.sampler).__name__, model.sampler.steps) == ("dpm_solver", 5)
+
+
+def test_sizes_that_do_not_fit_are_named(make_model: Make, tiny: Tiny) -> None:
+    with pytest.raises(FaceDiffError, match=r"vertices are \{30\} in the model and \{24\} in the corpus"):
+        make_model(n_vertices=30).adopt(tiny.assets())
+    with pytest.raises(FaceDiffError, match="identities"):
+        make_model(identities=["B", "A"]).adopt(tiny.assets())

@@ -1,0 +1,57 @@
+"""The three-level identity embedding against equations 10 and 11."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from facediff.models.identity_encoders import HierarchicalIdentity
+
+
+@pytest.fixture
+def encoder() -> HierarchicalIdentity:
+    torch.manual_seed(0)
+    made = HierarchicalIdentity(dim=8, n_identities=4, level_dim=3)
+    torch.nn.init.normal_(made.norm.weight)
+    torch.nn.init.normal_(made.norm.bias)
+    return made.double()
+
+
+def expected(encoder: HierarchicalIdentity, identity: int) -> np.ndarray:
+    parts = [table.weight[identity].detach().numpy() for table in (encoder.coarse, encoder.mid, encoder.fine)]
+    weight, bias = encoder.attention.weight.detach().numpy(), encoder.attention.bias.detach().numpy()
+    scores = np.exp(weight @ np.concatenate(parts) + bias)
+    beta = scores / scores.sum()  # eq. 10
+    joined = np.concatenate([b * part for b, part in zip(beta, parts, strict=True)])
+    normed = (joined - joined.mean()) / np.sqrt(joined.var() + 1e-5)
+    return normed * encoder.norm.weight.detach().numpy() + encoder.norm.bias.detach().numpy()  # eq. 11
+
+
+def test_against_numpy(encoder: HierarchicalIdentity) -> None:
+    result = encoder(torch.tensor([2, 0, 3])).detach().numpy()
+    for row, identity in enumerate((2, 0, 3)):
+        np.testing.assert_allclose(result[row], expected(encoder, identity), atol=1e-10)
+
+
+def test_an_unknown_person_gets_the_mean(encoder: HierarchicalIdentity) -> None:
+    result = encoder(torch.tensor([-1, 1])).detach().numpy()
+    np.testing.assert_allclose(result[0], np.mean([expected(encoder, i) for i in range(4)], axis=0), atol=1e-10)
+    np.testing.assert_allclose(result[1], expected(encoder, 1), atol=1e-10)
+
+
+def test_level_weights_sum_to_one(encoder: HierarchicalIdentity) -> None:
+    weights = encoder.level_weights()
+    assert weights.shape == (4, 3)
+    assert (weights > 0).all()
+    torch.testing.assert_close(weights.sum(1), torch.ones(4).double())
+
+
+def test_width_follows_the_level() -> None:
+    assert HierarchicalIdentity(dim=8, n_identities=2).token_dims == (8, 8, 8)
+    assert HierarchicalIdentity(dim=8, n_identities=2, level_dim=5)(torch.tensor([0])).shape == (1, 15)
+
+
+def test_an_identity_that_does_not_exist_is_an_error(encoder: HierarchicalIdentity) -> None:
+    with pytest.raises(IndexError):
+        encoder(torch.tensor([4]))

@@ -1,0 +1,67 @@
+"""As whom strangers are tested: by name, stated with the result, and scored as a mean by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+
+from facediff.data import collate
+from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion
+from facediff.models.evaluation import conditioned
+from tests.fakes.tiny import Tiny
+
+Make = Callable[..., DualPathDiffusion]
+
+
+def test_a_part_of_a_batch_is_the_batch_of_a_part(tiny: Tiny) -> None:
+    samples = [tiny.dataset("test_a")[i] for i in range(3)]
+    samples.append(tiny.dataset("test_b")[0])
+    chosen = collate(samples).select([2, 0])
+    want = collate([samples[2], samples[0]])
+    for name, value in vars(want).items():
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(getattr(chosen, name), value, msg=name)
+        else:
+            assert getattr(chosen, name) == value, name
+
+
+def test_each_seen_identity_lends_itself_and_its_style(tiny: Tiny) -> None:
+    assets = tiny.assets()
+    batch = collate([tiny.dataset("test_a")[0], tiny.dataset("test_b")[0]])
+    views = conditioned(batch, "each_seen", assets.identities, assets.references)
+    assert [name for name, _ in views] == ["", "A", "B"]
+    assert views[0][1].names == batch.names[:1]
+    for index, (name, view) in enumerate(views[1:]):
+        assert view.names == batch.names[1:]
+        assert view.identity.tolist() == [index]
+        assert view.reference_names == [assets.references[name].clip]
+        torch.testing.assert_close(view.reference[0], assets.references[name].motion.float())
+    assert conditioned(batch, "style_only", assets.identities, assets.references)[0][1] is batch
+    with pytest.raises(FaceDiffError, match=r"is of C, whom the model does not know.*facediff adapt"):
+        conditioned(batch, "adapted", assets.identities, assets.references)
+
+
+def test_the_mean_over_identities_is_reported(
+    make_model: Make, tiny: Tiny, make_trainer: Callable[..., Trainer]
+) -> None:
+    """Scores of test B are the mean over clips and identities of those computed by hand."""
+    model = make_model(unseen_identity="each_seen", motion_scale="none")
+    trainer = make_trainer()
+    metrics = trainer.test(model, datamodule=tiny, verbose=False)
+    reported = {name: value for part in metrics for name, value in part.items()}
+    total, frames = 0.0, 0
+    dataset, assets = tiny.dataset("test_b"), tiny.assets()
+    for i in range(len(dataset)):
+        batch = collate([dataset[i]])
+        for _, view in conditioned(batch, "each_seen", assets.identities, assets.references):
+            with torch.inference_mode():
+                motion = model.eval().generate(view, seed=0)
+            error = (motion - batch.motion)[0][:, assets.regions["lips"]].double().square().sum(-1).amax(-1)
+            total, frames = total + float(error.sum()), frames + len(error)
+    assert reported["test_b/lve"] == pytest.approx(total / frames, rel=1e-4)
+    rows = [row for row in model.evaluation.sequences() if row["split"] == "test_b" and row["method"] == "model"]
+    assert {row["identity"] for row in rows} == {"A", "B"}

@@ -1,0 +1,105 @@
+"""The log-mel encoder: its filters, its independence of loudness, and that sound and frame keep time."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from facediff.models.audio_encoders import MelEncoder, mel_filters, standardise
+
+RATE = 16_000
+
+
+@pytest.fixture
+def encoder() -> MelEncoder:
+    torch.manual_seed(0)
+    return MelEncoder(dim=8, hidden_dim=16, num_layers=0).eval()
+
+
+def burst(frame: int, frames: int, hertz: float = 1000.0) -> Tensor:
+    """A tone that sounds during one motion frame at 25 frames a second."""
+    time = torch.arange(frames * 640) / RATE
+    gate = (torch.arange(frames * 640) // 640 == frame).float()
+    return (gate * torch.sin(2 * math.pi * hertz * time))[None]
+
+
+def test_filters_are_triangles_on_the_mel_scale() -> None:
+    filters = mel_filters(40, 4096, 60.0, 7600.0)
+    hertz = torch.arange(2049) * RATE / 4096
+    assert filters.shape == (40, 2049)
+    assert (filters >= 0).all()
+    peaks = hertz[filters.argmax(1)]
+    assert (peaks.diff() > 0).all()
+    assert not filters[:, (hertz < 60) | (hertz > 7600)].any()
+    mels = 2595 * torch.log10(1 + peaks / 700)
+    torch.testing.assert_close(mels.diff(), mels.diff().mean().expand(39), rtol=0.15, atol=0)
+    # Unit area: a flat spectrum gives a flat result.
+    torch.testing.assert_close(filters.sum(1) * RATE / 4096, torch.ones(40), rtol=0.02, atol=0)
+    rising = [row[: row.argmax() + 1].diff().min() >= 0 and row[row.argmax() :].diff().max() <= 0 for row in filters]
+    assert all(rising)
+
+
+def test_no_filter_of_the_encoder_is_empty(encoder: MelEncoder) -> None:
+    """At 31 Hz between bins the lowest triangles could fall between two of them."""
+    assert (encoder.filters.sum(1) > 0).all()
+
+
+def test_a_tone_shows_in_its_own_band(encoder: MelEncoder) -> None:
+    for hertz in (200.0, 1000.0, 5000.0):
+        audio = torch.sin(2 * math.pi * hertz * torch.arange(RATE) / RATE)[None]
+        spectrum, _ = encoder._log_mel(audio, torch.tensor([RATE]))
+        band = int(spectrum[0, 50].argmax())
+        low, high = (int(encoder.filters[band].nonzero()[place]) * RATE / 512 for place in (0, -1))
+        assert low - 32 <= hertz <= high + 32
+
+
+@pytest.mark.parametrize("frame", [3, 10, 18])
+def test_a_burst_shows_at_its_time(encoder: MelEncoder, frame: int) -> None:
+    spectrum, steps = encoder._log_mel(burst(frame, 20), torch.tensor([20 * 640]))
+    assert steps.tolist() == [80]
+    power = (4 * spectrum[0, :80]).exp().sum(1)
+    centre = float((power * torch.arange(80)).sum() / power.sum()) / 100  # spectrum k is centred at k/100 s
+    assert centre == pytest.approx((frame + 0.5) / 25, abs=0.006)
+
+
+@pytest.mark.parametrize("frames", [20, 25])
+def test_a_frame_listens_to_its_own_time(encoder: MelEncoder, frames: int) -> None:
+    """Where in the sound the gradient of a frame's feature lies, also at another frame rate."""
+    torch.manual_seed(1)
+    audio = torch.randn(1, RATE, requires_grad=True)
+    for frame in (4, 10, 15):
+        out = encoder(audio, torch.tensor([RATE]), torch.tensor([frames]))
+        (gradient,) = torch.autograd.grad(out[0, frame].square().sum(), audio)
+        weight = gradient[0].square()
+        centre = float((weight * torch.arange(RATE)).sum() / weight.sum()) / RATE
+        assert centre == pytest.approx((frame + 0.5) / frames, abs=0.012)
+
+
+def test_loudness_and_offset_do_not_matter(encoder: MelEncoder) -> None:
+    audio, lengths, frames = torch.randn(1, 9600), torch.tensor([9600]), torch.tensor([15])
+    expected = encoder(audio, lengths, frames)
+    for other in (30 * audio, 0.02 * audio, audio + 2):
+        torch.testing.assert_close(encoder(other, lengths, frames), expected, rtol=0, atol=2e-4)
+
+
+def test_silence_and_a_tenth_of_a_second_are_fine(encoder: MelEncoder) -> None:
+    for samples in (1600, 100, 1):
+        out = encoder(torch.zeros(1, samples), torch.tensor([samples]), torch.tensor([3]))
+        assert out.shape == (1, 3, 8)
+        assert torch.isfinite(out).all()
+
+
+def test_standardise_against_transformers() -> None:
+    from transformers import Wav2Vec2FeatureExtractor
+
+    waves = [3 + 0.2 * torch.randn(800), 0.01 * torch.randn(500)]
+    padded = torch.nn.utils.rnn.pad_sequence(waves, batch_first=True)
+    padded[1, 500:] = 77.0
+    ours = standardise(padded, torch.tensor([800, 500]))
+    theirs = Wav2Vec2FeatureExtractor()([wave.numpy() for wave in waves], sampling_rate=RATE)["input_values"]
+    for row, wave in enumerate(theirs):
+        torch.testing.assert_close(ours[row, : len(wave)], torch.as_tensor(wave), rtol=0, atol=1e-4)
+    assert not ours[1, 500:].any()

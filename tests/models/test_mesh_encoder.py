@@ -1,0 +1,221 @@
+"""Mesh encoders, whatever their name; and the spiral one against its definition, vertex by vertex."""
+
+from __future__ import annotations
+
+import copy
+import io
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.errors import FaceDiffError
+from facediff.mesh.hierarchy import MeshHierarchy, mesh_hierarchy
+from facediff.models.mesh_encoders import MeshEncoder, SpiralMeshEncoder
+from tests.fakes.meshes import relief
+
+DIM, ROWS, COLUMNS = 7, 14, 12
+VERTICES = ROWS * COLUMNS
+NAMES = registry.mesh_encoder.names()
+Hierarchy = Callable[..., MeshHierarchy]
+
+
+@pytest.fixture(scope="module")
+def hierarchy(tmp_path_factory: pytest.TempPathFactory) -> Hierarchy:
+    folder: Path = tmp_path_factory.mktemp("topology")
+    return cache(lambda **options: mesh_hierarchy(*relief(ROWS, COLUMNS), cache=folder, **options))
+
+
+@pytest.fixture
+def make(hierarchy: Hierarchy) -> Callable[..., MeshEncoder]:
+    def build(name: str, seed: int = 0, **options: Any) -> MeshEncoder:  # noqa: ANN401
+        torch.manual_seed(seed)
+        encoder: MeshEncoder = registry.mesh_encoder.get(name)(dim=DIM, n_vertices=VERTICES, **options)
+        if not encoder.attached:
+            encoder.attach(hierarchy(**encoder.mesh_options))
+        assert encoder.attached
+        return encoder
+
+    return build
+
+
+def motion(batch: int = 2, frames: int = 3, seed: int = 5) -> Tensor:
+    return torch.randn(batch, frames, VERTICES, 3, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shape_and_independence_of_frames(name: str, make: Callable[..., MeshEncoder]) -> None:
+    encoder, inputs = make(name).eval(), motion()
+    before = inputs.clone()
+    out = encoder(inputs)
+    assert out.shape == (2, 3, DIM)
+    assert out.dtype == torch.float32
+    assert torch.equal(inputs, before)
+    for clip in range(2):
+        for frame in range(3):
+            alone = encoder(inputs[clip : clip + 1, frame : frame + 1])
+            torch.testing.assert_close(out[clip, frame], alone[0, 0], rtol=0, atol=1e-5)
+    spoilt = inputs.clone()
+    spoilt[1, 2] = torch.nan  # a padded frame
+    torch.testing.assert_close(encoder(spoilt)[0], out[0], rtol=0, atol=1e-5)
+    torch.testing.assert_close(encoder(spoilt)[1, :2], out[1, :2], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradient_reaches_parameters_and_motion(name: str, make: Callable[..., MeshEncoder]) -> None:
+    encoder, inputs = make(name), motion().requires_grad_()
+    encoder(inputs).square().sum().backward()
+    assert [key for key, p in encoder.named_parameters() if p.grad is None or not p.grad.any()] == []
+    assert inputs.grad is not None
+    # Down-sampling may select vertices, but their spirals reach nearly all of the others.
+    assert (inputs.grad.abs().sum((0, 1, 3)) > 0).float().mean() > 0.9
+
+
+def test_the_mean_sees_every_vertex(make: Callable[..., MeshEncoder]) -> None:
+    inputs = motion().requires_grad_()
+    make("spiral", pooling="mean")(inputs).square().sum().backward()
+    assert inputs.grad is not None
+    assert inputs.grad.abs().sum((0, 1, 3)).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_state_dict_needs_no_mesh(name: str, make: Callable[..., MeshEncoder]) -> None:
+    expected = make(name)(motion())
+    file = io.BytesIO()
+    torch.save(make(name).state_dict(), file)
+    file.seek(0)
+    fresh: nn.Module = registry.mesh_encoder.get(name)(dim=DIM, n_vertices=VERTICES)
+    fresh.load_state_dict(torch.load(file, weights_only=True))
+    assert fresh.attached
+    assert torch.equal(fresh(motion()), expected)
+    assert not torch.equal(make(name, seed=1)(motion()), expected)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_wrong_motion_is_refused(name: str, make: Callable[..., MeshEncoder]) -> None:
+    encoder = make(name)
+    for vertices in (VERTICES + 1, VERTICES - 1):
+        with pytest.raises(ValueError, match=f"made for {VERTICES}"):
+            encoder(torch.zeros(1, 2, vertices, 3))
+    with pytest.raises(TypeCheckError):
+        encoder(torch.zeros(1, 2, VERTICES, 2))
+
+
+def naive(encoder: SpiralMeshEncoder, mesh: MeshHierarchy, frame: np.ndarray) -> np.ndarray:
+    """A frame (V, 3) through [spiral convolution at every vertex → selection → leaky ReLU] …, in float64 loops."""
+    features = frame.astype(np.float64)
+    for step, level in zip(encoder.steps, mesh.levels, strict=False):
+        weight = step.map.weight.detach().double().numpy()
+        bias = step.map.bias.detach().double().numpy()
+        convolved = np.empty((len(features), len(weight)))
+        for vertex, spiral in enumerate(level.spirals):
+            convolved[vertex] = weight @ np.concatenate([features[near] for near in spiral]) + bias
+        assert level.down is not None
+        pooled = np.zeros((level.down.shape[0], len(weight)))
+        for row, column, share in zip(level.down.rows, level.down.columns, level.down.weights, strict=True):
+            pooled[row] += share * convolved[column]
+        features = np.where(pooled > 0, pooled, 0.2 * pooled)
+    weight = encoder.map.weight.detach().double().numpy()
+    flat: np.ndarray = weight @ features.ravel() + encoder.map.bias.detach().double().numpy()
+    return flat
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"channels": (4,), "factor": 3},
+        {"channels": (4, 5), "spiral_length": 9, "dilation": 2},
+        {"channels": ()},
+        {"pooling": "mean"},
+    ],
+    ids=str,
+)
+def test_spiral_against_its_definition(
+    options: dict[str, Any], make: Callable[..., MeshEncoder], hierarchy: Hierarchy
+) -> None:
+    torch.manual_seed(0)
+    encoder = make("spiral", **options)
+    assert isinstance(encoder, SpiralMeshEncoder)
+    for step in encoder.steps:
+        nn.init.normal_(step.map.bias)
+    mesh, inputs = hierarchy(**encoder.mesh_options), 0.3 * motion()
+    out = encoder.double()(inputs.double()).detach().numpy()
+    for clip in range(2):
+        for frame in range(3):
+            np.testing.assert_allclose(out[clip, frame], naive(encoder, mesh, inputs[clip, frame].numpy()), atol=1e-6)
+
+
+def test_published_widths() -> None:
+    """Chai et al.: 3 → 16 → 32 → 32 channels, spirals of 12, four times fewer vertices each time."""
+    encoder = SpiralMeshEncoder(dim=64, n_vertices=5023)
+    assert [tuple(step.map.weight.shape) for step in encoder.steps] == [(16, 36), (32, 192), (32, 384)]
+    assert encoder.map.weight.shape == (64, 79 * 32)
+    assert encoder.mesh_options == {
+        "levels": 3,
+        "factor": 4,
+        "spiral_length": 12,
+        "dilation": 1,
+        "pooling": "select",
+    }
+
+
+@pytest.mark.parametrize("frames", [1, 2, 6, 100])
+def test_few_frames_at_a_time_change_nothing(frames: int, make: Callable[..., MeshEncoder]) -> None:
+    results = []
+    for options in ({}, {"max_frames": frames}):
+        encoder, inputs = make("spiral", **options), motion().requires_grad_()
+        out = encoder(inputs)
+        out.square().sum().backward()
+        results.append([out.detach(), inputs.grad, *(p.grad for p in encoder.parameters())])
+    for one, other in zip(*results, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("pooling", ["select", "mean"])
+def test_without_a_mesh_it_says_so(hierarchy: Hierarchy, pooling: Literal["select", "mean"]) -> None:
+    encoder = SpiralMeshEncoder(dim=DIM, n_vertices=VERTICES, pooling=pooling)
+    assert not encoder.attached
+    with pytest.raises(FaceDiffError, match="mesh is not known yet"):
+        encoder(motion())
+    shapes = {name: buffer.shape for name, buffer in encoder.named_buffers()}
+    other = copy.deepcopy(encoder)  # as weight averaging does before a corpus is known
+    encoder.attach(hierarchy(**encoder.mesh_options))
+    assert {name: buffer.shape for name, buffer in encoder.named_buffers()} == shapes
+    assert not other.attached
+    for mine, theirs in zip(other.buffers(), encoder.buffers(), strict=True):
+        mine.copy_(theirs)
+    other.load_state_dict(dict(encoder.named_parameters()), strict=False)
+    assert torch.equal(other(motion()), encoder(motion()))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"levels": 2}, r"\[168, 42, 11\] vertices at its levels; expected \[168, 42, 11, 3\]"),
+        ({"factor": 3}, r"\[168, 56, 19, 7\]"),
+        ({"pooling": "mean"}, r"spirals of the shape \(168, 12\); expected \(42, 12\)"),
+        ({"spiral_length": 9}, r"spirals of the shape \(42, 9\); expected \(42, 12\)"),
+        ({"vertices": tuple(range(100))}, r"\[100, 25, 7, 2\]"),
+    ],
+)
+def test_another_mesh_is_refused_and_changes_nothing(
+    options: dict[str, Any], message: str, hierarchy: Hierarchy
+) -> None:
+    encoder = SpiralMeshEncoder(dim=DIM, n_vertices=VERTICES)
+    with pytest.raises(FaceDiffError, match=message):
+        encoder.attach(hierarchy(**{**encoder.mesh_options, **options}))
+    assert not encoder.attached
+
+
+@pytest.mark.parametrize("option", ["factor", "spiral_length", "dilation", "max_frames"])
+def test_impossible_options_are_refused(option: str) -> None:
+    with pytest.raises(ValueError, match=f"{option} 0; expected at least 1"):
+        SpiralMeshEncoder(dim=DIM, n_vertices=VERTICES, **{option: 0})

@@ -1,0 +1,122 @@
+"""What does not change over the denoising steps: computed once, and the same as if it were computed in every step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import collate
+from facediff.models import DualPathDiffusion
+from facediff.models.dual_path import Conditions, StepEmbedding
+from tests.fakes.plugin.facediff_moving_average import MovingAverageDecoder
+from tests.fakes.tiny import Tiny
+
+Make = Callable[..., DualPathDiffusion]
+DIM, FRAMES = 16, 12
+
+VARIANTS: list[dict[str, Any]] = [{"decoder": registry.decoder.get(name)} for name in registry.decoder.names()]
+VARIANTS += [{"fusion": registry.fusion.get(name)} for name in registry.fusion.names()]
+VARIANTS += [
+    {"fusion": partial(registry.fusion.cross_attention, rotary=False)},
+    {"style_tokens": "single"},
+    # As many pairs of head and token as channels: keys and values are not multiplied out.
+    {"decoder": partial(registry.decoder.style_transformer, num_layers=1, num_heads=4), "dim": 8},
+    # From outside, and it has never heard of preparing.
+    {"decoder": MovingAverageDecoder},
+]
+
+
+def conditions(dim: int, frames: int = FRAMES, padded: int = 0) -> Conditions:
+    mask = torch.arange(frames)[None] < torch.tensor([[frames], [frames - padded]])
+    return Conditions(torch.randn(2, frames, dim).double(), torch.randn(2, 3, dim).double(), mask)
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=str)
+@pytest.mark.parametrize("padded", [0, 5])
+def test_the_core_gives_the_same_with_prepared_conditions(
+    make_model: Make, variant: dict[str, Any], padded: int
+) -> None:
+    model = make_model(**variant).double().eval()
+    network, dim = model.network, variant.get("dim", DIM)
+    given = conditions(dim, padded=padded)
+    for known in (given, given.frames(2, 9)):
+        ready = network.prepared(known, model.process.steps)
+        for step in (0, 17, model.process.steps - 1):
+            motion, steps = torch.randn(*known.audio.shape).double(), torch.tensor([step, step])
+            with torch.no_grad():
+                out, expected = network.core(motion, steps, ready), network.core(motion, steps, known)
+            torch.testing.assert_close(out[known.mask], expected[known.mask], rtol=0, atol=1e-12)
+
+
+def test_steps_are_embedded_as_they_come_without_a_table(make_model: Make) -> None:
+    network = make_model().double().eval().network
+    given, motion = conditions(DIM), torch.randn(2, FRAMES, DIM).double()
+    steps = torch.tensor([3, 30])
+    ready = network.prepared(given)
+    assert ready.steps is None
+    torch.testing.assert_close(network.core(motion, steps, ready), network.core(motion, steps, given))
+
+
+def test_the_table_of_steps_is_kept_until_the_weights_change() -> None:
+    torch.manual_seed(0)
+    embedding = StepEmbedding(DIM)
+    with torch.inference_mode():
+        table = embedding.table(40)
+    torch.testing.assert_close(table, embedding(torch.arange(40)).detach(), rtol=0, atol=1e-6)
+    assert embedding.table(40) is table
+    assert len(embedding.table(50)) == 50
+    # As weight averages are swapped in: without a trace in any counter.
+    embedding.mlp[2].bias.data.add_(1.0)
+    torch.testing.assert_close(embedding.table(40), table + 1.0)
+    assert "_table" not in "".join(embedding.state_dict())
+    # It can be used where gradients are computed, though it carries none and was made in inference mode.
+    (table * torch.ones(DIM, requires_grad=True)).sum().backward()
+
+
+def test_nothing_constant_is_computed_in_a_step(make_model: Make, tiny: Tiny) -> None:
+    """Ten steps call as many maps of what is constant as one step does."""
+    calls: dict[str, int] = {}
+    sampler = partial(registry.sampler.ddim, steps=10)
+    model = make_model(decoder=partial(registry.decoder.style_transformer, num_layers=2), sampler=sampler)
+    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    network = model.eval().network
+    once = {
+        "speech's norm": network.fusion.audio_norm,
+        "speech's query": network.fusion.audio_from_motion.query,
+        "style's keys": network.decoder.blocks[0].style_attention.key_value,
+        "style's keys in the next block": network.decoder.blocks[1].style_attention.key_value,
+        "step": network.step_embedding.mlp,
+    }
+    watched: dict[str, nn.Module] = {**once, "motion's norm": network.fusion.motion_norm}
+    for name, module in watched.items():
+
+        def count(*_: object, name: str = name) -> None:
+            calls[name] = calls.get(name, 0) + 1
+
+        module.register_forward_hook(count)
+    batch = collate([tiny.dataset("val")[0]])
+    first = model.generate(batch)
+    assert calls == dict.fromkeys(once, 1) | {"motion's norm": 10}
+    calls.clear()
+    assert torch.equal(model.generate(batch), first)
+    assert calls.get("step", 0) == 0  # the table of the steps belongs to the model
+
+
+def test_generating_leaves_nothing_that_training_stumbles_over(make_model: Make, tiny: Tiny) -> None:
+    model = make_model()
+    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    batch = collate([tiny.dataset("val")[0]])
+    with torch.inference_mode():
+        before: Tensor = model.generate(batch)
+    model.losses(batch)["loss"].backward()
+    with torch.no_grad():
+        for parameter in model.network.step_embedding.parameters():
+            parameter.add_(0.5)
+    with torch.inference_mode():
+        assert not torch.allclose(model.generate(batch), before)

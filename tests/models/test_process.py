@@ -1,0 +1,67 @@
+"""The forward process against equation 1 of the paper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from facediff.models.samplers import NoiseProcess
+
+
+@pytest.mark.parametrize("steps", [10, 1000])
+def test_cosine_schedule(steps: int) -> None:
+    """Nichol and Dhariwal 2021, eq. 17, with their s = 0.008 and their cap of 0.999."""
+
+    def curve(t: np.ndarray) -> np.ndarray:
+        return np.cos((t / steps + 0.008) / 1.008 * np.pi / 2) ** 2
+
+    n = np.arange(steps)
+    expected = np.minimum(1 - curve(n + 1) / curve(n), 0.999)
+    process = NoiseProcess(steps)
+    np.testing.assert_allclose(process.variances.numpy(), expected, rtol=1e-5)
+    np.testing.assert_allclose(process.signal.numpy(), np.cumprod(1 - expected), rtol=1e-3)
+    assert process.signal[-1] < 1e-4  # the process ends in pure noise, from which sampling starts
+
+
+@pytest.mark.parametrize("schedule", ["squaredcos_cap_v2", "linear"])
+def test_closed_form_is_the_product_of_single_steps(schedule: str) -> None:
+    process = NoiseProcess(60, schedule)
+    step = torch.arange(60)
+    ones, zeros = torch.ones(60, 1), torch.zeros(60, 1)
+    signal = process.add_noise(ones, zeros, step)[:, 0].double().numpy()
+    noise = process.add_noise(zeros, ones, step)[:, 0].double().numpy()
+    mean, variance = 1.0, 0.0
+    for n, alpha in enumerate(process.variances.double().numpy()):
+        mean, variance = np.sqrt(1 - alpha) * mean, (1 - alpha) * variance + alpha  # eq. 1
+        assert signal[n] == pytest.approx(mean, rel=1e-4)
+        assert noise[n] ** 2 == pytest.approx(variance, rel=2e-3)
+
+
+def test_simulated_noising_has_the_closed_forms_statistics() -> None:
+    process, samples, last = NoiseProcess(25), 40_000, 14
+    generator = torch.Generator().manual_seed(0)
+    clean = torch.tensor([1.5, -0.5]).expand(samples, 2)
+    noisy = clean.clone()
+    for alpha in process.variances[: last + 1]:
+        noisy = (1 - alpha).sqrt() * noisy + alpha.sqrt() * torch.randn(samples, 2, generator=generator)
+    noise = torch.randn(samples, 2, generator=generator)
+    closed = process.add_noise(clean, noise, torch.full((samples,), last))
+    torch.testing.assert_close(closed.mean(0), noisy.mean(0), rtol=0, atol=0.02)
+    torch.testing.assert_close(closed.std(0), noisy.std(0), rtol=0.015, atol=0)
+
+
+def test_every_clip_is_noised_by_its_own_step() -> None:
+    process = NoiseProcess(30)
+    clean, noise, step = torch.randn(3, 4, 6), torch.randn(3, 4, 6), torch.tensor([29, 0, 11])
+    together = process.add_noise(clean, noise, step)
+    for i in range(3):
+        kept = process.signal[step[i]]
+        torch.testing.assert_close(together[i], kept.sqrt() * clean[i] + (1 - kept).sqrt() * noise[i])
+
+
+def test_drawn_steps_cover_the_process_evenly() -> None:
+    torch.manual_seed(0)
+    counts = torch.bincount(NoiseProcess(10).draw_steps(20_000, torch.device("cpu")), minlength=10)
+    assert len(counts) == 10
+    assert ((counts - 2000).abs() < 250).all()

@@ -1,0 +1,278 @@
+"""Every registered sampler against the truth that it must recover, and each one's step against its formula."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from facediff import registry
+from facediff.errors import FaceDiffError
+from facediff.models.samplers import NoiseProcess, Sampler
+
+NAMES = registry.sampler.names()
+every_sampler = pytest.mark.parametrize("name", NAMES)
+
+
+def make(name: str, process: NoiseProcess, **options: Any) -> Sampler:  # noqa: ANN401
+    return registry.sampler.get(name)(process=process, **options)
+
+
+def noise_of(seed: int) -> Callable[[Tensor], Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return lambda like: torch.randn(like.shape, generator=generator)
+
+
+def trace(
+    sampler: Sampler, predict: Callable[[Tensor, int], Tensor], start: Tensor, seed: int = 0
+) -> tuple[list[int], list[Tensor]]:
+    """The steps that were asked for, and the motion before each of them and at the end."""
+    steps: list[int] = []
+    motions: list[Tensor] = []
+
+    def denoise(noisy: Tensor, step: int) -> Tensor:
+        steps.append(step)
+        motions.append(noisy.clone())
+        return predict(noisy, step)
+
+    motions.append(sampler.run(denoise, start, noise=noise_of(seed)))
+    return steps, motions
+
+
+@every_sampler
+@pytest.mark.parametrize(("total", "steps"), [(10, n) for n in range(1, 11)] + [(1000, 7), (1000, 15), (50, 33)])
+def test_a_perfect_denoiser_gives_the_truth(name: str, total: int, steps: int) -> None:
+    truth = torch.randn(2, 5, 12)
+    seen, motions = trace(make(name, NoiseProcess(total), steps=steps), lambda *_: truth, torch.randn(2, 5, 12))
+    torch.testing.assert_close(motions[-1], truth, rtol=0, atol=1e-6)
+    assert seen[0] == total - 1  # pure noise
+    assert len(seen) == steps
+    assert seen == sorted(set(seen), reverse=True)
+
+
+@every_sampler
+def test_gaussian_data_come_out_with_their_mean_and_deviation(name: str) -> None:
+    """For data N(m, s²) the best denoiser E[M⁰ | Mⁿ] is known, so the samples' distribution is too."""
+    process = NoiseProcess(1000)
+    mean, deviation = torch.tensor([0.7, -1.5]), torch.tensor([0.3, 1.4])
+
+    def predict(noisy: Tensor, step: int) -> Tensor:
+        kept = process.signal[step]
+        weight = kept * deviation**2 + 1 - kept
+        return (mean * (1 - kept) + kept.sqrt() * deviation**2 * noisy) / weight
+
+    options = {} if name == "ddpm" else {"steps": 150}
+    start = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(1))
+    samples = make(name, process, **options).run(predict, start, noise=noise_of(2))
+    torch.testing.assert_close(samples.mean(0), mean, rtol=0, atol=0.03)
+    torch.testing.assert_close(samples.std(0), deviation, rtol=0.025, atol=0)
+
+
+@every_sampler
+def test_a_seed_repeats_bit_for_bit_whatever_the_global_state(name: str) -> None:
+    start = torch.randn(2, 3, 4)
+    runs = []
+    for state in (1, 2):
+        torch.manual_seed(state)
+        runs.append(trace(make(name, NoiseProcess(20), steps=10), lambda x, _: 0.5 * x.tanh(), start, seed=3)[1][-1])
+    assert torch.equal(*runs)
+
+
+@every_sampler
+@pytest.mark.parametrize("steps", [0, -1, 21])
+def test_impossible_numbers_of_steps_are_refused(name: str, steps: int) -> None:
+    with pytest.raises(FaceDiffError, match=rf"steps: {steps} .* 1 to 20"):
+        make(name, NoiseProcess(20), steps=steps)
+
+
+@every_sampler
+def test_progress_wraps_the_steps(name: str) -> None:
+    seen: list[int] = []
+
+    def progress(steps: Any) -> Any:  # noqa: ANN401
+        for step in steps:
+            seen.append(step)
+            yield step
+
+    make(name, NoiseProcess(20), steps=5).run(lambda x, _: 0 * x, torch.randn(1, 2, 3), progress=progress)
+    assert len(seen) == 5
+
+
+@pytest.mark.parametrize(("name", "option"), [("ddim", {"eta": 1.5}), ("dpm_solver", {"order": 4})])
+def test_impossible_options_are_refused(name: str, option: dict[str, float]) -> None:
+    with pytest.raises(FaceDiffError, match="choose"):
+        make(name, NoiseProcess(20), steps=5, **option)
+
+
+@pytest.mark.parametrize("steps", [20, 7])
+def test_ddpm_step_is_the_gaussian_posterior(steps: int) -> None:
+    """q(Mⁿ⁻¹ | Mⁿ, M⁰), Ho et al. 2020, eq. 6 and 7, between any two of the steps taken."""
+    process, shape = NoiseProcess(20), (400, 100)
+    truth = torch.randn(shape, generator=torch.Generator().manual_seed(9))
+    seen, motions = trace(make("ddpm", process, steps=steps), lambda *_: truth, torch.randn(shape))
+    kept = process.signal.double().numpy()
+    for i in range(steps - 1):
+        now, then = kept[seen[i]], kept[seen[i + 1]]
+        alpha = 1 - now / then  # noise variance from one to the other
+        mean = np.sqrt(then) * alpha / (1 - now) * truth + np.sqrt(1 - alpha) * (1 - then) / (1 - now) * motions[i]
+        variance = (1 - then) / (1 - now) * alpha
+        residual = (motions[i + 1] - mean).numpy() / np.sqrt(variance)
+        assert residual.mean() == pytest.approx(0, abs=0.02)
+        assert residual.std() == pytest.approx(1, abs=0.02)
+        for other in (truth, motions[i]):  # what is left is fresh noise
+            assert np.corrcoef(residual.ravel(), other.numpy().ravel())[0, 1] == pytest.approx(0, abs=0.02)
+
+
+@pytest.mark.parametrize("steps", [20, 7])
+def test_ddpm_is_the_librarys(steps: int) -> None:
+    """Against diffusers' DDPMScheduler with the same noise."""
+    from diffusers import DDPMScheduler
+
+    process = NoiseProcess(20)
+    sampler = make("ddpm", process, steps=steps)
+    start, fresh = torch.randn(3, 4, 5), [torch.randn(3, 4, 5) for _ in range(steps)]
+    queue = iter(fresh)
+    ours = sampler.run(lambda x, _: x.tanh(), start, noise=lambda _: next(queue))
+    scheduler = DDPMScheduler(**process.scheduler_config(), variance_type="fixed_small", clip_sample=False)
+    scheduler.set_timesteps(timesteps=sampler.places())
+    theirs, queue = start, iter(fresh)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("diffusers.schedulers.scheduling_ddpm.randn_tensor", lambda *_, **__: next(queue))
+        for step in scheduler.timesteps:
+            theirs = scheduler.step(theirs.tanh(), step, theirs, return_dict=False)[0]
+    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("steps", [20, 7])
+def test_ddpm_adds_no_noise_in_the_last_step(steps: int) -> None:
+    predicted: list[Tensor] = []
+
+    def predict(noisy: Tensor, step: int) -> Tensor:
+        predicted.append(noisy.tanh())
+        return predicted[-1]
+
+    _, motions = trace(make("ddpm", NoiseProcess(20), steps=steps), predict, torch.randn(3, 4, 5))
+    torch.testing.assert_close(motions[-1], predicted[-1], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("steps", [20, 7, 15])
+@pytest.mark.parametrize("eta", [0.0, 0.4, 1.0])
+def test_ddim_step(steps: int, eta: float) -> None:
+    """Song et al. 2021, eq. 12 with the σ of eq. 16; at η = 1 it is ddpm's posterior."""
+    process, shape = NoiseProcess(20), (400, 100)
+    truth = torch.randn(shape, generator=torch.Generator().manual_seed(9))
+    seen, motions = trace(make("ddim", process, steps=steps, eta=eta), lambda *_: truth, torch.randn(shape))
+    kept = process.signal.double().numpy()
+    for i in range(steps - 1):
+        now, then = kept[seen[i]], kept[seen[i + 1]]
+        sigma = eta * np.sqrt((1 - then) / (1 - now)) * np.sqrt(1 - now / then)
+        noise = (motions[i] - np.sqrt(now) * truth) / np.sqrt(1 - now)
+        mean = np.sqrt(then) * truth + np.sqrt(1 - then - sigma**2) * noise
+        residual = (motions[i + 1] - mean).numpy()
+        if eta == 0:
+            np.testing.assert_allclose(residual, 0, atol=1e-5)
+        else:
+            assert residual.mean() == pytest.approx(0, abs=0.02 * sigma)
+            assert residual.std() == pytest.approx(sigma, rel=0.02)
+
+
+@pytest.mark.parametrize(("name", "deterministic"), [("ddim", True), ("dpm_solver", True), ("ddpm", False)])
+def test_which_samplers_depend_on_their_start_alone(name: str, deterministic: bool) -> None:
+    start = torch.randn(2, 3, 4)
+    ends = [
+        trace(make(name, NoiseProcess(20), steps=10), lambda x, _: 0.5 * x.tanh(), start, seed=seed)[1][-1]
+        for seed in (0, 1)
+    ]
+    assert torch.equal(*ends) == deterministic
+
+
+def test_dpm_solver_of_first_order_is_ddim() -> None:
+    """Lu et al. 2022, section 4.1: the first-order solver and DDIM are the same update."""
+    start = torch.randn(2, 3, 4)
+    ends = [
+        trace(make(name, NoiseProcess(1000), steps=20, **options), lambda x, _: 0.5 * x.tanh(), start)[1][-1]
+        for name, options in (("ddim", {}), ("dpm_solver", {"order": 1}))
+    ]
+    torch.testing.assert_close(*ends, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("steps", [1, 2, 3, 7, 14, 15, 20])
+def test_dpm_solver_is_the_librarys(order: int, steps: int) -> None:
+    """Against diffusers' DPMSolverMultistepScheduler with the same places."""
+    from diffusers import DPMSolverMultistepScheduler
+
+    process = NoiseProcess(1000)
+    sampler = make("dpm_solver", process, steps=steps, order=order)
+    start = torch.randn(3, 4, 5)
+    ours = sampler.run(lambda x, _: 0.5 * x.tanh(), start)
+    scheduler = DPMSolverMultistepScheduler(
+        **process.scheduler_config(), algorithm_type="dpmsolver++", solver_order=order, final_sigmas_type="zero"
+    )
+    scheduler.set_timesteps(timesteps=sampler.places())
+    theirs = start
+    for step in scheduler.timesteps:
+        theirs = scheduler.step(0.5 * theirs.tanh(), step, theirs, return_dict=False)[0]
+    torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4)
+
+
+LINEAR = [name for name in NAMES if registry.sampler.get(name).linear]
+VARIANTS = [(name, {}) for name in LINEAR] + [("ddim", {"eta": 0.6}), ("dpm_solver", {"order": 1})]
+VARIANTS += [("dpm_solver", {"order": 3})]
+
+
+def test_the_samplers_that_can_be_folded() -> None:
+    assert {"ddim", "ddpm", "dpm_solver"} <= set(LINEAR)
+
+
+@pytest.mark.parametrize(("name", "options"), VARIANTS)
+@pytest.mark.parametrize("steps", [1, 2, 7, 14, 15, 20])
+def test_a_linear_sampler_ends_at_its_last_prediction(name: str, options: dict[str, float], steps: int) -> None:
+    predictions: list[Tensor] = []
+
+    def predict(noisy: Tensor, step: int) -> Tensor:
+        predictions.append(noisy.tanh())
+        return predictions[-1]
+
+    _, motions = trace(make(name, NoiseProcess(20), steps=steps, **options), predict, torch.randn(3, 4, 5))
+    torch.testing.assert_close(motions[-1], predictions[-1], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(("name", "options"), VARIANTS)
+@pytest.mark.parametrize("steps", [2, 7, 20])
+def test_a_linear_sampler_commutes_with_linear_maps(name: str, options: dict[str, float], steps: int) -> None:
+    """Run on A x, with predictions A x̂₀ and noise A z, it gives A times what it gives on x."""
+    sampler = make(name, NoiseProcess(20), steps=steps, **options)
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    start, *rest = torch.randn(2 * steps + 1, 4, 5, generator=generator, dtype=torch.float64)
+    predictions, fresh = rest[:steps], rest[steps:]
+    runs = []
+    for through in (torch.eye(5, dtype=torch.float64), image):
+        clean, noise = iter(predictions), iter(fresh)
+        states = []
+
+        def predict(state: Tensor, _: int) -> Tensor:
+            states.append(state)  # noqa: B023
+            return next(clean) @ through  # noqa: B023
+
+        sampler.run(predict, start @ through, noise=lambda _: next(noise) @ through)  # noqa: B023
+        runs.append(torch.stack(states))
+    torch.testing.assert_close(runs[0] @ image, runs[1], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", registry.sampler.names())
+@pytest.mark.parametrize("steps", [1, 7, 61, 103, 121, 122, 201, 206, 217, 999, 1000])
+def test_every_number_of_steps_visits_as_many_places_downwards(name: str, steps: int) -> None:
+    # 61, 103, 121 … are numbers for which the library's own spacing has one step too many, the last at -1.
+    places = [
+        int(t) for t in registry.sampler.get(name)(process=NoiseProcess(1000), steps=steps).make_scheduler().timesteps
+    ]
+    assert len(places) == steps
+    assert places[0] == 999
+    assert places[-1] >= 0
+    assert places == sorted(set(places), reverse=True)

@@ -1,0 +1,452 @@
+"""Style-content disentanglement: its parts against references, its losses against oracles, its training."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import EMAWeightAveraging
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch, collate
+from facediff.models import Style, StyleContentDisentanglement, load_model
+from facediff.models.style_content.losses import (
+    Alignments,
+    MotionDistance,
+    align,
+    cepstra,
+    dynamics_distance,
+    pair_up,
+    relative_distance,
+    style_contrast,
+)
+from facediff.models.style_content.network import MotionDecoder, WindowedTransformer
+from tests.fakes.tiny import SEEN, VERTICES, Tiny
+
+MakeTrainer = Callable[..., Trainer]
+
+
+def masks(*lengths: int) -> Tensor:
+    return torch.arange(max(lengths))[None] < torch.tensor(lengths)[:, None]
+
+
+class TestDecoder:
+    def make(self) -> MotionDecoder:
+        torch.manual_seed(0)
+        return MotionDecoder(
+            n_vertices=7, content_dim=5, style_dim=3, channels=(6, 8, 8), kernels=(5, 3, 3), hidden=(9, 9), basis_size=4
+        )
+
+    def test_no_future_frame_is_seen(self) -> None:
+        decoder = self.make()
+        content, style, mask = torch.randn(1, 20, 5), torch.randn(1, 3), masks(20)
+        before = decoder(content, style, mask)
+        changed = content.clone()
+        changed[:, 12:] += 10.0
+        after = decoder(changed, style, mask)
+        assert torch.equal(before[:, :12], after[:, :12])
+        assert not torch.allclose(before[:, 12], after[:, 12])
+
+    def test_it_sees_as_much_past_as_it_says(self) -> None:
+        decoder = self.make()
+        assert decoder.past_frames == 8
+        content, style, mask = torch.randn(1, 20, 5), torch.randn(1, 3), masks(20)
+        changed = content.clone()
+        changed[:, 4] += 10.0
+        same = (decoder(content, style, mask) - decoder(changed, style, mask)).abs().amax((0, 2)) == 0
+        assert same.tolist() == [True] * 4 + [False] * 9 + [True] * 7
+
+    def test_style_stands_beside_the_features_of_each_convolution(self) -> None:
+        decoder = self.make()
+        assert [conv.in_channels for conv in decoder.convolutions] == [5 + 3, 6 + 3, 8 + 3]
+
+    def test_a_naive_rendition_gives_the_same(self) -> None:
+        decoder = self.make().double()
+        content, style = torch.randn(1, 6, 5, dtype=torch.float64), torch.randn(1, 3, dtype=torch.float64)
+        x = content[0].numpy()
+        for conv, kernel in zip(decoder.convolutions, (5, 3, 3), strict=True):
+            weight, bias = conv.weight.detach().numpy(), conv.bias.detach().numpy()
+            beside = np.concatenate([x, np.repeat(style.numpy(), len(x), 0)], 1)
+            padded = np.concatenate([np.zeros((kernel - 1, beside.shape[1])), beside])
+            y = np.stack([np.einsum("oik,ki->o", weight, padded[t : t + kernel]) + bias for t in range(len(x))])
+            x = np.where(y > 0, y, 0.2 * y)
+        for layer in decoder.connected:
+            if isinstance(layer, nn.Linear):
+                x = x @ layer.weight.detach().numpy().T + layer.bias.detach().numpy()
+            else:
+                x = np.where(x > 0, x, 0.2 * x)
+        x = x @ decoder.basis.weight.detach().numpy().T + decoder.basis.bias.detach().numpy()
+        # The last map is always in float32.
+        got = decoder.float()(content.float(), style.float(), masks(6))[0].detach().numpy()
+        np.testing.assert_allclose(got, x, rtol=1e-4, atol=1e-5)
+
+    def test_a_basis_from_principal_components_spans_them(self) -> None:
+        decoder = self.make()
+        mean, shapes = torch.randn(21), torch.randn(2, 21)
+        decoder.start_from(mean, shapes)
+        torch.testing.assert_close(decoder.basis(torch.tensor([2.0, -1.0, 0.0, 0.0])), mean + 2 * shapes[0] - shapes[1])
+
+
+class TestSpeech:
+    def test_the_middle_frame_asks_as_full_attention_would(self) -> None:
+        """The answer to the middle query is the middle row of the answer to all frames of the window."""
+        torch.manual_seed(0)
+        part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=7, num_heads=2, num_layers=2)
+        features = torch.randn(2, 11, 6)
+        got = part(features)
+        padded = nn.functional.pad(features, (0, 0, 3, 3))
+        for frame in range(11):
+            x = part.embed(padded[:, frame : frame + 7]) + part.positions
+            for layer in part.layers:
+                x = layer(x, x)
+            everything = part.out(part.query(x, x))
+            torch.testing.assert_close(got[:, frame], everything[:, 3], rtol=1e-5, atol=1e-5)
+
+    def test_attention_itself_against_its_formula(self) -> None:
+        torch.manual_seed(0)
+        layer = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=5, num_heads=2).query
+        query, context = torch.randn(3, 1, 8), torch.randn(3, 5, 8)
+        attention, norm = layer.attention, layer.norm
+        q = attention.query(norm(query)).view(3, 1, 2, 4).transpose(1, 2)
+        k, v = (t.view(3, 5, 2, 4).transpose(1, 2) for t in attention.key_value(norm(context)).chunk(2, -1))
+        mixed = ((q @ k.transpose(2, 3)) / 2.0).softmax(-1) @ v
+        want = query + attention.out(mixed.transpose(1, 2).flatten(2))
+        want = want + layer.feed_forward(want)
+        torch.testing.assert_close(layer(query, context), want)
+
+    def test_only_the_window_is_heard(self) -> None:
+        torch.manual_seed(0)
+        part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=4, num_heads=2)
+        features = torch.randn(1, 12, 6)
+        changed = features.clone()
+        changed[:, 6] += 5.0
+        heard = (part(features) - part(changed)).abs().amax((0, 2)) > 0
+        # Frame t hears t − 2 … t + 1.
+        assert heard.nonzero().flatten().tolist() == [5, 6, 7, 8]
+
+
+class TestReadings:
+    def test_a_warped_copy_is_aligned(self) -> None:
+        """A copy read at another pace: the alignment follows the warp."""
+        rng = np.random.default_rng(0)
+        first = np.cumsum(rng.normal(size=(60, 6)), 0)
+        pace = np.sort(np.concatenate([np.arange(60), rng.integers(0, 60, 20)]))
+        second = first[pace]
+        found = align(first, second)
+        assert (np.diff(found) >= 0).all()
+        np.testing.assert_array_equal(pace[found], np.arange(60))
+
+    def test_equal_readings_are_aligned_one_to_one(self) -> None:
+        features = np.random.default_rng(1).normal(size=(40, 5))
+        np.testing.assert_array_equal(align(features, features), np.arange(40))
+
+    def test_slowed_speech_is_aligned(self) -> None:
+        """Speech made of changing tones, and the same at two thirds of the pace."""
+
+        def speech(pace: float) -> Tensor:
+            time = torch.arange(int(16_000 * 2 / pace), dtype=torch.float64) / 16_000 * pace
+            pitch = 300 + 1500 * (time * 1.7 % 1) + 400 * torch.sin(9 * time)
+            return torch.sin(2 * torch.pi * torch.cumsum(pitch, 0) / 16_000).float()
+
+        fast, slow = (cepstra(speech(pace), round(50 / pace), 25.0) for pace in (1.0, 2 / 3))
+        found = align(fast, slow)
+        error = np.abs(found - (np.arange(50) + 0.5) * 1.5)
+        assert error.mean() < 1.5, "frames of the slow reading"
+
+    def test_features_say_little_of_loudness(self) -> None:
+        audio = torch.randn(16_000)
+        np.testing.assert_allclose(cepstra(audio, 25, 25.0), cepstra(audio * 3, 25, 25.0), atol=1e-3)
+
+
+class TestObjectives:
+    def test_distance_by_hand(self) -> None:
+        motion, truth = torch.randn(2, 5, 4, 3), torch.randn(2, 5, 4, 3)
+        rest, pairs, mask = torch.randn(2, 4, 3), torch.tensor([[0, 2]]), masks(5, 3)
+        got = MotionDistance(1.0, 5.0, 2.0)(motion, truth, mask, rest=rest, pairs=pairs)
+        positions, velocities, gaps = [], [], []
+        for clip, frames in enumerate((5, 3)):
+            error = (motion - truth)[clip, :frames].numpy()
+            positions += [(frame**2).mean() for frame in error]
+            velocities += [(step**2).mean() for step in np.diff(error, axis=0)]
+            face = [(each[clip, :frames] + rest[clip]).numpy() for each in (motion, truth)]
+            gap = [np.sqrt(((x[:, 0] - x[:, 2]) ** 2).sum(-1) + 1e-6) for x in face]
+            gaps += list((gap[0] - gap[1]) ** 2)
+        want = np.mean(positions) + 5 * np.mean(velocities) + 2 * np.mean(gaps)
+        assert float(got) == pytest.approx(want, rel=1e-5)
+
+    def test_the_content_pull_cannot_be_won_by_shrinking(self) -> None:
+        values, others, mask = torch.randn(2, 9, 4), torch.randn(2, 9, 4), masks(9, 6)
+        one = relative_distance(values, others, mask)
+        torch.testing.assert_close(relative_distance(values * 0.1, others * 0.1, mask), one, rtol=1e-3, atol=0)
+        assert float(relative_distance(values, values, mask)) == 0
+
+    def test_dynamics_compare_spreads(self) -> None:
+        """Against NumPy's own standard deviations; the order of frames does not count."""
+        motion, truth = torch.randn(3, 40, 6, 3), torch.randn(3, 40, 6, 3)
+        mask, truth_mask = masks(40, 30, 20), masks(40, 25, 35)
+        chosen, vertices = torch.tensor([True, False, True]), torch.tensor([1, 4])
+        spreads = []
+        for each, lengths in ((motion, (40, 20)), (truth, (40, 35))):
+            squared = (each.double().numpy() ** 2).sum(-1)[:, :, [1, 4]]
+            spreads.append(
+                np.stack([squared[clip, :frames].std(0) for clip, frames in zip((0, 2), lengths, strict=True)])
+            )
+        want = ((spreads[0] - spreads[1]) ** 2).mean() / (spreads[1].mean() ** 2 + 1e-6)
+        got = dynamics_distance(motion, truth, mask, truth_mask, chosen, vertices)
+        assert float(got) == pytest.approx(want, rel=1e-4)
+        other = motion[:, torch.randperm(40)]
+        everything = masks(40, 40, 40)
+        same = dynamics_distance(motion, other, everything, everything, chosen, vertices)
+        assert float(same) == pytest.approx(0, abs=1e-9)
+        assert float(dynamics_distance(motion, truth, mask, truth_mask, chosen & False, vertices)) == 0
+
+
+SMALL: dict[str, object] = {
+    "dim": 16,
+    "content_dim": 8,
+    "speech_layers": 1,
+    "decoder_channels": (16, 16, 16),
+    "decoder_hidden": (16, 16),
+    "basis_size": 6,
+    "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0),
+    "mesh_encoder": partial(registry.mesh_encoder.spiral, channels=(4, 4), spiral_length=5),
+    "style_encoder": partial(registry.style_encoder.lstm, style_dim=4),
+}
+
+
+def make(**options: object) -> StyleContentDisentanglement:
+    torch.manual_seed(0)
+    sizes: dict[str, object] = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": 25.0}
+    return StyleContentDisentanglement(**{**sizes, **SMALL, **options})  # type: ignore[arg-type]
+
+
+def pairs(data: Tiny, *names: str) -> Batch:
+    """The training clips of these names, in this order."""
+    dataset = data.dataset("train")
+    order = [clip.name for clip in dataset.clips]
+    return collate([dataset[order.index(name)] for name in names])
+
+
+class Oracle(nn.Module):
+    """A network for motion that is a person's amplitude times what is said: it knows both."""
+
+    def __init__(self, content: Tensor) -> None:
+        super().__init__()
+        self.said = content
+
+    def style(self, motion: Tensor, mask: Tensor) -> Tensor:
+        return motion.abs().amax((1, 2, 3), keepdim=False)[:, None] / self.said.abs().amax()
+
+    def content(self, motion: Tensor, mask: Tensor) -> Tensor:
+        return (motion / self.style(motion, mask)[:, :, None, None]).flatten(2)
+
+    def hear(self, audio: Tensor, *rest: object) -> Tensor:
+        return self.said.flatten(1)[None].expand(len(audio), -1, -1)
+
+    def decoder(self, content: Tensor, style: Tensor, mask: Tensor) -> Tensor:
+        return content * style[:, None]
+
+
+def test_style_contrast_by_hand() -> None:
+    styles, subjects = torch.randn(5, 3, dtype=torch.float64), ["A", "A", "B", "B", "C"]
+    directions = (styles / styles.norm(dim=1, keepdim=True)).numpy()
+    each = []
+    for i in range(4):
+        others = [k for k in range(5) if k != i]
+        logits = np.array([directions[i] @ directions[k] / 0.1 for k in others])
+        chances = logits - np.log(np.exp(logits).sum())
+        each.append(-np.mean([chances[n] for n, k in enumerate(others) if subjects[k] == subjects[i]]))
+    assert float(style_contrast(styles, subjects)) == pytest.approx(np.mean(each), rel=1e-5)
+    assert float(style_contrast(styles[:2], ["A", "A"])) == 0, "one person cannot be told from anybody"
+    assert float(style_contrast(styles[:2], ["A", "B"])) == 0
+
+
+class TestLosses:
+    def test_an_oracle_has_no_loss(self, tiny: Tiny) -> None:
+        """Two people say a sentence in one timing; amplitudes are powers of two, so that all arithmetic is exact."""
+        model = make(motion_scale="none")
+        model.adopt(tiny.assets())
+        sample = tiny.dataset("train")[0]
+        said = sample.motion / sample.motion.abs().amax()
+        model.network = Oracle(said)  # type: ignore[assignment]
+        made = [replace(sample, motion=said * 2.0, reference=said * 2.0, name="A_x", subject="A")]
+        made.append(replace(sample, motion=said * 0.5, reference=said * 0.5, name="B_x", subject="B"))
+        model.alignment_allowed = lambda: True  # type: ignore[method-assign]
+        terms = model.losses(collate(made))
+        assert set(terms) >= {"reconstruction", "swap", "cycle", "speech_reconstruction", "speech_swap", "speech_cycle"}
+        for name in terms:
+            if name not in ("person_style", "loss"):  # telling two people apart is never done
+                assert float(terms[name]) == 0.0, name
+
+    def test_a_network_that_ignores_style_has_a_swap_loss(self, tiny: Tiny) -> None:
+        model = make(motion_scale="none")
+        model.adopt(tiny.assets())
+        sample = tiny.dataset("train")[0]
+        oracle = Oracle(sample.motion / sample.motion.abs().amax())
+        oracle.decoder = lambda content, style, mask: content  # type: ignore[method-assign]
+        model.network = oracle  # type: ignore[assignment]
+        made = [replace(sample, motion=oracle.said * 2.0, reference=oracle.said, name="A_x", subject="A")]
+        made.append(replace(sample, motion=oracle.said * 0.5, reference=oracle.said, name="B_x", subject="B"))
+        model.alignment_allowed = lambda: True  # type: ignore[method-assign]
+        terms = {name: value.detach() for name, value in model.losses(collate(made)).items()}
+        assert float(terms["swap"]) > 0
+        assert float(terms["swap_dynamics"]) > 0
+
+    def test_neighbours_who_say_the_same_are_aligned(self, tiny: Tiny) -> None:
+        batch = pairs(tiny, "A_e01", "B_e01", "A_e02", "B_e03", "A_e04")
+        pairing = pair_up(batch, Alignments(25.0))
+        assert pairing.partner.tolist() == [1, 0, 3, 2, 4]
+        assert pairing.aligned.any(1).tolist() == [True, True, False, False, False]
+        assert pairing.unaligned.tolist() == [False, False, True, True, False]
+        # A and B move by one formula, B twice as far: in A's timing B's motion is twice A's.
+        mine, other = batch.motion[0, :, 0, 1], pairing.of_partner(batch.motion)[0, :, 0, 1]
+        inside = pairing.aligned[0]
+        np.testing.assert_allclose(other[inside], 2 * mine[inside], atol=0.006)
+        assert not pair_up(batch, None).aligned.any()
+        alone = pair_up(pairs(tiny, "A_e01", "A_e02"), Alignments(25.0))
+        assert alone.partner.tolist() == [0, 1], "two sentences of one person: nothing to swap"
+
+    def test_training_batches_are_pairs_of_one_sentence(self, tiny: Tiny, make_trainer: MakeTrainer) -> None:
+        model, seen = make(), []
+        model.losses_of = model.losses  # type: ignore[attr-defined]
+
+        def note(batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+            if model.training:
+                seen.append(list(zip(batch.subjects, batch.sentences, strict=True)))
+            return model.losses_of(batch, generator)  # type: ignore[attr-defined]
+
+        model.losses = note  # type: ignore[method-assign]
+        make_trainer(max_epochs=2).fit(model, datamodule=Tiny(root=str(tiny.root), batch_size=4))
+        assert len(seen) == 4
+        for batch in seen:
+            for (one, first), (other, second) in zip(batch[::2], batch[1::2], strict=True):
+                assert first == second
+                assert one != other
+
+    def test_ablations_are_one_override_each(self, tiny: Tiny) -> None:
+        batch = pairs(tiny, "A_e01", "B_e01")
+
+        def gradients(**options: object) -> dict[str, Tensor]:
+            model = make(**options)
+            model.adopt(tiny.assets().with_motion_scale(100.0))
+            model._attach_mesh()
+            model.alignment_allowed = lambda: True  # type: ignore[method-assign]
+            return {name: value.detach() for name, value in model.losses(batch).items()}
+
+        full = gradients()
+        for option, term in (
+            ({"swap_weight": 0.0}, 3 * (1 * full["swap"] + 2 * full["speech_swap"])),
+            ({"cycle_weight": 0.0}, full["cycle"] + 2 * full["speech_cycle"]),
+            ({"speech_content_weight": 0.0}, 5 * full["speech_content"]),
+        ):
+            without = gradients(**option)
+            torch.testing.assert_close(full["loss"] - without["loss"], term, rtol=1e-4, atol=1e-4)
+        apart = gradients(aligned_pairs=False)
+        assert float(apart["reading_content"]) == 0 < float(full["reading_content"])
+        assert float(apart["swap"]) != float(full["swap"])
+
+    def test_every_parameter_gets_a_gradient(self, tiny: Tiny) -> None:
+        for options in ({}, {"mesh_encoder": registry.mesh_encoder.linear}):
+            model = make(**options)
+            model.adopt(tiny.assets().with_motion_scale(100.0))
+            model._attach_mesh()
+            model.losses(pairs(tiny, "A_e01", "B_e01"))["loss"].backward()
+            assert [name for name, p in model.named_parameters() if p.grad is None] == []
+
+    def test_the_loss_does_not_look_at_padding(self, tiny: Tiny) -> None:
+        model = make()
+        model.adopt(tiny.assets().with_motion_scale(100.0))
+        model._attach_mesh()
+        batch = pairs(tiny, "A_e01", "B_e02")
+        garbage = torch.randn_like(batch.motion) * ~batch.mask[..., None, None]
+        longer = replace(batch, motion=batch.motion + garbage)
+        assert not torch.equal(longer.motion, batch.motion)
+        with torch.no_grad():
+            one, two = model.losses(batch), model.losses(longer)
+        for name in one:
+            torch.testing.assert_close(one[name], two[name], rtol=1e-4, atol=1e-5, msg=name)
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint after a few steps with weight averaging."""
+    folder = tmp_path_factory.mktemp("style_content")
+    averaging = EMAWeightAveraging(decay=0.9, use_buffers=False)
+    trainer = Trainer(
+        accelerator="cpu",
+        max_epochs=4,
+        logger=False,
+        callbacks=[averaging],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=folder,
+    )
+    trainer.fit(make(learning_rate=1e-3), datamodule=Tiny(root=str(tiny_root), batch_size=4))
+    trainer.save_checkpoint(folder / "trained.ckpt")
+    return folder / "trained.ckpt"
+
+
+class TestTrained:
+    def test_the_mesh_is_in_the_checkpoint(self, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A machine without the simplifier animates."""
+        monkeypatch.setitem(sys.modules, "fast_simplification", None)
+        model = load_model(trained)
+        assert model.network.content_encoder.attached
+        made = model.animate(torch.randn(16_000), subject="A")
+        assert made.vertices.shape == (25, VERTICES, 3)
+        assert torch.isfinite(made.vertices).all()
+
+    def test_it_is_a_function_of_speech_and_style(self, trained: Path) -> None:
+        model = load_model(trained)
+        speech = torch.randn(16_000)
+        one = model.animate(speech, subject="A", seed=0).vertices
+        assert torch.equal(one, model.animate(speech, subject="A", seed=7).vertices), "nothing is drawn"
+        assert not torch.equal(one, model.animate(torch.randn(16_000), subject="A").vertices)
+        other = Style(
+            "other", model.encode_style(torch.randn(1, 9, VERTICES, 3), torch.ones(1, 9, dtype=torch.bool))[0]
+        )
+        assert not torch.equal(one, model.animate(speech, subject="A", style=other).vertices)
+
+    def test_a_style_vector_does_what_its_reference_does(self, trained: Path) -> None:
+        model = load_model(trained)
+        reference = model.default_style("B")
+        motion = reference.motion.float()[None]
+        vector = model.encode_style(motion, torch.ones(motion.shape[:2], dtype=torch.bool))[0]
+        speech = torch.randn(16_000)
+        one = model.animate(speech, subject="A", style=reference).vertices
+        torch.testing.assert_close(one, model.animate(speech, subject="A", style=Style("B", vector)).vertices)
+
+    def test_swapping_keeps_the_content_given(self, trained: Path) -> None:
+        model = load_model(trained)
+        assert isinstance(model, StyleContentDisentanglement)
+        mask = masks(9)
+        content = model.encode_content(torch.randn(1, 9, VERTICES, 3), mask).detach()
+        # Mean and spread over the clip are taken out.
+        torch.testing.assert_close(content.mean(1), torch.zeros(1, 8), atol=1e-5, rtol=0)
+        assert float((content.std(1, correction=0) - 1).abs().max()) < 0.05
+
+
+def test_the_basis_starts_from_principal_components(tiny: Tiny) -> None:
+    """The components span the motion of the training clips as NumPy's own decomposition does."""
+    mean, shapes = tiny.principal_motion(4)
+    frames = []
+    for clip in tiny.clips("train"):
+        count = tiny.corpus.frames(clip)
+        for index in np.linspace(0, count - 1, min(count, 16)).astype(int):
+            frames.append(tiny.corpus.read_motion(clip, index, index + 1).flatten().double().numpy())
+    stack = np.stack(frames)
+    np.testing.assert_allclose(mean, stack.mean(0), atol=1e-7)
+    _, values, axes = np.linalg.svd(stack - stack.mean(0), full_matrices=False)
+    spreads = values / np.sqrt(len(stack))
+    for shape, spread, axis in zip(shapes.double().numpy(), spreads, axes, strict=False):
+        assert np.linalg.norm(shape) == pytest.approx(spread, rel=1e-4)
+        assert abs(shape @ axis) == pytest.approx(spread, rel=1e-4)

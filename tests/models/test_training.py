@@ -1,0 +1,265 @@
+"""Training, checkpoints and tests through Lightning's Trainer."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import lightning.pytorch as pl
+import numpy as np
+import pytest
+import torch
+import yaml
+from lightning.pytorch.callbacks import EMAWeightAveraging
+
+from facediff import registry
+from facediff.callbacks import PredictionWriter, ScoreTable
+from facediff.cli.app import main
+from facediff.data import Puppet, collate
+from facediff.errors import FaceDiffError
+from facediff.models import AnimationModel, DualPathDiffusion, load_model
+from facediff.models.base import Schedule, lr_factor
+from tests.fakes.tiny import Tiny
+
+Make = Callable[..., DualPathDiffusion]
+MakeTrainer = Callable[..., pl.Trainer]
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint made from Python, with components as partials and EMA."""
+    torch.manual_seed(0)
+    model = DualPathDiffusion(
+        n_vertices=24,
+        identities=["A", "B"],
+        frame_rate=25.0,
+        dim=16,
+        diffusion_steps=20,
+        learning_rate=np.float64(1e-3),  # NumPy scalars must not reach the checkpoint
+        decoder=partial(registry.decoder.get("gru"), num_layers=1),
+        sampler=partial(registry.sampler.get("ddim"), steps=2),
+    )
+    folder = tmp_path_factory.mktemp("trained")
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        max_epochs=2,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=False,
+        callbacks=[EMAWeightAveraging(decay=0.5, use_buffers=False)],
+        default_root_dir=folder,
+        num_sanity_val_steps=0,
+        log_every_n_steps=1,
+    )
+    trainer.fit(model, datamodule=Tiny(root=str(tiny_root)))
+    trainer.save_checkpoint(folder / "python.ckpt")
+    return folder / "python.ckpt"
+
+
+def test_a_checkpoint_is_plain_data_and_animates_without_the_corpus(trained: Path) -> None:
+    checkpoint = torch.load(trained, weights_only=True)
+    assert checkpoint["hyper_parameters"]["decoder"] == {
+        "class_path": "facediff.registry.decoder.gru",
+        "init_args": {"num_layers": 1, "bidirectional": True, "dropout": 0.1},
+    }
+    model = load_model(trained)
+    assert isinstance(model, DualPathDiffusion)
+    assert model.assets.motion_scale is not None
+    assert model.animate(torch.randn(8000), subject="B").vertices.shape == (12, 24, 3)
+
+
+def test_a_reloaded_system_trains_again_saves_and_loads(
+    trained: Path, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
+) -> None:
+    model = load_model(trained)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    trainer = make_trainer()
+    trainer.fit(model.train(), datamodule=tiny)
+    trainer.save_checkpoint(tmp_path / "again.ckpt")
+    again = load_model(tmp_path / "again.ckpt")
+    assert any(not torch.equal(before[name], value) for name, value in again.state_dict().items())
+    assert again.hparams["decoder"]["init_args"]["num_layers"] == 1
+    assert DualPathDiffusion.load_from_checkpoint(tmp_path / "again.ckpt", weights_only=True).hparams == again.hparams
+
+
+def test_the_checkpoint_holds_the_averaged_weights(trained: Path) -> None:
+    checkpoint = torch.load(trained, weights_only=True)
+    averaged, raw = checkpoint["state_dict"], checkpoint["current_model_state"]
+    assert averaged.keys() == raw.keys()
+    loaded = load_model(trained).state_dict()
+    assert all(torch.equal(loaded[name], averaged[name]) for name in averaged)
+
+
+def test_test_scores_the_model_beside_a_still_face_and_shuffled_speech(
+    trained: Path, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer = make_trainer(callbacks=[ScoreTable()])
+    (scores, *_) = trainer.test(load_model(trained), datamodule=tiny, verbose=False)
+    printed = capsys.readouterr().out
+    assert "SYNTHETIC corpus tiny, protocol paper" in printed
+    assert "region tiny/lips: 12 vertices" in printed
+    with (tmp_path / "test_scores.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["split"], row["method"]) for row in rows] == [
+        (split, method) for split in ("test_a", "test_b") for method in ("model", "still", "shuffled")
+    ]
+    still = next(row for row in rows if row["method"] == "still" and row["split"] == "test_a")
+    assert float(still["lve"]) == pytest.approx(scores["test_a/still/lve"])
+    # A still face's lip error is the truth's own largest lip offset, squared.
+    largest = [s.motion[:, :12].double().square().sum(-1).amax(1) for s in tiny.dataset("test_a")]
+    assert float(still["lve"]) == pytest.approx(float(torch.cat(largest).mean()), rel=1e-6)
+    assert int(still["frames"]) == sum(len(values) for values in largest)
+
+
+def test_predictions_are_written_as_the_field_names_them(
+    trained: Path, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
+) -> None:
+    make_trainer(callbacks=[PredictionWriter(str(tmp_path / "out"))]).predict(load_model(trained), datamodule=tiny)
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == [f"{c.name}_condition_{c.subject}.npy" for c in tiny.clips("test_a")]
+    clip = tiny.clips("test_a")[0]
+    written = np.load(tmp_path / "out" / names[0])
+    assert written.shape == (tiny.corpus.frames(clip), 72)
+    # Absolute vertices: near the template, not near zero.
+    assert np.abs(written.reshape(-1, 24, 3) - tiny.corpus.templates[clip.subject].numpy()).max() < 0.2
+
+
+def test_validation_is_the_same_twice(make_model: Make, tiny: Tiny, make_trainer: MakeTrainer) -> None:
+    model = make_model()
+    model.adopt(tiny.assets().with_motion_scale(2.0))
+    scores = [make_trainer().validate(model, datamodule=tiny, verbose=False)[0] for _ in range(2)]
+    assert scores[0] == scores[1]
+    assert {"val/loss", "val/mve", "val/lve", "val/fdd", "val/reconstruction"} <= scores[0].keys()
+
+
+def test_mixed_precision_trains_with_clipped_gradients(make_model: Make, tiny: Tiny, make_trainer: MakeTrainer) -> None:
+    model = make_model()
+    before = model.network.unembed.weight.detach().clone()
+    make_trainer(precision="bf16-mixed", gradient_clip_val=1.0).fit(model, datamodule=tiny)
+    batch = collate([tiny.dataset("val")[0]])
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        noisy = torch.randn(batch.motion.flatten(2).shape)
+        assert model.network(noisy, torch.tensor([3]), model._conditions(batch)).dtype == torch.float32
+    after = model.network.unembed.weight
+    assert after.dtype == torch.float32
+    assert torch.isfinite(after).all()
+    assert not torch.equal(before, after)
+
+
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
+def test_the_learning_rate_warms_up_and_ends_as_asked(schedule: Schedule) -> None:
+    factors = [lr_factor(step, total=100, warmup_steps=10, schedule=schedule) for step in range(100)]
+    assert factors[0] == pytest.approx(0.1)
+    assert factors[4] < factors[8] <= 1.0
+    assert factors[-1] == (1.0 if schedule == "constant" else pytest.approx(0.0, abs=1e-3))
+
+
+def test_files_that_are_no_checkpoints(tmp_path: Path, trained: Path) -> None:
+    with pytest.raises(FaceDiffError, match="no such checkpoint"):
+        load_model(tmp_path / "none.ckpt")
+    (tmp_path / "text.ckpt").write_text("hello")
+    with pytest.raises(FaceDiffError, match="not a checkpoint that can be loaded safely"):
+        load_model(tmp_path / "text.ckpt")
+    torch.save({"state_dict": {}}, tmp_path / "other.ckpt")
+    with pytest.raises(FaceDiffError, match="not of facediff"):
+        load_model(tmp_path / "other.ckpt")
+    (tmp_path / "cut.ckpt").write_bytes(trained.read_bytes()[:5000])
+    with pytest.raises(FaceDiffError, match="not a checkpoint that can be loaded safely"):
+        load_model(tmp_path / "cut.ckpt")
+
+
+def test_a_checkpoint_of_another_system_class_is_refused(tmp_path: Path, trained: Path) -> None:
+    checkpoint = torch.load(trained, weights_only=True)
+    checkpoint["hyper_parameters"]["_class_path"] = "os.system"
+    torch.save(checkpoint, tmp_path / "evil.ckpt")
+    with pytest.raises(FaceDiffError, match=r'the model "os\.model", which is not imported'):
+        load_model(tmp_path / "evil.ckpt")
+
+
+@pytest.mark.parametrize(
+    "named",
+    ["os.system", "subprocess.Popen", "facediff.registry.decoder.nothing", "facediff.registry.fusion.add", "this"],
+)
+def test_a_checkpoint_that_names_a_program_does_not_run_it(tmp_path: Path, trained: Path, named: str) -> None:
+    checkpoint = torch.load(trained, weights_only=True)
+    harm = {
+        "class_path": named,
+        "init_args": {"command": f"touch {tmp_path}/harm", "args": ["touch", f"{tmp_path}/harm"]},
+    }
+    for place in ("decoder", "dim"):
+        hostile = {**checkpoint, "hyper_parameters": {**checkpoint["hyper_parameters"], place: harm}}
+        torch.save(hostile, tmp_path / "hostile.ckpt")
+        with pytest.raises(FaceDiffError, match="it was not loaded"):
+            load_model(tmp_path / "hostile.ckpt")
+    nested = {"class_path": "facediff.registry.decoder.gru", "init_args": {"num_layers": harm}}
+    checkpoint["hyper_parameters"]["decoder"] = nested
+    torch.save(checkpoint, tmp_path / "hostile.ckpt")
+    assert main(["test", "--ckpt_path", str(tmp_path / "hostile.ckpt")]) == 2
+    assert not (tmp_path / "harm").exists()
+
+
+def test_a_data_module_named_by_a_checkpoint_is_not_imported(tmp_path: Path, trained: Path) -> None:
+    checkpoint = torch.load(trained, weights_only=True)
+    checkpoint["facediff_data"] = {"class_path": "this.Zen", "root": "/"}
+    torch.save(checkpoint, tmp_path / "hostile.ckpt")
+    assert main(["test", "--ckpt_path", str(tmp_path / "hostile.ckpt")]) == 2
+    assert "this" not in sys.modules
+
+
+def test_an_interruption_leaves_the_best_checkpoint_alone(
+    make_model: Make, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
+) -> None:
+    from lightning.pytorch.callbacks import ModelCheckpoint
+
+    bundled = yaml.safe_load((Path(__file__).parents[2] / "configs/trainer/cpu.yaml").read_text())["callbacks"]
+    keepers = [
+        ModelCheckpoint(dirpath=tmp_path, **callback["init_args"])
+        for callback in bundled
+        if callback["class_path"].endswith("ModelCheckpoint")
+    ]
+    seen: list[bytes] = []
+
+    class Interrupted(DualPathDiffusion):
+        def training_step(self, batch: object, batch_idx: int) -> torch.Tensor:
+            if self.current_epoch == 1 and batch_idx == 1:
+                seen.append((tmp_path / "best.ckpt").read_bytes())
+                raise RuntimeError("pulled the plug")
+            return super().training_step(batch, batch_idx)  # type: ignore[arg-type]
+
+    model = make_model()
+    model.__class__ = Interrupted
+    with pytest.raises(RuntimeError, match="pulled the plug"):
+        make_trainer(max_epochs=3, callbacks=keepers, enable_checkpointing=True).fit(model, datamodule=tiny)
+    assert seen == [(tmp_path / "best.ckpt").read_bytes()]
+    assert (tmp_path / "interrupted.ckpt").exists()
+
+
+def test_scores_do_not_depend_on_the_batch_size(trained: Path, tiny_root: Path, make_trainer: MakeTrainer) -> None:
+    model = load_model(trained)
+    scores = [
+        make_trainer().test(model, datamodule=Tiny(root=str(tiny_root), batch_size=size), verbose=False)[0]
+        for size in (1, 4)
+    ]
+    assert scores[0] == pytest.approx(scores[1], rel=1e-4)
+
+
+def test_a_corpus_folder_given_as_a_path_object_is_kept_as_text(tmp_path: Path) -> None:
+    data = Puppet(root=tmp_path)  # type: ignore[arg-type]
+    torch.save(dict(data.hparams), tmp_path / "h.pt")
+    assert torch.load(tmp_path / "h.pt", weights_only=True)["root"] == str(tmp_path)
+
+
+def test_the_corpus_must_fit_the_checkpoint(trained: Path, tiny_root: Path, make_trainer: MakeTrainer) -> None:
+    class Other(Tiny):
+        identities = ["A", "C"]
+
+    with pytest.raises(FaceDiffError, match="identities are"):
+        make_trainer().test(load_model(trained), datamodule=Other(root=str(tiny_root)), verbose=False)
+
+
+def test_systems_are_speech_animators() -> None:
+    assert issubclass(DualPathDiffusion, AnimationModel)

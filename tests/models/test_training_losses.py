@@ -1,0 +1,89 @@
+"""What a training step computes: the four losses of one draw, and in mixed precision something that is learnt from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import lightning.pytorch as pl
+import pytest
+import torch
+
+from facediff.data import collate
+from facediff.models import DualPathDiffusion, losses
+from tests.fakes.tiny import Tiny
+
+Make = Callable[..., DualPathDiffusion]
+
+
+@pytest.fixture
+def model(make_model: Make, tiny: Tiny) -> DualPathDiffusion:
+    made = make_model()
+    made.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    return made.eval()
+
+
+def test_a_step_takes_the_four_losses_of_noise_added_and_taken_away(model: DualPathDiffusion, tiny: Tiny) -> None:
+    dataset = tiny.dataset("train")
+    batch = collate([dataset[0], dataset[3], dataset[7]])
+    before, noise, step = batch.motion.clone(), torch.randn(3, batch.motion.shape[1], 72), torch.tensor([3, 20, 39])
+    terms = model.losses_at(batch, step, noise.clone())
+    assert torch.equal(batch.motion, before)
+    clean = batch.motion.flatten(2) * model.scale
+    noisy = model.process.add_noise(clean, noise, step)
+    predicted = model.network(noisy, step, model._conditions(batch)).view(batch.motion.shape)
+    truth, upper = clean.view(batch.motion.shape), model.assets.regions["upper_face"]
+    expected = {
+        "reconstruction": losses.reconstruction_loss(predicted, truth, batch.mask),
+        "velocity": losses.velocity_loss(predicted, truth, batch.mask),
+        "acceleration": losses.acceleration_loss(predicted, truth, batch.mask),
+        "face": losses.face_dynamics_loss(predicted, truth, batch.mask, upper),
+    }
+    expected["loss"] = sum(model.loss_weights[name] * term for name, term in expected.items())
+    torch.testing.assert_close(terms, expected, rtol=1e-5, atol=1e-6)
+    parameters = [p for p in model.parameters() if p.requires_grad]
+    found, wanted = (torch.autograd.grad(each["loss"], parameters, allow_unused=True) for each in (terms, expected))
+    for one, other in zip(found, wanted, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None:
+            torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+
+
+def test_the_loss_of_a_batch_is_that_of_its_clips(model: DualPathDiffusion, tiny: Tiny) -> None:
+    dataset = tiny.dataset("train")
+    clips = [dataset[place] for place in (0, 3, 7)]
+    batch = collate(clips)
+    lengths = batch.frame_lengths
+    assert len(set(lengths.tolist())) == 3
+    noise, step = torch.randn(3, batch.motion.shape[1], 72), torch.tensor([3, 20, 39])
+    whole = model.losses_at(batch, step, noise.clone())
+    singles = [
+        model.losses_at(collate([clip]), step[i : i + 1], noise[i : i + 1, : lengths[i]].clone())
+        for i, clip in enumerate(clips)
+    ]
+    for order, name in enumerate(("reconstruction", "velocity", "acceleration")):
+        shares = (lengths - order) / (lengths - order).sum()
+        mean = sum(share * single[name] for share, single in zip(shares, singles, strict=True))
+        torch.testing.assert_close(whole[name], mean, rtol=1e-4, atol=0)
+    torch.testing.assert_close(whole["face"], sum(single["face"] for single in singles) / 3, rtol=1e-4, atol=0)
+
+
+def test_mixed_precision_learns_as_full_precision_does(
+    make_model: Make, tiny: Tiny, make_trainer: Callable[..., pl.Trainer]
+) -> None:
+    ends = {}
+    for precision in ("32-true", "bf16-mixed"):
+        model = make_model(learning_rate=3e-3, diffusion_steps=10)
+        data = Tiny(root=str(tiny.root), max_frames_per_batch=200)
+        make_trainer(precision=precision, max_epochs=1, limit_val_batches=0).fit(model, datamodule=data)
+        batch = collate([data.dataset("train")[i] for i in range(8)])
+
+        def measured(model: DualPathDiffusion = model, batch: object = batch) -> float:
+            with torch.no_grad():
+                return float(model.eval().losses(batch, torch.Generator().manual_seed(0))["loss"])
+
+        first = measured()
+        trainer = make_trainer(precision=precision, max_epochs=25, limit_val_batches=0, gradient_clip_val=1.0)
+        trainer.fit(model.train(), datamodule=data)
+        ends[precision] = measured()
+        assert ends[precision] < 0.5 * first
+    assert ends["bf16-mixed"] == pytest.approx(ends["32-true"], rel=0.2)

@@ -1,0 +1,89 @@
+"""Speech repeats bit for bit, has its phonemes in time, and every sound has a mouth shape."""
+
+import time
+
+import numpy as np
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.synthetic import speech
+from facediff.synthetic.motion import SPEECH_CONTROLS, VISEMES, visemes_of
+from facediff.synthetic.rig import CONTROLS
+from facediff.synthetic.speakers import SPEAKERS
+from facediff.synthetic.speech import SENTENCES
+
+pytest.importorskip("espeakng_loader")
+VOICE = SPEAKERS["F1"].voice
+
+
+def test_same_text_same_samples_in_this_process_and_in_a_fresh_one() -> None:
+    first, other, again = (speech.speak(text, VOICE) for text in ("Bob mops.", "Pam hums.", "Bob mops."))
+    assert np.array_equal(first.samples, again.samples)
+    assert first.phonemes == again.phonemes
+    assert not np.array_equal(first.samples[:4000], other.samples[:4000])
+    fresh = speech._finish(*speech._speak_elsewhere("Bob mops.", VOICE))
+    assert np.array_equal(first.samples, fresh.samples)
+    assert first.phonemes == fresh.phonemes
+
+
+def test_noise_does_not_start_from_the_clock() -> None:
+    breathy = SPEAKERS["F2"].voice
+    before = speech.speak("Bob mops.", breathy)
+    time.sleep(1.1)
+    assert np.array_equal(before.samples, speech.speak("Bob mops.", breathy).samples)
+
+
+def test_a_library_that_is_loaded_already_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = speech.speak("Bob mops.", VOICE)
+    monkeypatch.setattr(speech, "_is_loaded", lambda library: True)
+    assert np.array_equal(speech.speak("Bob mops.", VOICE).samples, expected.samples)
+
+
+def test_phonemes_follow_one_another_and_the_sound() -> None:
+    said = speech.speak(SENTENCES[0], VOICE)
+    length = said.samples.size / speech.SAMPLE_RATE
+    for before, after in zip(said.phonemes[:-1], said.phonemes[1:], strict=True):
+        assert before.end == after.start
+        assert before.end > before.start
+    assert said.phonemes[-1].end == pytest.approx(length, abs=1e-3)
+    spoken = "".join(p.ipa for p in said.phonemes)
+    assert spoken.count("m") >= 4
+    vowel = next(p for p in said.phonemes if "ɑ" in p.ipa)
+    middle = said.samples[int(vowel.start * 16000) : int(vowel.end * 16000)]
+    assert np.abs(middle).max() > 0.1
+
+
+def test_every_viseme_aims_at_controls_that_exist() -> None:
+    assert set(SPEECH_CONTROLS) <= set(CONTROLS)
+    for viseme in VISEMES.values():
+        assert set(viseme.targets) <= set(SPEECH_CONTROLS), viseme.name
+        assert set(viseme.firm) <= set(SPEECH_CONTROLS), viseme.name
+
+
+@pytest.mark.parametrize(
+    ("ipa", "names"),
+    [
+        ("", ("SIL",)),
+        ("ˈaɪ", ("AA", "IH")),
+        ("tʃ", ("CH",)),
+        ("uː", ("UW",)),
+        ("ˌɔːɹ", ("OH", "RR")),
+        ("?", ("UX",)),
+    ],
+)
+def test_visemes_of(ipa: str, names: tuple[str, ...]) -> None:
+    assert visemes_of(ipa) == names
+
+
+def test_sentences_use_every_mouth_shape_and_are_all_different() -> None:
+    assert len(set(SENTENCES)) == 32
+    used = {name for text in SENTENCES for p in speech.speak(text, VOICE).phonemes for name in visemes_of(p.ipa)}
+    assert used == set(VISEMES)
+
+
+def test_unknown_voice_and_missing_package_are_told_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(FaceDiffError, match="no voice 'nobody'"):
+        speech.speak("Hello.", speech.Voice("nobody", 150, 50, 50))
+    monkeypatch.setitem(__import__("sys").modules, "espeakng_loader", None)
+    with pytest.raises(FaceDiffError, match=r"facediff\[puppet\]"):
+        speech.speak("Hello.", VOICE)

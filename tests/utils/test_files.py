@@ -1,0 +1,132 @@
+"""Files from elsewhere: speech in any form, pickles that must not run, meshes."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import trimesh
+
+from facediff.data.audio import read_speech
+from facediff.errors import FaceDiffError
+from facediff.mesh import read_mesh
+from facediff.utils.files import atomic, check_writable
+from facediff.utils.pickles import load_pickle
+
+
+@pytest.mark.parametrize(
+    ("rate", "channels", "suffix"),
+    [(16000, 1, "wav"), (44100, 2, "wav"), (22050, 1, "flac"), (48000, 2, "ogg"), (24000, 1, "mp3")],
+)
+def test_any_sound_file_becomes_16_khz_mono(tmp_path: Path, rate: int, channels: int, suffix: str) -> None:
+    time = np.arange(rate) / rate
+    tone = 0.5 * np.sin(2 * np.pi * 440 * time)
+    path = tmp_path / f"tone.{suffix}"
+    soundfile.write(path, np.stack([tone] * channels, 1), rate)
+    speech = read_speech(path)
+    assert speech.dtype == np.float32
+    assert len(speech) == pytest.approx(16000, abs=1200 if suffix == "mp3" else 2)
+    spectrum = np.abs(np.fft.rfft(speech[2000:14000]))
+    assert np.argmax(spectrum) * 16000 / 12000 == pytest.approx(440, abs=2)
+    assert np.abs(speech[4000:12000]).max() == pytest.approx(0.5, abs=0.03)
+
+
+def test_stereo_is_averaged(tmp_path: Path) -> None:
+    left = np.linspace(-0.5, 0.5, 1600)
+    soundfile.write(tmp_path / "a.wav", np.stack([left, -left / 2], 1), 16000, subtype="FLOAT")
+    np.testing.assert_allclose(read_speech(tmp_path / "a.wav"), left / 4, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (None, "no such sound file"),
+        (b"", "is empty"),
+        (b"this is text\n" * 9, "not a readable sound file"),
+        (b"RIFF\x10\x00\x00\x00WAVEfmt ", "not a readable sound file"),
+    ],
+)
+def test_what_is_no_sound_gets_one_sentence(tmp_path: Path, content: bytes | None, sentence: str) -> None:
+    path = tmp_path / "speech.wav"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(FaceDiffError, match=sentence) as error:
+        read_speech(path)
+    assert str(path) in str(error.value)
+
+
+class Bomb:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.mkdir, ("bomb-went-off",)
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_a_pickle_that_would_run_code_is_refused_and_does_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "templates.pkl").write_bytes(pickle.dumps({"A": Bomb()}, protocol))
+    with pytest.raises(FaceDiffError, match=r"templates\.pkl: not a pickle of plain NumPy arrays"):
+        load_pickle(tmp_path / "templates.pkl")
+    assert not (tmp_path / "bomb-went-off").exists()
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 4, 5])
+def test_arrays_in_containers_come_back(tmp_path: Path, protocol: int) -> None:
+    data = {"A": np.arange(6.0).reshape(2, 3), "B": [np.float32(2.5), (1, "x")]}
+    (tmp_path / "t.pkl").write_bytes(pickle.dumps(data, protocol))
+    loaded = load_pickle(tmp_path / "t.pkl")
+    assert np.array_equal(loaded["A"], data["A"])
+    assert loaded["B"] == data["B"]
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj"])
+def test_a_mesh_keeps_its_vertex_order_and_duplicates(tmp_path: Path, suffix: str) -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0], [1, 1, 0]], float)
+    faces = np.array([[0, 1, 2], [3, 1, 4]])
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / f"m.{suffix}")
+    mesh = read_mesh(tmp_path / f"m.{suffix}")
+    np.testing.assert_allclose(mesh.vertices, vertices)
+    assert np.array_equal(mesh.faces, faces)
+
+
+def test_a_mesh_without_faces(tmp_path: Path) -> None:
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
+    with pytest.raises(FaceDiffError, match=r"points\.obj"):
+        read_mesh(tmp_path / "points.obj")
+
+
+def test_an_atomic_file_is_whole_or_absent(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "out.txt"
+    with pytest.raises(RuntimeError, match="halfway"), atomic(path) as temporary:  # noqa: PT012
+        temporary.write_text("half")
+        raise RuntimeError("halfway")
+    assert list(tmp_path.rglob("*.txt")) == []
+    with atomic(path) as temporary:
+        temporary.write_text("whole")
+    assert path.read_text() == "whole"
+    assert [p.name for p in path.parent.iterdir()] == ["out.txt"]
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FaceDiffError, match="cannot be written"):
+        check_writable(tmp_path / "file" / "out.npy")
+    check_writable(tmp_path / "a" / "b" / "out.npy")
+    assert not (tmp_path / "a").exists()
+
+
+def test_an_obj_keeps_vertices_that_no_face_uses_and_its_colours(tmp_path: Path) -> None:
+    """As textured scans have them; a mesh library that drops them would shift all that follow."""
+    (tmp_path / "m.obj").write_text(
+        "vt 0 0\nv 0 0 0 1 0 0\nv 9 9 9 0 1 0\nv 1 0 0 0 0 1\nv 0 1 0 0.5 0.5 0.5\nf 1/1 3/1 4/1\nf -4//1 -2//1 -1//1\n"
+    )
+    mesh = read_mesh(tmp_path / "m.obj")
+    assert mesh.vertices.tolist() == [[0, 0, 0], [9, 9, 9], [1, 0, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == [[0, 2, 3], [0, 2, 3]]
+    assert mesh.colours is not None
+    assert mesh.colours.tolist() == [[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]]
