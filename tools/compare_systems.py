@@ -105,7 +105,7 @@ def real_time_factor(model: AnimationModel, data: Puppet, seconds: int = 10) -> 
     taken = []
     for _ in range(2):
         started = time.monotonic()
-        model.animate(speech, subject=SEEN_IDENTITIES[0])
+        model.animate(speech, identity=SEEN_IDENTITIES[0])
         taken.append(time.monotonic() - started)
     return min(taken) / seconds
 
@@ -133,7 +133,7 @@ def style_accuracy(model: AnimationModel, data: Puppet) -> float:
     vectors = styles(model, samples)
     distances = torch.cdist(vectors, vectors).fill_diagonal_(torch.inf)
     nearest = distances.argmin(1).tolist()
-    return sum(samples[i].subject == samples[n].subject for i, n in enumerate(nearest)) / len(samples)
+    return sum(samples[i].identity_name == samples[n].identity_name for i, n in enumerate(nearest)) / len(samples)
 
 
 def contents(model: StyleContentDisentanglement, samples: Sequence[Any]) -> list[torch.Tensor]:
@@ -150,14 +150,14 @@ def content_probe(model: StyleContentDisentanglement, data: Puppet) -> float:
     Fitted on three held-out sentences of each speaker, scored on the two others, every speaker counting alike.
     """
     samples = held_out(data)
-    subjects = sorted({s.subject for s in samples})
+    identities = sorted({s.identity_name for s in samples})
     features = contents(model, samples)
     fitted = [i for i, s in enumerate(samples) if s.sentence in ("e28", "e29", "e30")]
     scored = [i for i in range(len(samples)) if i not in fitted]
     x = torch.cat([features[i] for i in fitted]).clone()
-    y = torch.cat([torch.full((len(features[i]),), subjects.index(samples[i].subject)) for i in fitted])
+    y = torch.cat([torch.full((len(features[i]),), identities.index(samples[i].identity_name)) for i in fitted])
     mean, spread = x.mean(0), x.std(0).clamp_min(1e-6)
-    probe = torch.nn.Linear(x.shape[1], len(subjects))
+    probe = torch.nn.Linear(x.shape[1], len(identities))
     optimiser = torch.optim.LBFGS(probe.parameters(), max_iter=PROBE_STEPS, line_search_fn="strong_wolfe")
 
     def closure() -> torch.Tensor:
@@ -168,11 +168,11 @@ def content_probe(model: StyleContentDisentanglement, data: Puppet) -> float:
         return loss
 
     optimiser.step(closure)
-    hits: dict[str, list[float]] = {subject: [] for subject in subjects}
+    hits: dict[str, list[float]] = {identity: [] for identity in identities}
     with torch.inference_mode():
         for i in scored:
             named = probe((features[i] - mean) / spread).argmax(1)
-            hits[samples[i].subject] += (named == subjects.index(samples[i].subject)).float().tolist()
+            hits[samples[i].identity_name] += (named == identities.index(samples[i].identity_name)).float().tolist()
     return sum(sum(each) / len(each) for each in hits.values()) / len(hits)
 
 
@@ -183,20 +183,20 @@ def swaps(model: StyleContentDisentanglement, data: Puppet) -> Row:
     FDD as the released scripts have it: signed, and the mean over the sentences; of each ordered pair of speakers its
     absolute value, and the mean over these.
     """
-    samples = {(s.subject, s.sentence): s for s in held_out(data)}
+    samples = {(s.identity_name, s.sentence): s for s in held_out(data)}
     upper = model.assets.regions["upper_face"]
     correlations: list[float] = []
     to_other: dict[tuple[str, str], list[float]] = {}
     to_source: dict[tuple[str, str], list[float]] = {}
-    for (subject, sentence), source in samples.items():
-        for other in (s for s in samples.values() if s.sentence == sentence and s.subject != subject):
+    for (identity, sentence), source in samples.items():
+        for other in (s for s in samples.values() if s.sentence == sentence and s.identity_name != identity):
             mask = torch.ones(1, len(source.motion), dtype=torch.bool)
             content = model.encode_content(source.motion[None], mask)
             style = model.encode_style(other.motion[None], torch.ones(1, len(other.motion), dtype=torch.bool))
             made = model.decode(content, style, mask)[0]
             openings = [opening(model, motion, source.template) for motion in (made, source.motion)]
             correlations.append(float(torch.corrcoef(torch.stack(openings))[0, 1]))
-            pair = (subject, other.subject)
+            pair = (identity, other.identity_name)
             to_other.setdefault(pair, []).append(deviation(made, other.motion, upper))
             to_source.setdefault(pair, []).append(deviation(made, source.motion, upper))
     other_fdd, source_fdd = (
@@ -234,7 +234,7 @@ def person_lve(model: AnimationModel, data: Puppet, person: str) -> float:
     total, frames = 0.0, 0
     dataset = data.dataset("test_b")
     for index, clip in enumerate(dataset.clips):
-        if clip.subject != person:
+        if clip.identity != person:
             continue
         sample = dataset[index]
         sample.identity = model.assets.identity_index(person)

@@ -38,14 +38,14 @@ class ClipErrors:
     Attributes:
         split: its test split.
         clip: its name.
-        subject: whose face.
+        identity: whose face.
         audio: its speech (S,), 16 kHz.
         errors: distance between prediction and truth (V,), mean over the frames, in the corpus's unit.
     """
 
     split: str
     clip: str
-    subject: str
+    identity: str
     audio: npt.NDArray[np.float32]
     errors: npt.NDArray[np.float32]
 
@@ -83,7 +83,7 @@ def measure_clips(trainer: Trainer, model: AnimationModel, rows: list[dict[str, 
             motion = model.generate(batch, seed=0)
         errors = (motion[0].float() - batch.motion[0]).norm(dim=-1).mean(dim=0)
         measured.append(
-            ClipErrors(row["split"], sample.name, sample.subject, sample.audio.numpy(), errors.cpu().numpy())
+            ClipErrors(row["split"], sample.name, sample.identity_name, sample.audio.numpy(), errors.cpu().numpy())
         )
     return measured
 
@@ -105,7 +105,7 @@ def draw_errors(model: AnimationModel, clips: list[ClipErrors]) -> list[npt.NDAr
 
         pictures: list[npt.NDArray[np.uint8] | None] = []
         for clip in clips:
-            template = assets.template(clip.subject).numpy()
+            template = assets.template(clip.identity).numpy()
             renderer = Renderer(assets.faces.numpy(), template=template, size=PICTURE_SIZE)
             pictures.append(renderer.render(template, colours=heat_colours(clip.errors, highest_error(clips))))
         return pictures

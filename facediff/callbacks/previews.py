@@ -62,13 +62,13 @@ class ClipPreview:
     scores: dict[str, float]
 
 
-def first_of_each_subject(clips: Sequence[Clip], count: int) -> list[str]:
-    """Names of ``count`` clips (fewer if there are no more): each subject's first, then each one's second …."""
+def first_of_each_identity(clips: Sequence[Clip], count: int) -> list[str]:
+    """Names of ``count`` clips (fewer if there are no more): each identity's first, then each one's second …."""
     rounds: dict[str, int] = {}
     placed = []
     for place, clip in enumerate(clips):
-        rounds[clip.subject] = rounds.get(clip.subject, 0) + 1
-        placed.append((rounds[clip.subject], place, clip.name))
+        rounds[clip.identity] = rounds.get(clip.identity, 0) + 1
+        placed.append((rounds[clip.identity], place, clip.name))
     return [name for _, _, name in sorted(placed)[:count]]
 
 
@@ -402,7 +402,7 @@ class SamplingPreview(Callback):
         elif not clips:
             self._warn(trainer, f"there are no validation clips in {data.root}")
         else:
-            self._chosen = self.names or first_of_each_subject(clips, self.clips)
+            self._chosen = self.names or first_of_each_identity(clips, self.clips)
 
     def on_validation_batch_end(
         self,

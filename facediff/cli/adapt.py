@@ -72,7 +72,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
         known = ", ".join(sorted(data.corpus.templates))
         raise FaceDiffError(f"--person {args.person}: neither a person's folder nor a subject of the corpus ({known})")
     clips = data.clips("train")
-    if not any(clip.subject == person for clip in clips):
+    if not any(clip.identity == person for clip in clips):
         raise FaceDiffError(f"--person {args.person}: no clip of {person} lies outside the corpus's test split")
     seed_everything(args.seed, verbose=False)
     model = with_extra_identities(model, list(data.identities))
@@ -94,7 +94,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
         parameter.requires_grad_(True)
     with atomic(args.output) as temporary:
         trainer.save_checkpoint(temporary)
-    seconds = sum(data.corpus.frames(clip) for clip in clips if clip.subject == person) / data.frame_rate
+    seconds = sum(data.corpus.frames(clip) for clip in clips if clip.identity == person) / data.frame_rate
     print(
         f"{args.output}: knows {person} from {seconds:.0f} s of motion, after {time.monotonic() - started:.0f} s; "
         f"next: facediff animate speech.wav --checkpoint {args.output} --identity {person} -o speech.mp4"

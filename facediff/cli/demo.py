@@ -80,7 +80,7 @@ def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModu
         batch = collate([sample])
         with torch.inference_mode():
             motion = model.eval().generate(batch)[0]
-        facts = facts_of(model.assets, sample.subject)
+        facts = facts_of(model.assets, sample.identity_name)
         takes = [
             Animation(name=name, vertices=(moved + sample.template).numpy(), speech=sample.audio.numpy(), **facts)
             for name, moved in (("truth", sample.motion), ("facediff", motion))

@@ -1,6 +1,6 @@
 """THE data contract: what one clip and one batch of clips are, for every corpus and every model.
 
-Audio is 16 kHz mono float32 and spans exactly the time of the motion. Motion is offsets from the subject's neutral
+Audio is 16 kHz mono float32 and spans exactly the time of the motion. Motion is offsets from the speaker's neutral
 template, in the corpus's unit of length. Tensors are padded with zeros; lengths say what is valid.
 """
 
@@ -30,8 +30,8 @@ class Sample:
         template: neutral face.
         identity: index into the training identities, −1 for anybody else.
         reference: motion that carries the speaking style.
-        name: the clip's name, ``<subject>_<sentence>``.
-        subject: whose face it is.
+        name: the clip's name, ``<identity>_<sentence>``.
+        identity_name: whose face it is.
         sentence: which sentence is spoken.
         reference_name: the clip that the reference was taken from.
         decoy_audio: speech of another sentence, as long as ``audio``; only for evaluation against shuffled audio.
@@ -46,7 +46,7 @@ class Sample:
     identity: int
     reference: Float[Tensor, "reference_frames vertices 3"]
     name: str
-    subject: str
+    identity_name: str
     sentence: str
     reference_name: str
     decoy_audio: Float[Tensor, " samples"] | None = None
@@ -69,7 +69,7 @@ class Batch:
         reference: padded reference motions.
         reference_lengths: valid frames of each reference.
         names: clip names.
-        subjects: whose faces.
+        identity_names: whose faces.
         sentences: which sentences.
         reference_names: the clips that the references were taken from.
         decoy_audio: padded speech of other sentences, with the lengths of ``audio``; evaluation only.
@@ -88,7 +88,7 @@ class Batch:
     reference: Float[Tensor, "batch reference_frames vertices 3"]
     reference_lengths: Int[Tensor, " batch"]
     names: list[str]
-    subjects: list[str]
+    identity_names: list[str]
     sentences: list[str]
     reference_names: list[str]
     decoy_audio: Float[Tensor, "batch samples"] | None = None
@@ -122,9 +122,9 @@ class Batch:
     def to(self, device: torch.device | str) -> Batch:
         """The same batch on another device."""
         moved: dict[str, Any] = {
-            field.name: value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
-            for field in fields(self)
-            for value in (getattr(self, field.name),)
+            each.name: value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
+            for each in fields(self)
+            for value in (getattr(self, each.name),)
         }
         return Batch(**moved)
 
@@ -139,23 +139,23 @@ class Batch:
             "features": self.feature_lengths,
         }
         picked: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for each in fields(self):
+            value = getattr(self, each.name)
             if isinstance(value, Tensor):
                 value = value[chosen]
-                own = lengths.get(field.name)
+                own = lengths.get(each.name)
                 value = value if own is None else value[:, : int(own[chosen].max())]
             elif isinstance(value, list):
                 value = [value[clip] for clip in clips]
-            picked[field.name] = value
+            picked[each.name] = value
         return Batch(**picked)
 
     def pin_memory(self) -> Batch:
         """The same batch in page-locked memory; called by PyTorch's loaders."""
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for each in fields(self):
+            value = getattr(self, each.name)
             if isinstance(value, Tensor):
-                setattr(self, field.name, value.pin_memory())
+                setattr(self, each.name, value.pin_memory())
         return self
 
 
@@ -185,7 +185,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
         reference=pad([s.reference for s in samples]),
         reference_lengths=torch.tensor([len(s.reference) for s in samples]),
         names=[s.name for s in samples],
-        subjects=[s.subject for s in samples],
+        identity_names=[s.identity_name for s in samples],
         sentences=[s.sentence for s in samples],
         reference_names=[s.reference_name for s in samples],
         decoy_audio=pad(decoys) if len(decoys) == len(samples) else None,
@@ -228,12 +228,12 @@ class Assets:
         unit: unit of length of templates and motion.
         frame_rate: motion frames a second.
         identities: the training identities, in the order of the identity index.
-        templates: neutral face of every subject.
+        templates: neutral face of every identity.
         faces: triangles; None where the corpus has no mesh file.
         colours: vertex colours (sRGB, 0 to 255) for pictures; None where the mesh file has none.
         regions: vertex indices by region name: ``lips``, ``upper_face``.
         inner_lip_pairs: (upper, lower) vertex pairs on the inner lips, for the mouth's opening.
-        references: a default style reference for every subject that has one.
+        references: a default style reference for every identity that has one.
         motion_scale: factor that gives the training motion unit variance; None until it has been measured.
     """
 
@@ -255,21 +255,21 @@ class Assets:
         """Vertices of the topology."""
         return len(next(iter(self.templates.values())))
 
-    def template(self, subject: str) -> Float[Tensor, "vertices 3"]:
-        """The neutral face of a subject.
+    def template(self, identity: str) -> Float[Tensor, "vertices 3"]:
+        """The neutral face of an identity.
 
         Raises:
-            FaceDiffError: naming the known subjects.
+            FaceDiffError: naming the known identities.
         """
-        if subject not in self.templates:
+        if identity not in self.templates:
             raise FaceDiffError(
-                f'identity: there is no "{subject}"; the checkpoint knows {", ".join(sorted(self.templates))}'
+                f'identity: there is no "{identity}"; the checkpoint knows {", ".join(sorted(self.templates))}'
             )
-        return self.templates[subject]
+        return self.templates[identity]
 
-    def identity_index(self, subject: str) -> int:
+    def identity_index(self, identity: str) -> int:
         """Index of a training identity, −1 for anybody else."""
-        return self.identities.index(subject) if subject in self.identities else -1
+        return self.identities.index(identity) if identity in self.identities else -1
 
     def with_motion_scale(self, scale: float | None) -> Assets:
         """The same with another motion scale."""

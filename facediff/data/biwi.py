@@ -67,6 +67,6 @@ class Biwi(SpeechMotionDataModule):
     def split_of(self, clip: Clip) -> str | None:
         """By person and sentence number."""
         part = next((part for part, numbers in SENTENCES.items() if clip.number in numbers), None)
-        if clip.subject in UNSEEN:
+        if clip.identity in UNSEEN:
             return "test_b" if part == "test" else None
         return "test_a" if part == "test" else part

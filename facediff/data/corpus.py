@@ -111,14 +111,14 @@ class Clip:
 
     Attributes:
         name: the name of its files.
-        subject: who speaks.
+        identity: who speaks.
         sentence: what is said; clips of equal sentence say the same words.
         attributes: further columns of ``clips.csv``, or of the name, e.g. the mood.
         root: the corpus folder that holds its files.
     """
 
     name: str
-    subject: str
+    identity: str
     sentence: str
     attributes: dict[str, str] = field(default_factory=dict, hash=False)
     root: Path = field(default=Path(), repr=False, compare=False)
@@ -130,13 +130,13 @@ class Clip:
 
 
 NameParser = Callable[[str], Clip | None]
-"""Tells subject and sentence from a clip's name; None for a file that is no clip of the corpus."""
+"""Tells identity and sentence from a clip's name; None for a file that is no clip of the corpus."""
 
 
 def parse_name(name: str) -> Clip:
-    """``<subject>_<sentence>``, split at the last underscore."""
-    subject, _, sentence = name.rpartition("_")
-    return Clip(name, subject, sentence)
+    """``<identity>_<sentence>``, split at the last underscore."""
+    identity, _, sentence = name.rpartition("_")
+    return Clip(name, identity, sentence)
 
 
 class Corpus:
@@ -148,7 +148,7 @@ class Corpus:
         frame_rate: motion frames a second that are given out.
         stored_frame_rate: motion frames a second on disk, a whole multiple of ``frame_rate``, of which every second
             (third …) is taken; what ``manifest.json`` says goes before it.
-        parse: tells subject and sentence from a clip's name.
+        parse: tells identity and sentence from a clip's name.
         people: folders of further people with the same topology, as ``facediff data import-person`` writes them.
     """
 
@@ -217,7 +217,7 @@ class Corpus:
         ):
             clip = parse(name)
             if clip is not None:
-                clips[name] = Clip(name, clip.subject, clip.sentence, {**rows.get(name, {}), **clip.attributes}, root)
+                clips[name] = Clip(name, clip.identity, clip.sentence, {**rows.get(name, {}), **clip.attributes}, root)
         return clips
 
     @staticmethod
@@ -236,7 +236,7 @@ class Corpus:
 
     @cached_property
     def templates(self) -> dict[str, Tensor]:
-        """Neutral face (V, 3) of every subject, float32."""
+        """Neutral face (V, 3) of every identity, float32."""
         templates: dict[str, Tensor] = {}
         templates |= read_templates(self.root / "templates.pkl", self.n_vertices)
         for root in self.people:
@@ -250,17 +250,17 @@ class Corpus:
         return templates
 
     def template(self, clip: Clip) -> Tensor:
-        """Neutral face (V, 3) of a clip's subject.
+        """Neutral face (V, 3) of a clip's speaker.
 
         Raises:
             FaceDiffError: if there is none.
         """
-        if clip.subject not in self.templates:
+        if clip.identity not in self.templates:
             raise FaceDiffError(
-                f"{clip.root / 'templates.pkl'}: no template for {clip.subject}, needed by clip {clip.name}; "
+                f"{clip.root / 'templates.pkl'}: no template for {clip.identity}, needed by clip {clip.name}; "
                 f"it has {', '.join(sorted(self.templates))}"
             )
-        return self.templates[clip.subject]
+        return self.templates[clip.identity]
 
     def open_vertices(self, clip: Clip) -> npt.NDArray[np.floating]:
         """A clip's absolute vertices (T, V, 3) at the corpus's frame rate, memory-mapped."""
@@ -358,14 +358,14 @@ def open_vertices(path: Path, n_vertices: int, mode: Literal["r", "c"] = "r") ->
 
 
 def read_templates(path: Path, n_vertices: int) -> dict[str, Tensor]:
-    """``templates.pkl``: subject to neutral face (V, 3), float32.
+    """``templates.pkl``: identity to neutral face (V, 3), float32.
 
     Raises:
         FaceDiffError: if the file is not that.
     """
     loaded = load_pickle(path)
     if not isinstance(loaded, dict):
-        raise FaceDiffError(f"{path}: expected a dict from subject to (V, 3) array, got {type(loaded).__name__}")
+        raise FaceDiffError(f"{path}: expected a dict from identity to (V, 3) array, got {type(loaded).__name__}")
     templates = {}
     for name, value in loaded.items():
         try:

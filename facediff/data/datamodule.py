@@ -150,12 +150,12 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             many frames once they are padded.
         num_workers: loader processes.
         window: longest training window in frames; whole clips if None.
-        reference: where a training target's style reference comes from: another clip of the same subject, or itself.
+        reference: where a training target's style reference comes from: another clip of the same speaker, or itself.
         reference_frames: longest style reference, in frames.
         predict_split: the split that ``predict`` runs over; the first test split if None.
         people: folders of further people to train on, as ``facediff data import-person`` writes them; they come first
             in the order of the identity index.
-        extra_identities: further subjects of the corpus to train on, with those of their clips that belong to no split; they
+        extra_identities: further identities of the corpus to train on, with those of their clips that belong to no split; they
             come next in the order of the identity index.
         train_identities: train on the clips of these people only; of all if None.
         lips: file that says which vertices are the lips, e.g. ``regions/lve.txt`` or ``FLAME_masks.pkl:lips``, or
@@ -235,13 +235,13 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def split_of(self, clip: Clip) -> str | None:
         """The split a clip belongs to (``train``, ``val``, ``test_a``, ``test_b``), or None for none of them.
 
-        Clips of no split may serve as style references of their subject; clips of an evaluated split only where their
-        subject has no others. An imported person's clips are not asked for.
+        Clips of no split may serve as style references of their speaker; clips of an evaluated split only where their
+        speaker has no others. An imported person's clips are not asked for.
         """
 
     @classmethod
     def parse_name(cls, name: str) -> Clip | None:
-        """Subject and sentence of a clip's name; None for a file that is no clip of the corpus."""
+        """Identity and sentence of a clip's name; None for a file that is no clip of the corpus."""
         return parse_name(name)
 
     @classmethod
@@ -279,7 +279,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         found = [clip for clip in self.corpus.clips.values() if self.find_split(clip) == split]
         if split != "train" or self.train_identities is None:
             return found
-        return [clip for clip in found if clip.subject in self.train_identities]
+        return [clip for clip in found if clip.identity in self.train_identities]
 
     def find_split(self, clip: Clip) -> str | None:
         """The split of any clip.
@@ -293,7 +293,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 raise FaceDiffError(f"{clip.root / 'clips.csv'}: split of {clip.name} is {said!r}; train, val or test")
             return "test_a" if said == "test" else said
         split = self.split_of(clip)
-        return "train" if split is None and clip.subject in self.extra_identities else split
+        return "train" if split is None and clip.identity in self.extra_identities else split
 
     def missing_clips(self) -> dict[str, list[str]]:
         """Clips of a complete corpus that are not there, by split."""
@@ -309,7 +309,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         evaluated: dict[str, list[Clip]] = {}
         for clip in self.corpus.clips.values():
             chosen = candidates if self.find_split(clip) in ("train", None) else evaluated
-            chosen.setdefault(clip.subject, []).append(clip)
+            chosen.setdefault(clip.identity, []).append(clip)
         return ReferencePolicy(
             {**evaluated, **candidates}, self.reference_attributes, self.reference, self.reference_frames
         )
@@ -376,15 +376,15 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def _default_references(self) -> dict[str, Reference]:
         references = {}
-        for subject, clips in sorted(self.reference_policy().candidates.items()):
-            if subject in self.corpus.templates:
+        for identity, clips in sorted(self.reference_policy().candidates.items()):
+            if identity in self.corpus.templates:
                 clip = self.default_reference(clips)
                 motion = self.corpus.read_motion(clip, 0, self.reference_frames)
-                references[subject] = Reference(clip.name, motion.half())
+                references[identity] = Reference(clip.name, motion.half())
         return references
 
     def default_reference(self, clips: list[Clip]) -> Clip:
-        """The clip whose style stands for a subject when nobody asks for another."""
+        """The clip whose style stands for an identity when nobody asks for another."""
         return clips[0]
 
     def prepare_data(self) -> None:

@@ -230,9 +230,9 @@ class ReferencePolicy:
     """Which clip gives a target its style reference.
 
     Attributes:
-        candidates: clips that may serve, by subject; never a clip of an evaluated split.
+        candidates: clips that may serve, by identity; never a clip of an evaluated split.
         same: clip attributes that target and reference share where possible, e.g. the mood.
-        choice: another clip of the same subject, or (in training only) the target itself.
+        choice: another clip of the same speaker, or (in training only) the target itself.
         max_frames: longest reference; longer clips are cut to a window.
     """
 
@@ -248,19 +248,19 @@ class ReferencePolicy:
             FaceDiffError: as :meth:`eligible`.
         """
         for clip in targets:
-            if len(self.candidates.get(clip.subject, [])) < 2:
+            if len(self.candidates.get(clip.identity, [])) < 2:
                 self.eligible(clip)
 
     def eligible(self, target: Clip) -> list[Clip]:
         """The clips that may serve ``target``, the best matching ones, never ``target`` itself.
 
         Raises:
-            FaceDiffError: if the subject has no other clip outside the evaluated splits.
+            FaceDiffError: if the speaker has no other clip outside the evaluated splits.
         """
-        others = [clip for clip in self.candidates.get(target.subject, []) if clip.name != target.name]
+        others = [clip for clip in self.candidates.get(target.identity, []) if clip.name != target.name]
         if not others:
             raise FaceDiffError(
-                f"clip {target.name}: subject {target.subject} has no other clip to take a style reference from; "
+                f"clip {target.name}: speaker {target.identity} has no other clip to take a style reference from; "
                 f"add clips outside the test sentences, or train with data.reference=self"
             )
         alike = [c for c in others if all(c.attributes.get(k) == target.attributes.get(k) for k in self.same)]
@@ -328,10 +328,10 @@ class MotionDataset(Dataset[Sample]):
             audio=self.corpus.read_audio(clip, start, stop),
             motion=self.corpus.read_motion(clip, start, stop),
             template=self.corpus.template(clip),
-            identity=self.identities.index(clip.subject) if clip.subject in self.identities else UNKNOWN_IDENTITY,
+            identity=self.identities.index(clip.identity) if clip.identity in self.identities else UNKNOWN_IDENTITY,
             reference=reference,
             name=clip.name,
-            subject=clip.subject,
+            identity_name=clip.identity,
             sentence=clip.sentence,
             reference_name=reference_name,
             decoy_audio=self._decoy(index, stop - start) if self.decoys else None,

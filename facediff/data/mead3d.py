@@ -36,12 +36,12 @@ class Mead3D(SpeechMotionDataModule):
         max_frames_per_batch: frame budget of a batch of clips of like length, counted with their padding.
         num_workers: loader processes.
         window: longest training window in frames; whole clips if None.
-        reference: where a training target's style reference comes from: another clip of the same subject and emotion,
+        reference: where a training target's style reference comes from: another clip of the same speaker and emotion,
             or itself.
         reference_frames: longest style reference, in frames.
         predict_split: the split that ``predict`` runs over; the first test split if None.
         people: folders of further people with FLAME's topology to train on.
-        extra_identities: further subjects of the corpus to train on, with their clips of no split.
+        extra_identities: further identities of the corpus to train on, with their clips of no split.
         train_identities: train on the clips of these people only; of all if None.
         lips: file that says which vertices are the lips, or ``all``; the corpus's usual one if None.
         upper_face: the same for the upper face.
@@ -92,7 +92,7 @@ class Mead3D(SpeechMotionDataModule):
 
     @classmethod
     def parse_name(cls, name: str) -> Clip | None:
-        """``M003_001_0_0``: subject, sequence, emotion, intensity.
+        """``M003_001_0_0``: identity, sequence, emotion, intensity.
 
         Sequences of one number say the same words within one emotion only.
         """
@@ -107,8 +107,8 @@ class Mead3D(SpeechMotionDataModule):
         """By person (``identity``), or by sentence for the training people (``sentence``)."""
         if self.split == "identity":
             groups = {"train": TRAIN, "val": VALIDATION, "test_b": TEST}
-            return next((split for split, people in groups.items() if clip.subject in people), None)
-        if clip.subject not in TRAIN:
+            return next((split for split, people in groups.items() if clip.identity in people), None)
+        if clip.identity not in TRAIN:
             return None
         sentences = NEUTRAL_SENTENCES if clip.attributes["emotion"] == "neutral" else EMOTIONAL_SENTENCES
         return next((split for split, numbers in sentences.items() if clip.number in numbers), None)

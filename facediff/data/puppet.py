@@ -32,12 +32,12 @@ class Puppet(SpeechMotionDataModule):
         max_frames_per_batch: frame budget of a batch of clips of like length, counted with their padding.
         num_workers: loader processes.
         window: longest training window in frames; whole clips if None.
-        reference: where a training target's style reference comes from: another clip of the same subject and mood,
+        reference: where a training target's style reference comes from: another clip of the same speaker and mood,
             or itself.
         reference_frames: longest style reference, in frames.
         predict_split: the split that ``predict`` runs over; test A if None.
         people: folders of further people with this face's topology to train on.
-        extra_identities: further subjects of the corpus to train on, with their clips of no split.
+        extra_identities: further identities of the corpus to train on, with their clips of no split.
         train_identities: train on the clips of these people only; of all if None.
         lips: file that says which vertices are the lips, or ``all``; the corpus's own if None.
         upper_face: the same for the upper face.
@@ -85,7 +85,7 @@ class Puppet(SpeechMotionDataModule):
 
     def split_of(self, clip: Clip) -> str | None:
         """BIWI's way: by speaker and sentence number."""
-        seen = clip.subject in puppet.SEEN_IDENTITIES
+        seen = clip.identity in puppet.SEEN_IDENTITIES
         if clip.number in puppet.TEST_SENTENCES:
             return "test_a" if seen else "test_b"
         if not seen:

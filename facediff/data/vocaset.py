@@ -70,8 +70,8 @@ class Vocaset(SpeechMotionDataModule):
 
     def split_of(self, clip: Clip) -> str | None:
         """By person, and for validation and test by sentence number."""
-        if clip.subject in TRAIN:
+        if clip.identity in TRAIN:
             return "train"
         if clip.number not in EVALUATED:
             return None
-        return "val" if clip.subject in VALIDATION else "test_b" if clip.subject in TEST else None
+        return "val" if clip.identity in VALIDATION else "test_b" if clip.identity in TEST else None

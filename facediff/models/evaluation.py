@@ -44,8 +44,8 @@ def conditioned(
         return [("", batch)]
     if policy == "adapted":
         raise FaceDiffError(
-            f"unseen_identity=adapted: clip {batch.names[unknown[0]]} is of {batch.subjects[unknown[0]]}, whom the "
-            f"model does not know; let it get to know them with `facediff adapt`, or choose another policy"
+            f"unseen_identity=adapted: clip {batch.names[unknown[0]]} is of {batch.identity_names[unknown[0]]}, whom "
+            f"the model does not know; let it get to know them with `facediff adapt`, or choose another policy"
         )
     found = [("", batch.select(known))] if known else []
     unseen = batch.select(unknown)

@@ -54,20 +54,20 @@ class Prediction:
     vertices: Float[Tensor, "frames vertices 3"]
 
 
-def speech_sample(audio: Float[Tensor, " samples"], assets: Assets, subject: str, style: Reference | Style) -> Sample:
+def speech_sample(audio: Float[Tensor, " samples"], assets: Assets, identity: str, style: Reference | Style) -> Sample:
     """Speech alone as a sample of the data contract; its motion gives the number of frames only.
 
     Args:
         audio: speech at 16 kHz.
         assets: of the checkpoint.
-        subject: whose face and identity.
+        identity: whose face and identity.
         style: whose manner.
 
     Raises:
-        FaceDiffError: if the subject is unknown, the reference does not fit the topology, or the speech is shorter than
-            a frame.
+        FaceDiffError: if the identity is unknown, the reference does not fit the topology, or the speech is shorter
+            than a frame.
     """
-    template = assets.template(subject)
+    template = assets.template(identity)
     # A vector goes past the style path, which then has nothing to look at.
     nothing = template.new_zeros(1, *template.shape)
     reference = style if isinstance(style, Reference) else Reference(style.name, nothing)
@@ -84,10 +84,10 @@ def speech_sample(audio: Float[Tensor, " samples"], assets: Assets, subject: str
         audio=torch.nn.functional.pad(audio[:length], (0, max(0, length - len(audio)))),
         motion=torch.zeros(frames, *template.shape),
         template=template,
-        identity=assets.identity_index(subject),
+        identity=assets.identity_index(identity),
         reference=reference.motion.float(),
         name="speech",
-        subject=subject,
+        identity_name=identity,
         sentence="",
         reference_name=reference.clip,
         style=style.vector if isinstance(style, Style) else None,
@@ -692,7 +692,7 @@ class Inference(ABC):
         self,
         audio: Float[Tensor, " samples"],
         *,
-        subject: str,
+        identity: str,
         style: Reference | Style | None = None,
         seed: int = 0,
         progress: Progress | None = None,
@@ -701,23 +701,23 @@ class Inference(ABC):
 
         Args:
             audio: speech at 16 kHz.
-            subject: whose face and identity; any subject of the training corpus, also one not trained on.
-            style: reference motion, or a style vector made by this model; the subject's default one if None.
+            identity: whose face and identity; any speaker of the training corpus, also one not trained on.
+            style: reference motion, or a style vector made by this model; the speaker's default one if None.
             seed: seed of the noise; equal seeds give equal motion on one machine.
             progress: wraps the iteration over sampling steps, or over the seconds of long speech.
 
         Raises:
-            FaceDiffError: if the subject is unknown, the reference does not fit the topology, or the speech is
+            FaceDiffError: if the identity is unknown, the reference does not fit the topology, or the speech is
                 shorter than a frame.
         """
-        return self.animate_samples(audio, subject=subject, style=style, seeds=[seed], progress=progress)[0]
+        return self.animate_samples(audio, identity=identity, style=style, seeds=[seed], progress=progress)[0]
 
     @torch.inference_mode()
     def animate_samples(
         self,
         audio: Float[Tensor, " samples"],
         *,
-        subject: str,
+        identity: str,
         style: Reference | Style | None = None,
         seeds: Sequence[int],
         progress: Progress | None = None,
@@ -726,7 +726,7 @@ class Inference(ABC):
 
         Args:
             audio: speech at 16 kHz.
-            subject: as :meth:`animate` takes it.
+            identity: as :meth:`animate` takes it.
             style: as :meth:`animate` takes it.
             seeds: one for each take.
             progress: as :meth:`animate` takes it.
@@ -734,14 +734,14 @@ class Inference(ABC):
         Raises:
             FaceDiffError: as :meth:`animate`.
         """
-        clip = self.clip_of(audio, subject, style)
+        clip = self.clip_of(audio, identity, style)
         if self.windows.at_once(clip.motion.shape[1], self.frame_rate):
             takes = self.generate_samples(clip, seeds, progress=progress)
         else:
             takes = torch.cat(list(SpeechStream(self, clip, seeds=seeds).over(clip.audio[0], progress=progress)), 1)
-        identity = subject if int(clip.identity[0]) >= 0 else "unknown"
+        trained = identity if int(clip.identity[0]) >= 0 else "unknown"
         return [
-            Prediction(clip.names[0], identity, clip.reference_names[0], (motion + clip.template).cpu())
+            Prediction(clip.names[0], trained, clip.reference_names[0], (motion + clip.template).cpu())
             for motion in takes
         ]
 
@@ -749,7 +749,7 @@ class Inference(ABC):
     def stream(
         self,
         *,
-        subject: str,
+        identity: str,
         style: Reference | Style | None = None,
         seeds: Sequence[int] = (0,),
         plan: WindowPlan | None = None,
@@ -757,7 +757,7 @@ class Inference(ABC):
         """Animate speech of any length, in pieces as they come.
 
         Args:
-            subject: as :meth:`animate` takes it.
+            identity: as :meth:`animate` takes it.
             style: as :meth:`animate` takes it.
             seeds: one for each take.
             plan: how speech is cut; shorter windows give frames sooner. :attr:`windows` if None.
@@ -766,16 +766,16 @@ class Inference(ABC):
             FaceDiffError: as :meth:`animate`.
         """
         frame = torch.zeros(samples_for(1, self.frame_rate), device=self.device)
-        return SpeechStream(self, self.clip_of(frame, subject, style), seeds=seeds, plan=plan)
+        return SpeechStream(self, self.clip_of(frame, identity, style), seeds=seeds, plan=plan)
 
-    def clip_of(self, audio: Float[Tensor, " samples"], subject: str, style: Reference | Style | None) -> Batch:
+    def clip_of(self, audio: Float[Tensor, " samples"], identity: str, style: Reference | Style | None) -> Batch:
         """Speech, a face and a style as a batch of one clip on the model's device.
 
         Raises:
             FaceDiffError: as :meth:`animate`.
         """
-        self.assets.template(subject)  # who is not known at all has no style either
-        sample = speech_sample(audio, self.assets, subject, style or self.default_style(subject))
+        self.assets.template(identity)  # who is not known at all has no style either
+        sample = speech_sample(audio, self.assets, identity, style or self.default_style(identity))
         return collate([sample]).to(self.device)
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
@@ -790,12 +790,12 @@ class Inference(ABC):
         """
         raise FaceDiffError(f"{type(self).__name__} does not sample: leave --sampler and --steps away")
 
-    def default_style(self, subject: str) -> Reference:
-        """The stored reference of a subject.
+    def default_style(self, identity: str) -> Reference:
+        """The stored reference of an identity.
 
         Raises:
-            FaceDiffError: if the subject has none.
+            FaceDiffError: if it has none.
         """
-        if subject not in self.assets.references:
-            raise FaceDiffError(f"style: the checkpoint holds no reference motion of {subject}; give one with --style")
-        return self.assets.references[subject]
+        if identity not in self.assets.references:
+            raise FaceDiffError(f"style: the checkpoint holds no reference motion of {identity}; give one with --style")
+        return self.assets.references[identity]

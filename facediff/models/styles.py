@@ -119,7 +119,7 @@ def open_style(path: Path) -> StyleFile:
 def read_reference(
     opened: StyleFile, assets: Assets, whose: str | None, template: Tensor, stride: int = 1
 ) -> Reference:
-    """Offsets from a subject's template (V, 3), from absolute vertices (T, V, 3) or (T, 3V)."""
+    """Offsets from an identity's template (V, 3), from absolute vertices (T, V, 3) or (T, 3V)."""
     import torch
 
     from facediff.data import Reference
@@ -231,8 +231,8 @@ def refuse_unknown(path: Path, offsets: Tensor, assets: Assets, whose: str | Non
         )
     raise FaceDiffError(
         f"--style {path}: is not a motion of {whose}'s face, so it must be another person's; give that person's "
-        f"neutral face with --style-template, or name the file <subject>_<clip>.npy with a subject that the checkpoint "
-        f"knows ({', '.join(sorted(assets.templates))})"
+        f"neutral face with --style-template, or name the file <identity>_<clip>.npy with an identity that the "
+        f"checkpoint knows ({', '.join(sorted(assets.templates))})"
     )
 
 
@@ -373,7 +373,7 @@ def read_style(
     """A style from a file, from the checkpoint, or from the corpus that the checkpoint was trained on.
 
     A file holds a style vector that ``facediff style extract`` wrote, or a motion in absolute vertices: a take
-    (``.npz``), which says its own template, or a bare array (``.npy``). An array's subject is told by its name
+    (``.npz``), which says its own template, or a bare array (``.npy``). An array's identity follows from its file name
     (``F1_e03.npy``), else it is the identity, unless a template is given. A file in the ``vertices_npy`` of a corpus
     folder comes with that folder's templates and frame rate.
     """
@@ -388,12 +388,12 @@ def read_style(
         return read_vector(opened, model)
     if opened.template is not None:
         return reference_of_animation(opened, assets)
-    subject = path.stem.split("_condition_")[0].rpartition("_")[0]
+    owner = path.stem.split("_condition_")[0].rpartition("_")[0]
     templates, stored = folder_facts(path, assets, source)
     stride = stride_of(path, stored, assets.frame_rate)
-    if template is not None and style.endswith(MOTIONS) and not (in_corpus(path) and subject in templates):
+    if template is not None and style.endswith(MOTIONS) and not (in_corpus(path) and owner in templates):
         return read_reference(opened, assets, None, face_of(template, opened, assets), stride)
-    who = next((name for name in (subject, identity) if name in templates), None)
+    who = next((name for name in (owner, identity) if name in templates), None)
     face = templates[who] if who is not None else assets.template(identity)
     return read_reference(opened, assets, who or identity, face, stride)
 

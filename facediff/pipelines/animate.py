@@ -326,7 +326,7 @@ class AnimationPipeline:
         progress = None if self.args.quiet else partial(bar, description="sampling")
         made = self.model.animate_samples(
             torch.from_numpy(speech).to(self.model.device),
-            subject=self.identity,
+            identity=self.identity,
             style=self.style,
             seeds=seeds,
             progress=progress,
@@ -342,7 +342,7 @@ class AnimationPipeline:
 
         from facediff.animation.files import MotionWriter
 
-        stream = self.model.stream(subject=self.identity, style=self.style, seeds=seeds)
+        stream = self.model.stream(identity=self.identity, style=self.style, seeds=seeds)
         progress = None if self.args.quiet else partial(bar, description="seconds of speech")
         template = self.model.assets.template(self.identity)
         writers = [MotionWriter(folder / f"{seed}.npy", tuple(template.shape)) for seed in seeds]

@@ -80,7 +80,7 @@ def run_stream(args: argparse.Namespace) -> int:
     busy, heard = 0.0, 0
     with sink(args.output, tuple(template.shape)) as write, pipeline.precision(), ended_by_interrupt() as read:
         # In the precision asked for from the style on, as a file is animated.
-        stream = model.stream(subject=pipeline.identity, style=pipeline.style, seeds=[args.seed])
+        stream = model.stream(identity=pipeline.identity, style=pipeline.style, seeds=[args.seed])
         for samples in pcm(sys.stdin.buffer, args.rate, read):
             started = time.perf_counter()
             part = stream.feed(torch.from_numpy(samples))

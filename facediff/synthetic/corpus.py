@@ -47,12 +47,12 @@ class Clip:
     """One clip of the corpus.
 
     Attributes:
-        subject: Who speaks.
+        identity: Who speaks.
         number: Which sentence, from 1.
         mood: One of `MOODS`.
     """
 
-    subject: str
+    identity: str
     number: int
     mood: str
 
@@ -64,7 +64,7 @@ class Clip:
     @property
     def name(self) -> str:
         """Name of the clip and stem of its files, such as ``"F1_e01"``."""
-        return f"{self.subject}_{self.sentence}"
+        return f"{self.identity}_{self.sentence}"
 
 
 def clips() -> tuple[Clip, ...]:
@@ -74,11 +74,11 @@ def clips() -> tuple[Clip, ...]:
     often in training and every sentence is heard in every mood.
     """
     everything = (*TRAIN_SENTENCES, *VAL_SENTENCES, *TEST_SENTENCES)
-    plan = [(subject, everything) for subject in SEEN_IDENTITIES]
-    plan += [(subject, (*REFERENCE_SENTENCES, *TEST_SENTENCES)) for subject in UNSEEN_IDENTITIES]
+    plan = [(identity, everything) for identity in SEEN_IDENTITIES]
+    plan += [(identity, (*REFERENCE_SENTENCES, *TEST_SENTENCES)) for identity in UNSEEN_IDENTITIES]
     return tuple(
-        Clip(subject, number, MOODS[(number + turn) % len(MOODS)])
-        for turn, (subject, numbers) in enumerate(plan)
+        Clip(identity, number, MOODS[(number + turn) % len(MOODS)])
+        for turn, (identity, numbers) in enumerate(plan)
         for number in numbers
     )
 
@@ -301,7 +301,7 @@ def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, 
     Returns:
         The waveform at 16 kHz, shape (640 T,); rig weights, shape (T, controls); and the phonemes in time.
     """
-    speaker = SPEAKERS[clip.subject]
+    speaker = SPEAKERS[clip.identity]
     said = speak(SENTENCES[clip.number - 1], speaker.voice)
     before = round(_QUIET_BEFORE * SAMPLE_RATE)
     length = before + said.samples.size + round(_QUIET_AFTER * SAMPLE_RATE)
@@ -311,7 +311,7 @@ def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, 
     samples = samples[: frames * _SAMPLES_PER_FRAME]
     end = frames / FRAME_RATE
     phonemes = _in_quiet(said.phonemes, before / SAMPLE_RATE, end)
-    random = np.random.default_rng([seed, list(SPEAKERS).index(clip.subject), clip.number])
+    random = np.random.default_rng([seed, list(SPEAKERS).index(clip.identity), clip.number])
     weights = generate_clips(
         segments_of(phonemes), analyse(samples, SAMPLE_RATE), frames, speaker.manner, clip.mood, random
     )
@@ -319,9 +319,9 @@ def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, 
 
 
 @lru_cache(maxsize=8)
-def rig_of(subject: str) -> Rig:
+def rig_of(identity: str) -> Rig:
     """Rig of a speaker, by name."""
-    speaker = SPEAKERS[subject]
+    speaker = SPEAKERS[identity]
     return build_rig(speaker.shape, speaker.manner.asymmetry)
 
 
@@ -378,10 +378,10 @@ def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
     for name in ("wav", "vertices_npy", "phonemes", "regions"):
         (folder / name).mkdir()
     mesh = build_face()
-    templates = {subject: np.array(rig_of(subject).neutral) for subject in (*SEEN_IDENTITIES, *UNSEEN_IDENTITIES)}
+    templates = {identity: np.array(rig_of(identity).neutral) for identity in (*SEEN_IDENTITIES, *UNSEEN_IDENTITIES)}
     with (folder / "templates.pkl").open("wb") as stream:
         pickle.dump(templates, stream, protocol=2)
-    mean = np.mean([templates[subject] for subject in SEEN_IDENTITIES], axis=0)
+    mean = np.mean([templates[identity] for identity in SEEN_IDENTITIES], axis=0)
     write_ply(folder / "PUPPET.ply", mean, mesh.faces, mesh.colours)
     for name, index in regions().items():
         (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, index.tolist())) + "\n")
@@ -392,8 +392,8 @@ def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(["clip", "subject", "sentence", "mood", "voice", "text"])
         for clip in chosen:
-            voice, text = SPEAKERS[clip.subject].voice.name, SENTENCES[clip.number - 1]
-            table.writerow([clip.name, clip.subject, clip.sentence, clip.mood, voice, text])
+            voice, text = SPEAKERS[clip.identity].voice.name, SENTENCES[clip.number - 1]
+            table.writerow([clip.name, clip.identity, clip.sentence, clip.mood, voice, text])
 
 
 def _write_clips(folder: Path, chosen: Sequence[Clip], seed: int, workers: int | None, progress: bool) -> int:
@@ -425,7 +425,7 @@ def _write_clip(folder: Path, clip: Clip, seed: int) -> int:
 
     samples, weights, phonemes = generate_clip(clip, seed)
     soundfile.write(folder / "wav" / f"{clip.name}.wav", samples, SAMPLE_RATE, subtype="PCM_16")
-    vertices = rig_of(clip.subject).pose(weights).astype(np.float32)
+    vertices = rig_of(clip.identity).pose(weights).astype(np.float32)
     np.save(folder / "vertices_npy" / f"{clip.name}.npy", vertices.reshape(len(vertices), -1))
     with (folder / "phonemes" / f"{clip.name}.csv").open("w", newline="", encoding="utf-8") as stream:
         table = csv.writer(stream, lineterminator="\n")

@@ -22,7 +22,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 
 from facediff.callbacks import SamplingPreview
-from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_subject, length
+from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_identity, length
 from facediff.cli.app import main
 from facediff.data import collate
 from facediff.data.corpus import Clip
@@ -367,9 +367,9 @@ def test_a_system_is_given_back_as_it_was_lent(make_model: MakeModel) -> None:
 
 def test_each_persons_first_clip_comes_before_any_second() -> None:
     clips = [Clip(name, *name.split("_")) for name in ("A_e1", "A_e2", "A_e3", "B_e1", "C_e1", "C_e2")]  # type: ignore[call-arg]
-    assert first_of_each_subject(clips, 2) == ["A_e1", "B_e1"]
-    assert first_of_each_subject(clips, 5) == ["A_e1", "B_e1", "C_e1", "A_e2", "C_e2"]
-    assert first_of_each_subject(clips[:2], 9) == ["A_e1", "A_e2"]
+    assert first_of_each_identity(clips, 2) == ["A_e1", "B_e1"]
+    assert first_of_each_identity(clips, 5) == ["A_e1", "B_e1", "C_e1", "A_e2", "C_e2"]
+    assert first_of_each_identity(clips[:2], 9) == ["A_e1", "A_e2"]
 
 
 def test_lengths_are_for_people() -> None:

@@ -241,7 +241,7 @@ def test_long_speech_goes_to_disk_window_by_window(checkpoint: Path, tmp_path: P
     assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "out" / "long.npy", "--seed", 2) == 0
     made = np.load(tmp_path / "out" / "long.npy")
     model = load_model(checkpoint)
-    expected = model.animate(torch.from_numpy(read_speech(speech)), subject="A", seed=2).vertices.numpy()
+    expected = model.animate(torch.from_numpy(read_speech(speech)), identity="A", seed=2).vertices.numpy()
     assert made.shape == (325, 24, 3)
     np.testing.assert_array_equal(made, expected)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["long.npy"]
@@ -250,7 +250,7 @@ def test_long_speech_goes_to_disk_window_by_window(checkpoint: Path, tmp_path: P
 def test_speech_of_just_about_ten_seconds_is_made_as_the_system_makes_it(checkpoint: Path, tmp_path: Path) -> None:
     speech = write(tmp_path / "s.wav", 0.1 * np.random.default_rng(0).normal(size=160_100))  # 250 frames and a bit
     assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "s.npy") == 0
-    expected = load_model(checkpoint).animate(torch.from_numpy(read_speech(speech)), subject="A").vertices.numpy()
+    expected = load_model(checkpoint).animate(torch.from_numpy(read_speech(speech)), identity="A").vertices.numpy()
     np.testing.assert_array_equal(np.load(tmp_path / "s.npy"), expected)
 
 

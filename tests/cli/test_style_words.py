@@ -81,7 +81,7 @@ def test_a_mixture_is_the_weighted_mean_of_style_vectors(
     alike = read_styles(f"{clips['A']},{clips['B']}", "A", model)
     np.testing.assert_allclose(vector(alike, model), (a + b) / 2, atol=1e-5)
     speech = torch.randn(16_000, generator=torch.Generator().manual_seed(0)) * 0.1
-    assert torch.isfinite(model.animate(speech, subject="A", style=beyond).vertices).all()
+    assert torch.isfinite(model.animate(speech, identity="A", style=beyond).vertices).all()
 
 
 @pytest.mark.parametrize(

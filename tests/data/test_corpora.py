@@ -312,7 +312,7 @@ def test_an_imported_person_is_trained_on_beside_the_corpus(tmp_path: Path) -> N
         "test_a": ["F2_e37", "F2_e38", "Ada_s04"],
         "test_b": [],
     }
-    sample = next(s for s in data.dataset("test_a") if s.subject == "Ada")
+    sample = next(s for s in data.dataset("test_a") if s.identity_name == "Ada")
     assert sample.identity == 0
     assert sample.reference_name in ("Ada_s01", "Ada_s02")
     assert data.assets().identities[0] == "Ada"

@@ -15,11 +15,11 @@ from facediff.errors import FaceDiffError
 from tests.fakes.tiny import Tiny, write_tiny
 
 
-def test_motion_is_offsets_from_the_subjects_template(tiny: Tiny) -> None:
+def test_motion_is_offsets_from_the_identitys_template(tiny: Tiny) -> None:
     sample = tiny.dataset("val")[0]
     stored = np.load(tiny.root / "vertices_npy" / f"{sample.name}.npy").reshape(-1, 24, 3)
     torch.testing.assert_close(sample.motion + sample.template, torch.from_numpy(stored))
-    assert sample.identity == ["A", "B"].index(sample.subject)
+    assert sample.identity == ["A", "B"].index(sample.identity_name)
 
 
 def test_audio_spans_exactly_the_motion(tiny: Tiny) -> None:
@@ -51,7 +51,7 @@ def test_the_reference_is_never_the_clip_it_predicts_nor_an_evaluated_one(tiny: 
         for sample in dataset:
             assert sample.reference_name != sample.name
             assert sample.reference_name not in evaluated
-            assert sample.reference_name.startswith(f"{sample.subject}_")
+            assert sample.reference_name.startswith(f"{sample.identity_name}_")
 
 
 def test_the_reference_shares_the_targets_mood(tiny: Tiny) -> None:
@@ -167,10 +167,10 @@ def test_a_region_index_out_of_range_names_the_file(broken: Path) -> None:
 def test_newcomers_train_on_their_clips_of_no_split(tiny_root: Path) -> None:
     data = Tiny(root=str(tiny_root), extra_identities=["C"])
     assert data.identities == ["C", "A", "B"]
-    assert {clip.name for clip in data.clips("train") if clip.subject == "C"} == {f"C_e0{n}" for n in range(1, 6)}
-    assert {clip.subject for clip in data.clips("test_b")} == {"C"}, "test clips stay test clips"
+    assert {clip.name for clip in data.clips("train") if clip.identity == "C"} == {f"C_e0{n}" for n in range(1, 6)}
+    assert {clip.identity for clip in data.clips("test_b")} == {"C"}, "test clips stay test clips"
     only = Tiny(root=str(tiny_root), extra_identities=["C"], train_identities=["C"])
-    assert {clip.subject for clip in only.clips("train")} == {"C"}
+    assert {clip.identity for clip in only.clips("train")} == {"C"}
     assert only.identities == data.identities
     assert [clip.name for clip in only.clips("val")] == [clip.name for clip in data.clips("val")]
     with pytest.raises(FaceDiffError, match="A is there more than once"):

@@ -66,7 +66,7 @@ class Tiny(SpeechMotionDataModule):
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
 
     def split_of(self, clip: Clip) -> str | None:
-        seen = clip.subject in SEEN
+        seen = clip.identity in SEEN
         if clip.number >= 6:
             return "test_a" if seen else "test_b"
         if not seen:

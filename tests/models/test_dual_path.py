@@ -154,13 +154,13 @@ def test_a_tiny_model_overfits_one_clip(make_model: Make, tiny: Tiny) -> None:
 
 def test_animate_is_seeded_and_knows_unseen_people(model: DualPathDiffusion) -> None:
     speech = torch.randn(16_000)
-    first = model.animate(speech, subject="A", seed=1)
+    first = model.animate(speech, identity="A", seed=1)
     assert first.vertices.shape == (25, 24, 3)
-    assert torch.equal(first.vertices, model.animate(speech, subject="A", seed=1).vertices)
-    assert not torch.equal(first.vertices, model.animate(speech, subject="A", seed=2).vertices)
-    assert model.animate(speech, subject="C").identity == "unknown"
+    assert torch.equal(first.vertices, model.animate(speech, identity="A", seed=1).vertices)
+    assert not torch.equal(first.vertices, model.animate(speech, identity="A", seed=2).vertices)
+    assert model.animate(speech, identity="C").identity == "unknown"
     with pytest.raises(FaceDiffError, match='there is no "Z"; the checkpoint knows A, B, C'):
-        model.animate(speech, subject="Z")
+        model.animate(speech, identity="Z")
 
 
 def test_other_steps_keep_the_samplers_other_options(make_model: Make) -> None:

@@ -82,29 +82,29 @@ SAMPLERS = {
 )
 def test_a_microphone_gives_what_the_file_gives(ready: Ready, name: str, options: dict[str, object]) -> None:
     model, whole = ready(name, **options), speech(5.3)
-    offline = torch.cat(list(model.stream(subject="A", seeds=[3]).over(whole)), 1)
+    offline = torch.cat(list(model.stream(identity="A", seeds=[3]).over(whole)), 1)
     assert offline.shape == (1, round(5.3 * 25), VERTICES, 3)
     assert torch.isfinite(offline).all()
     for seed in (0, 1):
-        stream = model.stream(subject="A", seeds=[3])
+        stream = model.stream(identity="A", seeds=[3])
         parts = [stream.feed(piece) for piece in pieces(whole, seed)]
         assert torch.equal(torch.cat([*parts, stream.finish()], 1), offline)
-    vertices = model.animate(whole, subject="A", seed=3).vertices
+    vertices = model.animate(whole, identity="A", seed=3).vertices
     assert torch.equal(vertices, offline[0] + model.assets.templates["A"])
 
 
 def test_a_frame_comes_when_it_is_certain_and_no_later_than_promised(ready: Ready) -> None:
     model, whole = ready(), speech(6)
-    stream, given = model.stream(subject="A"), 0
+    stream, given = model.stream(identity="A"), 0
     for sample in range(0, len(whole), 160):
         given += stream.feed(whole[sample : sample + 160]).shape[1]
         heard = (sample + 160) / 16000
         assert given / 25 >= heard - PLAN.look_ahead - 0.011
         assert given == stream.frames
     # What comes later changes nothing of what was given.
-    other = model.stream(subject="A")
+    other = model.stream(identity="A")
     again = other.feed(torch.cat([whole, speech(3, seed=9)]))
-    first = model.stream(subject="A").feed(whole)
+    first = model.stream(identity="A").feed(whole)
     assert torch.equal(again[:, : first.shape[1]], first)
 
 
@@ -112,7 +112,7 @@ def test_a_frame_comes_when_it_is_certain_and_no_later_than_promised(ready: Read
 def test_every_frame_is_there_whatever_the_length(ready: Ready, frames: int) -> None:
     """Around the ends of windows (every 20 frames), of their overlaps and of what is heard after them."""
     model = ready()
-    stream = model.stream(subject="A")
+    stream = model.stream(identity="A")
     parts = [stream.feed(speech(samples_for(frames, 25) / 16000)), stream.finish()]
     motion = torch.cat(parts, 1)
     assert motion.shape[1] == frames
@@ -126,13 +126,13 @@ def test_every_frame_is_there_whatever_the_length(ready: Ready, frames: int) -> 
 def test_without_a_limit_all_speech_is_made_at_once(ready: Ready) -> None:
     model = ready()
     model.windows = replace(PLAN, above=float("inf"))
-    vertices = model.animate(speech(3), subject="A").vertices
+    vertices = model.animate(speech(3), identity="A").vertices
     clip = model.clip_of(speech(3), "A", None)
     assert torch.equal(vertices, model.generate_clips(clip)[0] + clip.template[0])
 
 
 def test_a_stream_cannot_take_frames_back(ready: Ready) -> None:
-    stream = ready().stream(subject="A")
+    stream = ready().stream(identity="A")
     given = stream.feed(speech(4)).shape[1]
     with pytest.raises(FaceDiffError, match=f"frames: 5 are fewer than the {given} that have been given out"):
         stream.finish(5)
@@ -140,7 +140,7 @@ def test_a_stream_cannot_take_frames_back(ready: Ready) -> None:
 
 def test_memory_does_not_grow_with_the_speech(ready: Ready) -> None:
     model = ready()
-    stream = model.stream(subject="A")
+    stream = model.stream(identity="A")
     held = []
     for second in range(40):
         stream.feed(speech(1, seed=second))
@@ -182,7 +182,7 @@ def test_the_first_shared_frame_is_the_old_windows_in_every_step(ready: Ready) -
         return motion, tail
 
     model.generate_window = watched  # type: ignore[method-assign,assignment]
-    list(model.stream(subject="A").over(speech(4)))
+    list(model.stream(identity="A").over(speech(4)))
     assert len(made) > 3
     size = made[0].std()
     for old, new in zip(made, made[1:], strict=False):
@@ -216,9 +216,9 @@ def test_takes_are_what_their_seeds_give_and_the_speech_is_encoded_once(ready: R
     encoder.register_forward_hook(lambda *_: heard.append(1))
     for seconds in (1.5, 4.0):
         heard.clear()
-        takes = model.animate_samples(speech(seconds), subject="B", seeds=[7, 8, 9])
+        takes = model.animate_samples(speech(seconds), identity="B", seeds=[7, 8, 9])
         once = len(heard)
-        single = [model.animate(speech(seconds), subject="B", seed=seed) for seed in (7, 8, 9)]
+        single = [model.animate(speech(seconds), identity="B", seed=seed) for seed in (7, 8, 9)]
         assert len(heard) == 4 * once
         for animation, alone in zip(takes, single, strict=True):
             torch.testing.assert_close(animation.vertices, alone.vertices, rtol=0, atol=1e-5)
@@ -298,11 +298,11 @@ def test_any_window_may_share_half_of_itself(rate: float) -> None:
 
 def test_windows_of_too_few_frames(ready: Ready) -> None:
     with pytest.raises(FaceDiffError, match="too few frames at 25 a second"):
-        ready().stream(subject="A", plan=WindowPlan(seconds=0.1, overlap=0.05))
+        ready().stream(identity="A", plan=WindowPlan(seconds=0.1, overlap=0.05))
 
 
 def test_speech_without_a_frame_is_refused(ready: Ready) -> None:
-    stream = ready().stream(subject="A")
+    stream = ready().stream(identity="A")
     stream.feed(torch.zeros(100))
     with pytest.raises(FaceDiffError, match="shorter than one frame"):
         stream.finish()

@@ -277,8 +277,8 @@ class TestLosses:
         sample = tiny.dataset("train")[0]
         said = sample.motion / sample.motion.abs().amax()
         model.network = Oracle(said)  # type: ignore[assignment]
-        made = [replace(sample, motion=said * 2.0, reference=said * 2.0, name="A_x", subject="A")]
-        made.append(replace(sample, motion=said * 0.5, reference=said * 0.5, name="B_x", subject="B"))
+        made = [replace(sample, motion=said * 2.0, reference=said * 2.0, name="A_x", identity_name="A")]
+        made.append(replace(sample, motion=said * 0.5, reference=said * 0.5, name="B_x", identity_name="B"))
         model.alignment_allowed = lambda: True  # type: ignore[method-assign]
         terms = model.losses(collate(made))
         assert set(terms) >= {"reconstruction", "swap", "cycle", "speech_reconstruction", "speech_swap", "speech_cycle"}
@@ -293,8 +293,8 @@ class TestLosses:
         oracle = Oracle(sample.motion / sample.motion.abs().amax())
         oracle.decoder = lambda content, style, mask: content  # type: ignore[method-assign]
         model.network = oracle  # type: ignore[assignment]
-        made = [replace(sample, motion=oracle.said * 2.0, reference=oracle.said, name="A_x", subject="A")]
-        made.append(replace(sample, motion=oracle.said * 0.5, reference=oracle.said, name="B_x", subject="B"))
+        made = [replace(sample, motion=oracle.said * 2.0, reference=oracle.said, name="A_x", identity_name="A")]
+        made.append(replace(sample, motion=oracle.said * 0.5, reference=oracle.said, name="B_x", identity_name="B"))
         model.alignment_allowed = lambda: True  # type: ignore[method-assign]
         terms = {name: value.detach() for name, value in model.losses(collate(made)).items()}
         assert float(terms["swap"]) > 0
@@ -320,7 +320,7 @@ class TestLosses:
 
         def note(batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
             if model.training:
-                seen.append(list(zip(batch.subjects, batch.sentences, strict=True)))
+                seen.append(list(zip(batch.identity_names, batch.sentences, strict=True)))
             return model.losses_of(batch, generator)  # type: ignore[attr-defined]
 
         model.losses = note  # type: ignore[method-assign]
@@ -401,20 +401,20 @@ class TestTrained:
         monkeypatch.setitem(sys.modules, "fast_simplification", None)
         model = load_model(trained)
         assert model.network.content_encoder.attached
-        made = model.animate(torch.randn(16_000), subject="A")
+        made = model.animate(torch.randn(16_000), identity="A")
         assert made.vertices.shape == (25, VERTICES, 3)
         assert torch.isfinite(made.vertices).all()
 
     def test_it_is_a_function_of_speech_and_style(self, trained: Path) -> None:
         model = load_model(trained)
         speech = torch.randn(16_000)
-        one = model.animate(speech, subject="A", seed=0).vertices
-        assert torch.equal(one, model.animate(speech, subject="A", seed=7).vertices), "nothing is drawn"
-        assert not torch.equal(one, model.animate(torch.randn(16_000), subject="A").vertices)
+        one = model.animate(speech, identity="A", seed=0).vertices
+        assert torch.equal(one, model.animate(speech, identity="A", seed=7).vertices), "nothing is drawn"
+        assert not torch.equal(one, model.animate(torch.randn(16_000), identity="A").vertices)
         other = Style(
             "other", model.encode_style(torch.randn(1, 9, VERTICES, 3), torch.ones(1, 9, dtype=torch.bool))[0]
         )
-        assert not torch.equal(one, model.animate(speech, subject="A", style=other).vertices)
+        assert not torch.equal(one, model.animate(speech, identity="A", style=other).vertices)
 
     def test_a_style_vector_does_what_its_reference_does(self, trained: Path) -> None:
         model = load_model(trained)
@@ -422,8 +422,8 @@ class TestTrained:
         motion = reference.motion.float()[None]
         vector = model.encode_style(motion, torch.ones(motion.shape[:2], dtype=torch.bool))[0]
         speech = torch.randn(16_000)
-        one = model.animate(speech, subject="A", style=reference).vertices
-        torch.testing.assert_close(one, model.animate(speech, subject="A", style=Style("B", vector)).vertices)
+        one = model.animate(speech, identity="A", style=reference).vertices
+        torch.testing.assert_close(one, model.animate(speech, identity="A", style=Style("B", vector)).vertices)
 
     def test_swapping_keeps_the_content_given(self, trained: Path) -> None:
         model = load_model(trained)

@@ -69,7 +69,7 @@ def test_a_checkpoint_is_plain_data_and_animates_without_the_corpus(trained: Pat
     model = load_model(trained)
     assert isinstance(model, DualPathDiffusion)
     assert model.assets.motion_scale is not None
-    assert model.animate(torch.randn(8000), subject="B").vertices.shape == (12, 24, 3)
+    assert model.animate(torch.randn(8000), identity="B").vertices.shape == (12, 24, 3)
 
 
 def test_a_reloaded_system_trains_again_saves_and_loads(
@@ -120,12 +120,12 @@ def test_predictions_are_written_as_the_field_names_them(
 ) -> None:
     make_trainer(callbacks=[PredictionWriter(str(tmp_path / "out"))]).predict(load_model(trained), datamodule=tiny)
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert names == [f"{c.name}_condition_{c.subject}.npy" for c in tiny.clips("test_a")]
+    assert names == [f"{c.name}_condition_{c.identity}.npy" for c in tiny.clips("test_a")]
     clip = tiny.clips("test_a")[0]
     written = np.load(tmp_path / "out" / names[0])
     assert written.shape == (tiny.corpus.frames(clip), 72)
     # Absolute vertices: near the template, not near zero.
-    assert np.abs(written.reshape(-1, 24, 3) - tiny.corpus.templates[clip.subject].numpy()).max() < 0.2
+    assert np.abs(written.reshape(-1, 24, 3) - tiny.corpus.templates[clip.identity].numpy()).max() < 0.2
 
 
 def test_validation_is_the_same_twice(make_model: Make, tiny: Tiny, make_trainer: MakeTrainer) -> None:

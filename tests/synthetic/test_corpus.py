@@ -36,13 +36,13 @@ def test_splits_are_disjoint_and_moods_balanced() -> None:
     assert puppet.SEEN_IDENTITIES == ("F1", "F2", "F3", "M1", "M2", "M3")
     plan = clips()
     assert len({clip.name for clip in plan}) == len(plan) == 6 * 32 + 2 * 29
-    for subject in puppet.SEEN_IDENTITIES:
-        moods = [c.mood for c in plan if c.subject == subject and c.number in puppet.TRAIN_SENTENCES]
+    for identity in puppet.SEEN_IDENTITIES:
+        moods = [c.mood for c in plan if c.identity == identity and c.number in puppet.TRAIN_SENTENCES]
         assert {moods.count(mood) for mood in puppet.MOODS} == {8}
-    for subject in puppet.UNSEEN_IDENTITIES:
-        references = [c for c in plan if c.subject == subject and c.number in puppet.REFERENCE_SENTENCES]
+    for identity in puppet.UNSEEN_IDENTITIES:
+        references = [c for c in plan if c.identity == identity and c.number in puppet.REFERENCE_SENTENCES]
         assert {c.mood for c in references} == set(puppet.MOODS)
-        assert {c.number for c in plan if c.subject == subject} == {*range(1, 25), *range(28, 33)}
+        assert {c.number for c in plan if c.identity == identity} == {*range(1, 25), *range(28, 33)}
 
 
 def test_layout(corpus: Path) -> None:

@@ -14,8 +14,8 @@ from facediff.synthetic.speech import Phoneme
 pytest.importorskip("espeakng_loader")
 
 
-def opening(vertices: np.ndarray, subject: str) -> np.ndarray:
-    rig = rig_of(subject)
+def opening(vertices: np.ndarray, identity: str) -> np.ndarray:
+    rig = rig_of(identity)
     return vertices[:, rig.upper, 1] - vertices[:, rig.lower, 1]
 
 
@@ -107,6 +107,6 @@ def test_chance_moves_the_upper_face_and_hardly_the_lips() -> None:
 
 
 def test_a_lively_speaker_opens_by_one_and_a_half_to_three_centimetres() -> None:
-    for subject in ("F1", "M3"):
-        _, weights, _ = generate_clip(Clip(subject, 1, "lively"))
-        assert 0.015 < opening(rig_of(subject).pose(weights), subject).max() < 0.03
+    for identity in ("F1", "M3"):
+        _, weights, _ = generate_clip(Clip(identity, 1, "lively"))
+        assert 0.015 < opening(rig_of(identity).pose(weights), identity).max() < 0.03

@@ -18,7 +18,7 @@ def test_deviation_is_the_metric_where_lengths_are_equal() -> None:
 
 
 def test_nearest_speaker_by_vectors_that_tell(monkeypatch: pytest.MonkeyPatch) -> None:
-    samples = [SimpleNamespace(subject=name) for name in "AABBCC"]
+    samples = [SimpleNamespace(identity_name=name) for name in "AABBCC"]
     monkeypatch.setattr(compare_models, "held_out", lambda data: samples)
     vectors = torch.tensor([[0.0, 0], [0, 1], [9, 0], [9, 1], [0, 9], [8, 0.5]])
     monkeypatch.setattr(compare_models, "styles", lambda model, given: vectors)
@@ -34,7 +34,7 @@ def test_the_probe_finds_a_speaker_who_is_there_and_no_other(
     samples, features = [], []
     for index, name in enumerate("ABCDEFGH"):
         for sentence in range(28, 33):
-            samples.append(SimpleNamespace(subject=name, sentence=f"e{sentence}"))
+            samples.append(SimpleNamespace(identity_name=name, sentence=f"e{sentence}"))
             content = torch.randn(60, 16)
             content[:, index] += 8.0 * told
             features.append(content)

@@ -77,7 +77,7 @@ def test_the_material_is_the_sentences_in_time(
     model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
     model.data_source = {"class_path": "tests.fakes.tiny.Tiny", "root": str(tiny_root)}
     made = tool.material(model, "B", 10.0)
-    samples = [s for split in tiny.test_splits for s in tiny.dataset(split) if s.subject == "B"]
+    samples = [s for split in tiny.test_splits for s in tiny.dataset(split) if s.identity_name == "B"]
     assert made.clip.motion.shape[1] >= 250
     assert made.clip.audio.shape[1] == made.clip.motion.shape[1] * 640
     second = samples[1]

@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", type=Path, help="a trained model whose corpus is on this machine")
-    parser.add_argument("--subject", help="whose test sentences; the first identity if absent")
+    parser.add_argument("--identity", help="whose test sentences; the first identity if absent")
     parser.add_argument("--seconds", type=float, default=600.0, help="length of the speech (default: 600)")
     parser.add_argument("--size", action="store_true", help="random weights at the size of BIWI; speed and memory only")
     parser.add_argument("--vertices", type=int, default=23370, help="vertices with --size")
@@ -74,17 +74,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif args.checkpoint is None:
         parser.error("give --checkpoint, or --size")
     else:
-        judged(load_model(args.checkpoint), args.subject, args.seconds, plans=args.plans)
+        judged(load_model(args.checkpoint), args.identity, args.seconds, plans=args.plans)
 
 
-def material(model: AnimationModel, subject: str, seconds: float) -> Material:
+def material(model: AnimationModel, identity: str, seconds: float) -> Material:
     """A person's test sentences, one after the other and again from the start, until they last long enough."""
     source = model.data_source
     module = imported(source["class_path"], SpeechMotionDataModule)  # type: ignore[type-abstract]
     if module is None or not Path(source["root"]).is_dir():
         raise SystemExit(f"the corpus of the checkpoint ({source}) is not on this machine")
     data = module(root=source["root"])
-    samples = [s for split in data.test_splits for s in data.dataset(split) if s.subject == subject]
+    samples = [s for split in data.test_splits for s in data.dataset(split) if s.identity_name == identity]
     audio, motion, joints, frames = [], [], [], 0
     while frames < seconds * model.frame_rate:
         sample = samples[len(joints) % len(samples)]
@@ -95,8 +95,9 @@ def material(model: AnimationModel, subject: str, seconds: float) -> Material:
         frames += len(sample.motion)
         joints.append(frames)
     whole = replace(samples[0], audio=torch.cat(audio), motion=torch.cat(motion), name="long", decoy_audio=None)
-    style = model.default_style(subject)
-    whole = replace(whole, reference=style.motion.float(), features=None, identity=model.assets.identity_index(subject))
+    style = model.default_style(identity)
+    index = model.assets.identity_index(identity)
+    whole = replace(whole, reference=style.motion.float(), features=None, identity=index)
     return Material(collate([whole]), model.assets.regions["lips"], joints[:-1])
 
 
@@ -140,13 +141,13 @@ def joints_of(frames: int, plan: WindowPlan, frame_rate: float) -> npt.NDArray[n
     return marked
 
 
-def judged(model: AnimationModel, subject: str | None, seconds: float, *, plans: bool) -> None:
+def judged(model: AnimationModel, identity: str | None, seconds: float, *, plans: bool) -> None:
     """Quality over time, at joints, and for other plans."""
-    subject = subject or model.identities[0]
-    made = material(model, subject, seconds)
+    identity = identity or model.identities[0]
+    made = material(model, identity, seconds)
     truth, plan = made.clip.motion[0], model.windows
     lasts = len(truth) / model.frame_rate
-    print(f"speech: test sentences of {subject}, {len(made.joints) + 1} in {lasts:.0f} s; {len(truth)} frames")
+    print(f"speech: test sentences of {identity}, {len(made.joints) + 1} in {lasts:.0f} s; {len(truth)} frames")
     print(f"windows of {plan.seconds:g} s, {plan.overlap:g} s shared\n")
     start = time.perf_counter()
     motion = by_windows(model, made.clip, plan)

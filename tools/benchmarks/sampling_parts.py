@@ -242,7 +242,7 @@ def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool) -> Ben
         identity=0,
         reference=1e-2 * torch.randn(REFERENCE_FRAMES, vertices, 3),
         name="speech",
-        subject=IDENTITIES[0],
+        identity_name=IDENTITIES[0],
         sentence="",
         reference_name="reference",
     )

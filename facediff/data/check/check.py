@@ -138,7 +138,7 @@ def count_subjects(
     have = set(templates)
     of: dict[str, list[str]] = {}
     for name, clip in clips.items():
-        of.setdefault(clip.subject, []).append(name)
+        of.setdefault(clip.identity, []).append(name)
     everybody = [*view.identities, *sorted({*of, *have} - set(view.identities))]
     return [
         {
@@ -156,11 +156,11 @@ def count_subjects(
 def unseen(view: View, clips: Mapping[str, Clip]) -> list[str]:
     """Clips of subjects that none of the corpus's splits knows."""
     known = set(view.identities)
-    known |= {clip.subject for names in view.expected.values() for name in names if (clip := view.parse(name))}
+    known |= {clip.identity for names in view.expected.values() for name in names if (clip := view.parse(name))}
     for clip in clips.values():
         if any(split_of(clip) is not None for split_of in view.split_of.values()):
-            known.add(clip.subject)
-    return [name for name, clip in clips.items() if clip.subject not in known]
+            known.add(clip.identity)
+    return [name for name, clip in clips.items() if clip.identity not in known]
 
 
 # Remarks that take all clips together: names, pairs of files, rates, copies.
@@ -183,7 +183,7 @@ def check_names(view: View, folder: Folder, clips: Mapping[str, Clip], findings:
         findings.append(Finding("warning", "unknown_name", "wav, vertices_npy", message))
     foreign = unseen(view, clips)
     if foreign:
-        people = dict.fromkeys(clips[name].subject for name in foreign)
+        people = dict.fromkeys(clips[name].identity for name in foreign)
         message = (
             f"{counted(len(foreign), 'clip')} of subjects that no split of {view.corpus} knows ({few(people)}), so not "
             f"trained or scored on: {few(foreign)}"
@@ -517,7 +517,7 @@ def _examine_all(rules: Rules, view: View, folder: Folder, *, workers: int, prog
     except ImportError as error:
         raise MissingExtraError("soundfile", "audio", "checking speech") from error
     tasks = [
-        ClipFiles(name, clip.subject, folder.motions.get(name), folder.sounds.get(name))
+        ClipFiles(name, clip.identity, folder.motions.get(name), folder.sounds.get(name))
         for name in folder.names
         if (clip := view.parse(name)) is not None
     ]
@@ -547,8 +547,8 @@ def _tell_subjects(
 ) -> None:
     lacking: dict[str, list[str]] = {}
     for name, clip in clips.items():
-        if report.templates["file"] and clip.subject not in {*templates, *report.templates["broken"]}:
-            lacking.setdefault(clip.subject, []).append(name)
+        if report.templates["file"] and clip.identity not in {*templates, *report.templates["broken"]}:
+            lacking.setdefault(clip.identity, []).append(name)
     for subject, names in lacking.items():
         message = f"no template of {subject}, needed by {counted(len(names), 'clip')} ({few(names)}); get the file anew"
         findings.append(Finding("error", "template_missing", "templates.pkl", message))

@@ -302,7 +302,7 @@ def _most_known(modules: Sequence[Module], names: Sequence[str]) -> Module | Non
 def knows(module: Module, name: str) -> bool:
     """Whether a name is one of the corpus's, as far as its data module can tell without the folder."""
     clip = module.parse_name(name)
-    return clip is not None and (names_tell(module) or clip.subject in module.identities)
+    return clip is not None and (names_tell(module) or clip.identity in module.identities)
 
 
 def names_tell(module: Module) -> bool:

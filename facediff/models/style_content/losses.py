@@ -137,7 +137,10 @@ def pair_up(batch: Batch, readings: Alignments | None) -> Pairing:
     count, frames = batch.mask.shape
     partner = torch.arange(count)
     for clip in range(0, count - 1, 2):
-        if batch.subjects[clip] != batch.subjects[clip + 1] or batch.sentences[clip] == batch.sentences[clip + 1]:
+        if (
+            batch.identity_names[clip] != batch.identity_names[clip + 1]
+            or batch.sentences[clip] == batch.sentences[clip + 1]
+        ):
             partner[clip], partner[clip + 1] = clip + 1, clip
     places = torch.zeros(count, frames, dtype=torch.long)
     aligned = torch.zeros(count, frames, dtype=torch.bool)
@@ -247,7 +250,7 @@ def relative_style_distance(
 
 
 def style_contrast(
-    styles: Float[Tensor, "clips dim"], subjects: Sequence[str], temperature: float = 0.1
+    styles: Float[Tensor, "clips dim"], identities: Sequence[str], temperature: float = 0.1
 ) -> Float[Tensor, ""]:
     """Pulls styles of one person together and those of different people apart.
 
@@ -257,11 +260,11 @@ def style_contrast(
 
     Args:
         styles: style vectors.
-        subjects: whose they are.
+        identities: whose they are.
         temperature: how sharp the choice is.
     """
-    same = torch.tensor([[one == other for other in subjects] for one in subjects], device=styles.device)
-    own = torch.eye(len(subjects), dtype=torch.bool, device=styles.device)
+    same = torch.tensor([[one == other for other in identities] for one in identities], device=styles.device)
+    own = torch.eye(len(identities), dtype=torch.bool, device=styles.device)
     same &= ~own
     directions = torch.nn.functional.normalize(styles.float(), dim=1)
     logits = (directions @ directions.T / temperature).masked_fill(own, -torch.inf)

@@ -222,7 +222,7 @@ class StyleContentDisentanglement(AnimationModel):
         heard = network.hear(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.cached_features)
         terms = {
             "reading_content": relative_distance(content, pairing.of_partner(content), pairing.aligned),
-            "person_style": style_contrast(torch.cat([style, usual]), batch.subjects * 2),
+            "person_style": style_contrast(torch.cat([style, usual]), batch.identity_names * 2),
             "speech_content": relative_distance(content, heard, mask),
         }
         for prefix, said, own in (("", content, style), ("speech_", heard, usual)):

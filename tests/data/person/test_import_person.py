@@ -119,7 +119,7 @@ def test_translation_removed_is_that_of_the_head(files: Path, tmp_path: Path, kn
 
 def test_the_entry_is_an_ordinary_corpus(entry: Path, files: Path) -> None:
     corpus = Corpus(files / "corpus", VERTICES, RATE, people=[entry])
-    clips = [clip for clip in corpus.clips.values() if clip.subject == "Target"]
+    clips = [clip for clip in corpus.clips.values() if clip.identity == "Target"]
     assert [clip.name for clip in clips] == ["Target_s01", "Target_s02", "Target_s03", "Target_s04"]
     offset, samples = 0, speech(FRAMES / RATE)
     for clip in clips:
