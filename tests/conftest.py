@@ -5,9 +5,8 @@ import os
 # The shapes in the signatures of the mathematics are checked in tests only; the hook must come before the imports.
 from jaxtyping import install_import_hook
 
-install_import_hook(
-    ["facediff.models.layers", "facediff.models.losses", "facediff.models.samplers"], "beartype.beartype"
-)
+SHAPED = "audio_encoders identity_encoders mesh_encoders style_encoders fusions decoders layers losses samplers folding"
+install_import_hook([f"facediff.models.{module}" for module in SHAPED.split()], "beartype.beartype")
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["WANDB_MODE"] = "offline"
