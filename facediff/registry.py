@@ -198,7 +198,13 @@ corpus = Kind(
     aliases=False,
 )
 metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class", aliases=False)
-export_format = Kind("export_format", "facediff.export", "a file format that animations are written in", aliases=False)
+export_format = Kind(
+    "export_format",
+    "facediff.export.arrays facediff.export.glb facediff.export.sequences facediff.export.usd facediff.export.video "
+    "facediff.export.viewer.page",
+    "a file format that animations are written in",
+    aliases=False,
+)
 
 COMPONENTS: dict[str, Kind] = {
     kind.kind: kind for kind in (audio_encoder, identity_encoder, mesh_encoder, style_encoder, fusion, decoder, sampler)

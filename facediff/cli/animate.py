@@ -65,7 +65,7 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
         )
     check(args, args.output / f"recording{args.suffix}")
     kind = FORMATS[args.suffix]
-    if kind.folder or (args.takes > 1 and not kind.several):
+    if kind.is_folder or (args.takes > 1 and not kind.holds_several):
         fit = ".html or .mp4, which hold several takes" if args.takes > 1 else "a format of one file, such as .glb"
         raise FaceDiffError(f"--suffix {args.suffix}: a batch writes one file for each recording; choose {fit}")
     speeches = recordings(args.speech)

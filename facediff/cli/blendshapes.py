@@ -178,7 +178,7 @@ def solved(args: argparse.Namespace) -> int:
     from facediff.cli.data import check_picture_path
     from facediff.editing.blendshapes import SolveOptions, solve, write_live_link, write_weights
     from facediff.editing.shapes import ARKIT
-    from facediff.export.format import check_free
+    from facediff.export.writing import check_free
     from facediff.utils.files import check_writable
 
     if args.output.suffix.lower() != ".csv":

@@ -70,12 +70,12 @@ def run(name: str, arguments: Sequence[str]) -> int:
     )
     check_export(args.output, options, len(args.takes))
     check_directing(args)
-    if args.shapes is not None and args.output.suffix != ".csv":
+    if args.shapes is not None and not FORMATS[args.output.suffix].needs_shapes:
         raise FaceDiffError(f"--shapes: is for weights; write .csv instead of {args.output.suffix}, or leave it away")
     takes = told_apart([directed(animation_of(path, args), args) for path in args.takes], args.takes)
     for written in write_animations(args.output, takes, options):
         print(f"{written}: {size_of(written)}")
-    print(FORMATS[args.output.suffix].then)
+    print(FORMATS[args.output.suffix].next_step)
     return 0
 
 

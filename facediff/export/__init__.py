@@ -1,4 +1,10 @@
-"""Takes to the files of other programs: meshes that move, point caches, videos, tables of weights."""
+"""Animations as files of other programs: moving meshes, point caches, videos, tables of blendshape weights.
+
+Example:
+    >>> from facediff.export import FORMATS
+    >>> FORMATS[".glb"].help
+    'glTF 2.0 with morph targets: Blender, Unity, three.js, Unreal'
+"""
 
 from facediff.export.format import ExportOptions, Format
 from facediff.export.writing import FORMATS, check_export, write_animations

@@ -1,4 +1,4 @@
-"""NumPy's own files: bare vertices, or a whole take."""
+"""Numbers: NumPy's files of vertices or of a whole animation, and a table of blendshape weights."""
 
 from __future__ import annotations
 
@@ -11,40 +11,71 @@ import numpy as np
 from facediff.animation import Animation, write_archive
 from facediff.animation.files import MotionWriter
 from facediff.export.format import ExportOptions, Format, Space
+from facediff.registry import export_format
 
 
-def write_vertices(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
-    """Absolute vertices (T, V, 3), float32; written frame by frame."""
-    (animation,) = takes
-    writer = MotionWriter(path, animation.template.shape)
-    try:
-        for frame in Space.of(animation, options).frames(animation):
-            writer.write(frame[None])
-    finally:
-        writer.close()
+@export_format.register("npy")
+class Vertices(Format):
+    """NumPy: absolute vertices (frames, vertices, 3), float32."""
+
+    next_step = "numpy.load gives the vertices; `facediff evaluate` scores them"
+    needs_mesh = False
+
+    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
+        """Write frame by frame."""
+        (animation,) = animations
+        writer = MotionWriter(path, animation.template.shape)
+        try:
+            for frame in Space.of(animation, options).frames(animation):
+                writer.write(frame[None])
+        finally:
+            writer.close()
 
 
-def write_animation(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
-    """The take with everything it has, in another unit where one is chosen."""
-    (animation,) = takes
-    space = Space.of(animation, options)
-    if options.unit is not None:
-        vertices = np.stack(list(space.frames(animation)))
-        animation = replace(animation, vertices=vertices, template=space.place(animation.template), unit=space.unit)
-    write_archive(path, animation if options.speech else replace(animation, speech=None))
+@export_format.register("npz")
+class Archive(Format):
+    """NumPy: the whole animation with mesh, speech, frame rate and unit."""
+
+    next_step = "`facediff export`, `view`, `blendshapes` and `retarget` read it without further options"
+    speech = "in the file"
+    needs_mesh = False
+    up_axes = ("y",)
+
+    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
+        """Write everything that the animation has, in another unit where one is chosen."""
+        (animation,) = animations
+        space = Space.of(animation, options)
+        if options.unit is not None:
+            vertices = np.stack(list(space.frames(animation)))
+            animation = replace(animation, vertices=vertices, template=space.place(animation.template), unit=space.unit)
+        write_archive(path, animation if options.speech else replace(animation, speech=None))
 
 
-VERTICES = Format(
-    help="NumPy: absolute vertices (frames, vertices, 3), float32",
-    write=write_vertices,
-    then="numpy.load gives the vertices; `facediff evaluate` scores them",
-    needs_mesh=False,
-)
-TAKE = Format(
-    help="NumPy: the whole take with mesh, speech, frame rate and unit",
-    write=write_animation,
-    then="`facediff export`, `view`, `blendshapes` and `retarget` take it without further options",
-    holds_sound=True,
-    needs_mesh=False,
-    ups=("y",),
-)
+@export_format.register("csv")
+class BlendshapeWeights(Format):
+    """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes."""
+
+    next_step = "Unreal: docs/tools/unreal.md; `facediff blendshapes` has more options"
+    speech = "next to it"
+    needs_mesh = False
+    needs_shapes = True
+    units = "none"
+    up_axes = ()
+
+    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
+        """Solve for the weights and write them, with a .json file that says how well they fit.
+
+        Raises:
+            FaceDiffError: if the blendshapes do not fit the animation.
+        """
+        from facediff.editing.blendshapes import SolveOptions, solve, write_live_link
+        from facediff.editing.shapes import read_shapes
+
+        (animation,) = animations
+        assert options.shapes is not None  # noqa: S101 - checked by check_export
+        shapes = read_shapes(options.shapes, animation.template, animation.unit)
+        write_live_link(path, solve(animation, shapes, SolveOptions()))
+
+    def companions(self, path: Path, animation: Animation) -> list[Path]:
+        """The .json file."""
+        return [path.with_suffix(".json")]

@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.errors import FaceDiffError
-from facediff.export.format import ExportOptions, Format, Space, facts, linear_colours, normals_of, outward, write_wav
+from facediff.export.format import ExportOptions, Format, Space, facts, linear_colours, normals_of, outward
+from facediff.registry import export_format
 
 # A motion as few shapes and their weights, all within 0 and 1.
 #
@@ -179,21 +180,29 @@ class Binary:
         return len(self.accessors) - 1
 
 
-def write(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
-    """Write one take as .glb, and its speech beside it, since glTF holds no sound."""
-    (animation,) = takes
-    space = Space.of(animation, options, "m")
-    rest = space.place(animation.template)
-    offsets = np.stack([frame - rest for frame in space.frames(animation)])
-    morphs = compress(offsets, options.tolerance_mm / 1000)
-    binary = Binary()
-    document = describe(animation, space, rest, morphs, binary)
-    told = document["nodes"][0]["extras"]
-    told["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance_mm
-    if sound is not None:
-        write_wav(path.with_name(sound), animation)
-        told["speech"] = sound
-    write_container(path, document, binary)
+@export_format.register("glb")
+class Glb(Format):
+    """glTF 2.0 with morph targets: Blender, Unity, three.js, Unreal."""
+
+    next_step = "Blender: File > Import > glTF 2.0, then play; other programs: docs/export.md"
+    speech = "next to it"
+    units = "m"
+    up_axes = ("y",)
+
+    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
+        """Write one animation."""
+        (animation,) = animations
+        space = Space.of(animation, options, "m")
+        rest = space.place(animation.template)
+        offsets = np.stack([frame - rest for frame in space.frames(animation)])
+        morphs = compress(offsets, options.tolerance_mm / 1000)
+        binary = Binary()
+        document = describe(animation, space, rest, morphs, binary)
+        told = document["nodes"][0]["extras"]
+        told["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance_mm
+        if options.speech_file is not None:
+            told["speech"] = options.speech_file
+        write_container(path, document, binary)
 
 
 def describe(
@@ -284,13 +293,3 @@ def write_container(path: Path, document: dict[str, Any], binary: Binary) -> Non
         stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
         stream.write(struct.pack("<I4s", binary.length, b"BIN\0"))
         stream.writelines(binary.parts)
-
-
-FORMAT = Format(
-    help="glTF 2.0 with morph targets: Blender, Unity, three.js, Unreal",
-    write=write,
-    then="Blender: File > Import > glTF 2.0, then play; other programs: docs/export.md",
-    sound_beside=True,
-    unit="m",
-    ups=("y",),
-)

@@ -1,4 +1,4 @@
-"""Universal Scene Description: a mesh with points for every frame, and a sound that refers to the .wav beside."""
+"""Universal Scene Description: a mesh with points for every frame, and a sound that refers to the .wav file."""
 
 from __future__ import annotations
 
@@ -10,48 +10,65 @@ import numpy as np
 
 from facediff.animation import Animation
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.export.format import ExportOptions, Format, Space, facts, linear_colours, normals_of, outward, write_wav
+from facediff.export.format import ExportOptions, Format, Space, facts, linear_colours, normals_of, outward
+from facediff.registry import export_format
 
 
-def write(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
-    """Write one take as .usdc (binary) or .usda (text); frame t is time code t.
+class Usd(Format):
+    """USD: a mesh with points for every frame; USD itself writes text or binary data, as the suffix says."""
 
-    Raises:
-        FaceDiffError: if the layer cannot be written.
-        MissingExtraError: if usd-core is not installed.
-    """
-    try:
-        from pxr import Sdf, Tf, Usd, UsdGeom
-    except ImportError as error:
-        raise MissingExtraError("pxr", "usd", "writing USD") from error
-    (animation,) = takes
-    space = Space.of(animation, options)
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if space.up == "z" else UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, space.metres)
-    stage.SetTimeCodesPerSecond(animation.frame_rate)
-    stage.SetFramesPerSecond(animation.frame_rate)
-    stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(len(animation.vertices) - 1)
-    root = Sdf.Path(f"/{Tf.MakeValidIdentifier(animation.name)}")
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, root).GetPrim())
-    told: dict[str, Any] = facts(animation, space)
-    if sound is not None:
-        write_wav(path.with_name(sound), animation)
-        add_sound(stage, root.AppendChild("speech"), sound)
-        told["speech"] = sound
-    layer = stage.GetRootLayer()
-    layer.customLayerData = {"facediff": told}
-    layer.documentation = f"{animation.name}, written by facediff"
-    try:
-        add_face(stage, root.AppendChild("face"), animation, space)
-        if not layer.Export(str(path)):
-            raise FaceDiffError(f"{path}: cannot be written; is the disk full?")
-    except Tf.ErrorException as error:
-        raise FaceDiffError(f"{path}: cannot be written; is the disk full?") from error
+    next_step = "Blender: File > Import > USD; other programs: docs/export.md"
+    speech = "next to it"
+    requires = ("pxr", "usd")
+
+    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
+        """Write one animation; frame t is time code t.
+
+        Raises:
+            FaceDiffError: if the layer cannot be written.
+            MissingExtraError: if usd-core is not installed.
+        """
+        try:
+            from pxr import Sdf, Tf, Usd, UsdGeom
+        except ImportError as error:
+            raise MissingExtraError("pxr", "usd", "writing USD") from error
+        (animation,) = animations
+        space = Space.of(animation, options)
+        stage = Usd.Stage.CreateInMemory()
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if space.up == "z" else UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, space.metres)
+        stage.SetTimeCodesPerSecond(animation.frame_rate)
+        stage.SetFramesPerSecond(animation.frame_rate)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(len(animation.vertices) - 1)
+        root = Sdf.Path(f"/{Tf.MakeValidIdentifier(animation.name)}")
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, root).GetPrim())
+        data: dict[str, Any] = facts(animation, space)
+        if options.speech_file is not None:
+            _add_sound(stage, root.AppendChild("speech"), options.speech_file)
+            data["speech"] = options.speech_file
+        layer = stage.GetRootLayer()
+        layer.customLayerData = {"facediff": data}
+        layer.documentation = f"{animation.name}, written by facediff"
+        try:
+            _add_face(stage, root.AppendChild("face"), animation, space)
+            if not layer.Export(str(path)):
+                raise FaceDiffError(f"{path}: cannot be written; check whether the disk is full")
+        except Tf.ErrorException as error:
+            raise FaceDiffError(f"{path}: cannot be written; check whether the disk is full") from error
 
 
-def add_face(stage: Any, path: Any, animation: Animation, space: Space) -> None:  # noqa: ANN401 - usd-core has no type hints
+@export_format.register("usdc")
+class BinaryUsd(Usd):
+    """USD, binary: a mesh with points for every frame."""
+
+
+@export_format.register("usda")
+class TextUsd(Usd):
+    """USD, text: a mesh with points for every frame."""
+
+
+def _add_face(stage: Any, path: Any, animation: Animation, space: Space) -> None:  # noqa: ANN401 - usd-core has no type hints
     """A polygon mesh without subdivision, with points, normals and extent of every frame."""
     from pxr import Sdf, UsdGeom, Vt
 
@@ -75,27 +92,12 @@ def add_face(stage: Any, path: Any, animation: Animation, space: Space) -> None:
         colour.Set(Vt.Vec3fArray.FromNumpy(linear_colours(animation.colours)))
 
 
-def add_sound(stage: Any, path: Any, file: str) -> None:  # noqa: ANN401
-    """The speech, from the first frame on, wherever the listener stands."""
+def _add_sound(stage: Any, path: Any, file: str) -> None:  # noqa: ANN401
+    """The speech, from the first frame on, equally loud wherever the listener stands."""
     from pxr import Sdf, UsdMedia
 
     sound = UsdMedia.SpatialAudio.Define(stage, path)
     sound.CreateFilePathAttr(Sdf.AssetPath(f"./{file}"))
     sound.CreateAuralModeAttr(UsdMedia.Tokens.nonSpatial)
-    # The start is time code 0 by default; to say so would ask for a newer version of the file than old readers know.
+    # The start is time code 0 by default. Writing it would mark the file as a newer version than old readers know.
     sound.CreatePlaybackModeAttr(UsdMedia.Tokens.onceFromStart)
-
-
-def usd(kind: str) -> Format:
-    """The format, as ``binary`` or as ``text``."""
-    return Format(
-        help=f"USD, {kind}: a mesh with points for every frame",
-        write=write,
-        then="Blender: File > Import > USD; other programs: docs/export.md",
-        sound_beside=True,
-        package=("pxr", "usd"),
-    )
-
-
-BINARY = usd("binary")
-TEXT = usd("text")

@@ -1,4 +1,4 @@
-"""A video with the speech; several takes side by side."""
+"""A video with the speech; several animations are shown side by side."""
 
 from __future__ import annotations
 
@@ -12,47 +12,59 @@ import numpy.typing as npt
 from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.export.format import ExportOptions, Format
+from facediff.registry import export_format
 
 Frame = npt.NDArray[np.uint8]
 
 
-def write(path: Path, takes: Sequence[Animation], options: ExportOptions, sound: str | None) -> None:
-    """Write an .mp4 with the speech of the first take that has one.
+@export_format.register("mp4")
+class Mp4(Format):
+    """Video with the speech; several animations side by side."""
 
-    A take that ends before the longest stays on its last frame.
+    next_step = "any player shows it"
+    holds_several = True
+    speech = "in the file"
+    units = "none"
+    up_axes = ()
+    requires = ("av", "render")
 
-    Raises:
-        FaceDiffError: if a take has no triangles, or the frame rates differ.
-        MissingExtraError: if what draws or encodes is not installed.
-    """
-    from facediff.render import write_video
+    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
+        """Write a video with the speech of the first animation that has one.
 
-    frames = max(len(animation.vertices) for animation in takes)
-    shown: Iterable[Frame] = drawn_frames(takes, options)
-    if not options.quiet:
-        shown = _bar(shown, f"drawing {path.name}", frames)
-    speaker = next((animation for animation in takes if animation.speech is not None), takes[0])
-    heard = speaker.sound() if options.speech else None
-    write_video(path, shown, speaker.frame_rate, heard, speaker.sample_rate)
+        An animation that ends before the longest stays on its last frame.
+
+        Raises:
+            FaceDiffError: if an animation has no triangles, or the frame rates differ.
+            MissingExtraError: if the packages that draw or encode are not installed.
+        """
+        from facediff.render import write_video
+
+        frames: Iterable[Frame] = drawn_frames(animations, options)
+        if not options.quiet:
+            frames = _bar(frames, f"drawing {path.name}", max(len(animation.vertices) for animation in animations))
+        speaking = next((animation for animation in animations if animation.speech is not None), animations[0])
+        sound = speaking.sound() if options.speech else None
+        write_video(path, frames, speaking.frame_rate, sound, speaking.sample_rate)
 
 
-def drawn_frames(takes: Sequence[Animation], options: ExportOptions) -> Iterator[Frame]:
-    """Pictures of takes side by side, one a frame; everything is checked before the first is drawn.
+def drawn_frames(animations: Sequence[Animation], options: ExportOptions) -> Iterator[Frame]:
+    """Pictures of animations side by side, one a frame; everything is checked before the first is drawn.
 
     Faces of one unit are seen by one camera, so that their sizes compare.
 
     Raises:
-        FaceDiffError: if a take has no triangles, or the frame rates differ.
+        FaceDiffError: if an animation has no triangles, or the frame rates differ.
     """
     from facediff.render import Camera, Renderer, side_by_side
 
-    if len({animation.frame_rate for animation in takes}) > 1:
-        told = ", ".join(f"{animation.name} {animation.frame_rate:g}" for animation in takes)
-        raise FaceDiffError(f"the takes differ in frame rate ({told}); a video has one, so write a video for each")
-    metres = [metres_per_unit(animation.unit) for animation in takes]
+    if len({animation.frame_rate for animation in animations}) > 1:
+        rates = ", ".join(f"{animation.name} {animation.frame_rate:g}" for animation in animations)
+        raise FaceDiffError(
+            f"the animations differ in frame rate ({rates}); a video has one, so write a video for each"
+        )
     camera = None
-    if len(set(metres)) == 1:
-        camera = Camera.framing([animation.template for animation in takes], view=options.view)
+    if len({metres_per_unit(animation.unit) for animation in animations}) == 1:
+        camera = Camera.framing([animation.template for animation in animations], view=options.view)
     renderers = [
         Renderer(
             animation.triangles,
@@ -62,25 +74,27 @@ def drawn_frames(takes: Sequence[Animation], options: ExportOptions) -> Iterator
             camera=camera,
             colours=animation.colours,
         )
-        for animation in takes
+        for animation in animations
     ]
-    frames = max(len(animation.vertices) for animation in takes)
-    motions = [held(animation.vertices, frames) for animation in takes]
-    # Where nothing else is to be said, the corpora: that one is synthetic must not get lost on the way to a video.
-    corpora = dict.fromkeys(animation.metadata["corpus"] for animation in takes if "corpus" in animation.metadata)
-    footer = " – ".join(part for part in (options.footer or ", ".join(corpora), procedural(takes)) if part)
-    return side_by_side(renderers, motions, [animation.name for animation in takes], footer=footer or None)
+    frames = max(len(animation.vertices) for animation in animations)
+    motions = [_hold_last(animation.vertices, frames) for animation in animations]
+    # A video must say that a corpus is synthetic, so that the footer names the corpora unless the user chose a text.
+    corpora = dict.fromkeys(animation.metadata["corpus"] for animation in animations if "corpus" in animation.metadata)
+    footer = " – ".join(part for part in (options.footer or ", ".join(corpora), procedural(animations)) if part)
+    return side_by_side(renderers, motions, [animation.name for animation in animations], footer=footer or None)
 
 
-def procedural(takes: Sequence[Animation]) -> str:
-    """What in the takes was made by rules and not learnt, in short: it must be told wherever it is seen."""
-    told = dict.fromkeys(re.sub(r" \([^)]*\)", "", animation.metadata.get("procedural", "")) for animation in takes)
-    words = ", ".join(text.replace(";", ",") for text in told if text)
+def procedural(animations: Sequence[Animation]) -> str:
+    """A short text that names what in the animations follows rules and was not learnt; empty if nothing does."""
+    notes = dict.fromkeys(
+        re.sub(r" \([^)]*\)", "", animation.metadata.get("procedural", "")) for animation in animations
+    )
+    words = ", ".join(note.replace(";", ",") for note in notes if note)
     return f"procedural: {words}" if words else ""
 
 
-def held(motion: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:
-    """A motion (T, V, 3) that stays on its last frame until there are so many."""
+def _hold_last(motion: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:
+    """A motion (T, V, 3) that stays on its last frame until it has the given number of frames."""
     missing = frames - len(motion)
     return motion if not missing else np.concatenate([motion, np.repeat(motion[-1:], missing, axis=0)])
 
@@ -91,15 +105,3 @@ def _bar(items: Iterable[Frame], description: str, total: int) -> Iterable[Frame
     except ImportError as error:
         raise MissingExtraError("tqdm", "train", "a progress bar") from error
     return tqdm(items, desc=description, total=total, leave=False)
-
-
-FORMAT = Format(
-    help="video with the speech; several takes side by side",
-    write=write,
-    then="any player shows it",
-    several=True,
-    holds_sound=True,
-    unit="none",
-    ups=(),
-    package=("av", "render"),
-)

@@ -1,157 +1,288 @@
-"""The one place where takes become files, whatever the format."""
+"""Writing animations in the format that a suffix chooses: checks, names of files, and all files or none."""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+import os
+import secrets
+import shutil
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from facediff import registry
 from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError, MissingExtraError, choices
-from facediff.export import arrays, glb, obj, page, ply, point_cache, usd, video, weights
-from facediff.export.format import ExportOptions, Format, check_free, folder_of, numbered, speech_name, staged
+from facediff.export.format import ExportOptions, Format, folder_of
+from facediff.export.sequences import RECORD
 from facediff.utils.files import check_writable
 
-FORMATS: Mapping[str, Format] = {
-    ".glb": glb.FORMAT,
-    ".usdc": usd.BINARY,
-    ".usda": usd.TEXT,
-    ".obj": obj.FORMAT,
-    ".ply": ply.FORMAT,
-    ".pc2": point_cache.PC2,
-    ".mdd": point_cache.MDD,
-    ".mp4": video.FORMAT,
-    ".html": page.FORMAT,
-    ".csv": weights.FORMAT,
-    ".npz": arrays.TAKE,
-    ".npy": arrays.VERTICES,
-}
+
+class _Formats(Mapping[str, Format]):
+    """All registered formats by suffix; they are loaded when the first one is looked up."""
+
+    def __getitem__(self, suffix: str) -> Format:
+        if suffix not in list(self):
+            raise KeyError(suffix)
+        made: Format = registry.export_format.get(suffix[1:])()
+        return made
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([f".{name}" for name in registry.export_format.names()])
+
+    def __len__(self) -> int:
+        return len(registry.export_format.names())
 
 
-def check_export(path: Path, options: ExportOptions, n_samples: int = 1) -> None:
-    """Refuse what can be refused before any work is done.
-
-    Args:
-        path: the file that is wanted; its suffix chooses the format.
-        options: the choices.
-        n_samples: how many takes there will be.
-
-    Raises:
-        FaceDiffError: if the suffix is unknown, the format has no place for a choice, the set of shapes is missing, or
-            the place cannot be written.
-        MissingExtraError: if a package is missing.
-    """
-    if not path.suffix:
-        raise FaceDiffError(f"{path}: has no suffix, which names the format; give one, such as {path.name}.glb")
-    if path.suffix not in FORMATS:
-        raise FaceDiffError(f'{path}: there is no format "{path.suffix}": {choices(path.suffix.lower(), FORMATS)}')
-    if n_samples < 1:
-        raise FaceDiffError(f"{path}: there is no take to write; give at least one")
-    made = FORMATS[path.suffix]
-    check_space(path, made, options)
-    if path.suffix == ".csv":
-        if options.shapes is None:
-            raise weights.missing_shapes(path)
-        if not options.shapes.exists():
-            raise FaceDiffError(f"{options.shapes}: no such folder or file; expected the set of shapes for {path}")
-    if not 0 < options.tolerance_mm < float("inf"):
-        raise FaceDiffError(f"tolerance of {options.tolerance_mm:g} mm: expected more than 0, such as 0.05")
-    if made.package is not None and importlib.util.find_spec(made.package[0]) is None:
-        raise MissingExtraError(*made.package, f"writing {path.suffix}")
-    for target in targets(path, made, n_samples):
-        check_writable(target)
-        if made.folder:
-            check_free(folder_of(target))
+FORMATS: Mapping[str, Format] = _Formats()
+"""Format by suffix (``".glb"``): the built-in ones and those that installed packages have added."""
 
 
-def check_space(path: Path, made: Format, options: ExportOptions) -> None:
-    """Refuse a unit or an axis that the format has no place for.
-
-    Raises:
-        FaceDiffError: saying which it takes.
-    """
-    if options.unit is not None:
-        metres = metres_per_unit(options.unit)
-        if made.unit == "none":
-            raise FaceDiffError(f"{path}: {path.suffix} holds no lengths; leave the unit away")
-        if made.unit == "m" and metres != 1:
-            raise FaceDiffError(
-                f"{path}: {path.suffix} is in metres by its standard; leave the unit away, and let the program that "
-                f"reads it scale"
-            )
-    if options.up is not None and options.up not in made.ups:
-        told = f"has {made.ups[0]} up by definition" if made.ups else "holds no axes"
-        raise FaceDiffError(f"{path}: {path.suffix} {told}; leave the axis away")
-
-
-def write_animations(path: Path, takes: Sequence[Animation], options: ExportOptions | None = None) -> list[Path]:
-    """Write takes in the format that the suffix names: every file appears whole, all of them or none.
+def write_animations(path: Path, animations: Sequence[Animation], options: ExportOptions | None = None) -> list[Path]:
+    """Write animations in the format that the suffix chooses; either all files appear, each complete, or none.
 
     Args:
-        path: the file. Several takes in a format that shows one become ``NAME_take1.glb``, ``NAME_take2.glb`` …; a
-            format of many files makes a folder (``hello.obj`` gives ``hello_obj/``).
-        takes: at least one.
-        options: the choices; the defaults if None.
+        path: the file. If several animations are written in a format that holds one, their files are called
+            ``NAME_sample1.glb``, ``NAME_sample2.glb`` …; a format of many files makes a folder (``hello.obj`` gives
+            ``hello_obj/``).
+        animations: at least one.
+        options: what the user chose; the defaults if None.
 
     Returns:
-        What was written, files and folders, the animations before what lies beside them.
+        The written files and folders: first the animations, then what was written next to them.
 
     Raises:
-        FaceDiffError: as :func:`check_export`; if a motion is not finite, a mesh is missing, something that facediff
-            did not write is in the way, or the disk is full.
+        FaceDiffError: as :func:`check_export`; also if a motion is not finite, a mesh is missing, a file that facediff
+            did not write would be replaced, or the disk is full.
+
+    Example:
+        >>> write_animations(Path("hello.usdc"), [animation], ExportOptions(unit="cm", up="z"))  # doctest: +SKIP
+        [PosixPath('hello.usdc'), PosixPath('hello.wav')]
     """
     options = options or ExportOptions()
-    check_export(path, options, len(takes))
-    made = FORMATS[path.suffix]
-    for animation in takes:
-        check_animation(animation, made)
-    groups = [takes] if made.several else [[animation] for animation in takes]
-    goals = targets(path, made, len(takes))
-    for goal, animation in zip(goals, takes, strict=False):
-        for beside in named_by_nobody(goal, animation):
-            check_free(beside)
-    sounds = [sound_of(goal, made, group[0], options) for goal, group in zip(goals, groups, strict=True)]
-    with staged(path) as hidden:
-        for goal, group, sound in zip(goals, groups, sounds, strict=True):
-            made.write(hidden / goal.name, group, options, sound)
+    check_export(path, options, len(animations))
+    form = FORMATS[path.suffix]
+    for animation in animations:
+        check_animation(animation, form)
+    targets = _targets(path, form, len(animations))
+    groups = [animations] if form.holds_several else [[animation] for animation in animations]
+    for target, group in zip(targets, groups, strict=True):
+        for companion in form.companions(target, group[0]):
+            check_free(companion)
+    speech_files = [
+        _speech_file(target, form, group[0], options) for target, group in zip(targets, groups, strict=True)
+    ]
+    with _staged(path) as hidden:
+        for target, group, speech_file in zip(targets, groups, speech_files, strict=True):
+            staged = hidden / target.name
+            form.write(staged, group, replace(options, speech_file=speech_file))
+            if speech_file is not None:
+                write_wav((folder_of(staged) if form.is_folder else hidden) / speech_file, group[0])
         written = {file.name for file in hidden.iterdir()}
-    first = [(folder_of(goal) if made.folder else goal).name for goal in goals]
+    first = [(folder_of(target) if form.is_folder else target).name for target in targets]
     return [path.with_name(name) for name in [*first, *sorted(written - set(first))]]
 
 
-def check_animation(animation: Animation, made: Format) -> None:
-    """Refuse a take that would make a broken file.
+def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> None:
+    """Refuse what can be refused before any work is done.
+
+    Args:
+        path: the file to write; its suffix chooses the format.
+        options: what the user chose.
+        n_animations: how many animations will be written.
 
     Raises:
-        FaceDiffError: naming the take and what is wrong with it.
+        FaceDiffError: if the suffix is unknown, the format does not support an option, the blendshapes are missing, or
+            the place cannot be written.
+        MissingExtraError: if a package is not installed.
+    """
+    suffix = path.suffix
+    if not suffix:
+        raise FaceDiffError(f"{path}: has no suffix, which chooses the format; add one, such as {path.name}.glb")
+    if suffix not in FORMATS:
+        raise FaceDiffError(f'{path}: there is no format "{suffix}": {choices(suffix.lower(), FORMATS)}')
+    if n_animations < 1:
+        raise FaceDiffError(f"{path}: there is no animation to write; give at least one")
+    form = FORMATS[suffix]
+    if options.unit is not None:
+        metres = metres_per_unit(options.unit)
+        if form.units == "none":
+            raise FaceDiffError(f"{path}: {suffix} holds no lengths; omit the unit")
+        if form.units == "m" and metres != 1:
+            raise FaceDiffError(
+                f"{path}: {suffix} is in metres by its standard; omit the unit, and scale in the program that reads it"
+            )
+    if options.up is not None and options.up not in form.up_axes:
+        reason = f"has {form.up_axes[0]} up by definition" if form.up_axes else "holds no axes"
+        raise FaceDiffError(f"{path}: {suffix} {reason}; omit the axis")
+    if form.needs_shapes and options.shapes is None:
+        raise FaceDiffError(
+            f"{path}: {suffix} needs blendshapes; give --shapes with a folder of meshes or a .glb with named targets"
+        )
+    if form.needs_shapes and options.shapes is not None and not options.shapes.exists():
+        raise FaceDiffError(f"{options.shapes}: no such folder or file; expected the blendshapes for {path}")
+    if not 0 < options.tolerance_mm < float("inf"):
+        raise FaceDiffError(f"tolerance of {options.tolerance_mm:g} mm: expected more than 0, such as 0.05")
+    if form.requires is not None and importlib.util.find_spec(form.requires[0]) is None:
+        raise MissingExtraError(*form.requires, f"writing {suffix}")
+    for target in _targets(path, form, n_animations):
+        check_writable(target)
+        if form.is_folder:
+            check_free(folder_of(target))
+
+
+def check_animation(animation: Animation, form: Format) -> None:
+    """Refuse an animation that would make a broken file.
+
+    Raises:
+        FaceDiffError: naming the animation and what is wrong with it.
     """
     animation.refuse_not_finite()
     if not np.isfinite(animation.template).all():
-        raise FaceDiffError(f"{animation.name}: its template holds NaN or infinity; give a sound mesh")
+        raise FaceDiffError(f"{animation.name}: its template holds NaN or infinity; give a mesh without them")
     if animation.colours is not None and animation.colours.shape != animation.template.shape:
         raise FaceDiffError(
-            f"{animation.name}: its vertex colours have shape {animation.colours.shape}; expected {animation.template.shape}"
+            f"{animation.name}: its vertex colours have shape {animation.colours.shape}; expected "
+            f"{animation.template.shape}"
         )
-    if made.needs_mesh:
+    if form.needs_mesh:
         _ = animation.triangles
 
 
-def targets(path: Path, made: Format, n_samples: int) -> list[Path]:
-    """The files that a user asked for."""
-    return [path] if made.several else numbered(path, n_samples)
+def _targets(path: Path, form: Format, count: int) -> list[Path]:
+    """The files that the user asked for."""
+    if form.holds_several or count == 1:
+        return [path]
+    return [path.with_name(f"{path.stem}_sample{index + 1}{path.suffix}") for index in range(count)]
 
 
-def sound_of(path: Path, made: Format, animation: Animation, options: ExportOptions) -> str | None:
-    """The name of the .wav that goes with a file; None where there is to be none."""
-    if not made.sound_beside or not options.speech or animation.speech is None:
+def _speech_file(path: Path, form: Format, animation: Animation, options: ExportOptions) -> str | None:
+    """Name of the .wav file: ``hello.wav``, or ``hello_speech.wav`` where the former is the user's; None for none."""
+    if form.speech != "next to it" or not options.speech or animation.speech is None:
         return None
-    return f"{path.stem}.wav" if made.folder else speech_name(path)
+    usual = path.with_suffix(".wav")
+    if form.is_folder or is_free(usual):
+        return usual.name
+    other = path.with_name(f"{path.stem}_speech.wav")
+    check_free(other)
+    return other.name
 
 
-def named_by_nobody(path: Path, animation: Animation) -> list[Path]:
-    """What comes along with a file, beside the speech, without having been asked for by name."""
-    if path.suffix in (".pc2", ".mdd") and animation.faces is not None:
-        return [path.with_suffix(".obj")]
-    return [path.with_suffix(".json")] if path.suffix == ".csv" else []
+def write_wav(path: Path, animation: Animation) -> None:
+    """Write the speech as 16-bit PCM, exactly as long as the motion; nothing for a silent animation.
+
+    Raises:
+        FaceDiffError: if the speech is not finite.
+    """
+    sound = animation.sound()
+    if sound is None:
+        return
+    if not np.isfinite(sound).all():
+        raise FaceDiffError(f"{animation.name}: its speech holds NaN or infinity; read the recording again")
+    # Readers divide by 32768, so that a 16-bit recording comes back bit by bit.
+    data = np.clip(np.rint(sound * 32768), -32768, 32767).astype("<i2").tobytes()
+    rate = animation.sample_rate
+    # The standard library's module wave cannot write the entry ISFT (software). It stands before the samples, where
+    # is_free finds it, so that an export replaces its own .wav but never a recording of the user's.
+    chunks = [
+        (b"fmt ", struct.pack("<HHIIHH", 1, 1, rate, 2 * rate, 2, 16)),
+        (b"LIST", b"INFOISFT" + struct.pack("<I", 10) + b"facediff\0\0"),
+        (b"data", data),
+    ]
+    body = b"WAVE" + b"".join(name + struct.pack("<I", len(content)) + content for name, content in chunks)
+    path.write_bytes(b"RIFF" + struct.pack("<I", len(body)) + body)
+
+
+MARK = b"facediff"
+"""Stands near the start of every file that is written without having been named by the user."""
+
+
+def is_free(path: Path) -> bool:
+    """Whether a path does not exist or was written by facediff; for a folder, whether all of its files were.
+
+    Raises:
+        FaceDiffError: if the file or folder cannot be read.
+    """
+    if not path.exists():
+        return True
+    try:
+        if path.is_dir():
+            files = list(path.iterdir())
+            recorded = not files or (path / RECORD) in files
+            return recorded and all(file.is_file() and is_free(file) for file in files)
+        with path.open("rb") as stream:
+            return MARK in stream.read(200)
+    except OSError as error:
+        raise FaceDiffError(
+            f"{path}: is in the way and cannot be read ({error.strerror}); choose another -o"
+        ) from error
+
+
+def check_free(path: Path) -> None:
+    """Refuse a file or folder that the user did not name and that facediff did not write.
+
+    Raises:
+        FaceDiffError: naming the file or folder.
+    """
+    if not is_free(path):
+        what = "is a folder with files" if path.is_dir() else "is a file"
+        raise FaceDiffError(
+            f"{path}: {what} that facediff did not write, and would be replaced; choose another -o, or move it"
+        )
+
+
+@contextmanager
+def _staged(path: Path) -> Iterator[Path]:
+    """A hidden folder next to ``path``; at the end its content moves next to ``path``, all of it or nothing.
+
+    Raises:
+        FaceDiffError: if the place cannot be written, the disk is full, or a folder is in the way.
+    """
+    parent = path.parent
+    made = [folder for folder in (parent, *parent.parents) if not folder.exists()]
+    hidden = parent / f".{path.stem}.partial-{os.getpid()}-{secrets.token_hex(4)}"
+    done = False
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        hidden.mkdir()
+        yield hidden
+        arrivals = sorted(hidden.iterdir())
+        for arrival in arrivals:
+            if (parent / arrival.name).is_dir() != arrival.is_dir() and (parent / arrival.name).exists():
+                raise FaceDiffError(f"{parent / arrival.name}: is in the way; move it, or choose another -o")
+        for arrival in arrivals:
+            _move(arrival, parent / arrival.name)
+        done = True
+    except OSError as error:
+        raise FaceDiffError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space or choose another folder. "
+            f"Nothing was left there"
+        ) from error
+    except FaceDiffError as error:
+        # The format's writer names the hidden folder, which the user has never seen.
+        if str(hidden) not in str(error):
+            raise
+        raise FaceDiffError(str(error).replace(str(hidden), str(parent))) from error
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
+        for folder in [] if done else made:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _move(source: Path, target: Path) -> None:
+    """Rename; a folder of an earlier export is renamed first and removed afterwards."""
+    if not target.is_dir():
+        os.replace(source, target)
+        return
+    aside = source.with_name(f"{source.name}.old")
+    os.rename(target, aside)
+    try:
+        os.rename(source, target)
+    except OSError:
+        os.rename(aside, target)
+        raise

@@ -193,7 +193,7 @@ def test_several_takes_differ_and_stand_side_by_side_or_in_files_of_their_own(
     speech: Path, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "t.npy", "--takes", 2, "--seed", 5) == 0
-    first, second = (np.load(tmp_path / f"t_take{i}.npy") for i in (1, 2))
+    first, second = (np.load(tmp_path / f"t_sample{i}.npy") for i in (1, 2))
     assert not np.array_equal(first, second)
     assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "five.npy", "--seed", 5) == 0
     np.testing.assert_allclose(first, np.load(tmp_path / "five.npy"), rtol=0, atol=1e-5)
@@ -443,8 +443,8 @@ def test_takes_are_carried_to_another_mesh_by_one_correspondence(
     template = load_model(checkpoint).assets.templates["A"].numpy()
     rest = read_mesh(tiny_root / "tiny.ply").vertices
     for animation in (1, 2):
-        carried, own = np.load(tmp_path / f"t_take{animation}.npy"), np.load(tmp_path / f"own_take{animation}.npy")
+        carried, own = np.load(tmp_path / f"t_sample{animation}.npy"), np.load(tmp_path / f"own_sample{animation}.npy")
         moved, wanted = carried - rest, own - template
         # The same topology of nearly the same face: nearly the same motion, and another one for each take.
         assert np.abs(moved - wanted).max() < 0.25 * np.abs(wanted).max()
-    assert not np.array_equal(np.load(tmp_path / "t_take1.npy"), np.load(tmp_path / "t_take2.npy"))
+    assert not np.array_equal(np.load(tmp_path / "t_sample1.npy"), np.load(tmp_path / "t_sample2.npy"))

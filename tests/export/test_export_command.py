@@ -58,7 +58,7 @@ def test_takes_of_one_recording_are_told_apart_by_their_files(animation: Animati
     [
         (["a.npz", "-o", "a.fbx"], 'there is no format ".fbx"'),
         (["a.npz", "-o", "a.csv"], "give --shapes"),
-        (["a.npz", "-o", "a.glb", "--shapes", "."], "--shapes: is for weights; write .csv"),
+        (["a.npz", "-o", "a.glb", "--shapes", "."], "--shapes"),
         (["a.npz", "-o", "a.npy"], "a.npz: no such file"),
         (["a.npz", "-o", "a.mp4", "--up", "z"], ".mp4 holds no axes"),
     ],

@@ -28,12 +28,12 @@ COMMANDS = {
 
 def test_the_table_of_formats_is_complete() -> None:
     rows = re.findall(r"^\| `(\.\w+)` \|(.*)\|$", PAGES[0].read_text(), re.MULTILINE)
-    assert [suffix for suffix, _ in rows] == list(FORMATS)
+    assert sorted(suffix for suffix, _ in rows) == list(FORMATS)
     for suffix, row in rows:
         speech = row.split("|")[4]
-        assert ("in it" in speech) == FORMATS[suffix].holds_sound
-        assert ("beside" in speech or "in the folder" in speech) == FORMATS[suffix].sound_beside
-        assert ("y up" in row and "any" not in row) == (FORMATS[suffix].unit == "m")
+        assert ("in it" in speech) == (FORMATS[suffix].speech == "in the file")
+        assert ("beside" in speech or "in the folder" in speech) == (FORMATS[suffix].speech == "next to it")
+        assert ("y up" in row and "any" not in row) == (FORMATS[suffix].units == "m")
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import textwrap
@@ -18,13 +19,14 @@ from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.export import FORMATS, ExportOptions, check_export, write_animations
 
 OWN = [".glb", ".usdc", ".usda", ".obj", ".ply", ".pc2", ".mdd", ".mp4", ".npz", ".npy"]
-"""Formats that need no set of shapes and no other room's page."""
+"""Formats that need no blendshapes and no browser page."""
+ROOT = Path(__file__).parents[2]
 
 
 def test_the_formats_are_as_promised() -> None:
     assert {*OWN, ".html", ".csv"} == set(FORMATS)
-    assert {suffix for suffix, made in FORMATS.items() if made.several} == {".mp4", ".html"}
-    assert {suffix for suffix, made in FORMATS.items() if made.holds_sound} == {".mp4", ".html", ".npz"}
+    assert {suffix for suffix, made in FORMATS.items() if made.holds_several} == {".mp4", ".html"}
+    assert {suffix for suffix, made in FORMATS.items() if made.speech == "in the file"} == {".mp4", ".html", ".npz"}
     assert {suffix for suffix, made in FORMATS.items() if not made.needs_mesh} == {
         ".pc2",
         ".mdd",
@@ -32,30 +34,30 @@ def test_the_formats_are_as_promised() -> None:
         ".npz",
         ".npy",
     }
-    assert all(made.help and made.then for made in FORMATS.values())
+    assert all(made.help and made.next_step for made in FORMATS.values())
 
 
 @pytest.mark.parametrize(
-    ("name", "options", "sentence"),
+    ("name", "options", "words"),
     [
-        ("a.gltf", {}, 'there is no format ".gltf": did you mean ".glb"? known are .glb, .usdc'),
-        ("a.GLB", {}, 'there is no format ".GLB": did you mean ".glb"?'),
-        ("a", {}, "has no suffix, which names the format"),
-        ("a.glb", {"unit": "cm"}, ".glb is in metres by its standard"),
-        ("a.glb", {"up": "z"}, ".glb has y up by definition"),
-        ("a.npz", {"up": "z"}, ".npz has y up by definition"),
-        ("a.mp4", {"unit": "cm"}, ".mp4 holds no lengths"),
-        ("a.mp4", {"up": "y"}, ".mp4 holds no axes"),
-        ("a.obj", {"unit": "parsec"}, 'unit "parsec"'),
-        ("a.csv", {}, "weights need a set of shapes; give --shapes"),
-        ("a.csv", {"shapes": Path("nowhere")}, "nowhere: no such folder or file"),
-        ("a.glb", {"tolerance_mm": 0.0}, "tolerance of 0 mm"),
-        ("file/a.glb", {}, "cannot be written"),
-        ("folder.glb", {}, "is a folder"),
-        ("foreign.obj", {}, "foreign_obj: is a folder with files that facediff did not write"),
+        ("a.gltf", {}, ["a.gltf", 'no format ".gltf"', '".glb"?', ".usdc"]),
+        ("a.GLB", {}, ['no format ".GLB"', '".glb"?']),
+        ("a", {}, ["suffix", "a.glb"]),
+        ("a.glb", {"unit": "cm"}, [".glb", "metres"]),
+        ("a.glb", {"up": "z"}, [".glb", "y up"]),
+        ("a.npz", {"up": "z"}, [".npz", "y up"]),
+        ("a.mp4", {"unit": "cm"}, [".mp4", "no lengths"]),
+        ("a.mp4", {"up": "y"}, [".mp4", "no axes"]),
+        ("a.obj", {"unit": "parsec"}, ['unit "parsec"']),
+        ("a.csv", {}, ["a.csv", "--shapes"]),
+        ("a.csv", {"shapes": Path("nowhere")}, ["nowhere: no such folder or file"]),
+        ("a.glb", {"tolerance_mm": 0.0}, ["tolerance of 0 mm"]),
+        ("file/a.glb", {}, ["cannot be written"]),
+        ("folder.glb", {}, ["is a folder"]),
+        ("foreign.obj", {}, ["foreign_obj: is a folder with files"]),
     ],
 )
-def test_refused_before_any_work(tmp_path: Path, name: str, options: dict[str, object], sentence: str) -> None:
+def test_refused_before_any_work(tmp_path: Path, name: str, options: dict[str, object], words: list[str]) -> None:
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "folder.glb").mkdir()
     (tmp_path / "foreign_obj").mkdir()
@@ -63,7 +65,7 @@ def test_refused_before_any_work(tmp_path: Path, name: str, options: dict[str, o
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(FaceDiffError) as caught:
         check_export(tmp_path / name, ExportOptions(**options))  # type: ignore[arg-type]
-    assert sentence in str(caught.value)
+    assert all(word in str(caught.value) for word in words), caught.value
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -83,7 +85,7 @@ def test_what_a_format_prescribes_may_be_said(tmp_path: Path, unit: str | None) 
     ],
 )
 @pytest.mark.parametrize("suffix", [".glb", ".usdc", ".obj", ".ply"])
-def test_takes_that_would_make_broken_files(
+def test_animations_that_would_make_broken_files(
     make_animation: Callable[..., Animation], tmp_path: Path, change: dict[str, object], sentence: str, suffix: str
 ) -> None:
     for name in [name for name, value in change.items() if isinstance(value, str)]:
@@ -97,46 +99,47 @@ def test_takes_that_would_make_broken_files(
     assert not list(tmp_path.iterdir())
 
 
-def test_several_takes_get_a_file_each(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+def test_several_animations_get_a_file_each(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     first, second = make_animation(), make_animation(speech=None)
     second = replace(second, vertices=second.vertices[:7])
     written = write_animations(tmp_path / "a.npy", [first, second])
-    assert written == [tmp_path / "a_take1.npy", tmp_path / "a_take2.npy"]
+    assert written == [tmp_path / "a_sample1.npy", tmp_path / "a_sample2.npy"]
     assert [len(np.load(path)) for path in written] == [40, 7]
     written = write_animations(tmp_path / "a.glb", [first, second])
-    assert [path.name for path in written] == ["a_take1.glb", "a_take2.glb", "a_take1.wav"]
+    assert [path.name for path in written] == ["a_sample1.glb", "a_sample2.glb", "a_sample1.wav"]
     written = write_animations(tmp_path / "a.ply", [first, second])
-    assert [path.name for path in written] == ["a_take1_ply", "a_take2_ply"]
-    assert (written[1] / "a_take2_0006.ply").is_file()
-    assert not (written[1] / "a_take2_0007.ply").exists()
+    assert [path.name for path in written] == ["a_sample1_ply", "a_sample2_ply"]
+    assert (written[1] / "a_sample2_0006.ply").is_file()
+    assert not (written[1] / "a_sample2_0007.ply").exists()
 
 
-def test_no_take_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match="no take to write"):
+def test_no_animation_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="no animation"):
         write_animations(tmp_path / "a.glb", [])
 
 
 def test_a_full_disk_leaves_nothing(animation: Animation, tmp_path: Path) -> None:
     """A process that may not write files beyond a few kB, with the speech (which fails early) and without."""
-    write_archive(tmp_path / "take.npz", animation)
+    write_archive(tmp_path / "in.npz", animation)
     program = """
         import resource, sys
         from pathlib import Path
         from facediff.errors import FaceDiffError
         from facediff.export import ExportOptions, write_animations
-        from facediff.takes import read_archive
-        take = read_archive(Path(sys.argv[1]))
+        from facediff.animation import read_archive
+        animation = read_archive(Path(sys.argv[1]))
         resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
         for suffix in sys.argv[3:]:
             for speech in (True, False):
                 try:
-                    write_animations(Path(sys.argv[2]) / f"a{suffix}", [take], ExportOptions(speech=speech, size=64))
+                    options = ExportOptions(speech=speech, size=64)
+                    write_animations(Path(sys.argv[2]) / f"a{suffix}", [animation], options)
                 except FaceDiffError as error:
                     print(error)
     """
     place = tmp_path / "new"
     run = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program), tmp_path / "take.npz", place, *OWN],
+        [sys.executable, "-c", textwrap.dedent(program), tmp_path / "in.npz", place, *OWN],
         capture_output=True,
         text=True,
         timeout=120,
@@ -145,25 +148,25 @@ def test_a_full_disk_leaves_nothing(animation: Animation, tmp_path: Path) -> Non
     sentences = run.stdout.splitlines()
     assert len(sentences) == 2 * len(OWN), run.stdout
     assert all(str(place) in sentence and "partial" not in sentence for sentence in sentences), run.stdout
-    assert sorted(file.name for file in tmp_path.rglob("*")) == ["take.npz"]
+    assert sorted(file.name for file in tmp_path.rglob("*")) == ["in.npz"]
 
 
 def test_if_the_last_of_several_fails_none_appears(
     animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "a_take1.pc2").write_text("from before")
+    (tmp_path / "a_sample1.pc2").write_text("from before")
     write = Path.write_bytes
 
     def full(self: Path, data: bytes) -> int:
-        if self.name == "a_take2.obj":
+        if self.name == "a_sample2.obj":
             raise OSError(28, "No space left on device")
         return write(self, data)
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(FaceDiffError, match="No space left on device"):
         write_animations(tmp_path / "a.pc2", [animation, animation])
-    assert [file.name for file in tmp_path.iterdir()] == ["a_take1.pc2"]
-    assert (tmp_path / "a_take1.pc2").read_text() == "from before"
+    assert [file.name for file in tmp_path.iterdir()] == ["a_sample1.pc2"]
+    assert (tmp_path / "a_sample1.pc2").read_text() == "from before"
 
 
 def test_files_beside_never_replace_the_users_own(animation: Animation, tmp_path: Path) -> None:
@@ -222,7 +225,7 @@ def test_the_speech_beside_is_readable_everywhere(animation: Animation, tmp_path
     np.testing.assert_array_equal(values / np.float32(32768), animation.speech)
 
 
-def test_the_page_gets_all_takes(animation: Animation, tmp_path: Path) -> None:
+def test_the_page_gets_all_animations(animation: Animation, tmp_path: Path) -> None:
     path = tmp_path / "a.html"
     assert write_animations(path, [animation, animation]) == [path]
     assert path.read_text(encoding="utf-8").lstrip().lower().startswith("<!doctype html>")
@@ -253,3 +256,52 @@ def test_missing_packages_are_named_before_any_work(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r'writing \.mp4 needs the package "av"'):
         check_export(tmp_path / "a.mp4", ExportOptions())
+
+
+BOUNDS = """
+from facediff.export import Format
+from facediff.export.format import Space
+
+class Bounds(Format):
+    "The box around the vertices of every frame, as text."
+
+    next_step = "read it"
+    speech = "next to it"
+
+    def write(self, path, animations, options):
+        (animation,) = animations
+        frames = Space.of(animation, options).frames(animation)
+        path.write_text("".join(f"{frame.min()} {frame.max()} {options.speech_file}\\n" for frame in frames))
+"""
+
+
+def test_a_format_of_an_installed_package_is_reached_by_its_suffix(animation: Animation, tmp_path: Path) -> None:
+    info = tmp_path / "site" / "bounds-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: bounds\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[facediff.export_format]\nbounds = bounds_format:Bounds\n")
+    (tmp_path / "site" / "bounds_format.py").write_text(BOUNDS)
+    write_archive(tmp_path / "in.npz", animation)
+
+    def facediff(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "facediff", *words],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), str(ROOT)])},
+        )
+
+    written = facediff("export", "in.npz", "-o", "y.bounds", "--output-unit", "mm")
+    assert (written.returncode, written.stderr) == (0, "")
+    assert written.stdout.splitlines()[-1] == "read it"
+    lines = (tmp_path / "y.bounds").read_text().splitlines()
+    low, high, speech_file = lines[7].split()
+    frame = animation.vertices[7] * 1000
+    assert (float(low), float(high)) == pytest.approx((frame.min(), frame.max()), rel=1e-6)
+    assert (len(lines), speech_file) == (40, "y.wav")
+    assert (tmp_path / "y.wav").is_file()
+    assert "The box around the vertices" in facediff("export", "--help").stdout
+    refused = facediff("export", "in.npz", "-o", "z.bound")
+    assert (refused.returncode, 'did you mean ".bounds"' in refused.stderr) == (2, True)

@@ -8,6 +8,7 @@ import html
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 
 from facediff.animation import Animation
 from facediff.errors import FaceDiffError
+from facediff.export.format import ExportOptions, Format
 from facediff.export.viewer.packing import (
     CHUNK_FRAMES,
     STEP,
@@ -29,6 +31,7 @@ from facediff.export.viewer.packing import (
     pack_motion,
     scale_end,
 )
+from facediff.registry import export_format
 from facediff.utils.files import atomic, check_writable
 
 FORMAT = "facediff page 1"
@@ -80,6 +83,21 @@ def write_page(path: Path, takes: Sequence[Animation], *, max_mb: float = 30.0, 
         )
     with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
         stream.writelines(parts)
+
+
+@export_format.register("html")
+class Page(Format):
+    """A page that plays in any browser, without a server."""
+
+    next_step = "open it in a browser; `facediff view` has more options"
+    holds_several = True
+    speech = "in the file"
+    units = "none"
+    up_axes = ()
+
+    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
+        """Write a page that shows all animations next to each other."""
+        write_page(path, [a if options.speech else replace(a, speech=None) for a in animations])
 
 
 def page_facts(takes: Sequence[Animation], truth: int | None, blobs: Blobs) -> dict[str, Any]:
