@@ -379,8 +379,8 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     options = options or SolveOptions()
     if shapes.deltas.shape[1] != len(animation.template):
         raise FaceDiffError(
-            f"{animation.name}: has {len(animation.template)} vertices and the shapes {shapes.deltas.shape[1]}; give shapes of "
-            f"the same mesh, or carry them over with `facediff blendshapes --carry`"
+            f"{animation.name}: has {len(animation.template)} vertices and the shapes {shapes.deltas.shape[1]}; give "
+            f"shapes of the same mesh, or carry them over with `facediff blendshapes --carry`"
         )
     moving = _moving(animation, shapes, options)
     scale = np.sqrt(moving.energy)

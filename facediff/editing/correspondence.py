@@ -633,10 +633,10 @@ def correspond(
     """Find the place on a source mesh of every vertex of a target mesh.
 
     Meshes with equal triangles correspond vertex by vertex. Others are laid onto one another by a similarity
-    (:func:`facediff.editing.correspondence.place`); the target is bent onto the source in rounds, ever less stiffly, after
-    Amberg, Romdhani and Vetter, "Optimal step nonrigid ICP algorithms for surface registration", CVPR 2007, with
-    displacements for unknowns; then each vertex takes the nearest point of the source's surface. A sheet that faces
-    another way (the other lip) is avoided.
+    (:func:`place`); the target is bent onto the source in rounds, ever less stiffly, after Amberg, Romdhani and Vetter,
+    "Optimal step nonrigid ICP algorithms for surface registration", CVPR 2007, with displacements for unknowns; then
+    each vertex takes the nearest point of the source's surface. A sheet that faces another way (the other lip) is
+    avoided.
 
     Args:
         source_vertices: (Vs, 3) neutral face of what moves.

@@ -1,28 +1,29 @@
-"""Sets of blendshapes: what each name does to a face."""
+"""Sets of blendshapes: ARKit's names, a set that fits an animation, and the files that sets are read from."""
 
 from __future__ import annotations
 
-import json
 import re
-import struct
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
-from facediff.errors import FaceDiffError
-from facediff.mesh import face_size, read_mesh, robust_align
-from facediff.mesh.mesh import read_obj
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.mesh import Mesh, face_size, read_mesh, robust_align
 
-# The 52 names of ARKit's face and how others spell them.
-#
-# Names are Apple's (developer documentation of ``ARFaceAnchor.BlendShapeLocation``). Their order and the columns beside
-# them are those of the CSV files that Epic's app Live Link Face records, as public readers of such files state them.
+if TYPE_CHECKING:
+    from pygltflib import GLTF2
+
+Array = npt.NDArray[np.float64]
+
+# The 52 names are Apple's (developer documentation of ``ARFaceAnchor.BlendShapeLocation``). Their order and the further
+# columns are those of the CSV files that Epic's app Live Link Face records, as public readers of such files state them.
 
 _EYE = ("eyeBlink", "eyeLookDown", "eyeLookIn", "eyeLookOut", "eyeLookUp", "eyeSquint", "eyeWide")
 ARKIT: tuple[str, ...] = (
@@ -73,14 +74,14 @@ ROTATIONS: tuple[str, ...] = (
     *(f"Head{axis}" for axis in ("Yaw", "Pitch", "Roll")),
     *(f"{side}Eye{axis}" for side in ("Left", "Right") for axis in ("Yaw", "Pitch", "Roll")),
 )
-"""Columns that follow the names: turns of the head and the eyes."""
+"""Columns that follow the names: rotations of the head and the eyes."""
 
 NEUTRAL = ("neutral", "basis", "rest", "base", "template")
 """Names (without case and punctuation) of the face at rest in a set of shapes."""
 
 
 def live_link_name(name: str) -> str:
-    """An ARKit name as the recordings capitalise it: ``jawOpen`` is ``JawOpen``."""
+    """An ARKit name as Live Link Face capitalises it: ``jawOpen`` becomes ``JawOpen``."""
     return name[:1].upper() + name[1:]
 
 
@@ -129,279 +130,13 @@ def beyond_arkit(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in names if name not in ARKIT)
 
 
-# Blendshapes on disk: a folder of meshes, or a glb with named targets.
-
-SUFFIXES = (".obj", ".ply")
-
-
-@dataclass(frozen=True, eq=False)
-class ShapeFiles:
-    """Shapes as read, whatever their topology, unit and axes.
-
-    Attributes:
-        path: the folder or the file.
-        first: the file to name where the topology is wrong.
-        names: K names as written.
-        shapes: (K, V, 3) vertices of each shape.
-        neutral: (V, 3) the face at rest; None if there is none.
-        faces: (F, 3) triangles; None if there are none.
-        metric: whether lengths are in metres by prescription, as in glb.
-        rest: name of the file with the face at rest.
-        notes: what was found on reading.
-    """
-
-    path: Path
-    first: Path
-    names: tuple[str, ...]
-    shapes: npt.NDArray[np.floating]
-    neutral: npt.NDArray[np.floating] | None
-    faces: npt.NDArray[np.integer] | None
-    metric: bool = False
-    rest: str = ""
-    notes: tuple[str, ...] = field(default=())
-
-
-def read_shape_files(path: Path) -> ShapeFiles:
-    """Read a folder of meshes or a glb.
-
-    Raises:
-        FaceDiffError: if it is missing or damaged, holds no shapes, or its meshes differ in topology or vertex order.
-    """
-    if path.suffix.lower() == ".glb":
-        mesh = read_glb_targets(path)
-        return ShapeFiles(
-            path, path, mesh.names, mesh.neutral + mesh.deltas, mesh.neutral, mesh.faces, metric=True, rest=path.name
-        )
-    if not path.is_dir():
-        raise FaceDiffError(f"{path}: no such folder; expected one of .obj or .ply files, or a .glb with named targets")
-    found = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
-    rest = [file for file in found if plain(file.stem) in NEUTRAL]
-    if len(rest) > 1:
-        raise FaceDiffError(f"{path}: {rest[0].name} and {rest[1].name} are both the face at rest; keep one of them")
-    shapes = [file for file in found if file not in rest]
-    if not shapes:
-        raise FaceDiffError(f"{path}: holds no shapes; expected .obj or .ply files named jawOpen, mouthFunnel …")
-    meshes = _read_alike([*rest, *shapes])
-    points = np.stack([vertices for vertices, _ in meshes])
-    return ShapeFiles(
-        path,
-        (rest or shapes)[0],
-        tuple(file.stem for file in shapes),
-        points[len(rest) :],
-        points[0] if rest else None,
-        meshes[0][1],
-        rest=rest[0].name if rest else "",
-    )
-
-
-def _read_alike(files: list[Path]) -> list[tuple[npt.NDArray[np.float64], npt.NDArray[np.integer] | None]]:
-    """Vertices and triangles of each file; all must have the first one's topology."""
-    meshes: list[tuple[npt.NDArray[np.float64], npt.NDArray[np.integer] | None]] = []
-    text = None
-    for file in files:
-        if file.suffix.lower() == ".obj":
-            obj = read_obj(file)
-            # Equal lines are equal triangles, and reading them takes longest.
-            same = text is not None and obj.face_text == text
-            meshes.append((obj.vertices, meshes[0][1] if same else obj.faces))
-            text = obj.face_text if len(meshes) == 1 else text
-        else:
-            mesh = read_mesh(file)
-            meshes.append((mesh.vertices, mesh.faces))
-        (first, faces), (vertices, triangles) = meshes[0], meshes[-1]
-        if len(vertices) != len(first):
-            raise FaceDiffError(
-                f"{file}: has {len(vertices)} vertices and {files[0].name} {len(first)}; expected shapes of one mesh"
-            )
-        if faces is not None and triangles is not None and not np.array_equal(faces, triangles):
-            raise FaceDiffError(
-                f"{file}: its triangles are not those of {files[0].name}; expected shapes of one mesh with the order "
-                f"of its vertices kept"
-            )
-        if not np.isfinite(vertices).all():
-            raise FaceDiffError(f"{file}: holds NaN or infinity; write it anew")
-    return meshes
-
-
-# Morph targets of binary glTF 2.0 files, which may come from anywhere: every offset and count is checked.
-#
-# Khronos Group, "glTF 2.0 Specification": sections 3.6 (binary data, accessors, sparse accessors), 3.7.2 (meshes, morph
-# targets) and 4.4 (GLB). Names of targets are in ``mesh.extras.targetNames``, as the specification's note has it.
-
-Array = npt.NDArray[np.float64]
-
-MAGIC, JSON_CHUNK, BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
-FLOAT = 5126
-INDICES: dict[int, np.dtype[Any]] = {5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4")}
-WIDTHS = {"SCALAR": 1, "VEC3": 3}
-TRIANGLES = 4
-
-
-@dataclass(frozen=True, eq=False)
-class GlbTargets:
-    """A mesh with named targets.
-
-    Attributes:
-        names: K names.
-        neutral: (V, 3) vertices, the primitives' one after the other; in metres.
-        deltas: (K, V, 3) displacements.
-        faces: (F, 3) triangles.
-    """
-
-    names: tuple[str, ...]
-    neutral: Array
-    deltas: Array
-    faces: npt.NDArray[np.int64]
-
-
-def read_glb_targets(path: Path) -> GlbTargets:
-    """Read the mesh with the most targets; nodes' transforms are not applied.
-
-    Raises:
-        FaceDiffError: if the file is missing, damaged or compressed, or no mesh in it has named targets.
-    """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a .glb file") from error
-    try:
-        return _mesh(_Glb(data))
-    except _BadFileError as error:
-        raise FaceDiffError(f"{path}: {error}") from error
-    except (LookupError, TypeError, ValueError, AttributeError, struct.error, RecursionError) as error:
-        raise FaceDiffError(f"{path}: not a readable glb ({error}); export it anew") from error
-
-
-class _BadFileError(Exception):
-    """What is wrong with a file, without its name."""
-
-
-class _Glb:
-    """The file's JSON, and accessors by number.
-
-    Attributes:
-        gltf: the JSON.
-        binary: the bytes beside it.
-    """
-
-    def __init__(self, data: bytes) -> None:
-        if len(data) < 20 or struct.unpack_from("<II", data)[0:2] != (MAGIC, 2):
-            raise _BadFileError("not a binary glTF 2.0 file; export it as .glb")
-        chunks: dict[int, bytes] = {}
-        place, end = 12, min(len(data), struct.unpack_from("<I", data, 8)[0])
-        while place + 8 <= end:
-            length, kind = struct.unpack_from("<II", data, place)
-            if place + 8 + length > end:
-                raise _BadFileError("ends in the middle; export it anew")
-            chunks.setdefault(kind, data[place + 8 : place + 8 + length])
-            place += 8 + length
-        self.gltf: dict[str, Any] = json.loads(chunks[JSON_CHUNK])
-        self.binary = chunks.get(BIN_CHUNK, b"")
-        needed = [name for name in self.gltf.get("extensionsRequired", []) if "compression" in name or "quant" in name]
-        if needed:
-            raise _BadFileError(f"is compressed ({', '.join(map(str, needed))}); export it without compression")
-
-    def get(self, kind: str, index: object) -> dict[str, Any]:
-        """An object by its number; numbers from the end, which Python would take, are refused."""
-        listed = self.gltf[kind]
-        if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(listed):
-            raise _BadFileError(f"names {kind} {index}, which is not there; export it anew")
-        found: dict[str, Any] = listed[index]
-        return found
-
-    def slab(self, view: object, offset: int, kind: np.dtype[Any], count: int, width: int) -> npt.NDArray[Any]:
-        """Numbers (count, width) from a buffer view."""
-        found = self.get("bufferViews", view)
-        if found.get("buffer", 0) != 0 or "uri" in self.get("buffers", 0):
-            raise _BadFileError("keeps its data in another file; export it as one .glb")
-        start, length = found.get("byteOffset", 0), found["byteLength"]
-        row = kind.itemsize * width
-        stride = found.get("byteStride", row)
-        numbers = (start, length, offset, stride, count)
-        if not all(isinstance(number, int) for number in numbers) or min(numbers) < 0 or stride < row:
-            raise _BadFileError("has a negative or broken offset; export it anew")
-        if count and (offset + (count - 1) * stride + row > length or start + length > len(self.binary)):
-            raise _BadFileError("has data beyond its end; export it anew")
-        if not count:
-            return np.empty((0, width), kind)
-        return np.ndarray((count, width), kind, self.binary, start + offset, (stride, kind.itemsize)).copy()
-
-    def numbers(self, index: object, form: str, count: int | None = None) -> npt.NDArray[Any]:
-        """An accessor's numbers (N, width): positions (``VEC3``) or indices (``SCALAR``).
-
-        Args:
-            index: the accessor.
-            form: its type.
-            count: how many there must be; needed where the file need not hold them all (sparse accessors).
-        """
-        accessor = self.get("accessors", index)
-        kinds: dict[int, np.dtype[Any]] = {FLOAT: np.dtype("<f4")} if form == "VEC3" else INDICES
-        kind, told = kinds.get(accessor["componentType"]), accessor["count"]
-        if kind is None or accessor["type"] != form:
-            raise _BadFileError("holds positions or indices of an unknown type; export it without compression")
-        if not isinstance(told, int) or told < 0 or (count is not None and told != count):
-            raise _BadFileError(f"has a target of {told} vertices where the mesh has {count}; export it anew")
-        width = WIDTHS[form]
-        if "bufferView" in accessor:
-            values = self.slab(accessor["bufferView"], accessor.get("byteOffset", 0), kind, told, width)
-        elif count is not None:
-            values = np.zeros((count, width), kind)
-        else:
-            raise _BadFileError("has a mesh without data, perhaps a compressed one; export it without compression")
-        if "sparse" in accessor:
-            sparse = accessor["sparse"]
-            some, where = sparse["count"], sparse["indices"]
-            kind_of_places = INDICES[where["componentType"]]
-            places = self.slab(where["bufferView"], where.get("byteOffset", 0), kind_of_places, some, 1)[:, 0]
-            if len(places) and places.max() >= told:
-                raise _BadFileError("names a vertex that is not there; export it anew")
-            told_values = sparse["values"]
-            values[places] = self.slab(told_values["bufferView"], told_values.get("byteOffset", 0), kind, some, width)
-        return values
-
-
-def _mesh(glb: _Glb) -> GlbTargets:
-    """The mesh with the most targets."""
-    meshes = [mesh for mesh in glb.gltf.get("meshes", []) if mesh["primitives"][0].get("targets")]
-    if not meshes:
-        raise _BadFileError("no mesh in it has targets (shape keys); export them with the mesh")
-    mesh = max(meshes, key=lambda one: len(one["primitives"][0]["targets"]))
-    count = len(mesh["primitives"][0]["targets"])
-    names = mesh.get("extras", {}).get("targetNames", [])
-    if len(names) != count or not all(isinstance(name, str) for name in names):
-        raise _BadFileError(f"has {count} targets and {len(names)} names for them; export it with targetNames")
-    points, moves, faces, before = [], [], [], 0
-    for primitive in mesh["primitives"]:
-        if primitive.get("mode", TRIANGLES) != TRIANGLES or len(primitive.get("targets", [])) != count:
-            raise _BadFileError("its mesh has parts that are no triangles, or have other targets; export one mesh")
-        position = glb.numbers(primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
-        delta = np.zeros((count, len(position), 3))
-        for row, target in zip(delta, primitive["targets"], strict=True):
-            if "POSITION" in target:
-                row[:] = glb.numbers(target["POSITION"], "VEC3", len(position))
-        if "indices" in primitive:
-            corners = glb.numbers(primitive["indices"], "SCALAR")[:, 0].astype(np.int64)
-        else:
-            corners = np.arange(len(position))
-        if len(corners) % 3 or (len(corners) and corners.max() >= len(position)):
-            raise _BadFileError("its triangles name a vertex that is not there; export it anew")
-        faces.append(corners.reshape(-1, 3) + before)
-        points.append(position)
-        moves.append(delta)
-        before += len(position)
-    neutral, deltas = np.concatenate(points), np.concatenate(moves, axis=1)
-    if not len(neutral) or not (np.isfinite(neutral).all() and np.isfinite(deltas).all()):
-        raise _BadFileError("holds no vertices, or NaN or infinity; export it anew")
-    return GlbTargets(tuple(names), neutral, deltas, np.concatenate(faces))
-
-
 ANOTHER_ORDER = 0.3
 """Neutral faces whose vertices lie further apart than this share of the face's size are not in the same order."""
 ANOTHER_FACE, ENOUGH = 0.01, 8
-"""Without a neutral face, so many shapes may have no more than this share of the face's size in common: each moves its
-own part, so that their median is the face at rest that they were made from."""
+"""Without a neutral face, so many shapes may have no more than this share of the face's size in common: each moves a
+part of its own, so that their median is the face at rest that they were made from."""
 SAME_SIZE = 1.25
-"""People's heads differ less than this; units of length differ by more."""
+"""Heads differ by less than this factor; units of length differ by more."""
 SAME_POSE = np.deg2rad(20.0)
 STILL = 1e-6
 """A shape that moves no vertex by more than this share of the face's size moves nothing."""
@@ -413,9 +148,9 @@ class ShapeSet:
 
     Attributes:
         names: K names; ARKit's own spelling where they are ARKit's.
-        neutral: (V, 3) the face at rest, in the take's unit.
-        deltas: (K, V, 3) how each vertex moves at weight 1.
-        notes: what was found and done on reading, a sentence each.
+        neutral: (V, 3) the face at rest, in the animation's unit.
+        deltas: (K, V, 3) displacement of each vertex at weight 1.
+        notes: what was found and changed on reading, a sentence each.
     """
 
     names: tuple[str, ...]
@@ -457,7 +192,7 @@ def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m")
     Args:
         path: a folder of ``.obj`` or ``.ply`` files named as their shapes are, the face at rest among them as
             ``neutral`` or ``Basis`` (without one, the template is the face at rest), or a ``.glb`` with named targets.
-        template: (V, 3) the take's neutral face.
+        template: (V, 3) the animation's neutral face.
         unit: the template's unit of length.
 
     Raises:
@@ -470,62 +205,57 @@ def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m")
 def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m") -> ShapeSet:
     """Shapes as read, turned and scaled to a template of the same topology.
 
-    Where the set has a face at rest, a unit or an axis of its own is told by laying that face onto the template.
+    Where the set has a face at rest, its unit and axes are found by aligning that face with the template.
 
     Raises:
         FaceDiffError: as :func:`read_shapes`.
     """
     if files.shapes.shape[1] != len(template):
         raise FaceDiffError(
-            f"{files.first}: has {files.shapes.shape[1]} vertices and the take's template {len(template)}; give "
+            f"{files.first}: has {files.shapes.shape[1]} vertices and the animation's template {len(template)}; give "
             f"shapes of that mesh, or carry these over with `facediff blendshapes --carry`"
         )
     goal = np.asarray(template, np.float64)
-    size = face_size(goal)
     notes = list(files.notes)
-    if files.neutral is None:
-        deltas = files.shapes / metres_per_unit(unit) if files.metric else files.shapes.astype(np.float64)
-        deltas = deltas - goal
-        common = np.median(deltas, axis=0) if len(deltas) >= ENOUGH else np.zeros_like(goal)
-        if np.sqrt(np.square(common).sum(-1).mean()) > ANOTHER_FACE * size or _least(deltas) > ANOTHER_ORDER * size:
-            raise FaceDiffError(
-                f"{files.path}: the shapes do not lie on the take's neutral face; add the face at rest that they were "
-                f"made from as neutral{files.first.suffix}"
-            )
-        notes.append("no neutral face among the shapes: the take's template is taken for it")
-        return _named(files, goal, deltas, notes)
-    matrix = lay_onto(files, goal, notes, unit)
-    return _named(files, goal, (files.shapes - files.neutral) @ matrix.T, notes)
+    if files.neutral is not None:
+        matrix = lay_onto(files, goal, notes, unit)
+        return _named(files, goal, (files.shapes - files.neutral) @ matrix.T, notes)
+    deltas = files.shapes / (metres_per_unit(unit) if files.metric else 1.0) - goal
+    common = np.median(deltas, axis=0) if len(deltas) >= ENOUGH else np.zeros_like(goal)
+    size, least = face_size(goal), np.sqrt(np.square(deltas).sum(-1).mean(-1)).min()
+    if np.sqrt(np.square(common).sum(-1).mean()) > ANOTHER_FACE * size or least > ANOTHER_ORDER * size:
+        raise FaceDiffError(
+            f"{files.path}: the shapes do not fit the animation's neutral face; add the face at rest that they were "
+            f"made from as neutral{files.first.suffix}"
+        )
+    notes.append("no neutral face among the shapes: the animation's template is used instead")
+    return _named(files, goal, deltas, notes)
 
 
 def lay_onto(files: ShapeFiles, goal: Array, notes: list[str], unit: str) -> Array:
-    """The (3, 3) turn and scale from the files' face at rest to the template's; says in the notes what it did."""
+    """The (3, 3) rotation and scale from the files' face at rest to the template's; adds what it did to the notes."""
     neutral = np.asarray(files.neutral, np.float64)
     factor = 1.0 / metres_per_unit(unit) if files.metric else 1.0
+    rest = files.first.parent / files.rest
     try:
         found = robust_align(neutral * factor, goal, scale=True)
     except FaceDiffError as error:
-        raise FaceDiffError(
-            f"{files.first.parent / files.rest}: cannot be laid onto the take's face: {error}"
-        ) from error
+        raise FaceDiffError(f"{rest}: cannot be aligned with the animation's face: {error}") from error
     apart = np.linalg.norm(found.apply(neutral * factor) - goal, axis=1)
     if np.median(apart) > ANOTHER_ORDER * face_size(goal):
         raise FaceDiffError(
-            f"{files.first.parent / files.rest}: its vertices are those of the take's template in another order; "
-            f"write it anew with the order kept (Blender: import and export with vertex order), or use --carry"
+            f"{rest}: has the vertices of the animation's template in another order; write it again with the order "
+            f"kept (Blender: import and export with vertex order), or use --carry"
         )
+    # A small difference in size or pose is another speaker's head, whose movements are used as they are.
     scale = found.scale if not 1 / SAME_SIZE < found.scale < SAME_SIZE else 1.0
     angle = float(np.arccos(np.clip((np.trace(found.rotation) - 1) / 2, -1, 1)))
     if scale != 1.0:
-        notes.append(f"the shapes are scaled by {scale:.4g} to the take's unit of length")
+        notes.append(f"the shapes are scaled by {scale:.4g} to the animation's unit of length")
     if angle > SAME_POSE:
-        notes.append(f"the shapes are turned by {np.rad2deg(angle):.0f}° to the take's axes")
-    turned: Array = scale * factor * (found.rotation if angle > SAME_POSE else np.eye(3))
-    return turned
-
-
-def _least(deltas: Array) -> float:
-    return float(np.sqrt(np.square(deltas).sum(-1).mean(-1)).min())
+        notes.append(f"the shapes are turned by {np.rad2deg(angle):.0f}° to the animation's axes")
+    matrix: Array = scale * factor * (found.rotation if angle > SAME_POSE else np.eye(3))
+    return matrix
 
 
 def _named(files: ShapeFiles, neutral: Array, deltas: Array, notes: list[str]) -> ShapeSet:
@@ -536,11 +266,233 @@ def _named(files: ShapeFiles, neutral: Array, deltas: Array, notes: list[str]) -
         if known in names:
             raise FaceDiffError(f'{files.path}: "{names[known]}" and "{name}" are both {known}; keep one of them')
         names[known] = name
-    made = ShapeSet(tuple(names), neutral, np.ascontiguousarray(deltas), tuple(notes))
+    made = ShapeSet(tuple(names), neutral, np.ascontiguousarray(deltas))
+    if not np.isfinite(made.deltas).all():
+        raise FaceDiffError(f"{files.path}: a shape holds NaN or infinity; write it again")
     if made.extra:
         notes.append(f"not ARKit's, kept as channels of their own: {', '.join(made.extra)}")
     if made.still:
         notes.append(f"move no vertex, so that their weights stay 0: {', '.join(made.still)}")
-    if not np.isfinite(made.deltas).all():
-        raise FaceDiffError(f"{files.path}: a shape holds NaN or infinity; write it anew")
     return replace(made, notes=tuple(notes))
+
+
+# Blendshapes on disk: a folder of meshes, or a .glb with named targets.
+
+SUFFIXES = (".obj", ".ply")
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeFiles:
+    """Shapes as read, whatever their topology, unit and axes.
+
+    Attributes:
+        path: the folder or the file.
+        first: the file to name where the topology is wrong.
+        names: K names as written.
+        shapes: (K, V, 3) vertices of each shape.
+        neutral: (V, 3) the face at rest; None if there is none.
+        faces: (F, 3) triangles; None if there are none.
+        metric: whether lengths are in metres by definition of the format, as in .glb.
+        rest: name of the file with the face at rest.
+        notes: what was done to the shapes since, a sentence each.
+    """
+
+    path: Path
+    first: Path
+    names: tuple[str, ...]
+    shapes: npt.NDArray[np.floating]
+    neutral: npt.NDArray[np.floating] | None
+    faces: npt.NDArray[np.integer] | None
+    metric: bool = False
+    rest: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def read_shape_files(path: Path) -> ShapeFiles:
+    """Read a folder of meshes or a .glb.
+
+    Raises:
+        FaceDiffError: if it is missing or damaged, holds no shapes, or its meshes differ in topology or vertex order.
+        MissingExtraError: if pygltflib is not installed and the file is a .glb.
+    """
+    if path.suffix.lower() == ".glb":
+        return _read_glb(path)
+    if not path.is_dir():
+        raise FaceDiffError(f"{path}: no such folder; expected one of .obj or .ply files, or a .glb with named targets")
+    found = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
+    rest = [file for file in found if plain(file.stem) in NEUTRAL]
+    if len(rest) > 1:
+        raise FaceDiffError(f"{path}: {rest[0].name} and {rest[1].name} are both the face at rest; keep one of them")
+    shapes = [file for file in found if file not in rest]
+    if not shapes:
+        raise FaceDiffError(f"{path}: holds no shapes; expected .obj or .ply files named jawOpen, mouthFunnel …")
+    files = [*rest, *shapes]
+    meshes = [read_mesh(file, points_allowed=True) for file in files]
+    for file, mesh in zip(files, meshes, strict=True):
+        _check_alike(file, mesh, files[0], meshes[0])
+    points, faces = np.stack([mesh.vertices for mesh in meshes]), meshes[0].faces
+    return ShapeFiles(
+        path,
+        files[0],
+        tuple(file.stem for file in shapes),
+        points[len(rest) :],
+        points[0] if rest else None,
+        faces if len(faces) else None,
+        rest=rest[0].name if rest else "",
+    )
+
+
+def _check_alike(file: Path, mesh: Mesh, first_file: Path, first: Mesh) -> None:
+    if len(mesh.vertices) != len(first.vertices):
+        raise FaceDiffError(
+            f"{file}: has {len(mesh.vertices)} vertices and {first_file.name} {len(first.vertices)}; expected shapes "
+            f"of one mesh"
+        )
+    if len(first.faces) and len(mesh.faces) and not np.array_equal(mesh.faces, first.faces):
+        raise FaceDiffError(
+            f"{file}: its triangles are not those of {first_file.name}; expected shapes of one mesh with the order of "
+            f"its vertices kept"
+        )
+    if not np.isfinite(mesh.vertices).all():
+        raise FaceDiffError(f"{file}: holds NaN or infinity; write it again")
+
+
+# Morph targets of binary glTF 2.0 files. pygltflib parses the container and never opens another file by itself.
+#
+# Khronos Group, "glTF 2.0 Specification": sections 3.6 (binary data, accessors, sparse accessors), 3.7.2 (meshes, morph
+# targets) and 4.4 (GLB). Names of targets are in ``mesh.extras.targetNames``, as the specification's note has it.
+
+FLOAT = 5126
+INDICES: dict[int, np.dtype[Any]] = {5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4")}
+WIDTHS = {"SCALAR": 1, "VEC3": 3}
+TRIANGLES = 4
+
+
+def _read_glb(path: Path) -> ShapeFiles:
+    """Read the mesh with the most targets, its primitives one after the other; nodes' transforms are not applied."""
+    try:
+        from pygltflib import GLTF2
+    except ImportError as error:
+        raise MissingExtraError("pygltflib", "train", "reading a .glb") from error
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a .glb file") from error
+    try:
+        if data[:8] != b"glTF\2\0\0\0":
+            raise _BadFileError("not a binary glTF 2.0 file; export it as .glb")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # chunks and fields that pygltflib does not know do no harm
+            gltf = GLTF2.load_from_bytes(data)
+        names, neutral, deltas, faces = _targets(gltf, gltf.binary_blob() or b"")
+    except _BadFileError as error:
+        raise FaceDiffError(f"{path}: {error}") from error
+    except Exception as error:  # the file may come from anywhere, and damage shows in many ways
+        raise FaceDiffError(f"{path}: not a readable glb ({error}); export it again") from error
+    return ShapeFiles(path, path, names, neutral + deltas, neutral, faces, metric=True, rest=path.name)
+
+
+class _BadFileError(Exception):
+    """What is wrong with a file, without its name."""
+
+
+def _targets(gltf: GLTF2, binary: bytes) -> tuple[tuple[str, ...], Array, Array, npt.NDArray[np.int64]]:
+    """Names (K,) of the targets, the neutral face (V, 3) and displacements (K, V, 3) in metres, triangles (F, 3)."""
+    needed = [name for name in gltf.extensionsRequired or [] if "compression" in name or "quant" in name]
+    if needed:
+        raise _BadFileError(f"is compressed ({', '.join(map(str, needed))}); export it without compression")
+    meshes = [mesh for mesh in gltf.meshes if mesh.primitives[0].targets]
+    if not meshes:
+        raise _BadFileError("no mesh in it has targets (shape keys); export them with the mesh")
+    mesh = max(meshes, key=lambda one: len(one.primitives[0].targets))
+    count = len(mesh.primitives[0].targets)
+    names = (mesh.extras or {}).get("targetNames", [])
+    if len(names) != count or not all(isinstance(name, str) for name in names):
+        raise _BadFileError(f"has {count} targets and {len(names)} names for them; export it with targetNames")
+    points, moves, faces, before = [], [], [], 0
+    for primitive in mesh.primitives:
+        if primitive.mode != TRIANGLES or len(primitive.targets or []) != count:
+            raise _BadFileError("its mesh has parts that are no triangles, or have other targets; export one mesh")
+        position = _numbers(gltf, binary, primitive.attributes.POSITION, "VEC3").astype(np.float64)
+        delta = np.zeros((count, len(position), 3))
+        for row, target in zip(delta, primitive.targets, strict=True):
+            if "POSITION" in target:
+                row[:] = _numbers(gltf, binary, target["POSITION"], "VEC3", len(position))
+        if primitive.indices is None:
+            corners = np.arange(len(position))
+        else:
+            corners = _numbers(gltf, binary, primitive.indices, "SCALAR")[:, 0].astype(np.int64)
+        if len(corners) % 3 or (len(corners) and corners.max() >= len(position)):
+            raise _BadFileError("its triangles name a vertex that does not exist; export it again")
+        faces.append(corners.reshape(-1, 3) + before)
+        points.append(position)
+        moves.append(delta)
+        before += len(position)
+    neutral, deltas = np.concatenate(points), np.concatenate(moves, axis=1)
+    if not len(neutral) or not (np.isfinite(neutral).all() and np.isfinite(deltas).all()):
+        raise _BadFileError("holds no vertices, or NaN or infinity; export it again")
+    return tuple(names), neutral, deltas, np.concatenate(faces)
+
+
+def _numbers(gltf: GLTF2, binary: bytes, index: object, form: str, count: int | None = None) -> npt.NDArray[Any]:
+    """An accessor's numbers (N, width): positions (``VEC3``) or indices (``SCALAR``).
+
+    Args:
+        gltf: the file's JSON.
+        binary: the file's binary chunk.
+        index: the accessor.
+        form: its type.
+        count: how many there must be; a sparse accessor without a buffer view states no size that could be trusted.
+    """
+    accessor = _entry(gltf.accessors, index, "accessor")
+    kinds: dict[int, np.dtype[Any]] = {FLOAT: np.dtype("<f4")} if form == "VEC3" else INDICES
+    kind, stated, width = kinds.get(accessor.componentType), accessor.count, WIDTHS[form]
+    if kind is None or accessor.type != form:
+        raise _BadFileError("holds positions or indices of an unknown type; export it without compression")
+    if not isinstance(stated, int) or stated < 0 or (count is not None and stated != count):
+        raise _BadFileError(f"has a target of {stated} vertices where the mesh has {count}; export it again")
+    if accessor.bufferView is not None:
+        values = _slab(gltf, binary, accessor, kind, stated, width)
+    elif count is not None:
+        values = np.zeros((count, width), kind)
+    else:
+        raise _BadFileError("has a mesh without data, perhaps a compressed one; export it without compression")
+    if (sparse := accessor.sparse) is not None:
+        places = _slab(gltf, binary, sparse.indices, INDICES[sparse.indices.componentType], sparse.count, 1)[:, 0]
+        if len(places) and places.max() >= stated:
+            raise _BadFileError("names a vertex that does not exist; export it again")
+        values[places] = _slab(gltf, binary, sparse.values, kind, sparse.count, width)
+    return values
+
+
+def _slab(
+    gltf: GLTF2,
+    binary: bytes,
+    at: Any,  # noqa: ANN401
+    kind: np.dtype[Any],
+    count: int,
+    width: int,
+) -> npt.NDArray[Any]:
+    """Numbers (count, width) from the buffer view and offset that an object names."""
+    # pygltflib hands out what the file says: every offset and count is checked before memory is touched.
+    view = _entry(gltf.bufferViews, at.bufferView, "buffer view")
+    if view.buffer != 0 or gltf.buffers[0].uri is not None:
+        raise _BadFileError("keeps its data in another file; export it as one .glb")
+    row = kind.itemsize * width
+    start, offset = view.byteOffset or 0, at.byteOffset or 0
+    stride = row if view.byteStride is None else view.byteStride
+    numbers = (start, view.byteLength, offset, stride, count)
+    if not all(isinstance(number, int) for number in numbers) or min(numbers) < 0 or stride < row:
+        raise _BadFileError("has a negative or broken offset; export it again")
+    if not count:
+        return np.empty((0, width), kind)
+    if offset + (count - 1) * stride + row > view.byteLength or start + view.byteLength > len(binary):
+        raise _BadFileError("has data beyond its end; export it again")
+    return np.ndarray((count, width), kind, binary, start + offset, (stride, kind.itemsize)).copy()
+
+
+def _entry(listed: Sequence[Any], index: object, kind: str) -> Any:  # noqa: ANN401
+    """An object by its number; numbers from the end, which Python would accept, are refused."""
+    if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(listed):
+        raise _BadFileError(f"names {kind} {index}, which does not exist; export it again")
+    return listed[index]

@@ -392,7 +392,7 @@ def test_names_within_the_known_packages_do_nothing_either(tmp_path: Path) -> No
         import sys
         from pathlib import Path
         sys.path.insert(0, ".")
-        from facediff.topology.flame import Flame
+        from facediff.mesh.flame import Flame
         assert Flame.read(Path("m.pkl")).n_vertices == 80
         assert not any(name.startswith("chumpy") for name in sys.modules)
     """

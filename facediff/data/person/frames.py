@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.mesh import Similarity, face_size, read_mesh, robust_align
-from facediff.mesh.mesh import read_obj
+from facediff.mesh import Mesh, Similarity, face_size, read_mesh, robust_align
 from facediff.utils.pickles import load_pickle
 
 # Arrays on disk that are needed while importing only.
@@ -28,43 +27,9 @@ def scratch_array(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]
 
 # Reading the meshes of single frames: vertices in the order of the file, and which triangles they form.
 
-Faces = npt.NDArray[np.int64]
+Faces = npt.NDArray[np.integer]
 
 MESHES = (".obj", ".ply")
-
-
-@dataclass(frozen=True)
-class FrameMesh:
-    """A mesh as read.
-
-    Attributes:
-        vertices: (V, 3) float64.
-        faces: (F, 3) vertex indices; None if the file has none.
-        face_text: the lines of an OBJ's faces, by which equal faces are told without reading them; empty otherwise.
-    """
-
-    vertices: npt.NDArray[np.float64]
-    faces: Faces | None
-    face_text: bytes = b""
-
-
-def read_frame_mesh(path: Path, *, known: FrameMesh | None = None) -> FrameMesh:
-    """Read an OBJ or PLY file.
-
-    Args:
-        path: the file.
-        known: a mesh read before; where the lines of the faces are the same, its faces are taken.
-
-    Raises:
-        FaceDiffError: if the file is missing or damaged, or holds no vertex.
-        MissingExtraError: if a PLY file is to be read and trimesh is not installed.
-    """
-    if path.suffix.lower() != ".obj":
-        mesh = read_mesh(path)
-        return FrameMesh(mesh.vertices, mesh.faces.astype(np.int64))
-    obj = read_obj(path)
-    same = known is not None and known.face_text == obj.face_text
-    return FrameMesh(obj.vertices, known.faces if same and known else obj.faces, obj.face_text)
 
 
 def differing_faces(one: Faces, other: Faces) -> int:
@@ -168,8 +133,8 @@ def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:
     for folder in (root, root / "templates"):
         for path in sorted(folder.glob("*")):
             if path.suffix.lower() in MESHES and path.is_file():
-                mesh = read_frame_mesh(path)
-                if len(mesh.vertices) == n_vertices and mesh.faces is not None:
+                mesh = read_mesh(path, points_allowed=True)
+                if len(mesh.vertices) == n_vertices and len(mesh.faces):
                     return mesh.faces
     return None
 
@@ -334,9 +299,9 @@ def read_frames(
                 f"{files.paths[here + 1].name}; at most {MAX_GAP} s can be filled, so cut the video there"
             )
     frames = scratch_array(scratch, (files.frames, n_vertices, 3))
-    first: FrameMesh | None = None
+    first: Mesh | None = None
     for path, place in zip(_bar(files.paths, progress), files.places, strict=True):
-        mesh = read_frame_mesh(path, known=first)
+        mesh = read_mesh(path, points_allowed=True)
         first = first or mesh
         _check(path, mesh, files.paths[0], first, n_vertices)
         frames[place] = mesh.vertices
@@ -348,10 +313,10 @@ def read_frames(
     notes = [f"{len(filled)} missing frames filled from their neighbours: {spans(filled)}"] if filled else []
     if files.numbers[-1] - files.numbers[0] > files.places[-1]:
         notes.append("the files' numbers go up in equal steps of more than one; taken as consecutive frames")
-    return frames, None if first is None else first.faces, notes
+    return frames, first.faces if first is not None and len(first.faces) else None, notes
 
 
-def _check(path: Path, mesh: FrameMesh, first_path: Path, first: FrameMesh, n_vertices: int) -> None:
+def _check(path: Path, mesh: Mesh, first_path: Path, first: Mesh, n_vertices: int) -> None:
     count = len(mesh.vertices)
     if count != len(first.vertices):
         raise FaceDiffError(
@@ -361,9 +326,7 @@ def _check(path: Path, mesh: FrameMesh, first_path: Path, first: FrameMesh, n_ve
         raise FaceDiffError(f"{path}: has {count} vertices, but the corpus has {n_vertices}; its topology is another")
     if not np.isfinite(mesh.vertices).all():
         raise FaceDiffError(f"{path}: holds NaN or infinity; repair the frame, or remove the file")
-    if mesh.faces is first.faces:
-        return
-    if mesh.faces is None or first.faces is None or differing_faces(mesh.faces, first.faces):
+    if not np.array_equal(mesh.faces, first.faces) and differing_faces(mesh.faces, first.faces):
         raise FaceDiffError(f"{path}: its faces differ from those of {first_path.name}; expected one topology")
 
 

@@ -17,7 +17,6 @@ from facediff.data.person.frames import (
     Auxiliary,
     Faces,
     check_faces,
-    read_frame_mesh,
     read_frames,
     relative_residual,
     scratch_array,
@@ -25,7 +24,7 @@ from facediff.data.person.frames import (
 )
 from facediff.data.prepare.motion import read_parameters
 from facediff.errors import FaceDiffError
-from facediff.mesh import Similarity, face_size, median_face, remove_rigid_motion, robust_align
+from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
 from facediff.mesh.alignment import Indices, chunks
 from facediff.mesh.flame import Flame
 
@@ -420,8 +419,8 @@ def read_template(path: Path, corpus: Auxiliary) -> Template:
             raise FaceDiffError(f"{path}: has shape {array.shape}; expected ({count}, 3) like the corpus")
         vertices = np.array(array, np.float64).reshape(count, 3)
     elif suffix in MESHES:
-        mesh = read_frame_mesh(path)
-        vertices, faces = mesh.vertices, mesh.faces
+        mesh = read_mesh(path, points_allowed=True)
+        vertices, faces = mesh.vertices, mesh.faces if len(mesh.faces) else None
         if len(vertices) != count:
             raise FaceDiffError(
                 f"{path}: has {len(vertices)} vertices, but the corpus has {count}; its topology is another"

@@ -33,7 +33,7 @@ from facediff.data.prepare.runner import (
     write_templates,
 )
 from facediff.errors import FaceDiffError, MissingExtraError, choices
-from facediff.mesh.mesh import read_obj
+from facediff.mesh import read_mesh
 from facediff.utils.files import atomic
 
 # The ``.vl`` files of BIWI: one frame each, a count of vertices and then float32 x, y, z for each.
@@ -232,12 +232,10 @@ def write_clip(
 @lru_cache(maxsize=2 * len(SUBJECTS))
 def read_template(path: Path) -> tuple[Array, npt.NDArray[np.int32]]:
     """Vertices (V, 3) in mm and faces (F, 3) of a personal template, vertices in the order of the file."""
-    obj = read_obj(path)
-    if not np.isfinite(obj.vertices).all():
-        raise FaceDiffError(f"{path}: holds NaN or infinity; copy it anew")
-    if obj.faces is None:
-        raise FaceDiffError(f"{path}: holds no triangles; expected a whole mesh, get it anew")
-    return obj.vertices, obj.faces.astype(np.int32)
+    mesh = read_mesh(path)
+    if not np.isfinite(mesh.vertices).all():
+        raise FaceDiffError(f"{path}: holds NaN or infinity; copy it again")
+    return mesh.vertices, mesh.faces
 
 
 def _normalised(

@@ -19,7 +19,7 @@ from facediff.data.prepare.motion import codetalker
 from facediff.data.prepare.runner import Report, prepare
 from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
-from facediff.mesh.mesh import read_obj, surface_area
+from facediff.mesh.mesh import surface_area
 from facediff.utils.pickles import load_pickle
 from tests.fakes.biwi import (
     RATE,
@@ -377,8 +377,7 @@ def test_obj_keeps_every_vertex_in_its_place(tmp_path: Path) -> None:
         "f 1/1/1 3/1/1 4/1/1 5/1/1\nf -5//1 -3//1 -1//1\n",
         encoding="latin-1",
     )
-    obj = read_obj(path)
-    assert obj.faces is not None
+    obj = read_mesh(path)
     assert obj.vertices.tolist() == [[0, 0, 0], [9, 9, 9], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     assert obj.faces.tolist() == [[0, 2, 3], [0, 3, 4], [0, 2, 4]]
 
