@@ -177,7 +177,7 @@ def verdict(rows: Sequence[Scores], args: argparse.Namespace) -> str:
 
 def heading(args: argparse.Namespace, model: DualPathDiffusion, batches: dict[str, list[Batch]]) -> str:
     """What is measured, where and how."""
-    packages = ", ".join(f"{name} {version(name)}" for name in ("facediff", "torch", "diffusers"))
+    packages = ", ".join(f"{name} {version(name)}" for name in ("facediff", "torch"))
     clips = ", ".join(f"{split} {sum(map(len, some))} clips" for split, some in batches.items())
     synthetic = " (synthetic: says nothing about real people)" if model.assets.synthetic else ""
     millions = sum(p.numel() for p in model.parameters()) / 1e6

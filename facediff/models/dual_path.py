@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,19 +13,28 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import FaceDiffError
 from facediff.models import losses
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.decoders import Decoder, DecoderFactory, StyleTransformer
 from facediff.models.evaluation import IdentityPolicy
-from facediff.models.folding import Fold, FoldCache
+from facediff.models.folding import (
+    Blend,
+    Fold,
+    FoldedSpace,
+    SamplingSpace,
+    Space,
+    VertexSpace,
+    WeightCache,
+    fold,
+    unchanged,
+)
 from facediff.models.fusions import BidirectionalCrossAttention, Fusion, FusionFactory
 from facediff.models.identity_encoders import HierarchicalIdentity, IdentityEncoder, IdentityEncoderFactory
-from facediff.models.inference import ClipNoise, Progress, Window, WindowNoise, WindowOverlap, unchanged
+from facediff.models.inference import ClipNoise, Progress, Window, WindowNoise, WindowOverlap
 from facediff.models.layers import frame_mask
 from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoder, MeshEncoderFactory
-from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, Sampler, SamplerFactory, unit_noise
+from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, SamplerFactory, unit_noise
 from facediff.models.style_encoders import StyleEncoder, StyleEncoderFactory, TcnGruTransformer
 from facediff.registry import describe
 
@@ -47,34 +56,11 @@ class StepEmbedding(nn.Module):
         frequencies = torch.exp(-math.log(10_000.0) * torch.arange(half) / half)
         self.register_buffer("frequencies", frequencies, persistent=False)
         self.mlp = nn.Sequential(nn.Linear(2 * half, dim), nn.SiLU(), nn.Linear(dim, dim))
-        self._table: Tensor | None = None
-        self._weights: list[Tensor] = []
 
     def forward(self, step: Int[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
         """Embed step numbers counted from 0."""
         angle = step[:, None].float() * self.frequencies
         return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))
-
-    def table(self, steps: int) -> Float[Tensor, "steps dim"]:
-        """The embeddings of all steps, without gradient; kept until the weights are found changed.
-
-        Args:
-            steps: the process's steps N.
-        """
-        weights = [self.frequencies, *self.mlp.parameters()]
-        # Without inference mode, whose tensors could not be used outside of it later.
-        with torch.inference_mode(False), torch.no_grad(), torch.autocast(self.frequencies.device.type, enabled=False):
-            kept = self._table
-            if kept is None or len(kept) != steps or not all(map(same, weights, self._weights)):
-                kept = self._table = self(torch.arange(steps, device=self.frequencies.device))
-                # The weights themselves are looked at: no counter sees how averaged weights are swapped in and out.
-                self._weights = [weight.detach().clone() for weight in weights]
-        return kept
-
-
-def same(one: Tensor, other: Tensor) -> bool:
-    """Whether two tensors are equal, also in type and place."""
-    return one.dtype == other.dtype and one.device == other.device and torch.equal(one, other)
 
 
 # The network of dual-path style diffusion: conditions once per clip, one denoising pass per step.
@@ -90,39 +76,26 @@ class Conditions:
         audio: speech features F_a.
         style: style tokens, the condition F_s.
         mask: True on valid frames.
+        fusion: what the fusion prepared for inference.
+        decoder: what the decoder prepared for inference.
+        step_table: the embedding of each step; None if steps are embedded as they come.
     """
 
     audio: Float[Tensor, "batch frames dim"]
     style: Float[Tensor, "batch tokens dim"]
     mask: Bool[Tensor, "batch frames"]
+    fusion: object = None
+    decoder: object = None
+    step_table: Float[Tensor, "steps dim"] | None = None
 
     def frames(self, start: int, end: int) -> Conditions:
-        """Those of some of the frames."""
+        """Those of some of the frames, with nothing prepared."""
         return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end])
 
     def repeated(self, times: int) -> Conditions:
-        """One clip's conditions for several takes of it; nothing is copied."""
-        if times == 1:
-            return self
+        """One clip's conditions for several samples of it, with nothing prepared; nothing is copied."""
         audio, style = (value.expand(times, -1, -1) for value in (self.audio, self.style))
         return Conditions(audio, style, self.mask.expand(times, -1))
-
-
-@dataclass(frozen=True)
-class PreparedConditions(Conditions):
-    """Conditions with everything else that does not change over the steps; whole, not to be sliced.
-
-    It holds for the weights and the precision in which it was made.
-
-    Attributes:
-        fusion: what the fusion prepared.
-        decoder: what the decoder prepared.
-        steps: the embedding of each step; None if steps are embedded as they come.
-    """
-
-    fusion: object = None
-    decoder: object = None
-    steps: Float[Tensor, "steps dim"] | None = None
 
 
 class StyleTokens(nn.Module):
@@ -197,6 +170,7 @@ class DualPathNetwork(nn.Module):
         self.fused_norm = nn.LayerNorm(dim)
         self.decoder = decoder
         self.unembed = nn.Linear(dim, 3 * n_vertices)
+        self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
 
     def conditions(
         self,
@@ -221,25 +195,40 @@ class DualPathNetwork(nn.Module):
         style = torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1)
         return Conditions(encoded, self.style_tokens(style), frame_mask(frame_lengths, encoded.shape[1]))
 
-    def prepared(self, conditions: Conditions, steps: int | None = None) -> PreparedConditions:
-        """What :meth:`core` would compute anew in each of many steps, computed once.
+    def prepare_for_inference(
+        self, conditions: Conditions, steps: int, *, folded: bool, blend: Blend = unchanged
+    ) -> Space:
+        """Everything that is constant over the denoising steps of a clip or window, as the space a sampler runs in.
 
-        To be called on conditions as they will be used, after any slicing, once a clip or window; :meth:`core` gives
-        the same with the result as with the conditions themselves, up to rounding.
+        It holds for the weights and the precision in which it was made, so it is made again for every run; what follows
+        from the weights alone is kept until they change.
 
         Args:
-            conditions: as :meth:`conditions` gives them, or parts of them.
-            steps: the process's steps N, for a table of their embeddings; none is used if None.
+            conditions: as :meth:`conditions` gives them, or those of some frames.
+            steps: the process's steps N.
+            folded: run in the width of the model where both ends are linear, else on the vertices.
+            blend: changes the features that the network gives in every step.
         """
+        first, last = self.embed, self.unembed
+        folded = folded and isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
+        ends = [weight for weight in (first.weight, last.weight, last.bias) if weight is not None] if folded else []
+
+        def of_weights() -> tuple[Tensor, Fold | None]:
+            table = self.step_embedding(torch.arange(steps, device=conditions.audio.device))
+            return table, fold(first.weight, last.weight, last.bias) if folded else None
+
+        weights = [self.step_embedding.frequencies, *self.step_embedding.parameters(), *ends]
+        table, product = self._of_weights.get(weights, (steps, folded), of_weights)
         audio, style, mask = conditions.audio, conditions.style, conditions.mask
-        return PreparedConditions(
+        ready = Conditions(
             audio,
             style,
             mask,
             fusion=self.fusion.prepare(audio, mask),
             decoder=self.decoder.prepare(style, mask),
-            steps=None if steps is None else self.step_embedding.table(steps),
+            step_table=table,
         )
+        return VertexSpace(self, ready, blend) if product is None else FoldedSpace(self, ready, product, blend)
 
     def dynamic_style(
         self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
@@ -280,149 +269,15 @@ class DualPathNetwork(nn.Module):
         Args:
             motion: F_m.
             step: step numbers counted from 0.
-            conditions: as they are, or :meth:`prepared`.
+            conditions: as they are, or prepared for inference.
         """
-        ready = conditions if isinstance(conditions, PreparedConditions) else PreparedConditions(**vars(conditions))
         # A component that prepares nothing need not know that others do.
-        known = [() if part is None else (part,) for part in (ready.fusion, ready.decoder)]
-        fused = self.fusion(ready.audio, motion, ready.mask, *known[0])
-        embedded = self.step_embedding(step) if ready.steps is None else ready.steps[step]
+        fusion, decoder = ([] if made is None else [made] for made in (conditions.fusion, conditions.decoder))
+        fused = self.fusion(conditions.audio, motion, conditions.mask, *fusion)
+        table = conditions.step_table
+        embedded = self.step_embedding(step) if table is None else table[step]
         fused = self.fused_norm(fused + embedded[:, None])  # eq. 13
-        return self.decoder(fused, ready.style, ready.mask, *known[1])
-
-
-# Where the reverse process runs: on vertices, or folded into the width of the model.
-
-SamplingSpace = Literal["folded", "vertices"]
-
-Blend = Callable[[Tensor], Tensor]
-"""From the features that the network gave in a step to those that are used."""
-
-
-class Space(Protocol):
-    """A linear image of motion in which a sampler runs, none the wiser; made anew for every run.
-
-    Attributes:
-        width: numbers in a frame.
-    """
-
-    width: int
-
-    def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
-        """From independent unit Gaussian noise to the image of unit Gaussian noise on vertices."""
-        ...
-
-    def predict(
-        self, state: Float[Tensor, "batch frames width"], step: Int[Tensor, " batch"], conditions: Conditions
-    ) -> Float[Tensor, "batch frames width"]:
-        """The image of the predicted clean motion."""
-        ...
-
-    def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
-        """Scaled motion of the sampler's result."""
-        ...
-
-
-class VertexSpace:
-    """Motion itself; needs nothing of the network or the sampler.
-
-    Args:
-        network: the network.
-        width: coordinates of a frame, 3V.
-        blend: changes the features of every step.
-    """
-
-    def __init__(self, network: DualPathNetwork, width: int, blend: Blend = unchanged) -> None:
-        self.network = network
-        self.width = width
-        self.blend = blend
-
-    def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
-        """Unit noise as it is."""
-        return unit
-
-    def predict(
-        self, state: Float[Tensor, "batch frames width"], step: Int[Tensor, " batch"], conditions: Conditions
-    ) -> Float[Tensor, "batch frames width"]:
-        """M̂⁰."""
-        return self.network.leave(self.blend(self.network.core(self.network.embed(state), step, conditions)))
-
-    def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
-        """The sample as it is."""
-        return sample
-
-
-class FoldedSpace:
-    """y = E x, the noisy motion as the network sees it, without its bias; the same samples at the width's cost.
-
-    The last step of a linear sampler returns the last prediction E M̂⁰, and that is M̂⁰ = U h + b of the features h
-    which the network gave last: they are kept, since y alone does not say where the vertices are.
-
-    Args:
-        network: a network whose ``embed`` and ``unembed`` are linear.
-        fold: their products.
-        blend: changes the features of every step.
-    """
-
-    def __init__(self, network: DualPathNetwork, fold: Fold, blend: Blend = unchanged) -> None:
-        self.network = network
-        self.fold = fold
-        self.blend = blend
-        self.width = len(fold.offset)
-        self._features: Tensor | None = None
-        self._prediction: Tensor | None = None
-
-    def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
-        """Noise with the covariance E Eᵀ, independent over frames; zero where ``unit`` is."""
-        with torch.autocast(unit.device.type, enabled=False):
-            return unit @ self.fold.root
-
-    def predict(
-        self, state: Float[Tensor, "batch frames width"], step: Int[Tensor, " batch"], conditions: Conditions
-    ) -> Float[Tensor, "batch frames width"]:
-        """E M̂⁰ = E U h + E b."""
-        bias = self.network.embed.bias
-        features = self.blend(self.network.core(state if bias is None else state + bias, step, conditions))
-        with torch.autocast(features.device.type, enabled=False):
-            prediction = nn.functional.linear(features.to(state.dtype), self.fold.product, self.fold.offset)
-        self._features, self._prediction = features, prediction
-        return prediction
-
-    def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
-        """U h + b, the only step over the vertices.
-
-        Raises:
-            FaceDiffError: if the sampler did not end at the last prediction.
-        """
-        features, prediction = self._features, self._prediction
-        if (
-            features is None
-            or prediction is None
-            or not torch.allclose(sample, prediction, rtol=1e-3, atol=1e-4, equal_nan=True)
-        ):
-            raise FaceDiffError(
-                "sampler: it says that it is linear, but its last step does not return the last prediction; "
-                "choose --model.sampling_space=vertices"
-            )
-        return self.network.leave(features)
-
-
-def choose_space(
-    network: DualPathNetwork, wanted: SamplingSpace, sampler: Sampler, cache: FoldCache, blend: Blend = unchanged
-) -> Space:
-    """The folded space where it is wanted and exact, else the vertices.
-
-    Args:
-        network: the network; it can be folded if both ends are linear.
-        wanted: the space asked for.
-        sampler: the sampler that will run; it can be folded if it is linear.
-        cache: the network's fold from earlier.
-        blend: changes the features that the network gives in every step.
-    """
-    first, last = network.embed, network.unembed
-    if wanted == "folded" and sampler.linear and isinstance(first, nn.Linear) and isinstance(last, nn.Linear):
-        return FoldedSpace(network, cache.get(first.weight, last.weight, last.bias), blend)
-    return VertexSpace(network, network.coordinates, blend)
+        return self.decoder(fused, conditions.style, conditions.mask, *decoder)
 
 
 @registry.model.register("DualPathDiffusion")
@@ -449,7 +304,7 @@ class DualPathDiffusion(AnimationModel):
             cost per step that does not depend on the vertices, or on the ``vertices`` themselves, for comparison. A
             sampler or a network that cannot be folded runs on the vertices anyway.
         diffusion_steps: noising steps N.
-        noise_schedule: schedule of diffusers; ``squaredcos_cap_v2`` is the cosine schedule.
+        noise_schedule: ``squaredcos_cap_v2`` (the cosine schedule), ``linear`` or ``scaled_linear``.
         motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
             leaves it as it is.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
@@ -522,7 +377,6 @@ class DualPathDiffusion(AnimationModel):
         self.process = NoiseProcess(diffusion_steps, noise_schedule)
         self.sampler = sampler(process=self.process)
         self.sampling_space: SamplingSpace = sampling_space
-        self._fold_cache = FoldCache()
         style = style_encoder(dim=dim)
         self.network = DualPathNetwork(
             n_vertices=n_vertices,
@@ -648,17 +502,13 @@ class DualPathDiffusion(AnimationModel):
         self, conditions: Conditions, unit: NoiseSource, *, blend: Blend = unchanged, progress: Progress | None = None
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Run the sampler; ``unit`` gives unit noise, ``blend`` changes the features of every step."""
-        conditions = self.network.prepared(conditions, self.process.steps)
-        space = choose_space(self.network, self.sampling_space, self.sampler, self._fold_cache, blend)
+        folded = self.sampling_space == "folded" and self.sampler.linear
+        space = self.network.prepare_for_inference(conditions, self.process.steps, folded=folded, blend=blend)
         rows, frames = conditions.mask.shape
 
         def noise(like: Tensor) -> Tensor:
             return space.noise(unit(like))
 
-        def denoise(state: Tensor, step: int) -> Tensor:
-            steps = torch.full((rows,), step, device=state.device)
-            return space.predict(state, steps, conditions)
-
         start = noise(torch.empty(rows, frames, space.width, device=self.device, dtype=next(self.parameters()).dtype))
-        sample = self.sampler.run(denoise, start, noise=noise, progress=progress)
+        sample = self.sampler.run(space.denoise, start, noise=noise, progress=progress)
         return (space.motion(sample) / self.scale).view(rows, frames, self.n_vertices, 3)

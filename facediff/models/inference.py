@@ -572,11 +572,6 @@ class WindowOverlap:
         return features
 
 
-def unchanged(features: Tensor) -> Tensor:
-    """In place of a seam where there is none."""
-    return features
-
-
 class Inference(ABC):
     """The part of a model that animates.
 

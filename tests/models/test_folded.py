@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
-from facediff.models import DualPathDiffusion, folding
-from facediff.models.dual_path import FoldedSpace, Space, VertexSpace, choose_space
+from facediff.models import DualPathDiffusion, dual_path
+from facediff.models.folding import FoldedSpace, Space, VertexSpace
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]
@@ -52,16 +52,29 @@ def cast(batch: Batch, dtype: torch.dtype) -> Batch:
     return replace(batch, **{name: v.to(dtype) for name, v in tensors.items() if v.is_floating_point()})
 
 
-def run(model: DualPathDiffusion, batch: Batch, space: Space, noise: Callable[[], Tensor]) -> Tensor:
-    """The sampler in a space, with its noise given; on vertices, all is computed anew in every step."""
-    conditions = model._conditions(batch)
-    if isinstance(space, FoldedSpace):
-        conditions = model.network.prepared(conditions, model.process.steps)
+def run(model: DualPathDiffusion, space: Space, noise: Callable[[], Tensor]) -> Tensor:
+    """The sampler in a space, with its noise given."""
+    return space.motion(model.sampler.run(space.denoise, noise(), noise=lambda _: noise()))
 
-    def denoise(state: Tensor, step: int) -> Tensor:
-        return space.predict(state, torch.full((len(state),), step), conditions)
 
-    return space.motion(model.sampler.run(denoise, noise(), noise=lambda _: noise()))
+def vertices(model: DualPathDiffusion, batch: Batch) -> Space:
+    """On vertices, with everything computed again in every step."""
+    return VertexSpace(model.network, model._conditions(batch))
+
+
+def choose(model: DualPathDiffusion, batch: Batch) -> Space:
+    """The space that the model samples in."""
+    made: list[Space] = []
+    prepare = model.network.prepare_for_inference
+
+    def watched(*given: Any, **named: Any) -> Space:  # noqa: ANN401
+        made.append(prepare(*given, **named))
+        return made[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model.network, "prepare_for_inference", watched)
+        model.generate(batch)
+    return made[0]
 
 
 @pytest.mark.parametrize(("name", "options"), SAMPLERS)
@@ -72,7 +85,7 @@ def test_the_same_noise_gives_the_same_motion(
     model = ready(sampler=partial(registry.sampler.get(name), **options)).to(dtype)
     batch = cast(batch, dtype)
     network = model.network
-    space = choose_space(network, "folded", model.sampler, model._fold_cache)
+    space = choose(model, batch)
     assert isinstance(space, FoldedSpace)
     shape = (*batch.motion.shape[:2], network.coordinates)
 
@@ -82,12 +95,12 @@ def test_the_same_noise_gives_the_same_motion(
 
     drawn = draws(1)
     with torch.no_grad():
-        plain = run(model, batch, VertexSpace(network, network.coordinates), draws(1))
-        folded = run(model, batch, space, lambda: drawn() @ network.embed.weight.T)
+        plain = run(model, vertices(model, batch), draws(1))
+        folded = run(model, space, lambda: drawn() @ network.embed.weight.T)
     assert plain[batch.mask].std() > 0.5
     torch.testing.assert_close(folded[batch.mask], plain[batch.mask], rtol=0, atol=tolerance)
     with torch.no_grad():
-        other = run(model, batch, VertexSpace(network, network.coordinates), draws(2))
+        other = run(model, vertices(model, batch), draws(2))
     assert (other - plain)[batch.mask].abs().max() > 1e-2  # the noise matters
 
 
@@ -127,13 +140,9 @@ def test_fresh_noise_gives_the_same_mean_and_covariance(ready: Make, tiny: Tiny)
 def test_folded_is_the_default_and_vertices_an_option(ready: Make, batch: Batch) -> None:
     folded, plain = ready(), ready(sampling_space="vertices")
     assert folded.hparams["sampling_space"] == "folded"
-    assert isinstance(choose(folded), FoldedSpace)
-    assert isinstance(choose(plain), VertexSpace)
+    assert isinstance(choose(folded, batch), FoldedSpace)
+    assert isinstance(choose(plain, batch), VertexSpace)
     assert plain.generate(batch).shape == folded.generate(batch).shape == batch.motion.shape
-
-
-def choose(model: DualPathDiffusion) -> Space:
-    return choose_space(model.network, model.sampling_space, model.sampler, model._fold_cache)
 
 
 def test_ends_that_are_not_linear_sample_on_vertices(ready: Make, batch: Batch) -> None:
@@ -141,7 +150,7 @@ def test_ends_that_are_not_linear_sample_on_vertices(ready: Make, batch: Batch) 
     for one in (model, same):
         torch.manual_seed(1)
         one.network.embed = nn.Sequential(nn.Linear(72, 16), nn.Tanh())
-    assert isinstance(choose(model), VertexSpace)
+    assert isinstance(choose(model, batch), VertexSpace)
     assert torch.equal(model.generate(batch), same.generate(batch))
 
 
@@ -151,8 +160,8 @@ def test_ends_without_biases_fold(ready: Make, batch: Batch) -> None:
     network, batch = model.network, cast(batch, torch.float64)
     start = torch.randn(*batch.motion.shape[:2], 72, dtype=torch.float64)
     with torch.no_grad():
-        plain = run(model, batch, VertexSpace(network, 72), lambda: start)
-        folded = run(model, batch, choose(model), lambda: start @ network.embed.weight.T)
+        plain = run(model, vertices(model, batch), lambda: start)
+        folded = run(model, choose(model, batch), lambda: start @ network.embed.weight.T)
     torch.testing.assert_close(folded, plain, rtol=0, atol=1e-10)
 
 
@@ -161,7 +170,7 @@ def test_a_sampler_that_is_not_linear_runs_on_vertices(
 ) -> None:
     model = ready()
     monkeypatch.setattr(type(model.sampler), "linear", False)
-    assert isinstance(choose(model), VertexSpace)
+    assert isinstance(choose(model, batch), VertexSpace)
     assert model.generate(batch).shape == batch.motion.shape
 
 
@@ -187,7 +196,7 @@ def test_a_clip_does_not_depend_on_the_clips_beside_it(ready: Make, tiny: Tiny, 
 
 
 def test_noise_is_independent_over_frames_and_zero_on_padding(ready: Make, batch: Batch) -> None:
-    space = choose(ready())
+    space = choose(ready(), batch)
     unit = torch.randn(*batch.motion.shape[:2], space.width) * batch.mask[..., None]
     noise = space.noise(unit)
     assert not noise[~batch.mask].any()
@@ -209,8 +218,8 @@ def test_changed_weights_are_seen(ready: Make, batch: Batch) -> None:
 
 def test_weights_are_multiplied_once(ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
-    real = folding.fold
-    monkeypatch.setattr(folding, "fold", lambda *maps: (calls.append(1), real(*maps))[1])
+    real = dual_path.fold
+    monkeypatch.setattr(dual_path, "fold", lambda *maps: (calls.append(1), real(*maps))[1])
     model = ready()
     for seed in range(3):
         model.generate(batch, seed=seed)

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from facediff.models import folding
-from facediff.models.folding import FoldCache, fold
+from facediff.models.folding import Fold, WeightCache, fold
 
 
 def ends(dim: int, coordinates: int, dtype: torch.dtype = torch.float64) -> tuple[nn.Linear, nn.Linear]:
@@ -59,31 +59,40 @@ CHANGES: dict[str, Callable[[nn.Linear, nn.Linear], object]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_the_cache_sees_every_change_of_the_weights(change: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_sees_every_change_of_the_weights(change: str) -> None:
     calls: list[int] = []
-    real = folding.fold
-    monkeypatch.setattr(folding, "fold", lambda *maps: (calls.append(1), real(*maps))[1])
     first, last = ends(4, 12)
-    cache = FoldCache()
+    cache: WeightCache[Fold] = WeightCache()
+
+    def compute() -> Fold:
+        calls.append(1)
+        return fold(first.weight, last.weight, last.bias)
+
     for _ in range(3):
-        cache.get(first.weight, last.weight, last.bias)
+        cache.get([first.weight, last.weight, last.bias], "fold", compute)
     assert len(calls) == 1
     CHANGES[change](first, last)
-    found = cache.get(first.weight, last.weight, last.bias)
+    found = cache.get([first.weight, last.weight, last.bias], "fold", compute)
     assert len(calls) == 2
-    expected = real(first.weight.detach(), last.weight.detach(), last.bias.detach())
+    expected = fold(first.weight.detach(), last.weight.detach(), last.bias.detach())
     for name in ("product", "offset", "root"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
 
 
 def test_what_is_made_in_inference_mode_serves_outside_of_it() -> None:
     first, last = ends(4, 12)
-    cache = FoldCache()
+    cache: WeightCache[Fold] = WeightCache()
     with torch.inference_mode():
-        made = cache.get(first.weight, last.weight, last.bias)
+        made = cache.get([first.weight], "fold", lambda: fold(first.weight, last.weight, last.bias))
     assert not made.product.is_inference()
     weight = torch.ones(4, 4, dtype=torch.float64, requires_grad=True)
     (made.product @ weight).sum().backward()
+
+
+def test_the_cache_keeps_the_value_of_one_key() -> None:
+    cache: WeightCache[int] = WeightCache()
+    weights = [torch.ones(2, 2)]
+    assert [cache.get(weights, key, lambda key=key: key) for key in (1, 1, 2)] == [1, 1, 2]
 
 
 def test_equal_weights_give_the_same_root_whatever_the_signs_of_eigenvectors(monkeypatch: pytest.MonkeyPatch) -> None:

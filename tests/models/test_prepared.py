@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import collate
 from facediff.models import DualPathDiffusion
-from facediff.models.dual_path import Conditions, StepEmbedding
+from facediff.models.dual_path import Conditions
+from facediff.models.folding import Space
 from tests.fakes.plugin.facediff_moving_average import MovingAverageDecoder
 from tests.fakes.tiny import Tiny
 
@@ -46,37 +47,35 @@ def test_the_core_gives_the_same_with_prepared_conditions(
     network, dim = model.network, variant.get("dim", DIM)
     given = conditions(dim, padded=padded)
     for known in (given, given.frames(2, 9)):
-        ready = network.prepared(known, model.process.steps)
+        space = network.prepare_for_inference(known, model.process.steps, folded=False)
         for step in (0, 17, model.process.steps - 1):
             motion, steps = torch.randn(*known.audio.shape).double(), torch.tensor([step, step])
             with torch.no_grad():
-                out, expected = network.core(motion, steps, ready), network.core(motion, steps, known)
+                out, expected = space.features(motion, step), network.core(motion, steps, known)
             torch.testing.assert_close(out[known.mask], expected[known.mask], rtol=0, atol=1e-12)
 
 
-def test_steps_are_embedded_as_they_come_without_a_table(make_model: Make) -> None:
-    network = make_model().double().eval().network
-    given, motion = conditions(DIM), torch.randn(2, FRAMES, DIM).double()
-    steps = torch.tensor([3, 30])
-    ready = network.prepared(given)
-    assert ready.steps is None
-    torch.testing.assert_close(network.core(motion, steps, ready), network.core(motion, steps, given))
+def test_the_table_of_steps_is_kept_until_the_weights_change(make_model: Make) -> None:
+    network = make_model().eval().network
+    given = Conditions(torch.randn(1, FRAMES, DIM), torch.randn(1, 3, DIM), torch.ones(1, FRAMES, dtype=torch.bool))
 
+    def table(steps: int = 40) -> Tensor:
+        space: Space = network.prepare_for_inference(given, steps, folded=True)
+        found = space.conditions.step_table  # type: ignore[attr-defined]
+        assert isinstance(found, Tensor)
+        return found
 
-def test_the_table_of_steps_is_kept_until_the_weights_change() -> None:
-    torch.manual_seed(0)
-    embedding = StepEmbedding(DIM)
     with torch.inference_mode():
-        table = embedding.table(40)
-    torch.testing.assert_close(table, embedding(torch.arange(40)).detach(), rtol=0, atol=1e-6)
-    assert embedding.table(40) is table
-    assert len(embedding.table(50)) == 50
+        first = table()
+    torch.testing.assert_close(first, network.step_embedding(torch.arange(40)).detach(), rtol=0, atol=1e-6)
+    assert table() is first
+    assert len(table(50)) == 50
     # As weight averages are swapped in: without a trace in any counter.
-    embedding.mlp[2].bias.data.add_(1.0)
-    torch.testing.assert_close(embedding.table(40), table + 1.0)
-    assert "_table" not in "".join(embedding.state_dict())
+    network.step_embedding.mlp[2].bias.data.add_(1.0)
+    torch.testing.assert_close(table(), first + 1.0)
+    assert not [name for name in network.state_dict() if "of_weights" in name or "table" in name]
     # It can be used where gradients are computed, though it carries none and was made in inference mode.
-    (table * torch.ones(DIM, requires_grad=True)).sum().backward()
+    (first * torch.ones(DIM, requires_grad=True)).sum().backward()
 
 
 def test_nothing_constant_is_computed_in_a_step(make_model: Make, tiny: Tiny) -> None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from facediff.models.samplers import NoiseProcess
+from facediff.errors import FaceDiffError
+from facediff.models.samplers import SCHEDULES, NoiseProcess
 
 
 @pytest.mark.parametrize("steps", [10, 1000])
@@ -24,7 +25,30 @@ def test_cosine_schedule(steps: int) -> None:
     assert process.signal[-1] < 1e-4  # the process ends in pure noise, from which sampling starts
 
 
-@pytest.mark.parametrize("schedule", ["squaredcos_cap_v2", "linear"])
+@pytest.mark.parametrize("steps", [1, 10, 999, 1000])
+@pytest.mark.parametrize("schedule", SCHEDULES)
+def test_schedules_are_their_formulas_in_float32(schedule: str, steps: int) -> None:
+    """Checkpoints were trained with these very numbers: rounded once from the formula, multiplied in float64."""
+    process, n = NoiseProcess(steps, schedule), np.arange(steps)
+    if schedule == "squaredcos_cap_v2":
+        curve = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * np.pi / 2) ** 2
+        np.testing.assert_array_equal(process.variances, np.minimum(1 - curve[1:] / curve[:-1], 0.999).astype("f4"))
+    else:
+        power = 1 if schedule == "linear" else 2
+        first, last = np.float32(0.0001 ** (1 / power)), np.float32(0.02 ** (1 / power))
+        width = float((last - first) / np.float32(max(1, steps - 1)))
+        line = np.where((n < steps // 2) | (steps == 1), first + width * n, last - width * (steps - 1 - n))
+        np.testing.assert_array_max_ulp(process.variances.numpy(), line.astype("f4") ** power, maxulp=2)
+    kept = np.cumprod((np.float32(1) - process.variances.numpy()).astype("f8")).astype("f4")
+    np.testing.assert_array_equal(process.signal, kept)
+
+
+def test_unknown_schedule_is_refused() -> None:
+    with pytest.raises(FaceDiffError, match='"cosine".*squaredcos_cap_v2'):
+        NoiseProcess(10, "cosine")
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
 def test_closed_form_is_the_product_of_single_steps(schedule: str) -> None:
     process = NoiseProcess(60, schedule)
     step = torch.arange(60)

@@ -10,14 +10,15 @@ from functools import partial
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from facediff.data import Assets, Batch, Sample, collate
 from facediff.data.audio import samples_for
 from facediff.models import DualPathDiffusion
 from facediff.models.audio_encoders import HubertEncoder
 from facediff.models.decoders import StyleTransformer
-from facediff.models.dual_path import Conditions, PreparedConditions, SamplingSpace, Space, choose_space
-from facediff.models.folding import fold
+from facediff.models.dual_path import Conditions
+from facediff.models.folding import SamplingSpace, Space, fold
 from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.inference import ClipNoise
 from facediff.models.samplers import Sampler
@@ -105,12 +106,11 @@ class Bench:
         work()
         return min(self.clock(work) for _ in range(self.repeats))
 
-    def conditions(self) -> PreparedConditions:
-        """Everything that is computed once a clip."""
+    def conditions(self) -> Conditions:
+        """What is computed once a clip."""
         batch, network = self.batch, self.model.network
         style = self.model.encode_style(batch.reference, batch.reference_mask)
-        found = network.conditions(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.identity, style)
-        return network.prepared(found, self.model.process.steps)
+        return network.conditions(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.identity, style)
 
     def once_a_clip(self) -> tuple[float, float]:
         """Seconds of the audio encoder, and of all other conditions."""
@@ -132,24 +132,25 @@ class Bench:
         """Name and steps of the model's sampler."""
         return self.model.hparams["sampler"]["class_path"].rpartition(".")[2], self.model.sampler.steps
 
-    def space(self, name: SamplingSpace, sampler: Sampler) -> Space:
+    def space(self, name: SamplingSpace, conditions: Conditions) -> Space:
         """A sampling space, with the model's own cache."""
-        return choose_space(self.model.network, name, sampler, self.model._fold_cache)
+        steps = self.model.process.steps
+        return self.model.network.prepare_for_inference(conditions, steps, folded=name == "folded")
 
     def stepper(self, name: SamplingSpace, sampler: Sampler, conditions: Conditions) -> Callable[[], None]:
         """A call that takes one step of the real loop: prediction, noise, update."""
-        space, batch = self.space(name, sampler), self.batch
+        space, batch = self.space(name, conditions), self.batch
         unit = ClipNoise(batch.names, batch.frame_lengths.tolist(), [0] * len(batch), self.model.device)
         shape = (*batch.motion.shape[:2], space.width)
         state = space.noise(unit(torch.empty(shape, device=self.model.device)))
-        scheduler = sampler.make_scheduler()
-        places = iter(scheduler.timesteps.tolist())
+        places = iter(enumerate(sampler.timesteps))
+        predictions: list[Tensor] = []
 
         def step() -> None:
-            nonlocal state
-            place = next(places)
-            prediction = space.predict(state, torch.full((1,), place, device=state.device), conditions)
-            state = sampler.advance(scheduler, prediction, place, state, lambda like: space.noise(unit(like)))
+            nonlocal state, predictions
+            i, place = next(places)
+            predictions = [*predictions, space.denoise(state, place)][-sampler.memory :]
+            state = sampler.update(i, state, predictions, lambda like: space.noise(unit(like)))
 
         return step
 
@@ -166,17 +167,17 @@ class Bench:
         network, batch = self.model.network, self.batch
         audio_encoder, others = self.once_a_clip()
         conditions = self.conditions()
-        bare = Conditions(conditions.audio, conditions.style, conditions.mask)
-        first = next(iter(samplers.values()))
-        step = torch.full((len(batch),), self.model.process.steps // 2, device=self.model.device)
+        prepared = self.space("folded", conditions)
+        number = self.model.process.steps // 2
+        step = torch.full((len(batch),), number, device=self.model.device)
         entered = torch.randn(*batch.motion.shape[:2], network.embed.out_features, device=self.model.device)
         decoded = network.core(entered, step, conditions)
         vertices = network.leave(decoded)
         maps = network.embed.weight.detach(), network.unembed.weight.detach(), network.unembed.bias.detach()
         cores = self.in_turn(
             {
-                "kept": lambda: network.core(entered, step, conditions),
-                "anew": lambda: network.core(entered, step, bare),
+                "kept": lambda: prepared.features(entered, number),
+                "anew": lambda: network.core(entered, step, conditions),
             },
             self.repeats,
         )
@@ -184,7 +185,7 @@ class Bench:
             audio_encoder=audio_encoder,
             conditions=others,
             fold=self.clock(lambda: fold(*maps)),
-            look=self.quickest(lambda: self.space("folded", first)),
+            look=self.quickest(lambda: self.space("folded", conditions)),
             core=cores["kept"],
             core_unprepared=cores["anew"],
             leave=self.quickest(lambda: network.leave(decoded)),

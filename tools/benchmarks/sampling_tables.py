@@ -41,7 +41,7 @@ def heading(args: argparse.Namespace, bench: Bench) -> str:
     millions = sum(p.numel() for p in network.parameters()) / 1e6
     speech = sum(p.numel() for p in network.audio_encoder.parameters()) / 1e6
     encoder = "tiny HuBERT" if args.tiny_encoder else "HuBERT base"
-    packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "diffusers", "transformers"))
+    packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "transformers"))
     return "\n".join(
         [
             f"machine: {processor(args.device)}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start; "
