@@ -5,12 +5,11 @@ Source: Khronos Group, glTF 2.0 Specification. Metres, y up, the face looks alon
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,26 +19,53 @@ from facediff.errors import FaceDiffError
 from facediff.export.format import ExportOptions, Format, Space, facts, linear_colours, normals_of, outward
 from facediff.registry import export_format
 
-# A motion as few shapes and their weights, all within 0 and 1.
-#
-# Programs that clamp weights (Blender clamps shape keys to 0 … 1) would break the signed weights of principal components,
-# so that every component becomes two shapes: one for its positive and one for its negative half. Between two frames the
-# sum of both is linear where the component is, so that nothing is lost there.
+if TYPE_CHECKING:
+    from pygltflib import GLTF2  # type: ignore[import-untyped]
 
 Array = npt.NDArray[np.float32]
 
 BLOCK = 3000
-"""Coordinates that are looked at in one go; bounds the memory for residuals."""
+"""Coordinates that are processed together; bounds the memory for residuals."""
+
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+COMPONENT_TYPES = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
+LIMIT = 2**32 - 1
+"""The most bytes that the header of a .glb can count."""
+
+
+@export_format.register("glb")
+class Glb(Format):
+    """glTF 2.0 with morph targets: Blender, Unity, three.js, Unreal."""
+
+    next_step = "Blender: File > Import > glTF 2.0, then play; other programs: docs/export.md"
+    speech = "next to it"
+    units = "m"
+    up_axes = ("y",)
+    requires = ("pygltflib", "export")
+
+    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
+        """Write one animation."""
+        (animation,) = animations
+        space = Space.of(animation, options, "m")
+        rest = space.place(animation.template)
+        offsets = np.stack([frame - rest for frame in space.frames(animation)])
+        morphs = compress(offsets, options.tolerance_mm / 1000)
+        extras = facts(animation, space)
+        extras["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance_mm
+        if options.speech_file is not None:
+            extras["speech"] = options.speech_file
+        binary = Binary()
+        write_container(path, make_document(animation, space, rest, morphs, binary, extras), binary)
 
 
 @dataclass(frozen=True)
 class Morphs:
-    """Shapes and weights: frame t is ``rest + Σ weights[t, m] · shapes[m]``.
+    """A motion as shapes and their weights: frame t is ``rest + Σ weights[t, m] · shapes[m]``.
 
     Attributes:
         shapes: (M, V, 3) offsets from the rest face.
-        weights: (T, M) within 0 and 1.
-        components: principal components behind them; None where there is a shape for every frame.
+        weights: (T, M) from 0 to 1.
+        components: number of principal components that were kept; None where there is a shape for every frame.
     """
 
     shapes: Array
@@ -48,11 +74,10 @@ class Morphs:
 
 
 def compress(offsets: Array, tolerance: float) -> Morphs:
-    """As few shapes as keep every vertex of every frame within a distance.
+    """Find as few shapes as keep every vertex of every frame within a distance of the original.
 
-    Principal components of the offsets, not centred, so that the rest face stays where all weights are 0; their number
-    is found by bisection of the largest error, which is measured on what will be written, rounded to float32. Where
-    that takes no fewer shapes than there are frames, every frame becomes a shape, which is exact.
+    The shapes are principal components of the offsets, which are not centred, so that the rest face has only weights of
+    0. If they are no fewer than the frames, every frame becomes a shape, which is exact.
 
     Args:
         offsets: (T, V, 3) from the rest face.
@@ -60,29 +85,30 @@ def compress(offsets: Array, tolerance: float) -> Morphs:
     """
     frames, vertices, _ = offsets.shape
     flat = offsets.reshape(frames, -1)
-    scores, axes = principal(flat)
+    scores, axes = principal_components(flat)
     halves = (scores > 0).any(0).astype(int) + (scores < 0).any(0)
+    # The error shrinks with the number of components, so that bisection finds the smallest number that is enough: low
+    # is not enough, high is (once there is a best). It is measured on the numbers that are written, in float32.
     low, high, best = 0, int((halves.cumsum() < frames).sum()) + 1, None
-    while high - low > 1:  # low components are not enough; high are, once there is a best
+    while high - low > 1:
         middle = (low + high) // 2
-        made = split(scores[:, :middle], axes[:middle])
-        if largest_error(flat, *made) <= tolerance:
-            high, best = middle, made
+        candidate = split_signs(scores[:, :middle], axes[:middle])
+        if largest_error(flat, *candidate) <= tolerance:
+            high, best = middle, candidate
         else:
             low = middle
     if best is None and not flat.any():
-        best = split(scores[:, :0], axes[:0])
+        best = split_signs(scores[:, :0], axes[:0])
     if best is None:
         return Morphs(offsets, np.eye(frames, dtype=np.float32), None)
     return Morphs(best[1].reshape(-1, vertices, 3), best[0], high)
 
 
-def principal(flat: Array) -> tuple[Array, Array]:
-    """Scores (T, K) and axes (K, 3V), the strongest first, with their product equal to ``flat`` (T, 3V).
-
-    Through the T × T products between frames, since there are far fewer frames than coordinates. Squaring loses
-    components weaker than about 1e-7 of the strongest; whoever needs them sees it in the error.
-    """
+def principal_components(flat: Array) -> tuple[Array, Array]:
+    """Scores (T, K) and axes (K, 3V), the strongest first; their product is ``flat`` (T, 3V)."""
+    # The eigenvectors of the T × T products between frames give the same scores as a singular value decomposition, and
+    # are far cheaper, since there are fewer frames than coordinates. Squaring loses components weaker than about 1e-7
+    # of the strongest; the bisection in compress notices if one of them would have been needed.
     gram = np.zeros((len(flat), len(flat)))
     for block in _blocks(flat):
         gram += block @ block.T
@@ -94,8 +120,10 @@ def principal(flat: Array) -> tuple[Array, Array]:
     return scores.astype(np.float32), axes.astype(np.float32)
 
 
-def split(scores: Array, axes: Array) -> tuple[Array, Array]:
-    """Weights (T, M) within 0 and 1 and shapes (M, 3V): the halves that occur of every component."""
+def split_signs(scores: Array, axes: Array) -> tuple[Array, Array]:
+    """Weights (T, M) from 0 to 1 and shapes (M, 3V): the positive and the negative half of every component."""
+    # Programs that clamp weights (Blender clamps shape keys to 0 … 1) would break the signed weights of principal
+    # components. Between two frames the sum of both halves is as linear as the component, so that nothing is lost.
     weights, shapes = [], []
     for score, axis in zip(scores.T, axes, strict=True):
         for sign in (1, -1):
@@ -104,13 +132,13 @@ def split(scores: Array, axes: Array) -> tuple[Array, Array]:
             if peak > 0:
                 weights.append(half / peak)
                 shapes.append(sign * peak * axis)
-    if not weights:  # a face that never leaves its rest still needs something to animate
+    if not weights:  # a face that never moves still needs something to animate
         return np.zeros((len(scores), 1), np.float32), np.zeros((1, axes.shape[1]), np.float32)
     return np.stack(weights, 1), np.stack(shapes)
 
 
 def largest_error(flat: Array, weights: Array, shapes: Array) -> float:
-    """Largest distance of a vertex between ``flat`` (T, 3V) and what weights and shapes give."""
+    """Largest distance of a vertex between ``flat`` (T, 3V) and the motion of weights and shapes."""
     worst = 0.0
     for start in range(0, flat.shape[1], BLOCK):
         left = flat[:, start : start + BLOCK] - weights @ shapes[:, start : start + BLOCK]
@@ -119,10 +147,10 @@ def largest_error(flat: Array, weights: Array, shapes: Array) -> float:
 
 
 def normal_shapes(weights: Array, rest: Array, normals: Callable[[int], Array]) -> Array:
-    """Offsets of normals (M, V, 3) that come nearest to the true normals over all frames, with the shapes' weights.
+    """Offsets of normals (M, V, 3) which, added with the shapes' weights, come nearest to the true normals.
 
-    Normals are no linear function of the vertices, so that the normals of the shapes themselves would not add up;
-    least squares over the frames are nearest. Weak directions are left out, since they would only fit noise.
+    Normals are no linear function of the vertices, so that the normals of the shapes themselves would not add up. These
+    are the least-squares solution over all frames, without weak directions, which would only fit noise.
 
     Args:
         weights: (T, M).
@@ -130,12 +158,12 @@ def normal_shapes(weights: Array, rest: Array, normals: Callable[[int], Array]) 
         normals: the normals (V, 3) of a frame.
     """
     inverse = np.linalg.pinv(weights.astype(np.float64), rcond=1e-2).astype(np.float32)
-    made = np.zeros((len(inverse), *rest.shape), np.float32)
+    offsets = np.zeros((len(inverse), *rest.shape), np.float32)
     step = 16
     for start in range(0, len(weights), step):
         batch = np.stack([normals(index) - rest for index in range(start, min(start + step, len(weights)))])
-        made += np.tensordot(inverse[:, start : start + step], batch, axes=1)
-    return made
+        offsets += np.tensordot(inverse[:, start : start + step], batch, axes=1)
+    return offsets
 
 
 def _blocks(flat: Array) -> Iterator[npt.NDArray[np.float64]]:
@@ -143,151 +171,119 @@ def _blocks(flat: Array) -> Iterator[npt.NDArray[np.float64]]:
         yield flat[:, start : start + BLOCK].astype(np.float64)
 
 
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-TYPES = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
-LIMIT = 2**32 - 1
-"""Bytes that the header of a .glb can count."""
-
-
 class Binary:
-    """The binary part and the accessors into it; every array gets a view of its own, so that all are aligned."""
+    """The binary chunk and the accessors into it; every array has its own buffer view, so that all are aligned."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
         self.length = 0
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
+        self.views: list[Any] = []
+        self.accessors: list[Any] = []
 
     def add(self, array: npt.NDArray[Any], *, target: int | None = None, bounds: bool = False) -> int:
-        """Append an array (N,) or (N, components); gives the accessor's number."""
+        """Append an array (N,) or (N, 3) and return its accessor's number."""
+        from pygltflib import Accessor, BufferView
+
         array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         data = array.tobytes()
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.length, "byteLength": len(data)}
-        self.views.append(view | ({} if target is None else {"target": target}))
-        columns = array[:, None] if array.ndim == 1 else array
-        accessor: dict[str, Any] = {
-            "bufferView": len(self.views) - 1,
-            "componentType": TYPES[array.dtype],
-            "count": len(array),
-            "type": {1: "SCALAR", 3: "VEC3"}[columns.shape[1]],
-        }
-        if bounds:
-            accessor |= {"min": columns.min(0).tolist(), "max": columns.max(0).tolist()}
-        self.accessors.append(accessor)
-        data += bytes(-len(data) % 4)
-        self.parts.append(data)
-        self.length += len(data)
+        columns = array.reshape(len(array), -1)
+        self.views.append(BufferView(buffer=0, byteOffset=self.length, byteLength=len(data), target=target))
+        self.accessors.append(
+            Accessor(
+                bufferView=len(self.views) - 1,
+                componentType=COMPONENT_TYPES[array.dtype],
+                count=len(array),
+                type="SCALAR" if array.ndim == 1 else "VEC3",
+                min=columns.min(0).tolist() if bounds else None,
+                max=columns.max(0).tolist() if bounds else None,
+            )
+        )
+        self.parts += [data, bytes(-len(data) % 4)]
+        self.length += len(data) + len(self.parts[-1])
         return len(self.accessors) - 1
 
 
-@export_format.register("glb")
-class Glb(Format):
-    """glTF 2.0 with morph targets: Blender, Unity, three.js, Unreal."""
+def make_document(
+    animation: Animation, space: Space, rest: Array, morphs: Morphs, binary: Binary, extras: dict[str, object]
+) -> GLTF2:
+    """The glTF document of one animated mesh; its arrays are appended to the binary chunk.
 
-    next_step = "Blender: File > Import > glTF 2.0, then play; other programs: docs/export.md"
-    speech = "next to it"
-    units = "m"
-    up_axes = ("y",)
+    Args:
+        animation: gives triangles, colours, true normals and times.
+        space: metres, y up.
+        rest: (V, 3) the neutral face in that space.
+        morphs: the motion.
+        binary: receives the arrays.
+        extras: what the node says about the animation.
+    """
+    import pygltflib as gltf
 
-    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Write one animation."""
-        (animation,) = animations
-        space = Space.of(animation, options, "m")
-        rest = space.place(animation.template)
-        offsets = np.stack([frame - rest for frame in space.frames(animation)])
-        morphs = compress(offsets, options.tolerance_mm / 1000)
-        binary = Binary()
-        document = describe(animation, space, rest, morphs, binary)
-        told = document["nodes"][0]["extras"]
-        told["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance_mm
-        if options.speech_file is not None:
-            told["speech"] = options.speech_file
-        write_container(path, document, binary)
+    def add_vertices(positions: Array, normals: Array) -> dict[str, int]:
+        return {
+            "POSITION": binary.add(positions, target=ARRAY_BUFFER, bounds=True),
+            "NORMAL": binary.add(normals, target=ARRAY_BUFFER),
+        }
 
-
-def describe(
-    animation: Animation, space: Space, rest: npt.NDArray[np.float32], morphs: Morphs, binary: Binary
-) -> dict[str, Any]:
-    """The glTF document; fills the binary part."""
-    faces = outward(animation)
-    rest_normals = normals_of(rest, faces)
-    attributes = {
-        "POSITION": binary.add(rest, target=ARRAY_BUFFER, bounds=True),
-        "NORMAL": binary.add(rest_normals, target=ARRAY_BUFFER),
-    }
-    if animation.colours is not None:
-        attributes["COLOR_0"] = binary.add(linear_colours(animation.colours), target=ARRAY_BUFFER)
-    # The largest number of a type would restart a strip of triangles.
-    kind = np.uint16 if len(rest) < 65_535 else np.uint32
-    indices = binary.add(faces.astype(kind).ravel(), target=ELEMENT_ARRAY_BUFFER)
-
-    def normals(index: int) -> npt.NDArray[np.float32]:
+    def true_normals(index: int) -> Array:
         return normals_of(space.place(np.asarray(animation.vertices[index])), faces)
 
-    turned = normal_shapes(morphs.weights, rest_normals, normals)
-    targets = [
-        {
-            "POSITION": binary.add(shape, target=ARRAY_BUFFER, bounds=True),
-            "NORMAL": binary.add(normal, target=ARRAY_BUFFER),
-        }
-        for shape, normal in zip(morphs.shapes, turned, strict=True)
-    ]
+    faces = outward(animation)
+    rest_normals = normals_of(rest, faces)
+    attributes = add_vertices(rest, rest_normals)
+    material = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=0.7)
+    if animation.colours is None:
+        material.baseColorFactor = [0.6, 0.6, 0.6, 1.0]
+    else:
+        attributes["COLOR_0"] = binary.add(linear_colours(animation.colours), target=ARRAY_BUFFER)
+    # The largest number of a type is reserved: it restarts a strip of triangles.
+    index_type = np.uint16 if len(rest) < 65_535 else np.uint32
+    indices = binary.add(faces.astype(index_type).ravel(), target=ELEMENT_ARRAY_BUFFER)
+    turned = normal_shapes(morphs.weights, rest_normals, true_normals)
+    targets = [add_vertices(shape, normals) for shape, normals in zip(morphs.shapes, turned, strict=True)]
     prefix = "frame" if morphs.components is None else "shape"
-    names = [f"{prefix}_{index:04d}" for index in range(len(targets))]
     times = (np.arange(len(animation.vertices)) / animation.frame_rate).astype(np.float32)
-    animated = {
-        "input": binary.add(times, bounds=True),
-        "output": binary.add(morphs.weights.ravel()),
-        "interpolation": "LINEAR",
-    }
-    primitive = {"attributes": attributes, "indices": indices, "material": 0, "targets": targets}
-    return {
-        "asset": {"version": "2.0", "generator": "facediff"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": animation.name, "mesh": 0, "extras": facts(animation, space)}],
-        "meshes": [
-            {
-                "name": "face",
-                "primitives": [primitive],
-                "weights": [0.0] * len(targets),
-                "extras": {"targetNames": names},
-            }
+    sampler = gltf.AnimationSampler(
+        input=binary.add(times, bounds=True), output=binary.add(morphs.weights.ravel()), interpolation="LINEAR"
+    )
+    channel = gltf.AnimationChannel(sampler=0, target=gltf.AnimationChannelTarget(node=0, path="weights"))
+    face = gltf.Mesh(
+        name="face",
+        primitives=[
+            gltf.Primitive(attributes=gltf.Attributes(**attributes), indices=indices, material=0, targets=targets)
         ],
-        "materials": [
-            {
-                "name": "face",
-                "doubleSided": True,
-                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.7}
-                | ({} if animation.colours is not None else {"baseColorFactor": [0.6, 0.6, 0.6, 1.0]}),
-            }
-        ],
-        "animations": [
-            {
-                "name": animation.name,
-                "samplers": [animated],
-                "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
-            }
-        ],
-        "accessors": binary.accessors,
-        "bufferViews": binary.views,
-        "buffers": [{"byteLength": binary.length}],
-    }
+        weights=[0.0] * len(targets),
+        extras={"targetNames": [f"{prefix}_{index:04d}" for index in range(len(targets))]},
+    )
+    return gltf.GLTF2(
+        asset=gltf.Asset(generator="facediff"),
+        scene=0,
+        scenes=[gltf.Scene(nodes=[0])],
+        nodes=[gltf.Node(name=animation.name, mesh=0, extras=extras)],
+        meshes=[face],
+        # alphaCutoff has a default in pygltflib, which validators report for a material that is not masked.
+        materials=[gltf.Material(name="face", doubleSided=True, pbrMetallicRoughness=material, alphaCutoff=None)],
+        animations=[gltf.Animation(name=animation.name, samplers=[sampler], channels=[channel])],
+        accessors=binary.accessors,
+        bufferViews=binary.views,
+        buffers=[gltf.Buffer(byteLength=binary.length)],
+    )
 
 
-def write_container(path: Path, document: dict[str, Any], binary: Binary) -> None:
-    """Header, JSON chunk and binary chunk, each filled up to four bytes.
+def write_container(path: Path, document: GLTF2, binary: Binary) -> None:
+    """Write the header, the JSON chunk and the binary chunk, each padded to four bytes.
 
     Raises:
-        FaceDiffError: if the file would be larger than its header can say.
+        FaceDiffError: if the file would be larger than its header can count.
     """
-    text = json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
+    text = document.gltf_to_json(separators=(",", ":"), indent=None).encode()
     text += b" " * (-len(text) % 4)
     length = 12 + 8 + len(text) + 8 + binary.length
     if length > LIMIT:
         raise FaceDiffError(
             f"{path}: would have {length / 2**30:.1f} GiB, and a .glb may have 4; write .usdc, or export a shorter part"
         )
+    # pygltflib's save_binary copies the binary chunk twice: for 252 MB of targets it took 764 MB of memory and 1.7 s,
+    # where writing the parts one after the other takes 281 MB and 0.2 s.
     with path.open("wb") as stream:
         stream.write(struct.pack("<4sII", b"glTF", 2, length))
         stream.write(struct.pack("<I4s", len(text), b"JSON") + text)

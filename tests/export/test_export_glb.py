@@ -1,4 +1,4 @@
-"""A .glb read back by pygltflib and trimesh, and held against the rules of the glTF 2.0 specification."""
+"""A .glb read back by pygltflib and trimesh, and checked against the rules of the glTF 2.0 specification."""
 
 from __future__ import annotations
 
@@ -236,3 +236,9 @@ def test_a_mesh_without_faces_is_refused(make_animation: Callable[..., Animation
     with pytest.raises(FaceDiffError, match="comes without a mesh"):
         write_animations(tmp_path / "a.glb", [make_animation(faces=None)])
     assert not list(tmp_path.iterdir())
+
+
+def test_the_same_animation_gives_the_same_bytes(animation: Animation, tmp_path: Path) -> None:
+    for folder in ("one", "two"):
+        write_animations(tmp_path / folder / "a.glb", [animation])
+    assert (tmp_path / "one" / "a.glb").read_bytes() == (tmp_path / "two" / "a.glb").read_bytes()
