@@ -32,6 +32,11 @@ class MissingExtraError(FaceDiffError):
     """
 
     def __init__(self, package: str, extra: str, feature: str) -> None:
+        self.arguments = package, extra, feature
         super().__init__(
             f'{feature} needs the package "{package}", which is not installed: run  pip install "facediff[{extra}]"'
         )
+
+    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str, str]]:
+        """Pickling, by which worker processes hand errors over, must not call the class with the message alone."""
+        return type(self), self.arguments

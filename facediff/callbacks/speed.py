@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import nn
-from tqdm import tqdm
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.audio import ArrayStore
@@ -16,6 +15,7 @@ from facediff.data.dataset import CachedFeatures
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
 from facediff.utils.files import cache_dir
+from facediff.utils.progress import track
 
 # Running the frozen part of an audio encoder once per clip instead of in every training step.
 
@@ -54,9 +54,7 @@ class SpeechFeatureCache(Callback):
         features = CachedFeatures(ArrayStore(self.folder), f"{key}:{trainer.precision}")
         clips = [*data.clips("train"), *data.clips("val")]
         rank, world = trainer.global_rank, trainer.world_size
-        shown = tqdm(
-            clips, desc="speech features", leave=False, disable=rank > 0 or trainer.progress_bar_callback is None
-        )
+        shown = track(clips, "speech features", shown=rank == 0 and trainer.progress_bar_callback is not None)
         for place, clip in enumerate(shown):
             audio = features.add(data.corpus, clip)
             if audio is None or place % world != rank:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -22,7 +21,7 @@ from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMe
 from facediff.metrics.clips import Clips, align
 from facediff.metrics.one_pass import one_pass
 from facediff.metrics.options import LengthRule, Pooling
-from facediff.utils.jobs import processors
+from facediff.utils.jobs import run_tasks
 
 NATIVE = (np.float16, np.float32, np.float64)
 """Types that torch reads as they are."""
@@ -269,39 +268,10 @@ def score_all(
         FaceDiffError: the first that a clip raises; clips not yet begun are left.
     """
     found: dict[str, dict[str, ClipScores | str]] = {method: {} for method, _ in jobs}
-    with _one_thread_each(), _steps(len(jobs), shown=progress) as step:
-        pool = ThreadPoolExecutor(min(workers or processors(), max(len(jobs), 1)))
-        try:
-            running = {pool.submit(scorer.score, pair): (method, pair.clip) for method, pair in jobs}
-            for future in as_completed(running):
-                method, clip = running[future]
-                found[method][clip] = future.result()
-                step()
-        finally:
-            pool.shutdown(cancel_futures=True)
+    results = run_tasks(
+        lambda job: scorer.score(job[1]), jobs, workers=workers, mode="threads", progress="clips" if progress else ""
+    )
+    with closing(results):
+        for (method, pair), scores in results:
+            found[method][pair.clip] = scores
     return found
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Keep torch from giving each worker threads of its own; also, digits then do not depend on the machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextmanager
-def _steps(total: int, *, shown: bool) -> Iterator[Callable[[], object]]:
-    """A progress bar on standard error, if it is a terminal and tqdm is there; what is given is called after a clip."""
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        shown = False
-    if not shown:
-        yield lambda: None
-        return
-    with tqdm(total=total, desc="clips", unit="clip", disable=None) as bar:
-        yield bar.update

@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 from facediff.export.format import ExportOptions, Format
 from facediff.registry import export_format
+from facediff.utils.progress import track
 
 Frame = npt.NDArray[np.uint8]
 
@@ -41,7 +42,8 @@ class Mp4(Format):
 
         frames: Iterable[Frame] = drawn_frames(animations, options)
         if not options.quiet:
-            frames = _bar(frames, f"drawing {path.name}", max(len(animation.vertices) for animation in animations))
+            longest = max(len(animation.vertices) for animation in animations)
+            frames = track(frames, f"drawing {path.name}", total=longest)
         speaking = next((animation for animation in animations if animation.speech is not None), animations[0])
         sound = speaking.sound() if options.speech else None
         write_video(path, frames, speaking.frame_rate, sound, speaking.sample_rate)
@@ -97,11 +99,3 @@ def _hold_last(motion: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.f
     """A motion (T, V, 3) that stays on its last frame until it has the given number of frames."""
     missing = frames - len(motion)
     return motion if not missing else np.concatenate([motion, np.repeat(motion[-1:], missing, axis=0)])
-
-
-def _bar(items: Iterable[Frame], description: str, total: int) -> Iterable[Frame]:
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise MissingExtraError("tqdm", "train", "a progress bar") from error
-    return tqdm(items, desc=description, total=total, leave=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from facediff.cli.options import add_directing_options, check_directing, directed
 from facediff.errors import FaceDiffError
+from facediff.utils.progress import track
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -323,7 +324,7 @@ class AnimationPipeline:
     ) -> tuple[list[npt.NDArray[np.float32]], str]:
         import torch
 
-        progress = None if self.args.quiet else partial(bar, description="sampling")
+        progress = None if self.args.quiet else partial(track, description="sampling")
         made = self.model.animate_samples(
             torch.from_numpy(speech).to(self.model.device),
             identity=self.identity,
@@ -343,7 +344,7 @@ class AnimationPipeline:
         from facediff.animation.files import MotionWriter
 
         stream = self.model.stream(identity=self.identity, style=self.style, seeds=seeds)
-        progress = None if self.args.quiet else partial(bar, description="seconds of speech")
+        progress = None if self.args.quiet else partial(track, description="seconds of speech")
         template = self.model.assets.template(self.identity)
         writers = [MotionWriter(folder / f"{seed}.npy", tuple(template.shape)) for seed in seeds]
         for part in stream.over(torch.from_numpy(speech).to(self.model.device), progress=progress):
@@ -420,10 +421,3 @@ def device(name: str) -> str:
         reason = next(iter(str(error).splitlines()), "")
         raise FaceDiffError(f"--device {name}: not usable on this machine ({reason}); try --device cpu") from error
     return name
-
-
-def bar(items: Iterable[T], *, description: str) -> Iterable[T]:
-    """The items, with a progress bar."""
-    from tqdm import tqdm
-
-    return tqdm(items, desc=description, leave=False)

@@ -2,120 +2,28 @@
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import json
-import multiprocessing
-import shutil
 import time
 import traceback
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.pipelines.animate import refuse_replacing
-from facediff.utils.files import atomic, check_writable, sha256
-from facediff.utils.jobs import processors, start_worker, unheard
-
-# Long pieces of work in several processes, of which one that dies takes nothing but its own piece along.
-
-PoolTask = TypeVar("PoolTask")
-Result = TypeVar("Result")
-
-_work: Callable[[Any], Any] | None = None
-
-
-def run_tasks(
-    work: Callable[[PoolTask], Result], tasks: Sequence[PoolTask], workers: int
-) -> Iterator[tuple[PoolTask, Result | None]]:
-    """Tasks and their results as they come; in this process if there is one worker.
-
-    No worker is handed a task before it is free for it, so that a stop waits for what is at work and no more. Workers
-    compute on one thread each, leave Ctrl-C to this process, and end when it ends, however it went.
-
-    Args:
-        work: a function of a module, or an object of a module's class, which each worker gets once and keeps.
-        tasks: what it is called with.
-        workers: number of processes.
-
-    Yields:
-        a task, and its result, or None if it killed its process.
-    """
-    if min(workers, len(tasks)) <= 1:
-        for task in tasks:
-            yield task, work(task)
-        return
-    waiting = deque(tasks)
-    while waiting:
-        suspects: list[PoolTask] = []
-        yield from _together(work, waiting, min(workers, len(waiting)), suspects)
-        # One of them killed its process and spoilt the others' as well; alone it is known which.
-        for task in suspects:
-            yield from _alone(work, task)
-
-
-def _together(
-    work: Callable[[PoolTask], Result], waiting: deque[PoolTask], workers: int, suspects: list[PoolTask]
-) -> Iterator[tuple[PoolTask, Result | None]]:
-    """Results until all is done, or until a process dies: then what was at work becomes a suspect."""
-    running: dict[Future[Result], PoolTask] = {}
-    pool = _pool(work, workers)
-    try:
-        while waiting or running:
-            while waiting and len(running) < workers:
-                with unheard():
-                    running[pool.submit(_do, waiting[0])] = waiting[0]
-                waiting.popleft()
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                if not isinstance(future.exception(), BrokenProcessPool):
-                    yield running.pop(future), future.result()
-            if done & running.keys():
-                raise BrokenProcessPool
-    except BrokenProcessPool:
-        suspects += running.values()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _alone(work: Callable[[PoolTask], Result], task: PoolTask) -> Iterator[tuple[PoolTask, Result | None]]:
-    with _pool(work, 1) as pool:
-        try:
-            with unheard():
-                future = pool.submit(_do, task)
-            result = future.result()
-        except BrokenProcessPool:
-            result = None
-    yield task, result
-
-
-def _pool(work: Callable[[Any], Any], workers: int) -> ProcessPoolExecutor:
-    # Never a plain fork: the caller may have started threads.
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(work,))
-
-
-def _start(work: Callable[[Any], Any]) -> None:
-    global _work
-    start_worker()
-    _work = work
-
-
-def _do(task: Any) -> Any:  # noqa: ANN401
-    return _work(task) if _work is not None else None
-
+from facediff.utils.files import atomic, check_writable, locked, remove_partial, sha256
+from facediff.utils.jobs import WorkerDied, processors, run_tasks
 
 # What a batch has made of which recording with which options: one small file beside each output.
 
 STATE = ".facediff-batch"
 """Folder in the output's folder."""
-LOCK = "lock"
+LOCK = ".facediff-batch.lock"
+"""Next to the outputs while a batch is running."""
 
 
 @dataclass(frozen=True)
@@ -205,42 +113,6 @@ def _same_speech(known: Mapping[str, Any], speech: Path) -> bool:
     if all(known.get(name) == value for name, value in facts.items()):
         return True
     return speech.is_file() and known.get("bytes") == facts.get("bytes") and known.get("sha256") == sha256(speech)
-
-
-@contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Keep a second batch out of an output folder; one that was killed keeps nobody out.
-
-    Raises:
-        FaceDiffError: if another batch is at work there, or the folder cannot be made.
-    """
-    state = folder / STATE
-    try:
-        state.mkdir(parents=True, exist_ok=True)
-        stream = (state / LOCK).open("w")
-    except OSError as error:
-        raise FaceDiffError(
-            f"{folder}: cannot be written ({error.strerror}); choose a folder that you may write to"
-        ) from error
-    with stream:
-        try:
-            import fcntl
-
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise FaceDiffError(f"{folder}: another `facediff animate` is at work here; wait for its end") from error
-        except (ImportError, OSError):
-            pass  # Windows, or a network disk without locks: two runs at once are the user's lookout
-        yield
-
-
-def sweep(output: Path) -> None:
-    """Remove what a killed run left half-written of an output."""
-    for leftover in output.parent.glob(f".{glob.escape(output.stem)}.partial-*"):
-        if leftover.is_dir():
-            shutil.rmtree(leftover, ignore_errors=True)
-        else:
-            leftover.unlink(missing_ok=True)
 
 
 Animate = Callable[[Path, Path], None]
@@ -413,13 +285,13 @@ def run_folder(
     recipe = Recipe.of(command, files)
     check_writable(output / names[0])
     results: dict[Path, tuple[str, str]] = {}
-    with alone_in(output):
+    with locked(output / LOCK, "facediff animate"):
         tasks = []
         for speech, name in zip(speeches, names, strict=True):
             task = Task(speech, output / name, recipe)
             known = known_result(task, retry_failed)
             if known is None:
-                sweep(task.output)
+                remove_partial(output, task.output.stem)
                 tasks.append(task)
             else:
                 results[speech] = known
@@ -447,9 +319,9 @@ def known_result(task: Task, retry_failed: bool) -> tuple[str, str] | None:
 
 
 def _carry_out(work: Work, tasks: Sequence[Task], workers: int, results: dict[Path, tuple[str, str]]) -> None:
-    with closing(run_tasks(work, tasks, workers)) as outcomes:  # type: ignore[type-var]
+    with closing(run_tasks(work, tasks, workers=workers)) as outcomes:
         for place, (task, outcome) in enumerate(outcomes, start=1):
-            if outcome is None:
+            if isinstance(outcome, WorkerDied):
                 outcome = Outcome(f"{task.speech}: killed its process, perhaps for want of memory; try --workers 1")
                 write_record(task.speech, task.output, task.recipe, outcome.problem)
             if outcome.hopeless:

@@ -10,11 +10,9 @@ import shutil
 import socket
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
-from multiprocessing import get_context
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ from facediff.synthetic.rig import Rig, build_rig, lip_pairs
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.synthetic.speech import SAMPLE_RATE, SENTENCES, Phoneme, speak
 from facediff.utils.files import sha256
+from facediff.utils.jobs import WorkerDied, run_tasks
 
 # Who says what in which mood: the clips of the built-in corpus and its splits.
 
@@ -398,25 +397,19 @@ def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
 
 def _write_clips(folder: Path, chosen: Sequence[Clip], seed: int, workers: int | None, progress: bool) -> int:
     """Write all clips and return how many frames they have together."""
-    from tqdm import tqdm
-
     total = 0
-    with tqdm(total=len(chosen), desc="Puppet corpus", unit="clip", disable=not progress) as bar:
-        for frames in _written(folder, chosen, seed, workers):
+    results = run_tasks(
+        partial(_write_clip, folder, seed=seed),
+        chosen,
+        workers=workers or 1,
+        progress="Puppet corpus" if progress else "",
+    )
+    with closing(results):
+        for clip, frames in results:
+            if isinstance(frames, WorkerDied):
+                raise FaceDiffError(f"{clip.name}: killed the process that wrote it, perhaps for lack of memory")
             total += frames
-            bar.update()
     return total
-
-
-def _written(folder: Path, chosen: Sequence[Clip], seed: int, workers: int | None) -> Iterator[int]:
-    if not workers or workers == 1:
-        for clip in chosen:
-            yield _write_clip(folder, clip, seed)
-        return
-    # Spawned and not forked: the caller may have started threads, torch's for instance.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        count = len(chosen)
-        yield from pool.map(_write_clip, [folder] * count, chosen, [seed] * count, chunksize=8)
 
 
 def _write_clip(folder: Path, clip: Clip, seed: int) -> int:

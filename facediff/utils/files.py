@@ -1,52 +1,158 @@
-"""Writing files so that a reader sees all of a file or nothing of it."""
+"""Files and folders that appear whole or not at all, locks, manifests, and the folders that facediff itself uses."""
 
 from __future__ import annotations
 
 import csv
+import glob
 import hashlib
+import json
 import os
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+import shutil
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from facediff.errors import FaceDiffError
+from facediff.utils.jobs import run_tasks
+
+ABANDONED_AFTER = 86_400.0
+"""Seconds after which a half-written folder is removed even where the file system has no locks."""
 
 
 def cache_dir() -> Path:
-    """Where things are kept that can be made anew: ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
+    """Where data is kept that can be computed again: ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
     return Path(os.environ.get("FACEDIFF_CACHE") or Path.home() / ".cache" / "facediff")
+
+
+def config_dir() -> Path:
+    """The folder of the bundled configs (``experiment/``, ``model/``, ``data/``, ``trainer/``).
+
+    It lies inside an installed package, and next to the package in a checkout.
+    """
+    package = Path(__file__).parents[1]
+    inside = package / "configs"
+    return inside if inside.is_dir() else package.parent / "configs"
+
+
+# Atomic writing.
 
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """A temporary sibling to write to, renamed to ``path`` at the end; removed if anything fails.
+    r"""Write a file whole or not at all.
 
-    The temporary name keeps the suffix, since many writers choose the format by it.
+    Yields:
+        a temporary path next to ``path``, which is renamed to ``path`` at the end and removed if anything fails. Its
+        suffix is that of ``path``, since many writers choose the format by it.
 
     Raises:
-        FaceDiffError: if the folder cannot be made or written.
+        FaceDiffError: if the folder cannot be made or the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "results" / "table.csv"
+        >>> with atomic(path) as temporary:
+        ...     _ = temporary.write_text("clip,lve\n")
+        >>> path.read_text()
+        'clip,lve\n'
     """
-    # Containers that share a folder may have equal process numbers.
-    temporary = path.with_name(f".{path.stem}.partial-{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    temporary = _partial(path, path.suffix)
+    with _writing(path), _new_folders(path.parent):
+        try:
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            with suppress(OSError):  # never written, or renamed
+                temporary.unlink()
+
+
+@contextmanager
+def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
+    """Write a folder whole or not at all.
+
+    Args:
+        path: the folder that shall appear.
+        replace: whether it may take the place of a folder with content; an empty one is always replaced.
+
+    Yields:
+        a hidden folder next to ``path``, to be filled. It is renamed to ``path`` at the end and removed if anything
+        fails; what a killed process has left of the same folder is removed by the next one that writes it.
+
+    Raises:
+        FaceDiffError: if the folder cannot be written, or ``path`` is in the way.
+    """
+    if path.exists() and (not path.is_dir() or (not replace and any(path.iterdir()))):
+        what = "is not empty" if path.is_dir() else "is a file"
+        raise FaceDiffError(f"{path}: {what}; choose a new folder, or remove this one")
+    with scratch_folder(path) as scratch:
+        content = scratch / path.name
+        content.mkdir()
+        try:
+            yield content
+        except FaceDiffError as error:
+            # A writer that fails names the folder that it was given; users know the one that they asked for.
+            if str(content) not in str(error):
+                raise
+            raise FaceDiffError(str(error).replace(str(content), str(path))) from error
+        put_in_place(content, path, replace=replace)
+
+
+@contextmanager
+def scratch_folder(path: Path) -> Iterator[Path]:
+    """A hidden folder next to ``path``, on the same disk, which is removed at the end.
+
+    What killed processes have left under the same name is removed first. An :class:`OSError` in the block is raised as
+    a :class:`FaceDiffError` that names ``path``.
+    """
+    with _writing(path), _new_folders(path.parent):
+        _remove_abandoned(path)
+        folder = _partial(path)
+        # The folder is locked before it gets its name, so that no other process takes it for an abandoned one.
+        unnamed = folder.with_name(f"{folder.name}.new")
+        unnamed.mkdir()
+        with _locked_folder(unnamed):
+            unnamed.rename(folder)
+            try:
+                yield folder
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
+    """Rename a file or folder; a folder at ``target`` steps aside first and is then removed.
+
+    Args:
+        source: what to rename.
+        target: its new name, on the same disk.
+        replace: whether a folder with content may be replaced.
+
+    Raises:
+        OSError: if that fails; what was at ``target`` is there again.
+    """
+    if not target.is_dir():
+        try:
+            os.replace(source, target)
+            return
+        except OSError:
+            if not target.is_dir():  # unless another process has just made it
+                raise
+    if not replace:
+        target.rmdir()  # fails if it is not empty
+        os.rename(source, target)
+        return
+    aside = source.with_name(f"{source.name}.replaced-{secrets.token_hex(4)}")
+    with suppress(FileNotFoundError):  # another process has just moved it away
+        os.rename(target, aside)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise FaceDiffError(
-            f"{path}: cannot be written ({error.strerror or error}); choose a folder that you may write to"
-        ) from error
-    finally:
-        with suppress(OSError):  # not there, or below something that is no folder: the error above says it
-            temporary.unlink()
-
-
-def sha256(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+        os.rename(source, target)
+    except OSError:
+        if aside.exists():
+            os.rename(aside, target)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def check_writable(path: Path) -> None:
@@ -57,35 +163,187 @@ def check_writable(path: Path) -> None:
     """
     if path.is_dir():
         raise FaceDiffError(f"{path}: is a folder; expected the name of a file to write")
-    probe = path.with_name(f".{path.stem}.probe-{os.getpid()}")
-    made = [folder for folder in path.parents if not folder.exists()]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    probe = _partial(path)
+    with _writing(path), _new_folders(path.parent):
         probe.touch()
         probe.unlink()
+
+
+def remove_partial(folder: Path, stem: str = "*", *, recursive: bool = False) -> None:
+    """Remove what killed processes have left half-written in a folder; no other process may be writing there.
+
+    Args:
+        folder: the folder.
+        stem: only of files of this name without suffix.
+        recursive: whether to look into subfolders.
+    """
+    pattern = f".{stem if stem == '*' else glob.escape(stem)}.partial-*"
+    for left in list(folder.rglob(pattern) if recursive else folder.glob(pattern)):
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
+
+
+def _partial(path: Path, suffix: str = "") -> Path:
+    # Containers that share a folder may have equal process numbers, hence the token.
+    name = path.stem if suffix else path.name
+    return path.with_name(f".{name}.partial-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn errors of the operating system into a sentence that names the path."""
+    try:
+        yield
     except OSError as error:
         raise FaceDiffError(
-            f"{path}: cannot be written ({error.strerror}); choose a folder you may write to"
+            f"{path}: cannot be written ({error.strerror or error}); choose a folder that you may write to and that "
+            f"has room"
         ) from error
+
+
+@contextmanager
+def _new_folders(folder: Path) -> Iterator[None]:
+    """Make a folder and its parents; those that are still empty at the end are removed."""
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
     finally:
-        for folder in made:
-            with suppress(OSError):
-                folder.rmdir()
+        for each in made:
+            with suppress(OSError):  # not empty
+                each.rmdir()
 
 
-def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Rows of equal keys as CSV, whole or not at all."""
+# Locks.
+
+
+@contextmanager
+def locked(path: Path, command: str) -> Iterator[None]:
+    """Keep a second process out of a folder while the block runs; a process that was killed keeps nobody out.
+
+    Args:
+        path: the lock file, in the folder that is to be locked; it is removed at the end.
+        command: how the error calls the other process, e.g. ``facediff data prepare``.
+
+    Raises:
+        FaceDiffError: if another process holds the lock, or the folder cannot be written.
+    """
+    with ExitStack() as stack:
+        with _writing(path.parent):
+            stack.enter_context(_new_folders(path.parent))
+            stack.enter_context(_lock_file(path, command))
+        stack.callback(path.unlink, missing_ok=True)
+        yield
+
+
+def _lock_file(path: Path, command: str) -> IO[str]:
+    while True:
+        stream = path.open("w")
+        locked = _lock(stream.fileno())
+        if locked is False:
+            stream.close()
+            raise FaceDiffError(f"{path.parent}: another `{command}` is at work here; wait until it has ended")
+        # The previous holder may have removed the file between our opening and locking it.
+        if locked is None or (path.exists() and os.path.samestat(os.fstat(stream.fileno()), path.stat())):
+            return stream
+        stream.close()
+
+
+def _lock(descriptor: int) -> bool | None:
+    """Whether this process now holds the lock; None where there are no locks (Windows, some network disks)."""
+    try:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):
+        return None
+    return True
+
+
+@contextmanager
+def _locked_folder(folder: Path) -> Iterator[bool | None]:
+    """Hold a lock on a folder itself, which ends with the process at the latest; yields as :func:`_lock`."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:  # Windows cannot open folders; or the folder has just been removed
+        yield None
+        return
+    try:
+        yield _lock(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove the scratch folders of processes that have ended without removing them."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.partial-*"):
+        with suppress(OSError), _locked_folder(left) as free:
+            if free or (free is None and time.time() - left.stat().st_mtime > ABANDONED_AFTER):
+                shutil.rmtree(left, ignore_errors=True)
+
+
+# What files hold: checksums, manifests, tables.
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def describe_files(
+    folder: Path, names: Iterable[str] | None = None, *, workers: int = 1, progress: str = ""
+) -> dict[str, dict[str, int | str]]:
+    """Size and SHA-256 of files, as manifests record them.
+
+    Args:
+        folder: the folder.
+        names: paths relative to it; all files in it and its subfolders if None.
+        workers: number of threads; hashing releases the interpreter's lock.
+        progress: title of a progress bar; none if empty.
+
+    Returns:
+        ``{"bytes": …, "sha256": …}`` by name, in the order of the names.
+    """
+    if names is None:
+        names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    ordered = sorted(names)
+    digests = dict(
+        run_tasks(lambda name: sha256(folder / name), ordered, workers=workers, mode="threads", progress=progress)
+    )
+    return {name: {"bytes": (folder / name).stat().st_size, "sha256": digests[name]} for name in ordered}
+
+
+def same_sizes(folder: Path, files: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Whether all files that a manifest describes are there with their sizes; their content is not read."""
+    try:
+        return all((folder / name).stat().st_size == facts["bytes"] for name, facts in files.items())
+    except (OSError, KeyError, TypeError):
+        return False
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The object that a JSON file holds; None if there is no such file, or it holds anything else."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write an object as JSON, whole or not at all; equal objects give equal bytes."""
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], *, line_end: str = "\r\n") -> None:
+    """Write rows with equal keys as CSV, whole or not at all."""
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, fieldnames=list(rows[0]))
+        writer = csv.DictWriter(stream, fieldnames=list(rows[0]), lineterminator=line_end)
         writer.writeheader()
         writer.writerows(rows)
-
-
-# Where the shipped configs are: inside an installed package, beside it in a checkout.
-
-
-def config_dir() -> Path:
-    """The folder that holds ``experiment/``, ``model/``, ``data/`` and ``trainer/``."""
-    package = Path(__file__).parents[1]
-    inside = package / "configs"
-    return inside if inside.is_dir() else package.parent / "configs"

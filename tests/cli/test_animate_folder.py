@@ -19,8 +19,8 @@ from facediff.animation import read_archive
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import load_model
-from facediff.pipelines.folder import alone_in, output_names, recordings, run_folder, seed_of_recording
-from facediff.utils.files import atomic
+from facediff.pipelines.folder import LOCK, output_names, recordings, run_folder, seed_of_recording
+from facediff.utils.files import atomic, locked
 
 ROOT = Path(__file__).parents[2]
 FACES = "".join(f"f {r * 6 + c + 1} {r * 6 + c + 2} {r * 6 + c + 7}\n" for r in range(3) for c in range(5))
@@ -176,7 +176,10 @@ def test_a_checkpoint_that_is_no_good_stops_at_once(folder: Path) -> None:
 
 
 def test_two_batches_do_not_share_a_folder(folder: Path) -> None:
-    with alone_in(folder.parent / "out"), pytest.raises(FaceDiffError, match="another `facediff animate` is at work"):
+    with (
+        locked(folder.parent / "out" / LOCK, "facediff animate"),
+        pytest.raises(FaceDiffError, match="facediff animate"),
+    ):
         run(folder)
     assert run(folder) == 0
 

@@ -127,7 +127,7 @@ def test_only_a_whole_corpus_is_complete(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_an_interruption_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(corpus_module, "_write_clip", interrupt)

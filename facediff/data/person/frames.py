@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity, face_size, read_mesh, robust_align
 from facediff.utils.pickles import load_pickle
+from facediff.utils.progress import track
 
 # Arrays on disk that are needed while importing only.
 
@@ -300,7 +300,7 @@ def read_frames(
             )
     frames = scratch_array(scratch, (files.frames, n_vertices, 3))
     first: Mesh | None = None
-    for path, place in zip(_bar(files.paths, progress), files.places, strict=True):
+    for path, place in zip(track(files.paths, "reading meshes", shown=progress), files.places, strict=True):
         mesh = read_mesh(path, points_allowed=True)
         first = first or mesh
         _check(path, mesh, files.paths[0], first, n_vertices)
@@ -328,16 +328,6 @@ def _check(path: Path, mesh: Mesh, first_path: Path, first: Mesh, n_vertices: in
         raise FaceDiffError(f"{path}: holds NaN or infinity; repair the frame, or remove the file")
     if not np.array_equal(mesh.faces, first.faces) and differing_faces(mesh.faces, first.faces):
         raise FaceDiffError(f"{path}: its faces differ from those of {first_path.name}; expected one topology")
-
-
-def _bar(paths: list[Path], progress: bool) -> Iterable[Path]:
-    if not progress:
-        return paths
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise MissingExtraError("tqdm", "prepare", "the progress bar") from error
-    return tqdm(paths, desc="reading meshes", unit="frame", leave=False)
 
 
 def spans(places: list[int], most: int = 10) -> str:

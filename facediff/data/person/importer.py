@@ -43,7 +43,6 @@ from facediff.data.person.motion import (
 from facediff.data.prepare.motion import resample_frames, resampled_length
 from facediff.data.prepare.runner import (
     MANIFEST,
-    describe_files,
     motion_file,
     speech_file,
     version,
@@ -55,7 +54,7 @@ from facediff.data.prepare.runner import (
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, stable_vertices
 from facediff.mesh.alignment import chunks
-from facediff.utils.files import check_writable
+from facediff.utils.files import check_writable, describe_files
 
 # Writing a person's corpus entry: all of it, or nothing.
 
@@ -160,7 +159,7 @@ def write_entry(
         table.writerow(["clip", "subject", "sentence", "split"])
         table.writerows([clip.name, name, clip.name.rpartition("_")[2], clip.split] for clip in clips)
     written = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    files = describe_files(folder, written, 2, lambda: None)
+    files = describe_files(folder, written, workers=2)
     write_record(
         folder / MANIFEST, {"facediff": version(), "corpus": "person", "person": name, **facts, "files": files}
     )

@@ -37,6 +37,7 @@ from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.mesh.flame import SHAPES, Flame
 from facediff.utils.files import atomic, sha256
 from facediff.utils.pickles import load_pickle
+from facediff.utils.progress import track
 
 # Finding 3DMEAD's clips and MEAD's sound in raw folders.
 
@@ -356,15 +357,10 @@ def load_flame(path: Path) -> Flame:
 
 
 def _survey(recordings: Sequence[Recording], quiet: bool) -> Survey:
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise MissingExtraError("tqdm", "prepare", "preparing a data set") from error
-
     survey = Survey({}, {}, {})
     sums: dict[str, Array] = {}
     counts: dict[str, int] = {}
-    for recording in tqdm(recordings, desc="shapes", unit="clip", disable=True if quiet else None):
+    for recording in track(recordings, "shapes", shown=not quiet):
         try:
             parameters = read_parameters(recording.file)
         except MissingExtraError:

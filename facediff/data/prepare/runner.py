@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import errno
 import json
-import multiprocessing
-import os
 import pickle  # noqa: S403 - writes a pickle, opens none
 import re
 import shutil
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import metadata
-from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,8 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.utils.files import atomic, check_writable, sha256
-from facediff.utils.jobs import THREAD_VARIABLES, processors, start_worker, unheard
+from facediff.utils.files import atomic, check_writable, describe_files, locked, remove_partial, same_sizes
+from facediff.utils.jobs import WorkerDied, processors, run_tasks
+from facediff.utils.progress import progress_bar
 
 # Finding and copying files of a raw folder, which may hold the data set or the folder that an archive unpacked to.
 
@@ -277,30 +273,6 @@ def _word(value: object) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def describe_files(
-    out: Path, files: Iterable[str], workers: int, step: Callable[[], object]
-) -> dict[str, dict[str, int | str]]:
-    """Size and SHA-256 of files, given by path relative to ``out``; ``step`` is called after each."""
-
-    def describe(name: str) -> tuple[str, dict[str, int | str]]:
-        path = out / name
-        digest = sha256(path)
-        step()
-        return name, {"bytes": path.stat().st_size, "sha256": digest}
-
-    # Threads are enough: hashing leaves the interpreter's lock alone.
-    with ThreadPoolExecutor(workers) as pool:
-        return dict(pool.map(describe, sorted(files)))
-
-
-def same_sizes(out: Path, record: dict[str, Any]) -> bool:
-    """Whether every file of a manifest is there with its size; contents are not read."""
-    files: dict[str, dict[str, Any]] = record.get("files", {})
-    return all(
-        (out / name).is_file() and (out / name).stat().st_size == facts["bytes"] for name, facts in files.items()
-    )
-
-
 def manifest(
     plan: Plan, clips: dict[str, int], failed: dict[str, str], files: dict[str, dict[str, int | str]]
 ) -> dict[str, Any]:
@@ -327,8 +299,6 @@ def manifest(
 
 # Running clips in several processes, so that a stop at any moment leaves nothing running and nothing half-written.
 
-AHEAD = 2
-"""Clips handed out per worker at a time: none waits for work, and few are lost when the run is stopped."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
@@ -363,70 +333,13 @@ def attempt(job: Job, out: Path) -> Outcome:
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, workers: int) -> Generator[Outcome]:
-    """Outcomes as they come; in this process if there is one worker.
-
-    Raises:
-        FaceDiffError: if a worker process dies.
-    """
-    if min(workers, len(jobs)) <= 1:
-        for job in jobs:
-            yield attempt(job, out)
-        return
-    with _single_threaded():
-        pool = ProcessPoolExecutor(min(workers, len(jobs)), mp_context=_context(jobs), initializer=start_worker)
-        try:
-            yield from _hand_out(pool, jobs, out, AHEAD * workers)
-        except BrokenProcessPool as error:
-            raise FaceDiffError(
-                f"{out}: a worker process died, perhaps for want of memory; run the same command again with fewer "
-                f"--workers, finished clips are kept"
-            ) from error
-        finally:
-            # Clips at work are finished, those that wait are dropped.
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _hand_out(pool: ProcessPoolExecutor, jobs: Sequence[Job], out: Path, ahead: int) -> Iterator[Outcome]:
-    """A few clips at a time, since a job may carry its sound with it."""
-    waiting = iter(jobs)
-    running: set[Future[Outcome]] = set()
-    while True:
-        while len(running) < ahead and (job := next(waiting, None)) is not None:
-            with unheard():
-                running.add(pool.submit(partial(attempt, job, out)))
-        if not running:
-            return
-        done, running = wait(running, return_when=FIRST_COMPLETED)
-        for future in done:
-            yield future.result()
-
-
-def _context(jobs: Sequence[Job]) -> BaseContext:
-    """Never a plain fork: the caller may have started threads.
-
-    A fork server imports what the jobs need once for all workers, instead of once each.
-    """
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    functions = {getattr(job.work, "func", job.work) for job in jobs}
-    context.set_forkserver_preload([__name__, "facediff.data.audio", *sorted({f.__module__ for f in functions})])
-    return context
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Processes started inside compute on one thread each; there are as many of them as there are processors."""
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+    """Outcomes as they come."""
+    with closing(run_tasks(partial(attempt, out=out), jobs, workers=workers)) as results:
+        for job, result in results:
+            if isinstance(result, WorkerDied):
+                reason = "killed its process, perhaps for lack of memory; try --workers 1"
+                result = Outcome(job.name, None, f"{job.name}: {reason}")
+            yield result
 
 
 LOCK = ".prepare.lock"
@@ -483,7 +396,7 @@ def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = 
     if out.exists() and not out.is_dir():
         raise FaceDiffError(f"{out}: is a file; expected a folder to write the corpus to")
     check_writable(out / STATE)
-    with _alone_in(out):
+    with locked(out / LOCK, "facediff data prepare"):
         before = read_record(out / MANIFEST)
         begun = read_record(out / STATE) or before
         if begun is None:
@@ -493,7 +406,7 @@ def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = 
             before is not None
             and not (out / STATE).exists()
             and _says(before, plan, finished)
-            and same_sizes(out, before)
+            and same_sizes(out, before.get("files", {}))
         ):
             return _report(plan, out, before, 0)
         if begun is not None:
@@ -502,23 +415,17 @@ def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = 
         pending = [job for job in plan.jobs if job.name not in finished]
         _check_space(plan, pending, out)
         write_record(out / STATE, recipe(plan))
-        _sweep(out)
+        remove_partial(out, recursive=True)
         return _carry_out(plan, pending, finished, out, workers, quiet)
 
 
 def _carry_out(
     plan: Plan, pending: list[Job], finished: dict[str, int], out: Path, workers: int, quiet: bool
 ) -> Report:
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise MissingExtraError("tqdm", "prepare", "preparing a data set") from error
-
     shared = plan.shared(out)
     clips, failed = dict(finished), {}
-    silent = True if quiet else None  # None: silent where the output is no terminal
-    bar = tqdm(total=len(plan.jobs), initial=len(finished), desc=plan.corpus, unit="clip", disable=silent)
-    with bar, closing(run_jobs(pending, out, workers)) as outcomes:
+    bar = progress_bar(plan.corpus, len(plan.jobs), done=len(finished), shown=not quiet)
+    with bar as step, closing(run_jobs(pending, out, workers)) as outcomes:
         for outcome in outcomes:
             if outcome.hopeless:
                 raise FaceDiffError(outcome.problem)
@@ -528,10 +435,10 @@ def _carry_out(
                     file.unlink(missing_ok=True)
             else:
                 clips[outcome.name] = outcome.frames
-            bar.update()
+            step()
     files = [*shared, *(file.relative_to(out).as_posix() for name in clips for file in _files(out, name))]
-    with tqdm(total=len(files), desc="checksums", unit="file", disable=silent) as bar:
-        record = manifest(plan, clips, failed, describe_files(out, files, workers, bar.update))
+    checksums = describe_files(out, files, workers=workers, progress="" if quiet else "checksums")
+    record = manifest(plan, clips, failed, checksums)
     write_record(out / MANIFEST, record)
     (out / STATE).unlink()
     return _report(plan, out, record, len(clips) - len(finished))
@@ -569,30 +476,6 @@ def _report(plan: Plan, out: Path, record: dict[str, Any], written: int) -> Repo
     return Report(out, record["clips"], written, record["failed"], plan.missing, plan.notes, record["totals"])
 
 
-@contextmanager
-def _alone_in(out: Path) -> Iterator[None]:
-    """Keep a second run out of the folder; a run that was killed keeps nobody out."""
-    made = not out.exists()
-    out.mkdir(parents=True, exist_ok=True)
-    lock = out / LOCK
-    with lock.open("w") as stream:
-        try:
-            import fcntl
-
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise FaceDiffError(f"{out}: another `facediff data prepare` is at work here; wait for its end") from error
-        except (ImportError, OSError):
-            pass  # Windows, or a network disk without locks: two runs at once are the user's lookout
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
-            if made:
-                with suppress(OSError):  # not empty, as a rule
-                    out.rmdir()
-
-
 def _refuse_foreign(out: Path) -> None:
     found = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
     if found:
@@ -610,12 +493,6 @@ def _refuse_strays(plan: Plan, out: Path) -> None:
             raise FaceDiffError(
                 f"{path}: is no clip of the raw folder (any more); remove the file, or choose another folder"
             )
-
-
-def _sweep(out: Path) -> None:
-    """Remove what killed runs left half-written."""
-    for path in out.rglob(".*.partial-*"):
-        path.unlink(missing_ok=True)
 
 
 def _check_space(plan: Plan, pending: list[Job], out: Path) -> None:

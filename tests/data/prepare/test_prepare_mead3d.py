@@ -270,7 +270,7 @@ def test_options_of_the_command_line(tmp_path: Path, flame: Path) -> None:
     raw = write_raw_emote(tmp_path / "raw", audio="wav")
     words = ["mead3d", str(raw), str(tmp_path / "out"), "--dtype", "float64", "--quiet", "--flame", str(flame)]
     words += ["--shape", "clip", "--subjects", "M003, W040", "--audio", str(raw / "MEAD")]
-    plan = command.make_plan(command.parser().parse_args(words))
+    plan = command.make_plan(command.prepare_parser().parse_args(words))
     assert {job.name[:4] for job in plan.jobs} == {"M003", "W040"}
     assert plan.options["dtype"] == "float64"
     assert plan.options["shape"] == "clip"

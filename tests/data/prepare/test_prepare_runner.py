@@ -261,7 +261,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from facediff.prepare import biwi, runner
+from facediff.data.prepare import biwi, runner
 from slow import slow
 if __name__ == "__main__":
     plan = biwi.plan(Path(sys.argv[1]))
@@ -288,7 +288,7 @@ def test_a_stopped_run_is_taken_up_and_ends_as_if_nothing_had_happened(tmp_path:
     (tmp_path / "slow.py").write_text(SLOW)
     process = subprocess.Popen(
         [sys.executable, str(tmp_path / "program.py"), str(raw), str(out)],
-        env={**os.environ, "PYTHONPATH": f"{Path(__file__).parents[2]}:{tmp_path}"},
+        env={**os.environ, "PYTHONPATH": f"{Path(__file__).parents[3]}:{tmp_path}"},
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,

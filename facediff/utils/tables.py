@@ -1,0 +1,74 @@
+"""Tables for the terminal and for pipes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, TextIO
+
+from facediff.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+UNLIMITED = 100_000
+"""Width of a table that nothing cuts, in characters."""
+
+
+def format_table(head: Sequence[str], rows: Iterable[Sequence[object]], *, left: int = 1) -> str:
+    """A table as plain text: no colours, no frame, every cell in full.
+
+    Args:
+        head: titles of the columns; no titles if empty.
+        rows: cells; None becomes ``-``.
+        left: how many columns, from the left, are aligned to the left. The others, numbers as a rule, are aligned to
+            the right.
+
+    Example:
+        >>> print(format_table(["split", "clips"], [["train", 192], ["test", 24]]))
+        split  clips
+        train    192
+        test      24
+    """
+    stream = io.StringIO()
+    print_table(head, rows, left=left, stream=stream)
+    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
+
+
+def print_table(
+    head: Sequence[str], rows: Iterable[Sequence[object]], *, left: int = 1, stream: TextIO | None = None
+) -> None:
+    """Print a table: with bold titles and within the width of a terminal, or as plain text in full anywhere else.
+
+    Args:
+        head: titles of the columns; no titles if empty.
+        rows: cells; None becomes ``-``.
+        left: how many columns are aligned to the left, as in :func:`format_table`.
+        stream: where to print; standard output if None.
+
+    Raises:
+        MissingExtraError: if rich is not installed.
+    """
+    try:
+        from rich.console import Console
+    except ImportError as error:
+        raise MissingExtraError("rich", "train", "printing tables") from error
+    console = Console(file=stream, highlight=False)
+    if not console.is_terminal:
+        console = Console(file=stream, highlight=False, width=UNLIMITED, color_system=None)
+    console.print(_table(head, rows, left))
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[object]], left: int) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    # Text and not str: brackets in a file's name are no markup.
+    cells = [[Text("-" if cell is None else str(cell)) for cell in row] for row in rows]
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=bool(head), header_style="bold")
+    columns = head or [""] * max(map(len, cells), default=0)
+    for place, title in enumerate(columns):
+        table.add_column(Text(title), justify="left" if place < left else "right", overflow="fold")
+    for row in cells:
+        table.add_row(*row)
+    return table
