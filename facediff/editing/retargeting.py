@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.animation import METRES
@@ -143,11 +142,11 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
     made = sum(correspondence.weights[:, k, None] * moved[:, correspondence.corners[:, k]] for k in range(3)) @ matrix.T
     smoothing = averaging(correspondence.trust, correspondence.target_faces)
     if smoothing is not None:
-        flat = torch.from_numpy(np.ascontiguousarray(made.transpose(1, 0, 2)).reshape(made.shape[1], -1))
-        known = torch.from_numpy(correspondence.trust)[:, None] * flat
+        flat = made.transpose(1, 0, 2).reshape(made.shape[1], -1)
+        known = correspondence.trust[:, None] * flat
         for _ in range(ROUNDS):
-            flat = known + torch.sparse.mm(smoothing, flat)
-        made = flat.numpy().reshape(made.shape[1], made.shape[0], 3).transpose(1, 0, 2)
+            flat = known + smoothing @ flat
+        made = flat.reshape(made.shape[1], made.shape[0], 3).transpose(1, 0, 2)
     result: Array = correspondence.share[:, None] * made
     return result
 
