@@ -289,22 +289,32 @@ def component_class(factory: Any) -> type:  # noqa: ANN401
 
 
 def defaults(component: type) -> dict[str, Any]:
-    """A component's own options with their defaults, as plain data; what a model gives it has no default."""
-    parameters = inspect.signature(component).parameters.values()
-    return {p.name: plain(p.default) for p in parameters if p.default is not inspect.Parameter.empty}
+    """A class's options with their defaults; sizes that a model gives it have none and are left out.
+
+    A constructor that takes ``**options`` hands them to its base class, whose options count too.
+    """
+    found: dict[str, Any] = {}
+    for cls in component.__mro__:
+        if "__init__" in vars(cls):
+            parameters = inspect.signature(vars(cls)["__init__"]).parameters.values()
+            found = {p.name: p.default for p in parameters if p.default is not p.empty} | found
+            if all(p.kind is not p.VAR_KEYWORD for p in parameters):
+                break
+    return found
 
 
 def describe(factory: Any, component: object) -> dict[str, Any]:  # noqa: ANN401
     """A component's plain description for the checkpoint, with every option that it was made with.
 
-    Options left at their defaults are written down too: whoever rebuilds the component may fill what is missing from
-    the component that usually stands in its place. A component may have a method ``checkpoint_init_args`` that returns
-    constructor arguments which let it be built without the files that it was first built from (a pretrained network,
-    say).
+    Options left at their defaults are included: whoever rebuilds the component may fill what is missing from the
+    component that usually stands in its place.
+
+    Args:
+        factory: the component's class, or a ``functools.partial`` of it.
+        component: what the factory made. It may have a method ``checkpoint_init_args`` that returns constructor
+            arguments with which it can be built without the files that it was first built from (a pretrained network).
     """
     description: dict[str, Any] = plain(factory)
-    description["init_args"] = {**defaults(component_class(factory)), **description["init_args"]}
-    extra = getattr(component, "checkpoint_init_args", None)
-    if extra is not None:
-        description["init_args"] = {**description["init_args"], **plain(extra())}
+    given: dict[str, Any] = getattr(component, "checkpoint_init_args", dict)()
+    description["init_args"] = plain({**defaults(component_class(factory)), **description["init_args"], **given})
     return description

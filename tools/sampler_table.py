@@ -31,7 +31,7 @@ from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
 from facediff.metrics import Region, SampleDiversity
 from facediff.models import DualPathDiffusion, load_model
-from facediff.models.checkpoint import imported
+from facediff.models.checkpoint import corpus_class
 
 SAMPLERS = ("ddpm:1000", "ddim:50", "ddim:25", "ddim:10", "dpm_solver:20", "dpm_solver:10", "dpm_solver:5")
 TIMED_SECONDS = 10.0
@@ -205,13 +205,9 @@ def corpus_of(model: DualPathDiffusion, root: str | None) -> SpeechMotionDataMod
     """The corpus that a checkpoint was trained on.
 
     Raises:
-        FaceDiffError: if its class is not imported.
+        FaceDiffError: if its class is not known.
     """
-    path = model.data_source.get("class_path", "")
-    made = imported(path, SpeechMotionDataModule)
-    if made is None:
-        raise FaceDiffError(f"the checkpoint's corpus is {path or 'not named'}; import the package that it comes from")
-    data = made(root=root or model.data_source["root"])
+    data = corpus_class("--checkpoint", model.data_source)(root=root or model.data_source["root"])
     data.prepare_data()
     return data
 

@@ -60,13 +60,14 @@ def run(name: str, arguments: Sequence[str]) -> int:
     check_arguments(args)
     from lightning.pytorch import Trainer, seed_everything
 
-    from facediff.models import load_model
     from facediff.models.adaptation import train_only, with_extra_identities
+    from facediff.models.checkpoint import build_model, read_checkpoint
     from facediff.utils.files import atomic
 
     started = time.monotonic()
-    person, data = adaptation_data(args)
-    model = load_model(args.checkpoint)
+    checkpoint = read_checkpoint(args.checkpoint)
+    person, data = adaptation_data(args, checkpoint)
+    model = build_model(args.checkpoint, checkpoint)
     data.prepare_data()
     if person not in data.corpus.templates:
         known = ", ".join(sorted(data.corpus.templates))
@@ -114,20 +115,17 @@ def check_arguments(args: argparse.Namespace) -> None:
             raise FaceDiffError(f"{flag} {value}: expected a number above 0")
 
 
-def adaptation_data(args: argparse.Namespace) -> tuple[str, SpeechMotionDataModule]:
+def adaptation_data(args: argparse.Namespace, checkpoint: dict[str, Any]) -> tuple[str, SpeechMotionDataModule]:
     """The person's name, and the checkpoint's data module with the person put first.
 
     Raises:
         FaceDiffError: if the checkpoint or its data module is not known, or the person has no such folder.
     """
-    from facediff.cli.lightning import data_of
-    from facediff.data import SpeechMotionDataModule
+    from facediff.data.batch import DATA_SOURCE_KEY
     from facediff.data.datamodule import person_name
-    from facediff.models.checkpoint import imported, read_checkpoint
+    from facediff.models.checkpoint import corpus_class, corpus_options
 
-    checkpoint = read_checkpoint(args.checkpoint)
-    described = data_of(args.checkpoint, checkpoint)
-    options: dict[str, Any] = dict(described["init_args"])
+    module, options = corpus_class(args.checkpoint, checkpoint[DATA_SOURCE_KEY]), corpus_options(checkpoint)
     if args.data_root is not None:
         options["root"] = str(args.data_root)
     folder = Path(args.person)
@@ -139,7 +137,4 @@ def adaptation_data(args: argparse.Namespace) -> tuple[str, SpeechMotionDataModu
     else:
         options["extra_identities"] = [person, *(options.get("extra_identities") or [])]
     options["train_identities"] = [person] if args.mode == FINETUNE else None
-    module = imported(str(described["class_path"]), SpeechMotionDataModule)  # type: ignore[type-abstract]
-    if module is None:  # data_of has looked already
-        raise FaceDiffError(f"{args.checkpoint}: its data module {described['class_path']} is not imported")
     return person, module(**options)

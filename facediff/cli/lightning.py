@@ -26,8 +26,8 @@ from facediff.data import SpeechMotionDataModule
 from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.models import AnimationModel
-from facediff.models.checkpoint import is_imported, read_checkpoint
-from facediff.registry import defaults
+from facediff.models.checkpoint import corpus_class, corpus_options, read_checkpoint
+from facediff.registry import defaults, plain
 from facediff.utils.files import config_dir
 
 # Rewriting the words of ``facediff fit | validate | test | predict`` before LightningCLI parses them.
@@ -67,7 +67,7 @@ def fresh_components(words: Sequence[str]) -> Iterator[str]:
         flag, joined, value = word.partition("=") if word.startswith("--model.") else (flag, "", word)
         kind = registry.COMPONENTS.get(flag.rpartition(".")[2])
         if kind is not None and value in kind.names():
-            value = json.dumps({"class_path": value, "init_args": defaults(kind.get(value))})
+            value = json.dumps({"class_path": value, "init_args": plain(defaults(kind.get(value)))})
             word = f"{flag}={value}" if joined else value
         flag = ""
         yield word
@@ -106,20 +106,9 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
 
 
 def data_of(path: Path, checkpoint: dict[str, Any]) -> dict[str, Any]:
-    """The data module that a checkpoint was trained on, as a config.
-
-    Raises:
-        FaceDiffError: if it is not imported; an import path from a file is not followed.
-    """
-    source = checkpoint.get(DATA_SOURCE_KEY, {})
-    named = str(source.get("class_path"))
-    if not is_imported(named, SpeechMotionDataModule):
-        raise FaceDiffError(
-            f"{path}: was trained on the data module {named}, which facediff does not know by itself; "
-            f"if you trust it, add --data={named}"
-        )
-    hparams = checkpoint.get("datamodule_hyper_parameters") or {"root": source.get("root")}
-    return {"class_path": named, "init_args": described(hparams)["init_args"]}
+    """The data module that a checkpoint was trained on, as a config."""
+    found = corpus_class(path, checkpoint[DATA_SOURCE_KEY])
+    return {"class_path": f"{found.__module__}.{found.__qualname__}", "init_args": corpus_options(checkpoint)}
 
 
 def described(hparams: dict[str, Any], *, drop: Sequence[str] = ()) -> dict[str, Any]:

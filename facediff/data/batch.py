@@ -198,6 +198,12 @@ def collate(samples: Sequence[Sample]) -> Batch:
 
 # What a checkpoint must hold about its corpus to animate a face without the corpus.
 
+FORMAT_KEY = "facediff_format"
+"""Where a checkpoint keeps :data:`FORMAT`."""
+
+FORMAT = 2
+"""Number of the format of checkpoints; those of another number are refused."""
+
 ASSETS_KEY = "facediff_assets"
 """Where a checkpoint keeps :meth:`Assets.state`."""
 

@@ -1,30 +1,52 @@
-"""What all models share: sizes and assets, checkpoints, optimisation, evaluation, animation."""
+"""The base of all models: their common options, training, testing, prediction, and what a checkpoint keeps.
+
+A model adds its network and three methods: ``__init__`` with its own options, ``losses``, and ``generate_clips``.
+"""
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Bool, Float
 from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
 from facediff.data import Assets, Batch, SpeechMotionDataModule
-from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY
+from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY
 from facediff.errors import FaceDiffError
 from facediff.mesh.hierarchy import mesh_hierarchy
+from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
 from facediff.models.inference import Inference, Prediction, WindowPlan
 from facediff.models.mesh_encoders import MeshEncoder
-from facediff.registry import plain
-
-# The learning rate over training.
+from facediff.registry import COMPONENTS, component_class, defaults, describe, plain
 
 Schedule = Literal["constant", "cosine"]
+MotionScale = Literal["unit", "none"]
+Constructor = Callable[..., None]
+
+
+def keeps_arguments(init: Constructor) -> Constructor:
+    """Let a model's constructor keep its arguments as hyper-parameters, those left at their defaults included."""
+
+    @functools.wraps(init)
+    def wrapped(self: AnimationModel, *values: Any, **options: Any) -> None:  # noqa: ANN401
+        init(self, *values, **options)
+        # A base class's constructor, which runs on the way, sees only some of the arguments.
+        if type(self).__init__ is wrapped:
+            bound = inspect.signature(init).bind_partial(self, *values).arguments
+            bound.pop("self", None)
+            self.keep_hyperparameters({**bound, **options})
+
+    return wrapped
 
 
 def lr_factor(step: int, *, total: int, warmup_steps: int, schedule: Schedule) -> float:
@@ -42,55 +64,72 @@ def lr_factor(step: int, *, total: int, warmup_steps: int, schedule: Schedule) -
     return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / max(1, total))))
 
 
-MotionScale = Literal["unit", "none"]
-
-
 class AnimationModel(LightningModule, Inference, ABC):
     """Base of all models.
 
+    A model's own constructor names its own options and hands the others on::
+
+        def __init__(self, *, dim: int = 64, **options: Any) -> None:
+            super().__init__(**options)
+
+    Its arguments become hyper-parameters by themselves: plain data in which every option of every component is filled
+    in. An option that takes a component has the name of the component's kind (``decoder``, ``audio_encoder`` …).
+
     Args:
-        n_vertices: vertices of the topology.
-        identities: training identities in the order of the identity index.
-        frame_rate: motion frames a second.
+        n_vertices: vertices of the topology; taken from the data module on the command line.
+        identities: training identities in the order of the identity index; taken from the data module on the command
+            line.
+        frame_rate: motion frames a second; taken from the data module on the command line.
+        motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
+            leaves it as it is.
         learning_rate: AdamW's learning rate.
         weight_decay: AdamW's weight decay.
         lr_schedule: constant, or a cosine down to zero at the end of training.
         warmup_steps: optimiser steps over which the learning rate rises from zero.
         protocol: the metrics' protocol for validation and test.
-        motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
-            leaves it as it is.
-        unseen_identity: as whom people are tested whom the model was not trained on.
+        unseen_identity: which identity unseen speakers are tested with: none, with their own style (``style_only``),
+            each training identity in turn with the mean of the scores (``each_seen``), or their own, once the model is
+            adapted to them (``adapted``).
     """
 
+    @keeps_arguments
     def __init__(
         self,
         *,
         n_vertices: int,
         identities: list[str],
         frame_rate: float,
-        motion_scale: MotionScale,
-        unseen_identity: IdentityPolicy,
-        learning_rate: float,
-        weight_decay: float,
-        lr_schedule: Schedule,
-        warmup_steps: int,
-        protocol: str,
+        motion_scale: MotionScale = "unit",
+        learning_rate: float = 1e-4,
+        weight_decay: float = 0.05,
+        lr_schedule: Schedule = "constant",
+        warmup_steps: int = 0,
+        protocol: str = "paper",
+        unseen_identity: IdentityPolicy = "style_only",
     ) -> None:
         super().__init__()
         self.n_vertices = n_vertices
         self.identities = list(identities)
         self.frame_rate = frame_rate
+        self.motion_scaling = motion_scale
         # Optimisers keep these in checkpoints, where a NumPy scalar would make loading unsafe.
         self.learning_rate = float(learning_rate)
         self.weight_decay = float(weight_decay)
         self.lr_schedule = lr_schedule
         self.warmup_steps = warmup_steps
-        self.motion_scaling = motion_scale
         self.unseen_identity: IdentityPolicy = unseen_identity
-        self._assets: Assets | None = None
-        self.data_source: dict[str, str] = {}
         self.evaluation = Evaluation(protocol, unseen_identity)
         self.windows = WindowPlan()
+        self.data_source: dict[str, str] = {}
+        self._assets: Assets | None = None
+
+    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+        """Let every model keep its constructor's arguments."""
+        super().__init_subclass__(**words)
+        if "__init__" in vars(cls):
+            cls.__init__ = keeps_arguments(cls.__init__)  # type: ignore[method-assign]
+
+    # What a model adds; :meth:`generate_clips` of the base class too.
 
     @abstractmethod
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
@@ -98,22 +137,101 @@ class AnimationModel(LightningModule, Inference, ABC):
 
         Args:
             batch: clips with their true motion.
-            generator: source of whatever the loss draws; torch's global one if None.
+            generator: source of the loss's random numbers; torch's global one if None.
         """
 
-    @abstractmethod
-    def personal_modules(self) -> list[nn.Module]:
-        """The parts that hold who somebody is and how they move; the others may stay frozen when one is learnt."""
+    def encode_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Style vectors of reference motions; of width 0 for a model without a speaking style.
 
-    def remember(self, arguments: dict[str, Any]) -> None:
-        """Keep constructor arguments as plain hyper-parameters, in the form that Lightning rebuilds a module from."""
-        self.save_hyperparameters(
-            {
-                "_class_path": f"{type(self).__module__}.{type(self).__qualname__}",
-                "_instantiator": "lightning.pytorch.cli.instantiate_module",
-                **plain(arguments),
-            }
+        Args:
+            reference: offsets from the template.
+            mask: True on valid frames.
+        """
+        return reference.new_zeros(len(reference), 0)
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The parts that hold identity and style; ``facediff adapt --train person`` trains them alone."""
+        return []
+
+    @property
+    def speech_encoder(self) -> AudioEncoder:
+        """The model's audio encoder: the first among its modules.
+
+        Raises:
+            FaceDiffError: if there is none.
+        """
+        for module in self.modules():
+            if isinstance(module, AudioEncoder):
+                return module
+        raise FaceDiffError(
+            f"{type(self).__name__} has no audio encoder, which long speech and cached speech features need; make the "
+            f"module that takes the speech a subclass of facediff.models.audio_encoders.AudioEncoder"
         )
+
+    # Training, validation, test, prediction.
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        """AdamW on everything trainable, with the learning-rate schedule per optimiser step."""
+        parameters = [p for p in self.parameters() if p.requires_grad]
+        # Fused: one pass over all parameters instead of several operations for each.
+        optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        # A fused optimiser could undo a loss scale itself, so Lightning refuses to clip its gradients in mixed
+        # precision. Without this mark, the scale is undone before gradients are clipped.
+        optimizer._step_supports_amp_scaling = False
+        if self.lr_schedule == "constant" and not self.warmup_steps:
+            return optimizer
+        total = int(self.trainer.estimated_stepping_batches)
+        factor = functools.partial(lr_factor, total=total, warmup_steps=self.warmup_steps, schedule=self.lr_schedule)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The weighted loss; every term is logged as ``train/<term>``."""
+        losses = self.losses(batch)
+        logged = {f"train/{name}": value.detach() for name, value in losses.items()}
+        self.log_dict(logged, batch_size=len(batch), prog_bar=False)
+        self.log("loss", losses["loss"].detach(), batch_size=len(batch), prog_bar=True, logger=False)
+        return losses["loss"]
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Loss with fixed random numbers, so that epochs compare, and the protocol's metrics of generated motion."""
+        losses = self.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
+        logged = {f"val/{name}": value for name, value in losses.items()}
+        self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
+        self.evaluation.update("val", "model", self.generate(batch, seed=0), batch)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics as ``val/mve`` …."""
+        # The metrics have been summed over the processes already; averaging equal values changes nothing.
+        self.log_dict(self.evaluation.scalars("val"), prog_bar=False, sync_dist=True)
+
+    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
+        """Score generated motion, a still face, and the model's motion for another sentence's speech."""
+        split = self.evaluation.splits[dataloader_idx]
+        for name, view in conditioned(batch, self.unseen_identity, self.identities, self.assets.references):
+            self.evaluation.update(split, "model", self.generate(view, seed=0), view, name)
+        self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
+        if batch.decoy_audio is not None:
+            decoy = replace(batch, audio=batch.decoy_audio, features=None)
+            self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), batch)
+
+    def on_test_epoch_end(self) -> None:
+        """Log ``<split>/lve`` and so on; the table is printed by the callback ``ScoreTable``."""
+        for split in self.evaluation.splits:
+            self.log_dict(self.evaluation.scalars(split), sync_dist=True)
+
+    def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> list[Prediction]:
+        """Absolute vertices of every clip of the batch."""
+        vertices = self.generate(batch, seed=0) + batch.template[:, None]
+        names = [self.identities[i] if i >= 0 else "unknown" for i in batch.identity.tolist()]
+        return [
+            Prediction(name, names[i], batch.reference_names[i], vertices[i, : int(batch.frame_lengths[i])].cpu())
+            for i, name in enumerate(batch.names)
+        ]
+
+    # What the model knows of its corpus.
 
     @property
     def assets(self) -> Assets:
@@ -123,9 +241,7 @@ class AnimationModel(LightningModule, Inference, ABC):
             FaceDiffError: if neither a corpus nor a checkpoint has been seen yet.
         """
         if self._assets is None:
-            raise FaceDiffError(
-                "the model knows no templates yet; train it with a data module or load a checkpoint first"
-            )
+            raise FaceDiffError("the model has no templates yet; train it with a data module or load a checkpoint")
         return self._assets
 
     @property
@@ -156,7 +272,7 @@ class AnimationModel(LightningModule, Inference, ABC):
             if mine != theirs:
                 raise FaceDiffError(
                     f"the model and the corpus {assets.corpus} do not fit: {what} are {mine} in the model and {theirs} "
-                    f"in the corpus; use a checkpoint that was trained on this topology and these people"
+                    f"in the corpus; use a checkpoint that was trained on this topology and these identities"
                 )
         self._assets = assets
 
@@ -173,7 +289,7 @@ class AnimationModel(LightningModule, Inference, ABC):
         if scale is None and stage == "fit":
             scale = data.motion_scale()
         self.adopt(data.assets().with_motion_scale(scale))
-        self._attach_mesh()
+        self.attach_mesh()
         if stage != "predict":
             self.evaluation.prepare(
                 self.assets,
@@ -182,8 +298,12 @@ class AnimationModel(LightningModule, Inference, ABC):
                 self.trainer.strategy.root_device,
             )
 
-    def _attach_mesh(self) -> None:
-        """Tell mesh encoders that have not been told yet about the mesh; their tables are kept in the checkpoint."""
+    def attach_mesh(self) -> None:
+        """Give the mesh to those mesh encoders that have none yet; their tables are kept in the checkpoint.
+
+        Raises:
+            FaceDiffError: if one needs a mesh and the corpus has none.
+        """
         waiting = [m for m in self.modules() if isinstance(m, MeshEncoder) and not m.attached]
         if not waiting:
             return
@@ -192,12 +312,29 @@ class AnimationModel(LightningModule, Inference, ABC):
                 f"mesh_encoder: {type(waiting[0]).__name__} needs the mesh, and {self.assets.corpus} has no "
                 f"mesh file; put one into its folder, or choose mesh_encoder=linear"
             )
-        template = self.assets.templates[next(iter(sorted(self.assets.templates)))]
+        template = self.assets.templates[min(self.assets.templates)]
         for encoder in waiting:
             encoder.attach(mesh_hierarchy(template.numpy(), self.assets.faces.numpy(), **encoder.mesh_options))
 
+    # Checkpoints.
+
+    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
+        """Save the constructor's arguments as plain data, in the form that Lightning rebuilds a module from."""
+        options = {**defaults(type(self)), **given}
+        for kind in COMPONENTS.keys() & options.keys():
+            made = [m for m in self.modules() if isinstance(m, component_class(options[kind]))]
+            options[kind] = describe(options[kind], made[0] if made else None)
+        self.save_hyperparameters(
+            {
+                "_class_path": f"{type(self).__module__}.{type(self).__qualname__}",
+                "_instantiator": "lightning.pytorch.cli.instantiate_module",
+                **plain(options),
+            }
+        )
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the assets, so that the checkpoint animates without the corpus."""
+        checkpoint[FORMAT_KEY] = FORMAT
         checkpoint[ASSETS_KEY] = self.assets.state()
         checkpoint[DATA_SOURCE_KEY] = self.data_source
 
@@ -206,64 +343,3 @@ class AnimationModel(LightningModule, Inference, ABC):
         if ASSETS_KEY in checkpoint:
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
             self.data_source = checkpoint.get(DATA_SOURCE_KEY, {})
-
-    def configure_optimizers(self) -> OptimizerLRScheduler:
-        """AdamW on everything trainable, with the learning-rate schedule per optimiser step."""
-        parameters = [p for p in self.parameters() if p.requires_grad]
-        # Fused: one pass over all parameters instead of several operations for each.
-        optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
-        # It could undo a loss scale by itself, for which reason Lightning will not clip its gradients in mixed
-        # precision. Told that it does not, the scale, if there is one, is undone before gradients are clipped.
-        optimizer._step_supports_amp_scaling = False
-        if self.lr_schedule == "constant" and not self.warmup_steps:
-            return optimizer
-        total = int(self.trainer.estimated_stepping_batches)
-        factor = partial(lr_factor, total=total, warmup_steps=self.warmup_steps, schedule=self.lr_schedule)
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
-
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """The weighted loss; every term is logged as ``train/<term>``."""
-        losses = self.losses(batch)
-        logged = {f"train/{name}": value.detach() for name, value in losses.items()}
-        self.log_dict(logged, batch_size=len(batch), prog_bar=False)
-        self.log("loss", losses["loss"].detach(), batch_size=len(batch), prog_bar=True, logger=False)
-        return losses["loss"]
-
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Loss with fixed draws and the protocol's metrics of sampled motion, so that epochs compare."""
-        losses = self.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
-        logged = {f"val/{name}": value for name, value in losses.items()}
-        self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
-        self.evaluation.update("val", "model", self.generate(batch, seed=0), batch)
-
-    def on_validation_epoch_end(self) -> None:
-        """Log the metrics as ``val/mve`` …."""
-        # The metrics have been summed over the processes already; averaging equal values changes nothing.
-        self.log_dict(self.evaluation.scalars("val"), prog_bar=False, sync_dist=True)
-
-    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
-        """Score sampled motion, a still face, and the model's motion for another sentence's speech."""
-        split = self.evaluation.splits[dataloader_idx]
-        for name, view in conditioned(batch, self.unseen_identity, self.identities, self.assets.references):
-            self.evaluation.update(split, "model", self.generate(view, seed=0), view, name)
-        self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
-        if batch.decoy_audio is not None:
-            decoy = replace(batch, audio=batch.decoy_audio, features=None)
-            shuffled = self.generate(decoy, seed=0)
-            self.evaluation.update(split, "shuffled", shuffled, batch)
-
-    def on_test_epoch_end(self) -> None:
-        """Log ``<split>/lve`` and so on; the table is printed by the callback ``ScoreTable``."""
-        for split in self.evaluation.splits:
-            self.log_dict(self.evaluation.scalars(split), sync_dist=True)
-
-    def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> list[Prediction]:
-        """Absolute vertices of every clip of the batch."""
-        motion = self.generate(batch, seed=0)
-        vertices = motion + batch.template[:, None]
-        names = [self.identities[i] if i >= 0 else "unknown" for i in batch.identity.tolist()]
-        return [
-            Prediction(name, names[i], batch.reference_names[i], vertices[i, : int(batch.frame_lengths[i])].cpu())
-            for i, name in enumerate(batch.names)
-        ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,7 +17,6 @@ from facediff.models import losses
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.decoders import Decoder, DecoderFactory, StyleTransformer
-from facediff.models.evaluation import IdentityPolicy
 from facediff.models.folding import (
     Blend,
     Fold,
@@ -36,7 +35,6 @@ from facediff.models.layers import frame_mask
 from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoder, MeshEncoderFactory
 from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, SamplerFactory, unit_noise
 from facediff.models.style_encoders import StyleEncoder, StyleEncoderFactory, TcnGruTransformer
-from facediff.registry import describe
 
 # Embedding of the diffusion step, computed step by step or as a table of all steps.
 
@@ -289,9 +287,6 @@ class DualPathDiffusion(AnimationModel):
     ``style_encoder=none``, ``identity_encoder=none``, ``fusion=add``.
 
     Args:
-        n_vertices: vertices of the topology; taken from the data module on the command line.
-        identities: training identities; taken from the data module on the command line.
-        frame_rate: motion frames a second; taken from the data module on the command line.
         dim: model width C.
         audio_encoder: speech to features.
         identity_encoder: who the face is.
@@ -305,21 +300,12 @@ class DualPathDiffusion(AnimationModel):
             sampler or a network that cannot be folded runs on the vertices anyway.
         diffusion_steps: noising steps N.
         noise_schedule: ``squaredcos_cap_v2`` (the cosine schedule), ``linear`` or ``scaled_linear``.
-        motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
-            leaves it as it is.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
         identity_dropout: share of training clips whose identity is hidden, so that unknown people can be animated.
         velocity_weight: λ_vel.
         acceleration_weight: λ_acc.
         face_weight: λ_face.
-        learning_rate: AdamW's learning rate.
-        weight_decay: AdamW's weight decay.
-        lr_schedule: constant, or a cosine down to zero at the end of training.
-        warmup_steps: optimiser steps over which the learning rate rises from zero.
-        protocol: the metrics' protocol for validation and test.
-        unseen_identity: as whom people are tested whom the model was not trained on: as nobody known, with their own
-            style (``style_only``), as each training identity in turn with the mean of the scores (``each_seen``), or as
-            themselves, once the model is adapted to them (``adapted``).
+        options: those of every model, see :class:`facediff.models.AnimationModel`.
     """
 
     samples: ClassVar[bool] = True
@@ -327,9 +313,6 @@ class DualPathDiffusion(AnimationModel):
     def __init__(
         self,
         *,
-        n_vertices: int,
-        identities: list[str],
-        frame_rate: float,
         dim: int = 256,
         audio_encoder: AudioEncoderFactory = MelEncoder,
         identity_encoder: IdentityEncoderFactory = HierarchicalIdentity,
@@ -341,32 +324,14 @@ class DualPathDiffusion(AnimationModel):
         sampling_space: SamplingSpace = "folded",
         diffusion_steps: int = 1000,
         noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
-        motion_scale: Literal["unit", "none"] = "unit",
         style_tokens: TokenForm = "levels",
         identity_dropout: float = 0.1,
         velocity_weight: float = 0.003,
         acceleration_weight: float = 0.003,
         face_weight: float = 0.0005,
-        learning_rate: float = 1e-4,
-        weight_decay: float = 0.05,
-        lr_schedule: Literal["constant", "cosine"] = "constant",
-        warmup_steps: int = 0,
-        protocol: str = "paper",
-        unseen_identity: IdentityPolicy = "style_only",
+        **options: Any,  # noqa: ANN401
     ) -> None:
-        arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        super().__init__(
-            n_vertices=n_vertices,
-            identities=identities,
-            frame_rate=frame_rate,
-            learning_rate=learning_rate,
-            weight_decay=weight_decay,
-            lr_schedule=lr_schedule,
-            warmup_steps=warmup_steps,
-            protocol=protocol,
-            motion_scale=motion_scale,
-            unseen_identity=unseen_identity,
-        )
+        super().__init__(**options)
         self.identity_dropout = identity_dropout
         self.loss_weights = {
             "reconstruction": 1.0,
@@ -379,33 +344,23 @@ class DualPathDiffusion(AnimationModel):
         self.sampling_space: SamplingSpace = sampling_space
         style = style_encoder(dim=dim)
         self.network = DualPathNetwork(
-            n_vertices=n_vertices,
+            n_vertices=self.n_vertices,
             dim=dim,
             audio_encoder=audio_encoder(dim=dim),
-            identity_encoder=identity_encoder(dim=dim, n_identities=len(identities)),
+            identity_encoder=identity_encoder(dim=dim, n_identities=len(self.identities)),
             # Without a dynamic style there is nothing to embed, and no idle weights.
-            mesh_encoder=mesh_encoder(dim=dim, n_vertices=n_vertices) if style.token_dims else None,
+            mesh_encoder=mesh_encoder(dim=dim, n_vertices=self.n_vertices) if style.token_dims else None,
             style_encoder=style,
             fusion=fusion(dim=dim),
             decoder=decoder(dim=dim, style_dim=dim),
             token_form=style_tokens,
         )
-        for kind in ("audio_encoder", "identity_encoder", "style_encoder", "fusion", "decoder"):
-            arguments[kind] = describe(arguments[kind], getattr(self.network, kind))
-        arguments["mesh_encoder"] = describe(mesh_encoder, self.network.mesh_encoder)
-        arguments["sampler"] = describe(sampler, self.sampler)
-        self.remember(arguments)
 
     def personal_modules(self) -> list[nn.Module]:
         """The identity's and the dynamic style's encoders, and how both are presented to the decoder."""
         network = self.network
         parts = (network.identity_encoder, network.mesh_encoder, network.style_encoder, network.style_tokens)
         return [part for part in parts if part is not None]
-
-    @property
-    def speech_encoder(self) -> AudioEncoder:
-        """The audio encoder."""
-        return self.network.audio_encoder
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """Sample in another way from now on; checkpoints keep the sampler that the model was made with."""

@@ -59,7 +59,8 @@ def folder_facts(path: Path, assets: Assets, source: Mapping[str, str]) -> tuple
     """Templates that a motion file may belong to, and its motion frames a second."""
     from facediff.data import SpeechMotionDataModule
     from facediff.data.corpus import read_manifest, read_templates
-    from facediff.models.checkpoint import imported
+    from facediff.models.checkpoint import find_class
+    from facediff.registry import corpus
 
     templates: dict[str, Tensor] = dict(assets.templates)
     root = path.resolve().parent.parent
@@ -67,7 +68,7 @@ def folder_facts(path: Path, assets: Assets, source: Mapping[str, str]) -> tuple
         return templates, assets.frame_rate
     if (root / "templates.pkl").is_file():
         templates |= read_templates(root / "templates.pkl", assets.n_vertices)
-    module = imported(str(source.get("class_path")), SpeechMotionDataModule)  # type: ignore[type-abstract]
+    module = find_class(corpus, str(source.get("class_path")), SpeechMotionDataModule)
     usual = module.stored_frame_rate if module is not None and str(root) == source.get("root") else None
     return templates, float(read_manifest(root).get("frame_rate") or usual or assets.frame_rate)
 

@@ -337,7 +337,7 @@ class TestLosses:
         def gradients(**options: object) -> dict[str, Tensor]:
             model = make(**options)
             model.adopt(tiny.assets().with_motion_scale(100.0))
-            model._attach_mesh()
+            model.attach_mesh()
             model.alignment_allowed = lambda: True  # type: ignore[method-assign]
             return {name: value.detach() for name, value in model.losses(batch).items()}
 
@@ -357,14 +357,14 @@ class TestLosses:
         for options in ({}, {"mesh_encoder": registry.mesh_encoder.linear}):
             model = make(**options)
             model.adopt(tiny.assets().with_motion_scale(100.0))
-            model._attach_mesh()
+            model.attach_mesh()
             model.losses(pairs(tiny, "A_e01", "B_e01"))["loss"].backward()
             assert [name for name, p in model.named_parameters() if p.grad is None] == []
 
     def test_the_loss_does_not_look_at_padding(self, tiny: Tiny) -> None:
         model = make()
         model.adopt(tiny.assets().with_motion_scale(100.0))
-        model._attach_mesh()
+        model.attach_mesh()
         batch = pairs(tiny, "A_e01", "B_e02")
         garbage = torch.randn_like(batch.motion) * ~batch.mask[..., None, None]
         longer = replace(batch, motion=batch.motion + garbage)

@@ -176,7 +176,7 @@ def test_a_checkpoint_of_another_system_class_is_refused(tmp_path: Path, trained
     checkpoint = torch.load(trained, weights_only=True)
     checkpoint["hyper_parameters"]["_class_path"] = "os.system"
     torch.save(checkpoint, tmp_path / "evil.ckpt")
-    with pytest.raises(FaceDiffError, match=r'the model "os\.system", which is not imported'):
+    with pytest.raises(FaceDiffError, match=r'"os\.system".* was not loaded'):
         load_model(tmp_path / "evil.ckpt")
 
 

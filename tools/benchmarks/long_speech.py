@@ -29,10 +29,10 @@ import torch
 from sampling_parts import build
 from sampling_tables import processor
 
-from facediff.data import Batch, SpeechMotionDataModule, collate
+from facediff.data import Batch, collate
 from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.models import AnimationModel, load_model
-from facediff.models.checkpoint import imported
+from facediff.models.checkpoint import corpus_class
 from facediff.models.inference import SpeechStream, WindowPlan
 
 Array = npt.NDArray[np.float64]
@@ -80,10 +80,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def material(model: AnimationModel, identity: str, seconds: float) -> Material:
     """A person's test sentences, one after the other and again from the start, until they last long enough."""
     source = model.data_source
-    module = imported(source["class_path"], SpeechMotionDataModule)  # type: ignore[type-abstract]
-    if module is None or not Path(source["root"]).is_dir():
+    if not Path(source["root"]).is_dir():
         raise SystemExit(f"the corpus of the checkpoint ({source}) is not on this machine")
-    data = module(root=source["root"])
+    data = corpus_class("--checkpoint", source)(root=source["root"])
     samples = [s for split in data.test_splits for s in data.dataset(split) if s.identity_name == identity]
     audio, motion, joints, frames = [], [], [], 0
     while frames < seconds * model.frame_rate:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,9 +12,8 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
 from facediff.errors import FaceDiffError
-from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, MelEncoder
-from facediff.models.base import AnimationModel, Schedule
-from facediff.models.evaluation import IdentityPolicy
+from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
+from facediff.models.base import AnimationModel
 from facediff.models.inference import Progress
 from facediff.models.mesh_encoders import MeshEncoderFactory, SpiralMeshEncoder
 from facediff.models.style_content.losses import (
@@ -29,7 +28,6 @@ from facediff.models.style_content.losses import (
 )
 from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
 from facediff.models.style_encoders import LstmStyle, StyleEncoderFactory
-from facediff.registry import describe
 
 SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
 """Terms that the speech network has as well, by the name ``speech_<term>``."""
@@ -46,9 +44,6 @@ class StyleContentDisentanglement(AnimationModel):
     ``speech_content_weight=0``.
 
     Args:
-        n_vertices: vertices of the topology; taken from the data module on the command line.
-        identities: training identities; taken from the data module on the command line.
-        frame_rate: motion frames a second; taken from the data module on the command line.
         dim: channels of speech features and of motion features before the style encoder.
         content_dim: channels of the content.
         audio_encoder: speech to features.
@@ -64,8 +59,6 @@ class StyleContentDisentanglement(AnimationModel):
         basis_start: the basis starts from the principal components of the training motion, or at random.
         content_scale: ``clip`` takes mean and spread over a clip out of the content of motion, in which a person would
             be recognised; ``free`` leaves it as it is.
-        motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
-            leaves it as it is.
         aligned_pairs: where two people say the same sentence, supervise a swap of their styles with the other's
             reading, aligned in time; else, and everywhere if False, by the encoders' consistency.
         swap_region: where such a reading supervises.
@@ -81,22 +74,13 @@ class StyleContentDisentanglement(AnimationModel):
         velocity_weight: of velocities within it.
         lip_gap_weight: of the gap between the inner lips within it.
         upper_face_weight: of the upper face's positions within it, as a share of how much they vary.
-        learning_rate: Adam's learning rate.
         weight_decay: decoupled weight decay.
-        lr_schedule: constant, or a cosine down to zero at the end of training.
-        warmup_steps: optimiser steps over which the learning rate rises from zero.
-        protocol: the metrics' protocol for validation and test.
-        unseen_identity: as whom people are tested whom the model was not trained on: as nobody known, with their own
-            style (``style_only``), as each training identity in turn with the mean of the scores (``each_seen``), or as
-            themselves, once the model is adapted to them (``adapted``).
+        options: those of every model, see :class:`facediff.models.AnimationModel`.
     """
 
     def __init__(
         self,
         *,
-        n_vertices: int,
-        identities: list[str],
-        frame_rate: float,
         dim: int = 64,
         content_dim: int = 64,
         audio_encoder: AudioEncoderFactory = MelEncoder,
@@ -111,7 +95,6 @@ class StyleContentDisentanglement(AnimationModel):
         basis_size: int = 50,
         basis_start: Literal["pca", "random"] = "pca",
         content_scale: Literal["clip", "free"] = "clip",
-        motion_scale: Literal["unit", "none"] = "unit",
         aligned_pairs: bool = True,
         swap_region: Literal["lower_face", "face"] = "lower_face",
         reconstruction_weight: float = 1.0,
@@ -126,26 +109,10 @@ class StyleContentDisentanglement(AnimationModel):
         velocity_weight: float = 5.0,
         lip_gap_weight: float = 1.0,
         upper_face_weight: float = 0.0,
-        learning_rate: float = 1e-4,
         weight_decay: float = 0.0,
-        lr_schedule: Schedule = "constant",
-        warmup_steps: int = 0,
-        protocol: str = "paper",
-        unseen_identity: IdentityPolicy = "style_only",
+        **options: Any,  # noqa: ANN401
     ) -> None:
-        arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        super().__init__(
-            n_vertices=n_vertices,
-            identities=identities,
-            frame_rate=frame_rate,
-            learning_rate=learning_rate,
-            weight_decay=weight_decay,
-            lr_schedule=lr_schedule,
-            warmup_steps=warmup_steps,
-            protocol=protocol,
-            motion_scale=motion_scale,
-            unseen_identity=unseen_identity,
-        )
+        super().__init__(weight_decay=weight_decay, **options)
         self.basis_start = basis_start
         self.aligned_pairs = aligned_pairs
         self.swap_region = swap_region
@@ -160,25 +127,25 @@ class StyleContentDisentanglement(AnimationModel):
         }
         self.weights |= {f"speech_{term}": speech_weight * self.weights[term] for term in SPOKEN}
         self.distance = MotionDistance(position_weight, velocity_weight, lip_gap_weight, upper_face_weight)
-        self.readings = Alignments(frame_rate)
+        self.readings = Alignments(self.frame_rate)
         style = style_encoder(dim=dim)
         if not style.token_dims:
             raise FaceDiffError("style_encoder: this model cannot be without a style; choose another, such as lstm")
         self.network = DisentanglementNetwork(
-            content_encoder=mesh_encoder(dim=content_dim, n_vertices=n_vertices),
-            style_frames=mesh_encoder(dim=dim, n_vertices=n_vertices),
+            content_encoder=mesh_encoder(dim=content_dim, n_vertices=self.n_vertices),
+            style_frames=mesh_encoder(dim=dim, n_vertices=self.n_vertices),
             style_encoder=style,
             audio_encoder=audio_encoder(dim=dim),
             speech_content=WindowedTransformer(
                 in_dim=dim,
                 dim=dim,
                 out_dim=content_dim,
-                window=max(1, round(window_seconds * frame_rate)),
+                window=max(1, round(window_seconds * self.frame_rate)),
                 num_heads=speech_heads,
                 num_layers=speech_layers,
             ),
             decoder=MotionDecoder(
-                n_vertices=n_vertices,
+                n_vertices=self.n_vertices,
                 content_dim=content_dim,
                 style_dim=sum(style.token_dims),
                 channels=decoder_channels,
@@ -188,19 +155,10 @@ class StyleContentDisentanglement(AnimationModel):
             ),
             standardise_content=content_scale == "clip",
         )
-        made = {"audio_encoder": self.network.audio_encoder, "style_encoder": style}
-        for kind, component in (*made.items(), ("mesh_encoder", self.network.content_encoder)):
-            arguments[kind] = describe(arguments[kind], component)
-        self.remember(arguments)
 
     def personal_modules(self) -> list[nn.Module]:
         """The style encoder and the decoder, in whose basis a face's own shapes are."""
         return [self.network.style_frames, self.network.style_encoder, self.network.decoder]
-
-    @property
-    def speech_encoder(self) -> AudioEncoder:
-        """The audio encoder."""
-        return self.network.audio_encoder
 
     def setup(self, stage: str) -> None:
         """Ask for pairs of clips, and let a basis that was never trained start from the training motion."""
