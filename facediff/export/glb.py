@@ -41,7 +41,7 @@ class Glb(Format):
     speech = "next to it"
     units = "m"
     up_axes = ("y",)
-    requires = ("pygltflib", "export")
+    requires = ("pygltflib", "train")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write one animation."""
