@@ -20,7 +20,7 @@ from facediff.export.format import ExportOptions, Format, Space, facts, linear_c
 from facediff.registry import export_format
 
 if TYPE_CHECKING:
-    from pygltflib import GLTF2  # type: ignore[import-untyped]
+    from pygltflib import GLTF2
 
 Array = npt.NDArray[np.float32]
 

@@ -1,4 +1,4 @@
-"""Several motions next to each other with labels, and sheets of pictures."""
+"""Pictures made of pictures: motions side by side with labels, error heat maps, sheets, and words on them."""
 
 from __future__ import annotations
 
@@ -15,129 +15,16 @@ from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.render.rasteriser import Renderer, opencv
 from facediff.utils.files import atomic
 
-# Words on pictures, in the one font that Pillow brings with it.
-
-
-def pillow(module: str) -> Any:  # noqa: ANN401 - imported on first use
-    """A module of Pillow, or a sentence that says how to get it."""
-    try:
-        return importlib.import_module(f"PIL.{module}")
-    except ImportError as error:
-        raise MissingExtraError("PIL", "render", "writing pictures and labels") from error
-
-
-def draw_text(
-    picture: npt.NDArray[np.uint8], text: str, *, colour: tuple[int, int, int], scale: float
-) -> npt.NDArray[np.uint8]:
-    """A copy of the picture with a line of text in its middle.
-
-    Args:
-        picture: (height, width, 3).
-        text: the line; made smaller where it is wider than the picture.
-        colour: sRGB, 0 to 255.
-        scale: height of the letters as a share of the picture's height.
-    """
-    if not text.strip():
-        return picture.copy()
-    height, width, _ = picture.shape
-    mask = _text_mask(text, max(round(scale * height), 9), round(0.94 * width))
-    rows, columns = min(mask.shape[0], height), min(mask.shape[1], width)
-    top, left = (height - rows) // 2, (width - columns) // 2
-    result = picture.copy()
-    area = result[top : top + rows, left : left + columns]
-    opacity = mask[:rows, :columns, None]
-    area[:] = np.rint(area * (1 - opacity) + np.asarray(colour) * opacity).astype(np.uint8)
-    return result
-
-
-@lru_cache(maxsize=64)
-def _text_mask(text: str, points: int, max_width: int) -> npt.NDArray[np.float32]:
-    """Opacity of a line of text (rows, columns); cached, since every frame of a video has the same label."""
-    image, draw, fonts = pillow("Image"), pillow("ImageDraw"), pillow("ImageFont")
-    while True:
-        font = fonts.load_default(size=points)
-        left, top, right, bottom = font.getbbox(text)
-        if right - left <= max_width or points <= 6:
-            break
-        points = max(6, min(points - 1, int(points * max_width / (right - left))))
-    # Ascent and descent, not the box of these letters: labels side by side then share a base line.
-    ascent, descent = font.getmetrics()
-    canvas = image.new("L", (max(int(right - left), 1), ascent + descent))
-    draw.Draw(canvas).text((-left, 0), text, font=font, fill=255)
-    mask = np.asarray(canvas, dtype=np.float32) / np.float32(255)
-    mask.setflags(write=False)
-    return mask
-
-
-# Numbers at vertices as colours: error heat maps.
-
-HEAT_MAP = "cividis"
-"""Name of the colour map, in OpenCV and matplotlib alike; its lightness grows evenly and it reads the same to those who
-cannot tell red from green (Nuñez, Anderton and Renslow 2018)."""
-
-
-def heat_ramp() -> npt.NDArray[np.uint8]:
-    """The colour map from lowest to highest as sRGB (256, 3)."""
-    cv2 = opencv()
-    levels = np.arange(256, dtype=np.uint8)[:, None]
-    ramp: npt.NDArray[np.uint8] = cv2.applyColorMap(levels, cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
-    return np.ascontiguousarray(ramp)
-
-
-def heat_colours(values: npt.NDArray[np.floating], highest: float, lowest: float = 0.0) -> npt.NDArray[np.uint8]:
-    """Colours of values, those outside the scale taking the colour of its nearer end.
-
-    Args:
-        values: numbers of any shape, such as distances (V,) or (T, V).
-        highest: value of the last colour.
-        lowest: value of the first colour.
-
-    Returns:
-        sRGB, of the values' shape and one axis of 3 more.
-
-    Raises:
-        FaceDiffError: if the scale has no extent or a value is not finite.
-    """
-    if not highest > lowest:
-        raise FaceDiffError(f"a colour scale from {lowest} to {highest} has no extent: give a highest above the lowest")
-    if not np.isfinite(values).all():
-        raise FaceDiffError("a heat map of NaN or infinity cannot be drawn: check where the values come from")
-    levels = np.rint((np.asarray(values, np.float64) - lowest) * (255 / (highest - lowest)))
-    return heat_ramp()[np.clip(levels, 0, 255).astype(np.uint8)]
-
-
-def heat_key(
-    ground: npt.NDArray[np.uint8], lowest: str, highest: str, *, colour: tuple[int, int, int]
-) -> npt.NDArray[np.uint8]:
-    """A copy of a picture with the colour map as a bar in its middle, its ends named.
-
-    Args:
-        ground: (height, width, 3), what the bar is drawn upon.
-        lowest: text left of the bar.
-        highest: text right of it.
-        colour: of the letters, sRGB, 0 to 255.
-    """
-    height, width, _ = ground.shape
-    left, right = round(0.25 * width), round(0.7 * width)
-    top, bottom = round(0.3 * height), max(round(0.7 * height), round(0.3 * height) + 1)
-    key = ground.copy()
-    levels = np.rint(np.linspace(0, 255, right - left)).astype(np.uint8)
-    key[top:bottom, left:right] = heat_ramp()[levels]
-    for text, start, end in ((lowest, 2 * left - right // 2, left), (highest, right, width)):
-        start = max(start, 0)
-        key[:, start:end] = draw_text(key[:, start:end], text, colour=colour, scale=0.5)
-    return key
-
-
 Frame = npt.NDArray[np.uint8]
+Motion = npt.NDArray[np.floating]
 
 INK = (52, 56, 66)
-_FAINT = (104, 110, 122)
+FAINT_INK = (104, 110, 122)
 
 
 def side_by_side(
     renderers: Renderer | Sequence[Renderer],
-    motions: Sequence[npt.NDArray[np.floating]],
+    motions: Sequence[Motion],
     labels: Sequence[str],
     *,
     colours: Sequence[npt.NDArray[np.generic] | None] | None = None,
@@ -148,8 +35,8 @@ def side_by_side(
     Everything is checked before the first frame is drawn.
 
     Args:
-        renderers: one for all motions (the same camera for all), or one per motion where topologies differ;
-            give those one camera (`Camera.framing` of all templates) if they share a unit.
+        renderers: one for all motions (the same camera for all), or one per motion where topologies differ; give those
+            one camera (`Camera.framing` of all templates) if they share a unit.
         motions: per panel absolute positions (T, V, 3); all of one length.
         labels: per panel a short text, such as "truth".
         colours: per panel sRGB (V, 3) or (T, V, 3), or None for the renderer's own.
@@ -157,6 +44,9 @@ def side_by_side(
 
     Returns:
         A generator of T pictures as wide as all panels; strips for labels above and footer below add height.
+
+    Raises:
+        FaceDiffError: if the numbers of motions, labels, renderers and colours differ, or a motion cannot be drawn.
     """
     if not motions or len(labels) != len(motions):
         raise FaceDiffError(f"{len(motions)} motions and {len(labels)} labels: give a label for each.")
@@ -172,59 +62,41 @@ def side_by_side(
         check_motion(motion, drawer.n_vertices, label)
         if tint is not None and np.shape(tint) not in (np.shape(motion), np.shape(motion)[1:]):
             raise FaceDiffError(f'colours of "{label}" have the shape {np.shape(tint)}: not (V, 3) or (T, V, 3).')
-    lengths = {label: len(motion) for label, motion in zip(labels, motions, strict=True)}
     if len({len(motion) for motion in motions}) > 1:
-        told = ", ".join(f'"{label}" {length}' for label, length in lengths.items())
-        raise FaceDiffError(f"the motions differ in length (frames: {told}): cut them to one length.")
+        lengths = ", ".join(f'"{label}" {len(motion)}' for label, motion in zip(labels, motions, strict=True))
+        raise FaceDiffError(f"the motions differ in length (frames: {lengths}): cut them to one length.")
     return _frames(drawers, motions, labels, tints, footer)
 
 
 def _frames(
     renderers: Sequence[Renderer],
-    motions: Sequence[npt.NDArray[np.floating]],
+    motions: Sequence[Motion],
     labels: Sequence[str],
     colours: Sequence[npt.NDArray[np.generic] | None],
     footer: str | None,
 ) -> Iterator[Frame]:
     for index in range(len(motions[0])):
         panels = []
-        for renderer, motion, tint in zip(renderers, motions, colours, strict=True):
+        for renderer, motion, label, tint in zip(renderers, motions, labels, colours, strict=True):
             now = tint[index] if tint is not None and np.ndim(tint) == 3 else tint
-            panels.append(renderer.render(motion[index], colours=now))
-        if any(label.strip() for label in labels):
-            panels = [
-                _caption(panel, label, "top", INK, renderer.backdrop[:1])
-                for renderer, panel, label in zip(renderers, panels, labels, strict=True)
-            ]
+            panel = renderer.render(motion[index], colours=now)
+            labelled = any(text.strip() for text in labels)
+            panels.append(_caption(panel, label, "top", INK, renderer.backdrop[:1]) if labelled else panel)
         row = np.hstack(panels)
         ground = np.hstack([renderer.backdrop[-1:] for renderer in renderers])
-        yield row if not footer else _caption(row, footer, "bottom", _FAINT, ground)
+        yield row if not footer else _caption(row, footer, "bottom", FAINT_INK, ground)
 
 
-def _caption(picture: Frame, text: str, edge: str, colour: tuple[int, int, int], ground: Frame | None = None) -> Frame:
-    """The picture with a strip for one line of text added at an edge.
-
-    Args:
-        picture: (height, width, 3).
-        text: the line.
-        edge: "top" or "bottom".
-        colour: of the letters, sRGB.
-        ground: a row of pixels (1, width, 3) that the strip repeats, or None for white.
-    """
-    share = 0.085 if edge == "top" else 0.06
-    height = max(round(share * picture.shape[0] / 2) * 2, 16)
-    row = np.full((1, picture.shape[1], 3), 255, np.uint8) if ground is None else ground
-    strip = draw_text(np.repeat(row, height, axis=0), text, colour=colour, scale=0.55)
-    return np.concatenate([strip, picture] if edge == "top" else [picture, strip])
-
-
-def check_motion(motion: npt.NDArray[np.floating], n_vertices: int, name: str) -> None:
-    """Refuse a motion that cannot be drawn, with one sentence.
+def check_motion(motion: Motion, n_vertices: int, name: str) -> None:
+    """Refuse a motion that cannot be drawn.
 
     Args:
         motion: absolute positions (T, V, 3); read frame by frame, so a memory map stays on disk.
         n_vertices: V of the template it is drawn with.
         name: what the motion is called in the message.
+
+    Raises:
+        FaceDiffError: if the shape is wrong, there are no frames, or one is not finite.
     """
     if motion.ndim != 3 or motion.shape[2] != 3:
         raise FaceDiffError(f'motion "{name}" must have the shape (frames, vertices, 3), got {motion.shape}.')
@@ -240,56 +112,10 @@ def check_motion(motion: npt.NDArray[np.floating], n_vertices: int, name: str) -
             raise FaceDiffError(f'motion "{name}" holds NaN or infinity (first in frame {index}): check its source.')
 
 
-def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str] | None = None, gap: int = 6) -> Frame:
-    """Pictures of one size in rows, on white.
-
-    Args:
-        frames: pictures (height, width, 3).
-        columns: pictures per row.
-        labels: a text per picture, on a strip above it.
-        gap: pixels between pictures.
-    """
-    pictures = list(frames)
-    if not pictures or columns < 1:
-        raise FaceDiffError(f"contact sheet of {len(pictures)} frames in {columns} columns: give at least one of each.")
-    if len({picture.shape for picture in pictures}) > 1:
-        raise FaceDiffError("the frames of a contact sheet differ in size: draw them with one size.")
-    if labels is not None:
-        if len(labels) != len(pictures):
-            raise FaceDiffError(f"contact sheet of {len(pictures)} frames has {len(labels)} labels: give one for each.")
-        pictures = [_caption(picture, label, "top", INK) for picture, label in zip(pictures, labels, strict=True)]
-    height, width, _ = pictures[0].shape
-    columns = min(columns, len(pictures))
-    rows = -(-len(pictures) // columns)
-    sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), 255, np.uint8)
-    for index, picture in enumerate(pictures):
-        top, left = index // columns * (height + gap), index % columns * (width + gap)
-        sheet[top : top + height, left : left + width] = picture
-    return sheet
-
-
-def save_image(path: str | Path, image: Frame) -> None:
-    """Write a picture (height, width, 3) as PNG; it appears under its name only when complete."""
-    target = Path(path)
-    if target.suffix.lower() != ".png":
-        raise FaceDiffError(f'picture file "{target}" must end in .png.')
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-        raise ValueError(f"image must be uint8 (height, width, 3), got {image.dtype} {image.shape}")
-    picture = pillow("Image").fromarray(image)
-    with atomic(target) as temporary:
-        picture.save(temporary)
-
-
-# Truth, prediction and where they differ, next to each other.
-
-_KEY_SHARE = 0.085
-_MIN_KEY = 20
-
-
 def comparison(
     renderer: Renderer,
-    truth: npt.NDArray[np.floating],
-    prediction: npt.NDArray[np.floating],
+    truth: Motion,
+    prediction: Motion,
     *,
     highest: float,
     scale_label: str,
@@ -321,13 +147,166 @@ def comparison(
         raise FaceDiffError(
             f'"{labels[0]}" has {len(truth)} frames and "{labels[1]}" {len(prediction)}: cut them to one length.'
         )
-    errors = np.linalg.norm(np.asarray(prediction) - np.asarray(truth), axis=2)
-    heat = heat_colours(errors, highest)
+    heat = heat_colours(np.linalg.norm(np.asarray(prediction) - np.asarray(truth), axis=2), highest)
     frames = side_by_side(renderer, [truth, prediction, prediction], labels, colours=[None, None, heat])
     ground = renderer.backdrop[-1:]
-    height = max(round(_KEY_SHARE * renderer.height / 2) * 2, _MIN_KEY)
-    strip = np.repeat(np.hstack([ground, ground]), height, axis=0)
-    strip = draw_text(strip, footer, colour=INK, scale=0.5)
-    key = heat_key(np.repeat(ground, height, axis=0), "0", scale_label, colour=INK)
+    height = max(round(0.085 * renderer.height / 2) * 2, 20)
+    strip = draw_text(np.repeat(np.hstack([ground, ground]), height, axis=0), footer, colour=INK, scale=0.5)
+    key = _heat_key(np.repeat(ground, height, axis=0), "0", scale_label)
     foot = np.hstack([strip, key])
     return (np.concatenate([frame, foot]) for frame in frames)
+
+
+def heat_ramp() -> Frame:
+    """The colour map of heat maps, from lowest to highest, as sRGB (256, 3).
+
+    It is cividis (Nuñez, Anderton and Renslow 2018), whose lightness grows evenly and which reads the same to those who
+    cannot tell red from green.
+    """
+    cv2 = opencv()
+    levels = np.arange(256, dtype=np.uint8)[:, None]
+    ramp: Frame = cv2.applyColorMap(levels, cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
+    return np.ascontiguousarray(ramp)
+
+
+def heat_colours(values: npt.NDArray[np.floating], highest: float, lowest: float = 0.0) -> Frame:
+    """Colours of values; values outside the scale get the colour of its nearer end.
+
+    Args:
+        values: numbers of any shape, such as distances (V,) or (T, V).
+        highest: value of the last colour.
+        lowest: value of the first colour.
+
+    Returns:
+        sRGB, of the values' shape and one axis of 3 more.
+
+    Raises:
+        FaceDiffError: if the scale has no extent or a value is not finite.
+    """
+    if not highest > lowest:
+        raise FaceDiffError(f"a colour scale from {lowest} to {highest} has no extent: give a highest above the lowest")
+    if not np.isfinite(values).all():
+        raise FaceDiffError("a heat map of NaN or infinity cannot be drawn: check where the values come from")
+    levels = np.rint((np.asarray(values, np.float64) - lowest) * (255 / (highest - lowest)))
+    return heat_ramp()[np.clip(levels, 0, 255).astype(np.uint8)]
+
+
+def _heat_key(ground: Frame, lowest: str, highest: str) -> Frame:
+    """A copy of a picture (height, width, 3) with the colour map as a bar in its middle, its ends named."""
+    height, width, _ = ground.shape
+    left, right = round(0.25 * width), round(0.7 * width)
+    top, bottom = round(0.3 * height), max(round(0.7 * height), round(0.3 * height) + 1)
+    key = ground.copy()
+    levels = np.rint(np.linspace(0, 255, right - left)).astype(np.uint8)
+    key[top:bottom, left:right] = heat_ramp()[levels]
+    for text, start, end in ((lowest, max(2 * left - right // 2, 0), left), (highest, right, width)):
+        key[:, start:end] = draw_text(key[:, start:end], text, colour=INK, scale=0.5)
+    return key
+
+
+def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str] | None = None, gap: int = 6) -> Frame:
+    """Pictures of one size in rows, on white.
+
+    Args:
+        frames: pictures (height, width, 3).
+        columns: pictures per row.
+        labels: a text per picture, on a strip above it.
+        gap: pixels between pictures.
+
+    Raises:
+        FaceDiffError: if there is no picture or column, or sizes or numbers differ.
+    """
+    pictures = list(frames)
+    if not pictures or columns < 1:
+        raise FaceDiffError(f"contact sheet of {len(pictures)} frames in {columns} columns: give at least one of each.")
+    if len({picture.shape for picture in pictures}) > 1:
+        raise FaceDiffError("the frames of a contact sheet differ in size: draw them with one size.")
+    if labels is not None:
+        if len(labels) != len(pictures):
+            raise FaceDiffError(f"contact sheet of {len(pictures)} frames has {len(labels)} labels: give one for each.")
+        pictures = [_caption(picture, label, "top", INK) for picture, label in zip(pictures, labels, strict=True)]
+    height, width, _ = pictures[0].shape
+    columns = min(columns, len(pictures))
+    rows = -(-len(pictures) // columns)
+    sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), 255, np.uint8)
+    for index, picture in enumerate(pictures):
+        top, left = index // columns * (height + gap), index % columns * (width + gap)
+        sheet[top : top + height, left : left + width] = picture
+    return sheet
+
+
+def save_image(path: str | Path, image: Frame) -> None:
+    """Write a picture (height, width, 3) as PNG; it appears under its name only when complete.
+
+    Raises:
+        FaceDiffError: if the name does not end in .png, or the file cannot be written.
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".png":
+        raise FaceDiffError(f'picture file "{target}" must end in .png.')
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"image must be uint8 (height, width, 3), got {image.dtype} {image.shape}")
+    picture = _pillow("Image").fromarray(image)
+    with atomic(target) as temporary:
+        picture.save(temporary)
+
+
+def _caption(picture: Frame, text: str, edge: str, colour: tuple[int, int, int], ground: Frame | None = None) -> Frame:
+    """The picture with a strip for one line of text added at its "top" or "bottom" edge.
+
+    The strip repeats ``ground``, a row of pixels (1, width, 3); it is white without one.
+    """
+    share = 0.085 if edge == "top" else 0.06
+    height = max(round(share * picture.shape[0] / 2) * 2, 16)
+    row = np.full((1, picture.shape[1], 3), 255, np.uint8) if ground is None else ground
+    strip = draw_text(np.repeat(row, height, axis=0), text, colour=colour, scale=0.55)
+    return np.concatenate([strip, picture] if edge == "top" else [picture, strip])
+
+
+def draw_text(picture: Frame, text: str, *, colour: tuple[int, int, int], scale: float) -> Frame:
+    """A copy of the picture with a line of text in its middle.
+
+    Args:
+        picture: (height, width, 3).
+        text: the line; made smaller where it is wider than the picture.
+        colour: sRGB, 0 to 255.
+        scale: height of the letters as a share of the picture's height.
+    """
+    if not text.strip():
+        return picture.copy()
+    height, width, _ = picture.shape
+    mask = _text_mask(text, max(round(scale * height), 9), round(0.94 * width))
+    rows, columns = min(mask.shape[0], height), min(mask.shape[1], width)
+    top, left = (height - rows) // 2, (width - columns) // 2
+    result = picture.copy()
+    area = result[top : top + rows, left : left + columns]
+    opacity = mask[:rows, :columns, None]
+    area[:] = np.rint(area * (1 - opacity) + np.asarray(colour) * opacity).astype(np.uint8)
+    return result
+
+
+@lru_cache(maxsize=64)
+def _text_mask(text: str, points: int, max_width: int) -> npt.NDArray[np.float32]:
+    """Opacity of a line of text (rows, columns); cached, since every frame of a video has the same label."""
+    image, draw, fonts = _pillow("Image"), _pillow("ImageDraw"), _pillow("ImageFont")
+    while True:
+        font = fonts.load_default(size=points)
+        left, _, right, _ = font.getbbox(text)
+        if right - left <= max_width or points <= 6:
+            break
+        points = max(6, min(points - 1, int(points * max_width / (right - left))))
+    # Ascent and descent, not the box of these letters: labels side by side then share a base line.
+    ascent, descent = font.getmetrics()
+    canvas = image.new("L", (max(int(right - left), 1), ascent + descent))
+    draw.Draw(canvas).text((-left, 0), text, font=font, fill=255)
+    mask = np.asarray(canvas, dtype=np.float32) / np.float32(255)
+    mask.setflags(write=False)
+    return mask
+
+
+def _pillow(module: str) -> Any:  # noqa: ANN401 - imported on first use
+    """A module of Pillow."""
+    try:
+        return importlib.import_module(f"PIL.{module}")
+    except ImportError as error:
+        raise MissingExtraError("PIL", "render", "writing pictures and labels") from error

@@ -1,145 +1,198 @@
-"""Meshes to pictures without display or GPU, on the software rasteriser of OpenCV 5."""
+"""Drawing meshes without display or GPU, on the software rasteriser of OpenCV 5.
+
+:class:`Renderer` draws a frame; :class:`Camera` and :class:`Look` say what it looks like; ``_Canvas`` holds the buffers
+that OpenCV fills; functions on meshes (normals, winding, hollows) follow at the end.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
 
-if TYPE_CHECKING:
-    from types import ModuleType
-
-
-# What a mesh tells the renderer: sound faces, which side is outside, smooth normals, hollows.
-
+Picture = npt.NDArray[np.uint8]
+Faces = npt.NDArray[np.int32]
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.floating[Any]]
 
+INSIDE = 0.2
+"""Share of its light that the back of a face keeps: the inside of a head is dark."""
 
-def check_vertices(vertices: npt.ArrayLike, name: str, n_vertices: int | None = None) -> npt.NDArray[np.float64]:
-    """One set of vertex positions as float64, refused with one sentence when it cannot be drawn.
+HOLLOW_STRENGTH = 0.45
+"""How strongly hollows of the surface are darkened."""
+
+DEPTH_STRENGTH = 14.0
+"""How strongly points that lie behind their surroundings in the picture are darkened."""
+
+GAMMA_STEPS = 4095
+"""Steps of the gamma table: fine enough that the darkest step stays below one level of the picture."""
+
+
+class Renderer:
+    """Draws one topology in one view; keeps its buffers between frames, so use one per thread.
+
+    Normals are computed again for every frame and interpolated over the triangles; the light is looked up per sample of
+    the supersampled picture, averaged in linear light and gamma-corrected last. The same input gives the same bytes.
 
     Args:
-        vertices: positions (V, 3) in any length unit.
-        name: what the array is called in the message.
-        n_vertices: V where it is known already.
+        faces: triangles (F, 3) as vertex numbers; either winding.
+        template: neutral face (V, 3), y up and z to the viewer, in any unit; the camera is framed on it.
+        size: height and width of the picture in pixels, one number for a square.
+        view: "front", "three_quarter" or "side"; ignored where a camera is given.
+        supersample: samples per pixel and axis; 1 switches anti-aliasing off.
+        camera: a camera to use instead, such as one shared by several topologies.
+        look: material, lights and background.
+        colours: sRGB per vertex (V, 3) for frames without colours of their own, floats from 0 to 1 or uint8; without
+            them the look's material.
+
+    Attributes:
+        backdrop: the picture (height, width, 3) without the mesh.
+
+    Raises:
+        FaceDiffError: if the mesh cannot be drawn or an option is out of range.
+        MissingExtraError: if OpenCV 5 is not installed; raised by the first frame.
     """
-    array = np.asarray(vertices)
-    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
-        raise FaceDiffError(f"{name} must have the shape (vertices, 3), got {array.shape}: x, y, z each.")
-    if n_vertices is not None and array.shape[0] != n_vertices:
-        raise FaceDiffError(
-            f"{name} has {array.shape[0]} vertices but the renderer's template has {n_vertices}: "
-            "draw a motion with the template and the faces of its own topology."
-        )
-    if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
-        raise FaceDiffError(f"{name} must hold real numbers, got {array.dtype}: convert it to float32.")
-    array = array.astype(np.float64)
-    if not np.isfinite(array).all():
-        bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise FaceDiffError(f"{name} holds NaN or infinity (first at vertex {bad}): check its source.")
-    return array
+
+    def __init__(
+        self,
+        faces: npt.ArrayLike,
+        *,
+        template: npt.ArrayLike,
+        size: int | tuple[int, int] = 512,
+        view: str = "front",
+        supersample: int = 2,
+        camera: Camera | None = None,
+        look: Look | None = None,
+        colours: npt.ArrayLike | None = None,
+    ) -> None:
+        rest = check_vertices(template, "template")
+        self.n_vertices = len(rest)
+        self.faces = face_outward(check_faces(faces, self.n_vertices), rest)
+        self.height, self.width = (size, size) if isinstance(size, int) else size
+        if min(self.height, self.width) < 16 or max(self.height, self.width) > 8192:
+            raise FaceDiffError(f"size is {size}: give 16 to 8192 pixels for height and width.")
+        if not 1 <= supersample <= 8:
+            raise FaceDiffError(f"supersample is {supersample}: give 1 (no anti-aliasing) to 8.")
+        self.camera = camera or Camera.framing(rest, view=view, aspect=self.width / self.height)
+        self.look = look or Look()
+        self._colours = None if colours is None else self._linear_colours(colours)
+        self._open = is_open(self.faces)
+        self._canvas = _Canvas(self.camera, self.height, self.width, supersample)
+        self._light = light_table(self.look)
+        self._gamma = np.rint(255 * to_srgb(np.linspace(0, 1, GAMMA_STEPS + 1))).astype(np.uint8)
+        self._background = background(self.look, self.height, self.width)
+        self.backdrop = self._to_bytes(self._background.copy())
+
+    def render(self, vertices: npt.ArrayLike, *, colours: npt.ArrayLike | None = None) -> Picture:
+        """Draw one frame.
+
+        Args:
+            vertices: absolute positions (V, 3) in the template's unit.
+            colours: sRGB per vertex (V, 3), floats from 0 to 1 or uint8; without them the renderer's own.
+
+        Returns:
+            The picture (height, width, 3), sRGB.
+        """
+        points = self.camera.to_camera(check_vertices(vertices, "vertices", self.n_vertices))
+        linear = self._colours if colours is None else self._linear_colours(colours)
+        picture = self.backdrop.copy()
+        window = self._canvas.window(points)
+        if window is not None:
+            picture[window.pixels] = self._draw(points, linear, window)
+        return picture
+
+    def _draw(self, points: Float64, colours: Float32 | None, window: _Window) -> Picture:
+        """The window's pixels: rasterise, light, darken hollows, put over the background, gamma-correct."""
+        cv2, canvas = opencv(), self._canvas
+        positions = points.astype(np.float32)
+        self._draw_normals(points, positions, window)
+        coverage = canvas.coverage(window)
+        # Samples that no triangle reached hold -1 and fall off the table: remap gives them no light.
+        column, row = canvas.channel(window, 0), canvas.channel(window, 1)
+        column *= np.float32(TABLE_SIZE - 1)
+        row *= np.float32(TABLE_SIZE - 1)
+        lit = window.shrink(cv2.remap(self._light, column, row, cv2.INTER_LINEAR))
+        kept = self._kept_light(coverage, window)
+        if colours is None:
+            picture = lit[..., :3] * to_linear(self.look.albedo)
+            hollow = np.asarray(self.look.hollow, np.float32)
+            kept = kept * (1 - hollow) + hollow
+        else:
+            picture = lit[..., :3] * self._draw_albedo(positions, colours, coverage, window)
+        picture += lit[..., 3:]
+        picture *= kept
+        picture += self._background[window.pixels] * (1 - coverage)[..., None]
+        return self._to_bytes(picture)
+
+    def _draw_normals(self, points: Float64, positions: Float32, window: _Window) -> None:
+        """Fill the canvas with the normal's x and y from 0 to 1 and the share of light that a hollow leaves."""
+        normals = vertex_normals(points, self.faces)
+        shade = np.clip(1 - HOLLOW_STRENGTH * hollowness(points, normals, self.faces), 0, 1)
+        self._canvas.clear(window)
+        front = np.column_stack([normals[:, :2] * 0.5 + 0.5, shade])
+        self._canvas.draw(positions, self.faces, front, "front")
+        if self._open:
+            # Backs are drawn against the same depth buffer: they show only where one looks inside.
+            back = np.column_stack([0.5 - normals[:, :2] * 0.5, INSIDE * shade])
+            self._canvas.draw(positions, self.faces, back, "back")
+
+    def _draw_albedo(self, positions: Float32, colours: Float32, coverage: Float32, window: _Window) -> Float32:
+        """Linear surface colour per pixel from linear colours per vertex; overwrites the canvas."""
+        self._canvas.clear(window)
+        self._canvas.draw(positions, self.faces, colours, "both" if self._open else "front")
+        albedo = window.shrink(self._canvas.values[window.samples])
+        albedo[..., :2] += (1 - coverage)[..., None]  # the blank's -1 in the samples that are not covered
+        return np.asarray(albedo / np.maximum(coverage, np.float32(1e-3))[..., None], dtype=np.float32)
+
+    def _kept_light(self, coverage: Float32, window: _Window) -> Float32:
+        """Share of the light that is left where the surface lies in a hollow, per pixel (height, width, 1)."""
+        # Two cues: the surface's own hollows, and pixels that lie behind the mean depth of their surroundings
+        # (depth-buffer unsharp masking, Luft et al. 2006), which darkens the mouth between the lips.
+        cv2, (width, height) = opencv(), window.size
+        shade = window.shrink(self._canvas.channel(window, 2))
+        shade /= np.maximum(coverage, np.float32(1e-3))
+        distances = self._canvas.distances(window, coverage)
+        small = (max(width // 4, 1), max(height // 4, 1))
+        sums = [cv2.resize(image, small, interpolation=cv2.INTER_AREA) for image in (distances * coverage, coverage)]
+        mean, weight = (cv2.GaussianBlur(image, (0, 0), 0.0075 * self.height) for image in sums)
+        mean /= np.maximum(weight, np.float32(1e-3))
+        distances -= cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR)
+        behind = np.maximum(distances, 0, out=distances)
+        behind *= coverage
+        behind *= np.float32(DEPTH_STRENGTH / self.camera.radius)
+        return np.asarray((shade / (1 + behind))[..., None], dtype=np.float32)
+
+    def _to_bytes(self, picture: Float32) -> Picture:
+        """Linear light to sRGB bytes; overwrites its input."""
+        np.clip(picture, 0, 1, out=picture)
+        picture *= np.float32(GAMMA_STEPS)
+        picture += np.float32(0.5)
+        return np.take(self._gamma, picture.astype(np.uint16))
+
+    def _linear_colours(self, colours: npt.ArrayLike) -> Float32:
+        """Colours per vertex in linear light."""
+        array = np.asarray(colours)
+        values = check_vertices(array / 255 if array.dtype == np.uint8 else array, "colours", self.n_vertices)
+        if values.min() < 0 or values.max() > 1:
+            raise FaceDiffError("colours must be floats in [0, 1] or uint8: scale them before drawing.")
+        return to_linear(values)
 
 
-def check_faces(faces: npt.ArrayLike, n_vertices: int) -> npt.NDArray[np.int32]:
-    """Triangles (F, 3) as int32, refused when one names a vertex that the template does not have."""
-    array = np.asarray(faces)
-    shaped = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
-    if not shaped or not np.issubdtype(array.dtype, np.integer):
-        raise FaceDiffError(
-            f"faces must be whole numbers of the shape (faces, 3), got {array.dtype} {array.shape}: "
-            "pass the triangles of the template's mesh file."
-        )
-    low, high = int(array.min()), int(array.max())
-    if low < 0 or high >= n_vertices:
-        raise FaceDiffError(
-            f"faces name vertex {low if low < 0 else high} but the template has vertices 0 to "
-            f"{n_vertices - 1}: pass the faces of the same topology (counting from 0)."
-        )
-    return array.astype(np.int32)
+# The camera: a long lens whose distance is chosen so that the template fills the picture.
 
-
-def face_outward(faces: npt.NDArray[np.int32], template: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
-    """Turn all faces round if the mesh is wound inside out.
-
-    The sign of the flux that leaves through the faces decides. For a closed mesh it is the signed volume
-    whatever the reference point; for an open mask the point lies behind the mesh (z looks at the viewer).
-    """
-    low, high = template.min(axis=0), template.max(axis=0)
-    behind = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2] - (high - low).max()])
-    a, b, c = (template[faces[:, corner]] - behind for corner in range(3))
-    flux = np.einsum("ij,ij->", a, np.cross(b, c))
-    return faces if flux >= 0 else np.ascontiguousarray(faces[:, ::-1])
-
-
-def is_open(faces: npt.NDArray[np.int32]) -> bool:
-    """Whether an edge belongs to one face only, so that somebody may look inside."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    _, counts = np.unique(edges, axis=0, return_counts=True)
-    return bool((counts == 1).any())
-
-
-def vertex_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
-    """Unit normals (V, 3), each the mean of the adjacent faces' normals weighted by their areas.
-
-    A vertex without a face (or with faces of no area only) looks along +z.
-    """
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    # The cross product's length is twice the area: summing it unnormalised is the weighting.
-    normals = sum_at_vertices(_cross(b - a, c - a), faces, len(vertices))
-    length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-    flat = length <= np.finfo(np.float64).tiny
-    normals[flat] = (0.0, 0.0, 1.0)
-    length[flat] = 1.0
-    return np.asarray(normals / length[:, None], dtype=np.float64)
-
-
-def hollowness(
-    vertices: Floats, normals: npt.NDArray[np.float64], faces: npt.NDArray[np.int32]
-) -> npt.NDArray[np.float64]:
-    """How far each vertex lies below its neighbourhood, as a share of the neighbourhood's radius (V,).
-
-    Positive in hollows (between the lips, in the corner of an eye), negative on ridges, near zero on
-    smooth parts: the mean of the adjacent faces' centres, seen along the normal.
-    """
-    centres = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
-    counts = np.maximum(np.bincount(faces.ravel(), minlength=len(vertices)), 1)
-    offset = sum_at_vertices(centres, faces, len(vertices)) / counts[:, None] - vertices
-    radius = np.sqrt(np.einsum("ij,ij->i", offset, offset)) + np.ptp(vertices, axis=0).max() * 1e-2
-    return np.asarray(np.einsum("ij,ij->i", offset, normals) / radius, dtype=np.float64)
-
-
-def sum_at_vertices(values: Floats, faces: npt.NDArray[np.int32], n_vertices: int) -> npt.NDArray[np.float64]:
-    """Add each face's values (F, 3) to its three vertices: (V, 3)."""
-    corners = faces.ravel()
-    return np.stack([np.bincount(corners, np.repeat(values[:, k], 3), minlength=n_vertices) for k in range(3)], axis=1)
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Cross products of rows; numpy's own is several times slower on (F, 3)."""
-    return np.stack(
-        [
-            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
-            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
-            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
-        ],
-        axis=1,
-    )
-
-
-# Where the viewer stands: a long lens whose distance is chosen so that the template fills the picture.
-
-# Degrees by which the head turns about the vertical axis: negative turns the face to the viewer's left,
-# towards the key light.
 VIEWS: dict[str, float] = {"front": 0.0, "three_quarter": -35.0, "side": -90.0}
+"""Degrees by which the head turns about the vertical axis; negative turns the face to the key light on the left."""
 
-# A portrait lens: the nose does not swell as it does with a wide angle.
 FIELD_OF_VIEW = math.radians(18.0)
+"""That of a portrait lens: a wide angle would make the nose look large."""
 
 
 @dataclass(frozen=True)
@@ -147,8 +200,8 @@ class Camera:
     """A perspective camera that looks at `centre`; make one with `Camera.framing`.
 
     Attributes:
-        centre: the point (x, y, z) that comes to the middle of the picture, in the mesh's unit.
-        rotation: rows of the 3 x 3 rotation from the mesh's axes to the camera's (x right, y up, z to viewer)
+        centre: the point (x, y, z) in the middle of the picture, in the mesh's unit.
+        rotation: rows of the 3 x 3 rotation from the mesh's axes to the camera's (x right, y up, z to the viewer).
         distance: from the camera to the centre, in the mesh's unit.
         radius: how far vertices may lie from the centre and still be drawn, in the mesh's unit.
     """
@@ -182,12 +235,14 @@ class Camera:
         points = np.concatenate([check_vertices(template, "template") for template in templates])  # type: ignore[union-attr]
         size = float(np.ptp(points, axis=0).max())
         if size <= 0:
-            raise FaceDiffError("template has no extent (all vertices coincide): pass the rest positions.")
-        rotation = _turn(math.radians(VIEWS[view]))
+            raise FaceDiffError("template has no extent (all vertices coincide): pass the neutral face.")
+        cos, sin = math.cos(math.radians(VIEWS[view])), math.sin(math.radians(VIEWS[view]))
+        rotation = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
         turned = points @ rotation.T
         middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
         x, y, z = (turned - middle).T
         half = math.tan(FIELD_OF_VIEW / 2) * (1 - margin)
+        # A point at depth z in front of the centre is seen within the angle if |x| <= half · aspect · (distance - z).
         distance = float(max(np.max(np.abs(x) / (half * aspect) + z), np.max(np.abs(y) / half + z)))
         return cls(
             centre=tuple((middle @ rotation).tolist()),
@@ -198,7 +253,7 @@ class Camera:
 
     @property
     def near(self) -> float:
-        """Depth before which nothing is drawn."""
+        """Depth in front of which nothing is drawn."""
         return max(self.distance - self.radius, self.distance * 0.02)
 
     @property
@@ -206,33 +261,21 @@ class Camera:
         """Depth behind which nothing is drawn."""
         return self.distance + self.radius
 
-    def to_camera(self, vertices: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+    def to_camera(self, vertices: Floats) -> Float64:
         """Positions (V, 3) in the camera's axes, origin at the camera: visible points have negative z."""
         turned = (vertices - np.asarray(self.centre)) @ np.asarray(self.rotation).T
         turned[:, 2] -= self.distance
         return np.asarray(turned, dtype=np.float64)
 
 
-def _turn(angle: float) -> npt.NDArray[np.float64]:
-    """Rotation about the vertical axis by `angle` radians."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
-
-
-# The look: material, lights and background, and the colour of every direction that a surface can face.
-#
-# All lights are far away and fixed to the camera, so the colour of a point depends on its normal only. It is
-# computed once for the half sphere of normals that face the viewer and then looked up per pixel, which makes
-# shading per pixel (not per vertex) affordable without a GPU. Light is added up in linear units.
+# The look: material, lights and background.
 
 Colour = tuple[float, float, float]
-
-TABLE_SIZE = 256
 
 
 @dataclass(frozen=True)
 class Light:
-    """A far light.
+    """A distant light, fixed to the camera.
 
     Attributes:
         direction: where it stands seen from the face: x right, y up, z to the viewer; any length.
@@ -247,24 +290,24 @@ class Light:
     gloss: float = 0.0
 
 
-# Key from the upper left, cool fill from the right, rim from behind at the right.
 STUDIO = (
     Light((-0.55, 0.60, 0.80), (0.80, 0.76, 0.70), wrap=0.25, gloss=0.16),
     Light((0.85, 0.05, 0.60), (0.14, 0.17, 0.22), wrap=0.5),
     Light((0.75, 0.45, -0.55), (0.50, 0.52, 0.58), wrap=0.0),
 )
+"""Key light from the upper left, cool fill light from the right, rim light from behind at the right."""
 
-# The same strength from straight ahead: a symmetric face gives a symmetric picture.
 EVEN = (Light((0.0, 0.45, 0.9), (0.85, 0.83, 0.80), wrap=0.3, gloss=0.1),)
+"""About the same strength from straight ahead: a symmetric face gives a symmetric picture."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """Material, lights and background of a picture; colours are sRGB in [0, 1] unless a light's.
+    """Material, lights and background of a picture; colours are sRGB from 0 to 1 unless a light's.
 
     Attributes:
         albedo: the surface's own colour where no per-vertex colours are given.
-        lights: the lamps beside the ambient light.
+        lights: the lamps in addition to the ambient light.
         sky: linear ambient light on what faces up.
         ground: linear ambient light on what faces down.
         background_top: background at the upper edge.
@@ -281,26 +324,18 @@ class Look:
     hollow: Colour = (0.10, 0.02, 0.015)
 
 
-def to_linear(srgb: npt.ArrayLike) -> npt.NDArray[np.float32]:
-    """SRGB values in [0, 1] to linear light."""
-    values = np.asarray(srgb, dtype=np.float64)
-    linear = np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
-    return linear.astype(np.float32)
+TABLE_SIZE = 256
 
 
-def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[np.float32]:
-    """Linear light in [0, 1] to sRGB."""
-    values = np.clip(np.asarray(linear, dtype=np.float64), 0, 1)
-    srgb = np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055)
-    return srgb.astype(np.float32)
+def light_table(look: Look) -> Float32:
+    """Light that leaves a surface, by its normal: (TABLE_SIZE, TABLE_SIZE, 4).
 
-
-def light_table(look: Look) -> npt.NDArray[np.float32]:
-    """Light that leaves a surface, by the normal it has: (TABLE_SIZE, TABLE_SIZE, 4).
-
-    Row and column are the normal's y and x from -1 to 1 (row 0 is y = -1). Channels 0 to 2 hold what a
-    white matt surface sends back, channel 3 the highlight, which does not take the surface's colour.
+    Row and column are the normal's y and x from -1 to 1 (row 0 is y = -1). Channels 0 to 2 hold what a white matt
+    surface sends back, channel 3 the highlight, which does not take the surface's colour.
     """
+    # All lights are far away and fixed to the camera, so that the colour of a point depends on its normal only. It is
+    # computed once for the half sphere that faces the viewer and looked up per sample, which makes shading per pixel
+    # affordable without a GPU.
     axis = np.linspace(-1, 1, TABLE_SIZE)
     x, y = np.meshgrid(axis, axis)
     # Outside the unit disc lie interpolation errors at the outline only: treat them as the outline itself.
@@ -324,7 +359,7 @@ def light_table(look: Look) -> npt.NDArray[np.float32]:
     return np.concatenate([diffuse, gloss[..., None]], axis=-1).astype(np.float32)
 
 
-def background(look: Look, height: int, width: int) -> npt.NDArray[np.float32]:
+def background(look: Look, height: int, width: int) -> Float32:
     """Soft gradient in linear light (height, width, 3), a little brighter behind the head."""
     rows = np.linspace(0, 1, height)[:, None, None]
     top, bottom = np.asarray(look.background_top), np.asarray(look.background_bottom)
@@ -334,15 +369,30 @@ def background(look: Look, height: int, width: int) -> npt.NDArray[np.float32]:
     return to_linear(((1 - blend) * top + blend * bottom) * glow)
 
 
-# Buffers and the passes of OpenCV's software rasteriser that fill them.
+def to_linear(srgb: npt.ArrayLike) -> Float32:
+    """SRGB values from 0 to 1 as linear light (IEC 61966-2-1)."""
+    values = np.asarray(srgb, dtype=np.float64)
+    linear = np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
 
-# Windows start and end on multiples of this many pixels, so that nothing computed on a coarser grid inside
-# them shimmers when a window grows with the motion.
-GRID = 8
+
+def to_srgb(linear: npt.ArrayLike) -> Float32:
+    """Linear light from 0 to 1 as sRGB."""
+    values = np.clip(np.asarray(linear, dtype=np.float64), 0, 1)
+    srgb = np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055)
+    return srgb.astype(np.float32)
+
+
+# Buffers, and the calls of OpenCV's software rasteriser that fill them.
 
 
 def opencv() -> ModuleType:
-    """OpenCV 5, or a sentence that says how to get it."""
+    """The module cv2.
+
+    Raises:
+        MissingExtraError: if OpenCV is not installed.
+        FaceDiffError: if it is older than 5.
+    """
     try:
         import cv2
     except ImportError as error:
@@ -355,19 +405,12 @@ def opencv() -> ModuleType:
     return cv2
 
 
-class Window:
-    """A rectangle of the picture, in pixels and in samples.
+class _Window(NamedTuple):
+    """A rectangle of the picture, as slices of pixels and of samples, and its width and height in pixels."""
 
-    Args:
-        rows: first row and one past the last, in pixels.
-        columns: likewise.
-        supersample: samples per pixel and axis.
-    """
-
-    def __init__(self, rows: tuple[int, int], columns: tuple[int, int], supersample: int) -> None:
-        self.pixels = (slice(*rows), slice(*columns))
-        self.samples = tuple(slice(low * supersample, high * supersample) for low, high in (rows, columns))
-        self.size = (columns[1] - columns[0], rows[1] - rows[0])
+    pixels: tuple[slice, slice]
+    samples: tuple[slice, slice]
+    size: tuple[int, int]
 
     def shrink(self, samples: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Average the samples of each pixel."""
@@ -375,28 +418,21 @@ class Window:
         return np.asarray(cv2.resize(samples, self.size, interpolation=cv2.INTER_AREA))
 
 
-class Canvas:
-    """A depth buffer and three interpolated values per sample.
+class _Canvas:
+    """A depth buffer and three interpolated values per sample."""
 
-    Depth is kept as the rasteriser has it (0 at the near plane, 1 at the far plane and where nothing is).
-    Its other mode, which converts to distances and back around every call, loses what a second pass adds:
-    the empty samples come back a rounding error behind the far plane and count as untouchable.
-
-    Args:
-        camera: where the picture is taken from.
-        height: of the picture in pixels.
-        width: of the picture in pixels.
-        supersample: samples per pixel and axis.
-    """
+    GRID = 8
+    """Windows start and end on multiples of this many pixels: what is computed on a coarser grid inside them would
+    otherwise shimmer where a window grows with the motion."""
 
     def __init__(self, camera: Camera, height: int, width: int, supersample: int) -> None:
         self.camera = camera
         self.height, self.width, self.supersample = height, width, supersample
-        self._depth = np.ones((height * supersample, width * supersample), np.float32)
-        self._values = np.zeros((*self._depth.shape, 3), np.float32)
-        self._blank = np.broadcast_to(np.array([-1, -1, 0], np.float32), self._values.shape).copy()
+        self.depth = np.ones((height * supersample, width * supersample), np.float32)
+        self.values = np.zeros((*self.depth.shape, 3), np.float32)
+        self._blank = np.broadcast_to(np.array([-1, -1, 0], np.float32), self.values.shape).copy()
 
-    def window(self, points: npt.NDArray[np.float64]) -> Window | None:
+    def window(self, points: Float64) -> _Window | None:
         """The part of the picture that can show the points (V, 3, camera axes); None if there is none."""
         ahead = points[points[:, 2] < -self.camera.near]
         if len(ahead) == 0:
@@ -405,60 +441,59 @@ class Canvas:
         row, column = self.height / 2 - scale * ahead[:, 1], self.width / 2 + scale * ahead[:, 0]
         limits = []
         for pixel, size in ((row, self.height), (column, self.width)):
-            low = max((math.floor(pixel.min()) - 2) // GRID * GRID, 0)
-            high = min(-((-math.ceil(pixel.max()) - 2) // GRID) * GRID, size)
+            low = max((math.floor(pixel.min()) - 2) // self.GRID * self.GRID, 0)
+            high = min(-((-math.ceil(pixel.max()) - 2) // self.GRID) * self.GRID, size)
             if high <= low:
                 return None
             limits.append((low, high))
-        return Window(limits[0], limits[1], self.supersample)
+        (top, bottom), (left, right) = limits
+        s = self.supersample
+        return _Window(
+            pixels=(slice(top, bottom), slice(left, right)),
+            samples=(slice(top * s, bottom * s), slice(left * s, right * s)),
+            size=(right - left, bottom - top),
+        )
 
-    def clear(self, window: Window) -> None:
+    def clear(self, window: _Window) -> None:
         """Nothing drawn yet: depth 1, values (-1, -1, 0)."""
-        self._depth[window.samples] = 1
-        self._values[window.samples] = self._blank[window.samples]
+        self.depth[window.samples] = 1
+        self.values[window.samples] = self._blank[window.samples]
 
-    def draw(
-        self,
-        positions: npt.NDArray[np.float32],
-        faces: npt.NDArray[np.int32],
-        values: npt.NDArray[np.floating[Any]],
-        side: str,
-    ) -> None:
+    def draw(self, positions: Float32, faces: Faces, values: Floats, side: str) -> None:
         """Interpolate values (V, 3) over the triangles where they are the nearest surface so far.
 
         Args:
             positions: vertices (V, 3) in camera axes.
             faces: triangles (F, 3).
-            values: what to interpolate, in [0, 1].
+            values: what to interpolate, from 0 to 1.
             side: which side of the triangles, "front", "back" or "both".
         """
         cv2 = opencv()
         settings = cv2.TriangleRasterizeSettings()
         settings.setShadingType(cv2.RASTERIZE_SHADING_SHADED)
+        # Depth stays as the rasteriser computes it (0 at the near plane, 1 at the far plane and where nothing is). Its
+        # other mode converts to distances and back around every call and loses what a second pass adds: the empty
+        # samples come back a rounding error behind the far plane and are never drawn again.
         settings.setGlCompatibleMode(cv2.RASTERIZE_COMPAT_INVDEPTH)
         culled = {"front": "CW", "back": "CCW", "both": "NONE"}[side]
         settings.setCullingMode(getattr(cv2, f"RASTERIZE_CULLING_{culled}"))
         lens = (FIELD_OF_VIEW, self.camera.near, self.camera.far)
         values, pose = values.astype(np.float32), np.eye(4, dtype=np.float32)
-        cv2.triangleRasterize(positions, faces, values, self._values, self._depth, pose, *lens, settings)
+        cv2.triangleRasterize(positions, faces, values, self.values, self.depth, pose, *lens, settings)
 
-    def value(self, window: Window, channel: int) -> npt.NDArray[np.float32]:
+    def channel(self, window: _Window, index: int) -> Float32:
         """One of the three values per sample of the window."""
-        return np.asarray(opencv().extractChannel(self._values[window.samples], channel), dtype=np.float32)
+        return np.asarray(opencv().extractChannel(self.values[window.samples], index), dtype=np.float32)
 
-    def values(self, window: Window) -> npt.NDArray[np.float32]:
-        """The three values per pixel of the window, averaged over its samples."""
-        return window.shrink(self._values[window.samples])
-
-    def coverage(self, window: Window) -> npt.NDArray[np.float32]:
+    def coverage(self, window: _Window) -> Float32:
         """Share of each pixel that the mesh covers."""
         cv2 = opencv()
-        covered = window.shrink(cv2.compare(self._depth[window.samples], 1.0, cv2.CMP_LT))
+        covered = window.shrink(cv2.compare(self.depth[window.samples], 1.0, cv2.CMP_LT))
         return np.asarray(covered * np.float32(1 / 255), dtype=np.float32)
 
-    def distances(self, window: Window, coverage: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def distances(self, window: _Window, coverage: Float32) -> Float32:
         """Mean distance of each pixel's covered samples from the camera; meaningless where it has none."""
-        depth = window.shrink(self._depth[window.samples])
+        depth = window.shrink(self.depth[window.samples])
         depth += coverage
         depth -= 1  # what the empty samples added
         depth /= np.maximum(coverage, np.float32(1e-3))
@@ -466,176 +501,108 @@ class Canvas:
         return np.asarray(1 / (np.float32(near) + depth * np.float32(far - near)), dtype=np.float32)
 
 
-# What is seen of a face's back keeps this share of its light: the inside of a head is dark.
-INSIDE = 0.2
-
-# How strongly hollows of the surface, and points lying behind their surroundings, are darkened.
-HOLLOW_STRENGTH = 0.45
-DEPTH_STRENGTH = 14.0
-
-# Steps of the gamma table: fine enough that the darkest step stays below one level of the picture.
-_LEVELS = 4095
+# Meshes: what can be drawn, which side is outside, normals and hollows.
 
 
-class Renderer:
-    """Draws one topology in one view; keeps its buffers between frames, so use one per thread.
-
-    Normals are recomputed for every frame and interpolated over the triangles; the light is looked up per
-    sample of the supersampled picture (see `shading`), averaged in linear light and gamma-corrected last.
-    The same input gives the same bytes. `backdrop` is the picture (height, width, 3) without the mesh.
+def check_vertices(vertices: npt.ArrayLike, name: str, n_vertices: int | None = None) -> Float64:
+    """Vertex positions (V, 3) as float64; refuses what cannot be drawn.
 
     Args:
-        faces: triangles (F, 3) as vertex numbers; either winding.
-        template: rest positions (V, 3), y up and z to the viewer, in any unit; the camera is framed on them.
-        size: height and width of the picture in pixels, one number for a square.
-        view: "front", "three_quarter" or "side"; ignored where a camera is given.
-        supersample: samples per pixel and axis; 1 switches anti-aliasing off.
-        camera: a camera to use instead, such as one shared by several topologies.
-        look: material, lights and background.
-        colours: sRGB per vertex (V, 3) for frames that bring none, floats in [0, 1] or uint8; without
-            them the look's material.
+        vertices: positions (V, 3) in any length unit.
+        name: what the array is called in the message.
+        n_vertices: V where it is known already.
+
+    Raises:
+        FaceDiffError: if the shape or the kind of number is wrong, or one is not finite.
     """
+    array = np.asarray(vertices)
+    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
+        raise FaceDiffError(f"{name} must have the shape (vertices, 3), got {array.shape}: x, y, z each.")
+    if n_vertices is not None and array.shape[0] != n_vertices:
+        raise FaceDiffError(
+            f"{name} has {array.shape[0]} vertices but the renderer's template has {n_vertices}: "
+            "draw a motion with the template and the faces of its own topology."
+        )
+    if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
+        raise FaceDiffError(f"{name} must hold real numbers, got {array.dtype}: convert it to float32.")
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise FaceDiffError(f"{name} holds NaN or infinity (first at vertex {bad}): check its source.")
+    return array
 
-    def __init__(
-        self,
-        faces: npt.ArrayLike,
-        *,
-        template: npt.ArrayLike,
-        size: int | tuple[int, int] = 512,
-        view: str = "front",
-        supersample: int = 2,
-        camera: Camera | None = None,
-        look: Look | None = None,
-        colours: npt.ArrayLike | None = None,
-    ) -> None:
-        rest = check_vertices(template, "template")
-        self.n_vertices = len(rest)
-        self.faces = face_outward(check_faces(faces, self.n_vertices), rest)
-        self.height, self.width = (size, size) if isinstance(size, int) else size
-        if min(self.height, self.width) < 16 or max(self.height, self.width) > 8192:
-            raise FaceDiffError(f"size is {size}: give 16 to 8192 pixels for height and width.")
-        if not 1 <= supersample <= 8:
-            raise FaceDiffError(f"supersample is {supersample}: give 1 (no anti-aliasing) to 8.")
-        self.camera = camera or Camera.framing(rest, view=view, aspect=self.width / self.height)
-        self.look = look or Look()
-        self._colours = None if colours is None else self._check_colours(colours)
-        self._open = is_open(self.faces)
-        self._canvas = Canvas(self.camera, self.height, self.width, supersample)
-        self._table = light_table(self.look)
-        self._gamma = np.rint(255 * to_srgb(np.linspace(0, 1, _LEVELS + 1))).astype(np.uint8)
-        self._background = background(self.look, self.height, self.width)
-        self.backdrop = self._to_bytes(self._background.copy())
 
-    def render(self, vertices: npt.ArrayLike, *, colours: npt.ArrayLike | None = None) -> npt.NDArray[np.uint8]:
-        """Draw one frame.
+def check_faces(faces: npt.ArrayLike, n_vertices: int) -> Faces:
+    """Triangles (F, 3) as int32.
 
-        Args:
-            vertices: absolute positions (V, 3) in the template's unit.
-            colours: sRGB per vertex (V, 3), floats in [0, 1] or uint8; without them the renderer's own.
+    Raises:
+        FaceDiffError: if the shape is wrong, or a triangle names a vertex that does not exist.
+    """
+    array = np.asarray(faces)
+    shaped = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
+    if not shaped or not np.issubdtype(array.dtype, np.integer):
+        raise FaceDiffError(
+            f"faces must be whole numbers of the shape (faces, 3), got {array.dtype} {array.shape}: "
+            "pass the triangles of the template's mesh file."
+        )
+    low, high = int(array.min()), int(array.max())
+    if low < 0 or high >= n_vertices:
+        raise FaceDiffError(
+            f"faces name vertex {low if low < 0 else high} but the template has vertices 0 to "
+            f"{n_vertices - 1}: pass the faces of the same topology (counting from 0)."
+        )
+    return array.astype(np.int32)
 
-        Returns:
-            The picture (height, width, 3), sRGB.
-        """
-        points = self.camera.to_camera(check_vertices(vertices, "vertices", self.n_vertices))
-        tints = self._colours if colours is None else self._check_colours(colours)
-        picture = self.backdrop.copy()
-        window = self._canvas.window(points)
-        if window is not None:
-            picture[window.pixels] = self._draw(points, tints, window)
-        return picture
 
-    def animate(
-        self, motion: Iterable[npt.ArrayLike], *, colours: npt.NDArray[Any] | None = None
-    ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Draw frame after frame: positions (T, V, 3) and, where given, colours (V, 3) or (T, V, 3)."""
-        for index, vertices in enumerate(motion):
-            now = colours[index] if colours is not None and colours.ndim == 3 else colours
-            yield self.render(vertices, colours=now)
+def face_outward(faces: Faces, template: Float64) -> Faces:
+    """Triangles (F, 3) that are counter-clockwise seen from outside: all are reversed if the mesh is inside out."""
+    # The sign of the flux that leaves through the faces decides. For a closed mesh it is the signed volume, whatever
+    # the reference point; for an open mask the point must lie behind the mesh (z looks at the viewer).
+    low, high = template.min(axis=0), template.max(axis=0)
+    behind = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2] - (high - low).max()])
+    a, b, c = (template[faces[:, corner]] - behind for corner in range(3))
+    flux = np.einsum("ij,ij->", a, np.cross(b, c))
+    return faces if flux >= 0 else np.ascontiguousarray(faces[:, ::-1])
 
-    def _draw(
-        self, points: npt.NDArray[np.float64], colours: npt.NDArray[np.float32] | None, window: Window
-    ) -> npt.NDArray[np.uint8]:
-        """The window's pixels: rasterise, light, darken hollows, put over the background, gamma-correct."""
-        cv2, canvas = opencv(), self._canvas
-        positions = points.astype(np.float32)
-        self._draw_normals(points, positions, window)
-        coverage = canvas.coverage(window)
-        # Samples that no triangle reached hold -1 and fall off the table: remap gives them no light.
-        column, row = canvas.value(window, 0), canvas.value(window, 1)
-        column *= np.float32(TABLE_SIZE - 1)
-        row *= np.float32(TABLE_SIZE - 1)
-        lit = window.shrink(cv2.remap(self._table, column, row, cv2.INTER_LINEAR))
-        kept = self._kept_light(coverage, window)
-        if colours is None:
-            picture = lit[..., :3] * to_linear(self.look.albedo)
-            hollow = np.asarray(self.look.hollow, np.float32)
-            kept = kept * (1 - hollow) + hollow
-        else:
-            picture = lit[..., :3] * self._draw_albedo(positions, colours, coverage, window)
-        picture += lit[..., 3:]
-        picture *= kept
-        picture += self._background[window.pixels] * (1 - coverage)[..., None]
-        return self._to_bytes(picture)
 
-    def _draw_normals(
-        self, points: npt.NDArray[np.float64], positions: npt.NDArray[np.float32], window: Window
-    ) -> None:
-        """Fill the canvas with the normal's x and y in [0, 1] and the share of light that a hollow leaves."""
-        normals = vertex_normals(points, self.faces)
-        shade = np.clip(1 - HOLLOW_STRENGTH * hollowness(points, normals, self.faces), 0, 1)
-        self._canvas.clear(window)
-        front = np.column_stack([normals[:, :2] * 0.5 + 0.5, shade])
-        self._canvas.draw(positions, self.faces, front, "front")
-        if self._open:
-            # Backs are drawn against the same depth: they show only where one looks inside.
-            back = np.column_stack([0.5 - normals[:, :2] * 0.5, INSIDE * shade])
-            self._canvas.draw(positions, self.faces, back, "back")
+def is_open(faces: Faces) -> bool:
+    """Whether an edge belongs to one triangle only, so that the inside may be seen."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    return bool((counts == 1).any())
 
-    def _draw_albedo(
-        self,
-        positions: npt.NDArray[np.float32],
-        colours: npt.NDArray[np.float32],
-        coverage: npt.NDArray[np.float32],
-        window: Window,
-    ) -> npt.NDArray[np.float32]:
-        """Linear surface colour per pixel from linear colours per vertex; overwrites the canvas."""
-        self._canvas.clear(window)
-        self._canvas.draw(positions, self.faces, colours, "both" if self._open else "front")
-        albedo = self._canvas.values(window)
-        albedo[..., :2] += (1 - coverage)[..., None]  # the blank's -1 in the samples not covered
-        return np.asarray(albedo / np.maximum(coverage, np.float32(1e-3))[..., None], dtype=np.float32)
 
-    def _kept_light(self, coverage: npt.NDArray[np.float32], window: Window) -> npt.NDArray[np.float32]:
-        """Share of the light that is left where the surface lies in a hollow, per pixel (height, width, 1).
+def vertex_normals(vertices: Floats, faces: Faces) -> Float64:
+    """Unit normals (V, 3): the mean of the adjacent triangles' normals, weighted by their areas.
 
-        Two cues: the surface's own hollows, and pixels that lie behind the mean depth of their
-        surroundings (depth-buffer unsharp masking), which darkens the mouth between the lips.
-        """
-        cv2, (width, height) = opencv(), window.size
-        shade = window.shrink(self._canvas.value(window, 2))
-        shade /= np.maximum(coverage, np.float32(1e-3))
-        distances = self._canvas.distances(window, coverage)
-        small = (max(width // 4, 1), max(height // 4, 1))
-        sums = [cv2.resize(image, small, interpolation=cv2.INTER_AREA) for image in (distances * coverage, coverage)]
-        mean, weight = (cv2.GaussianBlur(image, (0, 0), 0.0075 * self.height) for image in sums)
-        mean /= np.maximum(weight, np.float32(1e-3))
-        distances -= cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR)
-        behind = np.maximum(distances, 0, out=distances)
-        behind *= coverage
-        behind *= np.float32(DEPTH_STRENGTH / self.camera.radius)
-        return np.asarray((shade / (1 + behind))[..., None], dtype=np.float32)
+    A vertex without triangles (or with triangles of no area only) looks along +z.
+    """
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
+    # Written out, since numpy's cross product is several times slower on (F, 3). Its length is twice the triangle's
+    # area, so that summing it unnormalised gives the weights.
+    cross = np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
+    normals = _sum_at_vertices(cross, faces, len(vertices))
+    length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
+    flat = length <= np.finfo(np.float64).tiny
+    normals[flat] = (0.0, 0.0, 1.0)
+    length[flat] = 1.0
+    return np.asarray(normals / length[:, None], dtype=np.float64)
 
-    def _to_bytes(self, picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-        """Linear light to sRGB bytes; overwrites its input."""
-        np.clip(picture, 0, 1, out=picture)
-        picture *= np.float32(_LEVELS)
-        picture += np.float32(0.5)
-        return np.take(self._gamma, picture.astype(np.uint16))
 
-    def _check_colours(self, colours: npt.ArrayLike) -> npt.NDArray[np.float32]:
-        """Colours per vertex as linear float32."""
-        array = np.asarray(colours)
-        values = check_vertices(array / 255 if array.dtype == np.uint8 else array, "colours", self.n_vertices)
-        if values.min() < 0 or values.max() > 1:
-            raise FaceDiffError("colours must be floats in [0, 1] or uint8: scale them before drawing.")
-        return to_linear(values)
+def hollowness(vertices: Floats, normals: Float64, faces: Faces) -> Float64:
+    """How far each vertex lies below its neighbourhood, as a share of the neighbourhood's radius (V,).
+
+    Positive in hollows (between the lips, in the corner of an eye), negative on ridges, near zero on smooth parts.
+    """
+    centres = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
+    counts = np.maximum(np.bincount(faces.ravel(), minlength=len(vertices)), 1)
+    offset = _sum_at_vertices(centres, faces, len(vertices)) / counts[:, None] - vertices
+    radius = np.sqrt(np.einsum("ij,ij->i", offset, offset)) + np.ptp(vertices, axis=0).max() * 1e-2
+    return np.asarray(np.einsum("ij,ij->i", offset, normals) / radius, dtype=np.float64)
+
+
+def _sum_at_vertices(values: Floats, faces: Faces, n_vertices: int) -> Float64:
+    """Add each triangle's values (F, 3) to its three vertices: (V, 3)."""
+    corners = faces.ravel()
+    return np.stack([np.bincount(corners, np.repeat(values[:, k], 3), minlength=n_vertices) for k in range(3)], axis=1)

@@ -17,16 +17,15 @@ from facediff.errors import FaceDiffError, MissingExtraError
 if TYPE_CHECKING:
     from av.container import OutputContainer
 
-
-# Rates (Hz) that AAC knows; sound of any other rate is resampled to the highest common one.
-_AAC_RATES = (96000, 88200, 64000, 48000, 44100, 32000, 24000, 22050, 16000, 12000, 11025, 8000)
-
-# One thread: x264's output depends on the number of threads, which would follow the machine's cores.
-_X264 = {"crf": "18", "preset": "medium", "threads": "1"}
-
-_CHUNK = 1024
-
 Frame = npt.NDArray[np.uint8]
+
+AAC_RATES = (96000, 88200, 64000, 48000, 44100, 32000, 24000, 22050, 16000, 12000, 11025, 8000)
+"""Rates (Hz) that AAC supports; sound of any other rate is resampled to 48 kHz."""
+
+X264_OPTIONS = {"crf": "18", "preset": "medium", "threads": "1"}
+"""One thread, since x264's output depends on the number of threads, which would otherwise follow the machine."""
+
+CHUNK = 1024
 
 
 def write_video(
@@ -38,21 +37,30 @@ def write_video(
 ) -> int:
     """Write an mp4 whose sound starts with its first frame.
 
-    The file appears under its name only when it is complete: until then it is a hidden sibling, which is
-    removed if anything fails (so is every folder that had to be made). Same input, same pictures bit by bit; the
+    The file appears under its name only when it is complete: until then it is a hidden sibling, which is removed if
+    anything fails (so is every folder that had to be made). The same input gives the same pictures bit by bit; the
     sound may differ inaudibly, since FFmpeg's AAC encoder now and then chooses other bits for the same samples.
 
     Args:
         path: ends in ".mp4"; missing folders are made.
-        frames: pictures (height, width, 3), sRGB, all of one size; taken one by one. An odd size is made
-            even, as H.264 wants it, by repeating the last row or column.
+        frames: pictures (height, width, 3), sRGB, all of one size; read one by one. An odd size is made even, as H.264
+            requires, by repeating the last row or column.
         frame_rate: frames per second.
-        audio: mono sound (samples,) with full scale 1, or None for a silent video. It is written whole, even
-            where it is longer than the picture.
+        audio: mono sound (samples,) with full scale 1, or None for a silent video. All of it is written, even where it
+            is longer than the picture.
         sample_rate: of the sound in Hz.
 
     Returns:
         The number of frames written.
+
+    Raises:
+        FaceDiffError: if an argument cannot be used, there are no frames, or the file cannot be written.
+        MissingExtraError: if PyAV is not installed.
+
+    Example:
+        >>> frames = (renderer.render(vertices) for vertices in motion)  # doctest: +SKIP
+        >>> write_video("hello.mp4", frames, 25, speech, 16_000)  # doctest: +SKIP
+        127
     """
     target = Path(path)
     if target.suffix.lower() != ".mp4":
@@ -65,8 +73,14 @@ def write_video(
         raise FaceDiffError(f'video file "{target}" is a folder: give the name of a file.')
     made = [folder for folder in target.parents if not folder.exists()]
     partial = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial.mp4")
+    # Unlike utils.files.atomic this lets an OSError through that comes from the caller's generator of frames.
     try:
-        _make_folder(target.parent)
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FaceDiffError(
+                f'cannot make the folder "{target.parent}" ({error.strerror}): choose another place.'
+            ) from error
         count = _encode(partial, frames, rate, sound, sample_rate or 0)
         partial.replace(target)
     except BaseException:
@@ -79,10 +93,31 @@ def write_video(
     return count
 
 
+def _check_audio(audio: npt.ArrayLike, sample_rate: int | None) -> npt.NDArray[np.float32]:
+    """Mono float32 sound, clipped to full scale."""
+    sound = np.asarray(audio, dtype=np.float32)
+    if sound.ndim != 1 or len(sound) == 0:
+        raise FaceDiffError(f"audio must be mono of the shape (samples,), got {sound.shape}: average the channels.")
+    if sample_rate is None or not 1000 <= sample_rate <= 384_000:
+        raise FaceDiffError(f"sample_rate is {sample_rate}: give the sound's rate in Hz, such as 16000.")
+    if not np.isfinite(sound).all():
+        raise FaceDiffError("audio holds NaN or infinity: check its source.")
+    return np.clip(sound, -1, 1)
+
+
+def _check_frame(frame: Frame, size: tuple[int, int] | None, index: int = 0) -> tuple[int, int]:
+    """Height and width of a frame that can be encoded."""
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+        raise ValueError(f"frame {index} must be uint8 (height, width, 3), got {frame.dtype} {frame.shape}")
+    if size is not None and frame.shape[:2] != size:
+        raise ValueError(f"frame {index} is {frame.shape[:2]} but frame 0 is {size}: one size for all")
+    return frame.shape[0], frame.shape[1]
+
+
 def _encode(
     path: Path, frames: Iterable[Frame], rate: Fraction, sound: npt.NDArray[np.float32] | None, hertz: int
 ) -> int:
-    """Encode everything into `path`; the first frame sets the size."""
+    """Encode everything into `path`; the first frame sets the size. Returns the number of frames."""
     try:
         import av
     except ImportError as error:
@@ -104,12 +139,12 @@ def _encode(
             return _Encoder(container, rate, size, sound, hertz).run(first, iterator)
     except av.error.FFmpegError as error:
         raise FaceDiffError(
-            f'writing the video in "{path.parent}" failed ({error.strerror}): is the disk full?'
+            f'writing the video in "{path.parent}" failed ({error.strerror}): check whether the disk is full.'
         ) from error
 
 
 class _Encoder:
-    """The two streams of one file, filled side by side so that neither waits in memory for the other."""
+    """The two streams of one file, filled in turn so that neither waits in memory for the other."""
 
     def __init__(
         self,
@@ -119,107 +154,73 @@ class _Encoder:
         sound: npt.NDArray[np.float32] | None,
         hertz: int,
     ) -> None:
+        import av
         from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
-        self._container, self._rate, self._size = container, rate, size
-        self._sound, self._hertz = sound, hertz
-        video = container.add_stream("libx264", rate=rate, options=_X264)
-        video.height, video.width = (side + side % 2 for side in size)
-        video.pix_fmt = "yuv420p"
-        context = video.codec_context
+        self.container, self.rate, self.size, self.sound, self.hertz = container, rate, size, sound, hertz
+        self.encoded_samples = 0
+        self.video = container.add_stream("libx264", rate=rate, options=X264_OPTIONS)
+        self.video.height, self.video.width = (side + side % 2 for side in size)
+        self.video.pix_fmt = "yuv420p"
+        context = self.video.codec_context
         context.time_base = 1 / rate
         context.gop_size = max(round(2 * rate), 1)  # a key frame every two seconds, so that players can seek
         # Without these tags players guess, and colours differ from one to the next.
         context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.IEC61966_2_1
-        self._video = video
-        self._written = 0
-        self._audio: Any = None
+        self.audio: Any = None
         if sound is not None:
-            out_rate = hertz if hertz in _AAC_RATES else 48000
+            out_rate = hertz if hertz in AAC_RATES else 48000
             # AAC allows 6 bits per sample and channel.
             bit_rate = min(128_000, 6 * out_rate)
-            self._audio = container.add_stream("aac", rate=out_rate, layout="mono", bit_rate=bit_rate)
-            self._resampler = _resampler(out_rate)
+            self.audio = container.add_stream("aac", rate=out_rate, layout="mono", bit_rate=bit_rate)
+            # Sound of the same rate passes unchanged.
+            self.resampler = av.AudioResampler(format="fltp", layout="mono", rate=out_rate)
 
     def run(self, first: Frame, others: Iterator[Frame]) -> int:
         """Encode all frames and all of the sound; returns the number of frames."""
-        self._add_frame(first, 0)
+        self.add_frame(first, 0)
         count = 1
         for frame in others:
-            _check_frame(frame, self._size, count)
-            self._add_frame(frame, count)
+            _check_frame(frame, self.size, count)
+            self.add_frame(frame, count)
             count += 1
-            self._add_sound(int(count / self._rate * self._hertz))
-        self._container.mux(self._video.encode(None))
-        if self._sound is not None:
-            self._add_sound(len(self._sound))
-            for frame in self._resampler.resample(None):
-                self._container.mux(self._audio.encode(frame))
-            self._container.mux(self._audio.encode(None))
+            self.add_sound(int(count / self.rate * self.hertz))
+        self.container.mux(self.video.encode(None))
+        if self.sound is not None:
+            self.add_sound(len(self.sound))
+            for frame in self.resampler.resample(None):
+                self.container.mux(self.audio.encode(frame))
+            self.container.mux(self.audio.encode(None))
         return count
 
-    def _add_frame(self, frame: Frame, index: int) -> None:
+    def add_frame(self, frame: Frame, index: int) -> None:
+        """Encode one picture."""
         import av
         from av.video.reformatter import ColorRange, Colorspace
 
-        height, width = self._size
+        height, width = self.size
         if height % 2 or width % 2:
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
         picture = picture.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)
-        picture.pts, picture.time_base = index, 1 / self._rate
-        self._container.mux(self._video.encode(picture))
+        picture.pts, picture.time_base = index, 1 / self.rate
+        self.container.mux(self.video.encode(picture))
 
-    def _add_sound(self, until: int) -> None:
+    def add_sound(self, until: int) -> None:
         """Encode the sound up to a sample, or a little less (whole chunks) unless that is its end."""
         import av
 
-        if self._sound is None:
+        if self.sound is None:
             return
-        until = min(until, len(self._sound))
-        while self._written < until:
-            chunk = self._sound[self._written : self._written + _CHUNK]
-            if self._written + len(chunk) > until:
+        until = min(until, len(self.sound))
+        while self.encoded_samples < until:
+            chunk = self.sound[self.encoded_samples : self.encoded_samples + CHUNK]
+            if self.encoded_samples + len(chunk) > until:
                 break
             frame = av.AudioFrame.from_ndarray(chunk[None].copy(), format="fltp", layout="mono")
-            frame.sample_rate, frame.pts = self._hertz, self._written
-            frame.time_base = Fraction(1, self._hertz)
-            self._written += len(chunk)
-            for part in self._resampler.resample(frame):
-                self._container.mux(self._audio.encode(part))
-
-
-def _resampler(rate: int) -> Any:  # noqa: ANN401 - av is imported on first use
-    """Passes sound through unchanged where the rate is the same already."""
-    import av
-
-    return av.AudioResampler(format="fltp", layout="mono", rate=rate)
-
-
-def _check_frame(frame: Frame, size: tuple[int, int] | None, index: int = 0) -> tuple[int, int]:
-    """Height and width of a frame that can be encoded."""
-    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
-        raise ValueError(f"frame {index} must be uint8 (height, width, 3), got {frame.dtype} {frame.shape}")
-    if size is not None and frame.shape[:2] != size:
-        raise ValueError(f"frame {index} is {frame.shape[:2]} but frame 0 is {size}: one size for all")
-    return frame.shape[0], frame.shape[1]
-
-
-def _check_audio(audio: npt.ArrayLike, sample_rate: int | None) -> npt.NDArray[np.float32]:
-    """Mono float32 sound, clipped to full scale."""
-    sound = np.asarray(audio, dtype=np.float32)
-    if sound.ndim != 1 or len(sound) == 0:
-        raise FaceDiffError(f"audio must be mono of the shape (samples,), got {sound.shape}: average the channels.")
-    if sample_rate is None or not 1000 <= sample_rate <= 384_000:
-        raise FaceDiffError(f"sample_rate is {sample_rate}: give the sound's rate in Hz, such as 16000.")
-    if not np.isfinite(sound).all():
-        raise FaceDiffError("audio holds NaN or infinity: look at what produced it.")
-    return np.clip(sound, -1, 1)
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FaceDiffError(f'cannot make the folder "{folder}" ({error.strerror}): choose another place.') from error
+            frame.sample_rate, frame.pts = self.hertz, self.encoded_samples
+            frame.time_base = Fraction(1, self.hertz)
+            self.encoded_samples += len(chunk)
+            for part in self.resampler.resample(frame):
+                self.container.mux(self.audio.encode(part))

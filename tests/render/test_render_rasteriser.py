@@ -169,7 +169,7 @@ def test_bad_input_is_one_clear_sentence(sphere: MakeSphere) -> None:
             call()
 
 
-def test_importing_the_room_is_cheap() -> None:
+def test_importing_the_package_is_cheap() -> None:
     code = (
         "import sys, facediff.render;"
         "heavy = {'cv2', 'av', 'PIL', 'torch', 'lightning'} & set(sys.modules);"

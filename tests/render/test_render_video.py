@@ -128,7 +128,7 @@ def test_a_mouth_opens_with_its_clicks(tmp_path: Path) -> None:
     clicks[[frame * SAMPLE_RATE // frame_rate for frame in opened]] = 1
     path = tmp_path / "a.mp4"
     renderer = Renderer(faces, template=still, size=96)
-    write_video(path, renderer.animate(motion), frame_rate, clicks, SAMPLE_RATE)
+    write_video(path, (renderer.render(frame) for frame in motion), frame_rate, clicks, SAMPLE_RATE)
 
     capture = cv2.VideoCapture(str(path))
     pictures = [capture.read()[1].astype(float) for _ in range(count)]
