@@ -6,6 +6,7 @@ import os
 from jaxtyping import install_import_hook
 
 SHAPED = "audio_encoders identity_encoders mesh_encoders style_encoders fusions decoders layers losses samplers folding"
+SHAPED += " losses_fused"
 install_import_hook([f"facediff.models.{module}" for module in SHAPED.split()], "beartype.beartype")
 
 os.environ["HF_HUB_OFFLINE"] = "1"

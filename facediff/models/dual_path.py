@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.models import losses
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.decoders import Decoder, DecoderFactory, StyleTransformer
@@ -32,6 +31,7 @@ from facediff.models.fusions import BidirectionalCrossAttention, Fusion, FusionF
 from facediff.models.identity_encoders import HierarchicalIdentity, IdentityEncoder, IdentityEncoderFactory
 from facediff.models.inference import ClipNoise, Progress, Window, WindowNoise, WindowOverlap
 from facediff.models.layers import frame_mask
+from facediff.models.losses_fused import fused_losses
 from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoder, MeshEncoderFactory
 from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, SamplerFactory, unit_noise
 from facediff.models.style_encoders import StyleEncoder, StyleEncoderFactory, TcnGruTransformer
@@ -392,7 +392,7 @@ class DualPathDiffusion(AnimationModel):
         signal = self.process.signal.to(noise.device)[step][:, None, None]
         noisy = noise.mul_((1 - signal).sqrt()).addcmul_(batch.motion.flatten(2), signal.sqrt() * self.scale)
         decoded = network.core(network.embed(noisy), step, self._conditions(batch))
-        return losses.losses_of_linear(
+        return fused_losses(
             decoded,
             network.unembed.weight,
             network.unembed.bias,

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from facediff.models import losses
+from facediff.models import losses, losses_fused
 
 Array = NDArray[np.float64]
 Clips = list[Array]
@@ -166,36 +166,30 @@ def linear_parts(lengths: tuple[int, ...], extra: int, dtype: torch.dtype = torc
     return [features.to(dtype), weight.to(dtype), bias.to(dtype), truth.to(dtype), mask]
 
 
-def one_by_one(
+def by_definition(
     features: Tensor, weight: Tensor, bias: Tensor, truth: Tensor, mask: Tensor, region: Tensor, scale: float
 ) -> dict[str, Tensor]:
     prediction = (features @ weight.T + bias).unflatten(2, (-1, 3))
-    terms = {
-        "reconstruction": losses.reconstruction_loss(prediction, scale * truth, mask),
-        "velocity": losses.velocity_loss(prediction, scale * truth, mask),
-        "acceleration": losses.acceleration_loss(prediction, scale * truth, mask),
-        "face": losses.face_dynamics_loss(prediction, scale * truth, mask, region),
-    }
-    return {**terms, "loss": sum(WEIGHTS[name] * term for name, term in terms.items())}
+    return losses.training_losses(prediction, scale * truth, mask, region, WEIGHTS)
 
 
 @pytest.mark.parametrize("lengths", [(9,), LENGTHS, (2,), (1,), (2, 1)], ids=str)
 @pytest.mark.parametrize("extra", [0, 4])
 @pytest.mark.parametrize("block", [1, 40, 10**6], ids=lambda size: f"block{size}")
 @pytest.mark.parametrize("region", [REGION, [0, 3, 3, 5], [2]], ids=str)
-def test_all_at_once_is_one_by_one(
+def test_fused_losses_are_their_definitions(
     lengths: tuple[int, ...], extra: int, block: int, region: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(losses, "CACHE_SIZE", block)
+    monkeypatch.setattr(losses_fused, "CACHE_SIZE", block)
     *parts, truth, mask = linear_parts(lengths, extra)
     found, expected = [], []
-    for compute, results in ((losses.losses_of_linear, found), (one_by_one, expected)):
+    for compute, results in ((losses_fused.fused_losses, found), (by_definition, expected)):
         leaves = [part.clone().requires_grad_() for part in parts]
         chosen = torch.tensor(region)
-        if compute is one_by_one:
-            terms = one_by_one(*leaves, truth, mask, chosen, 1.7)
+        if compute is by_definition:
+            terms = by_definition(*leaves, truth, mask, chosen, 1.7)
         else:
-            terms = losses.losses_of_linear(*leaves, truth, mask, chosen, WEIGHTS, scale=1.7)
+            terms = losses_fused.fused_losses(*leaves, truth, mask, chosen, WEIGHTS, scale=1.7)
         (3 * terms["loss"]).backward()
         results += [terms, [leaf.grad for leaf in leaves]]
     torch.testing.assert_close(found[0], expected[0], rtol=1e-12, atol=1e-14)
@@ -203,48 +197,48 @@ def test_all_at_once_is_one_by_one(
     assert not found[1][0][~mask].any()
 
 
-def test_all_at_once_leaves_alone_what_is_frozen_and_what_it_is_given() -> None:
+def test_fused_losses_leave_alone_what_is_frozen_and_what_it_is_given() -> None:
     features, weight, bias, truth, mask = linear_parts((6, 4), 1)
     kept = [part.clone() for part in (features, weight, bias, truth)]
     region = torch.tensor(REGION)
-    terms = losses.losses_of_linear(features.requires_grad_(), weight, None, truth, mask, region, WEIGHTS)
+    terms = losses_fused.fused_losses(features.requires_grad_(), weight, None, truth, mask, region, WEIGHTS)
     terms["loss"].backward()
     assert features.grad is not None
     assert weight.grad is None
     assert not any(term.requires_grad for name, term in terms.items() if name != "loss")
-    expected = one_by_one(features, weight, torch.zeros_like(bias), truth, mask, region, 1.0)
+    expected = by_definition(features, weight, torch.zeros_like(bias), truth, mask, region, 1.0)
     torch.testing.assert_close(terms["loss"], expected["loss"], rtol=1e-12, atol=0)
     with torch.no_grad():
-        unused = losses.losses_of_linear(features, weight, bias.requires_grad_(), truth, mask, region, WEIGHTS)
+        unused = losses_fused.fused_losses(features, weight, bias.requires_grad_(), truth, mask, region, WEIGHTS)
     assert not unused["loss"].requires_grad
     assert all(torch.equal(now, before) for now, before in zip((features, weight, bias, truth), kept, strict=True))
 
 
-def test_all_at_once_has_finite_gradients_without_any_motion() -> None:
+def test_fused_losses_have_finite_gradients_without_any_motion() -> None:
     features, weight, bias, truth, mask = linear_parts((5, 3), 2)
     features = torch.zeros_like(features).requires_grad_()
     bias = torch.zeros_like(bias).requires_grad_()
-    terms = losses.losses_of_linear(features, weight, bias, truth, mask, torch.tensor(REGION), WEIGHTS)
+    terms = losses_fused.fused_losses(features, weight, bias, truth, mask, torch.tensor(REGION), WEIGHTS)
     terms["loss"].backward()
     assert torch.isfinite(features.grad).all()
     assert torch.isfinite(bias.grad).all()
 
 
-def test_padding_changes_nothing_in_float32_all_at_once() -> None:
+def test_fused_losses_in_float32_do_not_depend_on_padding() -> None:
     found = []
     for extra in (0, 1, 5):
         *parts, truth, mask = linear_parts((6, 4), extra, torch.float32)
-        found.append(losses.losses_of_linear(*parts, truth, mask, torch.tensor(REGION), WEIGHTS))
+        found.append(losses_fused.fused_losses(*parts, truth, mask, torch.tensor(REGION), WEIGHTS))
     torch.testing.assert_close(found[1:], [found[0]] * 2, rtol=5e-7, atol=0)
 
 
-def test_bfloat16_leads_back_what_full_precision_predicts() -> None:
+def test_fused_losses_in_bfloat16_predict_in_full_precision() -> None:
     *parts, truth, mask = linear_parts((9, 7), 1, torch.float32)
     region, results = torch.tensor(REGION), []
     for enabled in (False, True):
         leaves = [part.clone().requires_grad_() for part in parts]
         with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
-            terms = losses.losses_of_linear(*leaves, truth, mask, region, WEIGHTS)
+            terms = losses_fused.fused_losses(*leaves, truth, mask, region, WEIGHTS)
         terms["loss"].backward()
         results.append((terms, [leaf.grad for leaf in leaves]))
     assert results[0][0] == results[1][0]

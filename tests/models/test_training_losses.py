@@ -32,13 +32,7 @@ def test_a_step_takes_the_four_losses_of_noise_added_and_taken_away(model: DualP
     noisy = model.process.add_noise(clean, noise, step)
     predicted = model.network(noisy, step, model._conditions(batch)).view(batch.motion.shape)
     truth, upper = clean.view(batch.motion.shape), model.assets.regions["upper_face"]
-    expected = {
-        "reconstruction": losses.reconstruction_loss(predicted, truth, batch.mask),
-        "velocity": losses.velocity_loss(predicted, truth, batch.mask),
-        "acceleration": losses.acceleration_loss(predicted, truth, batch.mask),
-        "face": losses.face_dynamics_loss(predicted, truth, batch.mask, upper),
-    }
-    expected["loss"] = sum(model.loss_weights[name] * term for name, term in expected.items())
+    expected = losses.training_losses(predicted, truth, batch.mask, upper, model.loss_weights)
     torch.testing.assert_close(terms, expected, rtol=1e-5, atol=1e-6)
     parameters = [p for p in model.parameters() if p.requires_grad]
     found, wanted = (torch.autograd.grad(each["loss"], parameters, allow_unused=True) for each in (terms, expected))

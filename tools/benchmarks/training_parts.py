@@ -21,10 +21,11 @@ from torch import Tensor
 from facediff.data import Batch, Biwi
 from facediff.data.audio import ArrayStore
 from facediff.data.dataset import CachedFeatures
-from facediff.models import DualPathDiffusion, losses
+from facediff.models import DualPathDiffusion
 from facediff.models.audio_encoders import HubertEncoder
 from facediff.models.decoders import StyleTransformer
 from facediff.models.fusions import BidirectionalCrossAttention
+from facediff.models.losses import training_losses
 from facediff.models.samplers import unit_noise
 from facediff.models.style_encoders import TcnGruTransformer
 
@@ -211,13 +212,7 @@ class Bench:
         noisy = model.process.add_noise(clean, noise, step)
         predicted = model.network(noisy, step, model._conditions(batch)).view(batch.motion.shape)
         truth, mask = clean.view(batch.motion.shape), batch.mask
-        terms = {
-            "reconstruction": losses.reconstruction_loss(predicted, truth, mask),
-            "velocity": losses.velocity_loss(predicted, truth, mask),
-            "acceleration": losses.acceleration_loss(predicted, truth, mask),
-            "face": losses.face_dynamics_loss(predicted, truth, mask, model.assets.regions["upper_face"]),
-        }
-        return {**terms, "loss": sum((model.loss_weights[n] * t for n, t in terms.items()), clean.new_zeros(()))}
+        return training_losses(predicted, truth, mask, model.assets.regions["upper_face"], model.loss_weights)
 
 
 def in_turn(bench: Bench, ways: list[Way], rounds: int, clips: int) -> dict[str, dict[str, float]]:
