@@ -137,26 +137,25 @@ def _results(
 ) -> Generator[tuple[Task, Result | WorkerDied]]:
     if mode == "threads" and tasks:
         with one_thread_each():
-            yield from _together(ThreadPoolExecutor(workers), work, deque(tasks), workers, [])
+            yield from _together(ThreadPoolExecutor(workers), work, deque(tasks), workers, deque())
     elif mode == "serial" or workers <= 1 or not _can_start():
         for task in tasks:
             yield task, work(task)
     else:
         waiting = deque(tasks)
         while waiting:
-            suspects: list[Task] = []
+            suspects: deque[Task] = deque()
             workers = min(workers, len(waiting))
             yield from _together(_pool(work, workers), _do, waiting, workers, suspects)
-            # One of these tasks killed its process and thereby the whole pool; alone it is known which.
-            for task in suspects:
-                again: list[Task] = []
-                yield from _together(_pool(work, 1), _do, deque([task]), 1, again)
-                for guilty in again:
-                    yield guilty, WorkerDied()
+            # One of these tasks killed its process and thereby the whole pool; one at a time it is known which.
+            while suspects:
+                guilty: deque[Task] = deque()
+                yield from _together(_pool(work, 1), _do, suspects, 1, guilty)
+                yield from ((task, WorkerDied()) for task in guilty)
 
 
 def _together(
-    pool: Executor, work: Callable[[Task], Result], waiting: deque[Task], workers: int, suspects: list[Task]
+    pool: Executor, work: Callable[[Task], Result], waiting: deque[Task], workers: int, suspects: deque[Task]
 ) -> Iterator[tuple[Task, Result]]:
     """Results until all tasks are done, or until a process dies: then what was running goes to ``suspects``."""
     running: dict[Future[Result], Task] = {}

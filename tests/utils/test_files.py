@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +16,22 @@ import trimesh
 from facediff.data.audio import read_speech
 from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
-from facediff.utils.files import atomic, check_writable
+from facediff.utils.files import (
+    atomic,
+    atomic_folder,
+    check_writable,
+    describe_files,
+    locked,
+    read_json,
+    same_sizes,
+    scratch_folder,
+    sha256,
+    write_json,
+    write_rows,
+)
 from facediff.utils.pickles import load_pickle
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
@@ -130,3 +146,93 @@ def test_an_obj_keeps_vertices_that_no_face_uses_and_its_colours(tmp_path: Path)
     assert mesh.faces.tolist() == [[0, 2, 3], [0, 2, 3]]
     assert mesh.colours is not None
     assert mesh.colours.tolist() == [[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]]
+
+
+def test_an_atomic_folder_is_whole_or_absent(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "out"
+    with pytest.raises(RuntimeError, match="halfway"), atomic_folder(path) as folder:  # noqa: PT012
+        (folder / "a").touch()
+        raise RuntimeError("halfway")
+    assert list(tmp_path.iterdir()) == []
+    with atomic_folder(path) as folder:
+        (folder / "a").touch()
+        assert not path.exists()
+    assert [p.name for p in path.parent.rglob("*")] == ["out", "a"]
+
+
+def test_an_atomic_folder_replaces_content_only_if_allowed(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    path.mkdir()
+    for text in ("first", "second"):
+        with atomic_folder(path, replace=text == "second") as folder:
+            (folder / "a").write_text(text)
+        assert (path / "a").read_text() == text
+    with pytest.raises(FaceDiffError, match="not empty"), atomic_folder(path):
+        pass
+    with pytest.raises(FaceDiffError, match=r"a: is a file"), atomic_folder(path / "a", replace=True):
+        pass
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_an_atomic_folder_gives_way_to_nothing_that_appears_meanwhile(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    with pytest.raises(FaceDiffError, match="out: cannot be written"), atomic_folder(path) as folder:  # noqa: PT012
+        (folder / "a").touch()
+        path.mkdir()
+        (path / "precious").touch()
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", "precious"]
+    with atomic_folder(path, replace=True) as folder:
+        (folder / "a").touch()
+        (path / "other").touch()
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
+
+
+def test_errors_of_writers_name_the_folder_that_was_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError) as caught, atomic_folder(tmp_path / "out") as folder:  # noqa: PT012
+        (folder / "file").touch()
+        check_writable(folder / "file" / "below")
+    assert str(tmp_path / "out" / "file" / "below") in str(caught.value)
+    assert "partial" not in str(caught.value)
+
+
+def test_a_folder_of_a_killed_process_is_removed_and_that_of_a_living_one_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    program = (
+        "import os, sys, pathlib; from facediff.utils.files import atomic_folder\n"
+        "with atomic_folder(pathlib.Path(sys.argv[1])) as folder: (folder / 'half').touch(); os._exit(9)"
+    )
+    run = subprocess.run([sys.executable, "-c", program, str(path)], cwd=ROOT)
+    assert run.returncode == 9
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".out.partial-")
+    with scratch_folder(path) as living:
+        with atomic_folder(path) as folder:
+            (folder / "a").touch()
+        assert {p.name for p in tmp_path.iterdir()} == {"out", living.name}
+    assert {p.name for p in tmp_path.iterdir()} == {"out"}
+
+
+def test_a_lock_keeps_others_out_and_leaves_nothing(tmp_path: Path) -> None:
+    lock = tmp_path / "new" / ".lock"
+    with locked(lock, "facediff test"), pytest.raises(FaceDiffError, match="new: another `facediff test`"):
+        locked(lock, "facediff test").__enter__()
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").touch()
+    with pytest.raises(FaceDiffError, match="cannot be written"):
+        locked(tmp_path / "file" / ".lock", "facediff test").__enter__()
+
+
+def test_descriptions_of_files_tell_whether_all_are_there(tmp_path: Path) -> None:
+    write_json(tmp_path / "b" / "x.json", {"a": "ä"})
+    write_rows(tmp_path / "a.csv", [{"clip": "A", "frames": 3}], line_end="\n")
+    assert (tmp_path / "a.csv").read_bytes() == b"clip,frames\nA,3\n"
+    assert read_json(tmp_path / "b" / "x.json") == {"a": "ä"}
+    assert read_json(tmp_path / "a.csv") is None
+    assert read_json(tmp_path / "none.json") is None
+    files = describe_files(tmp_path, workers=2)
+    assert list(files) == ["a.csv", "b/x.json"]
+    assert files["a.csv"] == {"bytes": 16, "sha256": sha256(tmp_path / "a.csv")}
+    assert same_sizes(tmp_path, files)
+    (tmp_path / "a.csv").write_text("clip")
+    assert not same_sizes(tmp_path, files)
+    assert not same_sizes(tmp_path, {"none": {"bytes": 1}})

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import pickle  # noqa: S403 - writes a pickle, opens none
 import re
 import shutil
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,8 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.batch import run_batch
 from facediff.utils.files import atomic, check_writable, describe_files, locked, remove_partial, same_sizes
-from facediff.utils.jobs import WorkerDied, processors, run_tasks
+from facediff.utils.jobs import processors
 from facediff.utils.progress import progress_bar
 
 # Finding and copying files of a raw folder, which may hold the data set or the folder that an archive unpacked to.
@@ -297,51 +297,6 @@ def manifest(
     }
 
 
-# Running clips in several processes, so that a stop at any moment leaves nothing running and nothing half-written.
-
-NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a clip.
-
-    Attributes:
-        name: the clip.
-        frames: frames written; None if it failed.
-        problem: the sentence that says why.
-        hopeless: the next clip would fail for the same reason: a package is missing or the disk is full.
-    """
-
-    name: str
-    frames: int | None
-    problem: str = ""
-    hopeless: bool = False
-
-
-def attempt(job: Job, out: Path) -> Outcome:
-    """Write one clip; an error that the user can put right becomes an outcome."""
-    try:
-        return Outcome(job.name, job.work(out))
-    except FaceDiffError as error:
-        cause = error.__cause__
-        full = isinstance(cause, OSError) and cause.errno in NO_SPACE
-        return Outcome(job.name, None, str(error), full or isinstance(error, MissingExtraError))
-    except Exception as error:
-        error.add_note(f"while preparing clip {job.name}")
-        raise
-
-
-def run_jobs(jobs: Sequence[Job], out: Path, workers: int) -> Generator[Outcome]:
-    """Outcomes as they come."""
-    with closing(run_tasks(partial(attempt, out=out), jobs, workers=workers)) as results:
-        for job, result in results:
-            if isinstance(result, WorkerDied):
-                reason = "killed its process, perhaps for lack of memory; try --workers 1"
-                result = Outcome(job.name, None, f"{job.name}: {reason}")
-            yield result
-
-
 LOCK = ".prepare.lock"
 WAV_HEADER = 44
 
@@ -425,16 +380,15 @@ def _carry_out(
     shared = plan.shared(out)
     clips, failed = dict(finished), {}
     bar = progress_bar(plan.corpus, len(plan.jobs), done=len(finished), shown=not quiet)
-    with bar as step, closing(run_jobs(pending, out, workers)) as outcomes:
-        for outcome in outcomes:
-            if outcome.hopeless:
-                raise FaceDiffError(outcome.problem)
-            if outcome.frames is None:
-                failed[outcome.name] = outcome.problem
-                for file in _files(out, outcome.name):  # damaged ones of an earlier run
+    outcomes = run_batch(partial(_write, out), pending, name=_clip_name, workers=workers)
+    with bar as step, closing(outcomes):
+        for job, outcome in outcomes:
+            if outcome.result is None:
+                failed[job.name] = outcome.problem
+                for file in _files(out, job.name):  # damaged ones of an earlier run
                     file.unlink(missing_ok=True)
             else:
-                clips[outcome.name] = outcome.frames
+                clips[job.name] = outcome.result
             step()
     files = [*shared, *(file.relative_to(out).as_posix() for name in clips for file in _files(out, name))]
     checksums = describe_files(out, files, workers=workers, progress="" if quiet else "checksums")
@@ -442,6 +396,14 @@ def _carry_out(
     write_record(out / MANIFEST, record)
     (out / STATE).unlink()
     return _report(plan, out, record, len(clips) - len(finished))
+
+
+def _write(out: Path, job: Job) -> int:
+    return job.work(out)
+
+
+def _clip_name(job: Job) -> str:
+    return f"clip {job.name}"
 
 
 def finished_frames(plan: Plan, job: Job, out: Path) -> int | None:

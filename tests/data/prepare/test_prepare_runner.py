@@ -157,7 +157,7 @@ def test_what_would_fail_every_clip_stops_the_run(tmp_path: Path, error: FaceDif
 def test_a_programming_error_is_no_failed_clip(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError) as caught:
         prepare(toy_plan({"A_e01": partial(raising, ZeroDivisionError("oops"))}), tmp_path / "out", workers=1)
-    assert caught.value.__notes__ == ["while preparing clip A_e01"]
+    assert "A_e01" in caught.value.__notes__[0]
 
 
 def test_other_options_are_refused(tmp_path: Path) -> None:

@@ -1,0 +1,216 @@
+"""Batches that can be stopped and continued: a task that fails stops no other, and what is done is not done again."""
+
+from __future__ import annotations
+
+import errno
+import time
+import traceback
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.files import read_json, sha256, write_json
+from facediff.utils.jobs import SetupError, WorkerDied, run_tasks
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+RECORDS = ".facediff-batch"
+"""Hidden folder next to the outputs of a batch; it holds one small file for each output."""
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[Result]):
+    """What became of a task.
+
+    Attributes:
+        result: what it returned; None if it failed.
+        problem: the sentence that says why it failed; empty if it did not.
+        seconds: how long it took.
+        fatal: whether every other task would fail for the same reason.
+    """
+
+    result: Result | None = None
+    problem: str = ""
+    seconds: float = 0.0
+    fatal: bool = False
+
+
+def run_batch(
+    work: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    *,
+    name: Callable[[Task], str],
+    workers: int | None = None,
+    record: Callable[[Task, str], None] | None = None,
+    survive_bugs: bool = False,
+) -> Generator[tuple[Task, Outcome[Result]]]:
+    """Do tasks in several processes past failures, as :func:`~facediff.utils.jobs.run_tasks` does them.
+
+    Args:
+        work: does a task; picklable, such as :class:`~facediff.utils.jobs.PerWorker`.
+        tasks: what it is called with.
+        name: how errors call a task.
+        workers: number of processes; as many as processors if None.
+        record: called with each task that is done and its problem, in the worker, so that also what is finished after
+            Ctrl-C is recorded; picklable.
+        survive_bugs: whether an exception that is no :class:`FaceDiffError` is printed and counts as a failure of the
+            task; it is raised otherwise.
+
+    Raises:
+        FaceDiffError: as soon as a task fails for a reason that would let all others fail too: the set-up of a worker
+            failed, a package is missing or the disk is full.
+    """
+    attempt = partial(_attempt, work, name, record, survive_bugs)
+    with closing(run_tasks(attempt, tasks, workers=workers)) as results:
+        for task, outcome in results:
+            if isinstance(outcome, WorkerDied):
+                problem = f"{name(task)}: killed its process, perhaps for lack of memory; try --workers 1"
+                outcome = Outcome(problem=problem)
+                if record is not None:
+                    record(task, problem)
+            if outcome.fatal:
+                raise FaceDiffError(outcome.problem)
+            yield task, outcome
+
+
+def _attempt(
+    work: Callable[[Task], Result],
+    name: Callable[[Task], str],
+    record: Callable[[Task, str], None] | None,
+    survive_bugs: bool,
+    task: Task,
+) -> Outcome[Result]:
+    started = time.monotonic()
+    try:
+        outcome = Outcome(work(task))
+    except FaceDiffError as error:
+        disk_full = isinstance(error.__cause__, OSError) and error.__cause__.errno in NO_SPACE
+        if disk_full or isinstance(error, SetupError | MissingExtraError):
+            return Outcome(problem=str(error), fatal=True)
+        outcome = Outcome(problem=str(error))
+    except Exception as error:
+        if not survive_bugs:
+            error.add_note(f"while working on {name(task)}")
+            raise
+        traceback.print_exc()
+        outcome = Outcome(problem=f"{name(task)}: {type(error).__name__}: {error} (see the traceback above)")
+    if record is not None:
+        record(task, outcome.problem)
+    return replace(outcome, seconds=time.monotonic() - started)
+
+
+# Is an output still current? One small file records what it was made of.
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What decides an output in addition to the file that it is made of.
+
+    Attributes:
+        command: the options.
+        files: SHA-256 of the files that they name (checkpoint, styles …), by path.
+    """
+
+    command: tuple[str, ...]
+    files: Mapping[str, str]
+
+    @classmethod
+    def of(cls, command: Sequence[str], files: Sequence[Path]) -> Recipe:
+        """Read the files.
+
+        Raises:
+            FaceDiffError: if one is missing.
+        """
+        for path in files:
+            if not path.is_file():
+                raise FaceDiffError(f"{path}: no such file")
+        return cls(tuple(command), {str(path): sha256(path) for path in files})
+
+
+@dataclass(frozen=True)
+class FileTask:
+    """A file to make of another one.
+
+    Attributes:
+        source: the file that is read.
+        output: the file to write.
+        recipe: what else decides it.
+    """
+
+    source: Path
+    output: Path
+    recipe: Recipe
+
+    @property
+    def _record_file(self) -> Path:
+        return self.output.parent / RECORDS / f"{self.output.name}.json"
+
+    def record(self, problem: str) -> None:
+        """Record that the task is done; an empty problem means that the output is there.
+
+        Raises:
+            FaceDiffError: if the record cannot be written.
+        """
+        record = {
+            "speech": _stat(self.source) | {"sha256": sha256(self.source) if self.source.is_file() else ""},
+            "recipe": {"command": list(self.recipe.command), "files": dict(self.recipe.files)},
+            "output_bytes": None if problem else self.output.stat().st_size,
+            "problem": problem,
+        }
+        write_json(self._record_file, record)
+
+    def earlier_problem(self) -> str | None:
+        """The problem that an earlier run recorded; None if nothing is recorded."""
+        record = self._read_record()
+        return None if record is None else str(record.get("problem") or "")
+
+    def change(self) -> str:
+        """What has changed since the task was recorded, in words; empty if nothing has."""
+        record = self._read_record()
+        if record is None:
+            return "it is not known how it was made" if self.output.exists() else ""
+        before = record.get("recipe") or {}
+        known = before.get("files") or {}
+        if before.get("command") != list(self.recipe.command):
+            return "the options have changed"
+        for path, digest in self.recipe.files.items():
+            if known.get(path) != digest:
+                return f"{path} has changed"
+        if known.keys() != self.recipe.files.keys():
+            return "the options have changed"
+        if not self._same_source(record["speech"]):
+            return "the recording has changed"
+        if not record.get("problem") and not (
+            self.output.is_file() and self.output.stat().st_size == record.get("output_bytes")
+        ):
+            return "the output is missing or damaged"
+        return ""
+
+    def _read_record(self) -> dict[str, Any] | None:
+        record = read_json(self._record_file)
+        return record if record is not None and isinstance(record.get("speech"), dict) else None
+
+    def _same_source(self, known: Mapping[str, Any]) -> bool:
+        """By path, size and time; where path or time differ, by the content."""
+        stat = _stat(self.source)
+        if all(known.get(name) == value for name, value in stat.items()):
+            return True
+        return (
+            self.source.is_file()
+            and known.get("bytes") == stat.get("bytes")
+            and known.get("sha256") == sha256(self.source)
+        )
+
+
+def _stat(path: Path) -> dict[str, Any]:
+    try:
+        stat = path.stat()
+    except OSError:
+        return {"path": str(path.resolve())}
+    return {"path": str(path.resolve()), "bytes": stat.st_size, "modified_ns": stat.st_mtime_ns}
