@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
-import os
 import pickle
-import subprocess
-import sys
-import tomllib
 import warnings
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,9 +15,6 @@ from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.models.decoders import Decoder, GruDecoder
 from facediff.registry import Kind, RegistrationError, UnknownComponentError, alias_path
-
-ROOT = Path(__file__).parents[1]
-PLUGIN = Path(__file__).parent / "fakes" / "plugin"
 
 
 @pytest.fixture
@@ -151,63 +141,3 @@ def test_a_broken_plug_in_is_a_warning_that_names_it(
         assert shelf.names() == ["taken"]
     assert reason in str(caught[0].message)
     assert shelf.get("taken").__bases__ == (GruDecoder,)
-
-
-@pytest.fixture(scope="module")
-def plugin_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The plug-in of ``fakes/plugin`` as a wheel, installed by pip where there is pip; needs no network."""
-    folder = tmp_path_factory.mktemp("plugin")
-    project = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]
-    stem = f"{project['name'].replace('-', '_')}-{project['version']}"
-    points = "".join(
-        f"[{group}]\n" + "".join(f"{name} = {target}\n" for name, target in rows.items())
-        for group, rows in project["entry-points"].items()
-    )
-    files = {
-        "facediff_moving_average.py": (PLUGIN / "facediff_moving_average.py").read_text(),
-        f"{stem}.dist-info/METADATA": "Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n".format(**project),
-        f"{stem}.dist-info/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
-        f"{stem}.dist-info/entry_points.txt": points,
-    }
-    files[f"{stem}.dist-info/RECORD"] = "".join(f"{path},,\n" for path in [*files, f"{stem}.dist-info/RECORD"])
-    wheel, site = folder / f"{stem}-py3-none-any.whl", folder / "site"
-    with zipfile.ZipFile(wheel, "w") as archive:
-        for path, text in files.items():
-            archive.writestr(path, text)
-    if importlib.util.find_spec("pip") is None:
-        zipfile.ZipFile(wheel).extractall(site)  # noqa: S202 - our own archive; this is what installing a wheel does
-    else:
-        options = ["--no-deps", "--no-index", "--quiet", "--disable-pip-version-check", "--target", str(site)]
-        subprocess.run([sys.executable, "-m", "pip", "install", *options, str(wheel)], check=True, timeout=120)
-    return site
-
-
-def facediff(site: Path, *words: str) -> str:
-    path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
-    run = subprocess.run(
-        [sys.executable, "-m", "facediff", *words],
-        capture_output=True,
-        text=True,
-        timeout=200,
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": path},
-    )
-    assert run.returncode == 0, run.stderr
-    return run.stdout
-
-
-def test_an_installed_package_is_listed(plugin_site: Path) -> None:
-    rows = json.loads(facediff(plugin_site, "components", "--json"))
-    ours = {(row["kind"], row["name"]) for row in rows}
-    assert ("decoder", "moving_average") in ours
-    assert {(kind, name) for kind in registry.COMPONENTS for name in registry.COMPONENTS[kind].names()} <= ours
-    [row] = [row for row in rows if row["name"] == "moving_average"]
-    assert row["class"] == "facediff_moving_average.MovingAverageDecoder"
-    assert row["summary"] == "Averages each frame with its neighbours and adds the mean style token."
-
-
-def test_an_installed_package_is_chosen_on_the_command_line(plugin_site: Path) -> None:
-    flags = ["--model.decoder=moving_average", "--model.decoder.reach=2"]
-    printed = facediff(plugin_site, "fit", "--config", "configs/experiment/puppet.yaml", *flags, "--print_config")
-    assert "class_path: facediff.registry.decoder.moving_average" in printed
-    assert "reach: 2" in printed

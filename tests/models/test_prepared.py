@@ -13,13 +13,25 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import collate
 from facediff.models import DualPathDiffusion
+from facediff.models.decoders import Decoder
 from facediff.models.dual_path import Conditions
 from facediff.models.folding import Space
-from tests.fakes.plugin.facediff_moving_average import MovingAverageDecoder
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]
 DIM, FRAMES = 16, 12
+
+
+class Unprepared(Decoder):
+    """A decoder of somebody else's, which prepares nothing and takes no prepared argument."""
+
+    def __init__(self, *, dim: int, style_dim: int) -> None:
+        super().__init__()
+        self.style = nn.Linear(style_dim, dim)
+
+    def forward(self, fused: Tensor, style: Tensor, mask: Tensor) -> Tensor:
+        return fused + self.style(style.mean(1, keepdim=True))
+
 
 VARIANTS: list[dict[str, Any]] = [{"decoder": registry.decoder.get(name)} for name in registry.decoder.names()]
 VARIANTS += [{"fusion": registry.fusion.get(name)} for name in registry.fusion.names()]
@@ -29,7 +41,7 @@ VARIANTS += [
     # As many pairs of head and token as channels: keys and values are not multiplied out.
     {"decoder": partial(registry.decoder.style_transformer, num_layers=1, num_heads=4), "dim": 8},
     # From outside, and it has never heard of preparing.
-    {"decoder": MovingAverageDecoder},
+    {"decoder": Unprepared},
 ]
 
 

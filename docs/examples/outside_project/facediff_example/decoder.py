@@ -1,4 +1,4 @@
-"""A decoder from outside facediff."""
+"""A decoder."""
 
 from __future__ import annotations
 

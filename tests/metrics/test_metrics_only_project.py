@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 ROOT = Path(__file__).parents[2]
-PROJECT = ROOT / "docs" / "examples" / "outside_project"
+PROJECT = ROOT / "docs" / "examples" / "metrics_only"
 # What the documentation tells people to run after `pip install .` without extras.
 OWN_TESTS = "python -m pytest --confcutdir=tests/metrics -o filterwarnings=error tests/metrics"
 

@@ -1,0 +1,1 @@
+"""One extension of facediff of every kind."""

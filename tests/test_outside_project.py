@@ -1,0 +1,111 @@
+"""A package outside facediff with one extension of every kind, installed by pip and driven by name."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from facediff import registry
+
+ROOT = Path(__file__).parents[1]
+PROJECT = ROOT / "docs" / "examples" / "outside_project"
+ADDED = {
+    ("decoder", "moving_average"),
+    ("model", "AutoregressiveTransformer"),
+    ("corpus", "ThreeSpeakers"),
+    ("export_format", "bounds"),
+}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where pip has installed the package; needs no network."""
+    if not all(map(importlib.util.find_spec, ("pip", "setuptools"))):
+        pytest.skip("installing a package needs pip and setuptools")
+    folder = tmp_path_factory.mktemp("outside")
+    copied = shutil.copytree(PROJECT, folder / "project")  # building leaves files behind
+    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
+    words = ["install", *options, "--target", str(folder / "site"), str(copied)]
+    subprocess.run([sys.executable, "-m", "pip", *words], check=True, timeout=120)
+    return folder / "site"
+
+
+def facediff(site: Path, *commands: list[str]) -> str:
+    """Run commands one after the other in a process that has the package; what they print."""
+    program = (
+        "import json, sys\nfrom facediff.cli.app import main\n"
+        "for words in json.loads(sys.argv[1]):\n    status = main(words)\n    assert status == 0, words\n"
+    )
+    path = os.pathsep.join([str(site), str(ROOT)])
+    run = subprocess.run(
+        [sys.executable, "-c", program, json.dumps(commands)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+    )
+    assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-3000:]
+    return run.stdout
+
+
+def test_components_lists_the_extensions_of_an_installed_package(site: Path) -> None:
+    rows = json.loads(facediff(site, ["components", "--json"]))
+    found = {(row["kind"], row["name"]) for row in rows}
+    assert found >= ADDED
+    assert {(kind, name) for kind in registry.KINDS for name in registry.KINDS[kind].names()} <= found
+    [row] = [row for row in rows if row["name"] == "moving_average"]
+    assert row["class"] == "facediff_example.decoder.MovingAverageDecoder"
+    assert row["summary"] == "Averages each frame with its neighbours and adds the mean style token."
+
+
+def test_an_installed_decoder_is_chosen_by_name(site: Path) -> None:
+    flags = ["--model.decoder=moving_average", "--model.decoder.reach=2"]
+    words = ["fit", "--config", "configs/experiment/puppet.yaml", *flags, "--print_config"]
+    printed = facediff(site, words)
+    assert "class_path: facediff.registry.decoder.moving_average" in printed
+    assert "reach: 2" in printed
+
+
+def test_an_installed_model_trains_tests_animates_and_exports(site: Path, tiny_root: Path, tmp_path: Path) -> None:
+    """A model and a corpus of a package, from training to a file in the package's own format."""
+    trainer = [
+        "--trainer.accelerator=cpu",
+        "--trainer.enable_progress_bar=false",
+        f"--trainer.logger.save_dir={tmp_path}",
+    ]
+    fit = ["--model=AutoregressiveTransformer", "--model.dim=16", "--model.learning_rate=0.01"]
+    fit += ["--data=ThreeSpeakers", f"--data.root={tiny_root}", "--trainer.max_epochs=3"]
+    checkpoint = tmp_path / "fit" / "version_0" / "checkpoints" / "epoch=2-step=24.ckpt"
+    speech, archive, boxes = (tmp_path / f"speech.{suffix}" for suffix in ("wav", "npz", "bounds"))
+    soundfile.write(speech, np.random.default_rng(0).normal(0, 0.1, 12 * 16_000), 16_000)
+    printed = facediff(
+        site,
+        ["fit", *fit, *trainer],
+        ["test", "--ckpt_path", str(checkpoint), *trainer],
+        # Twelve seconds: longer than what is animated in one pass.
+        ["animate", str(speech), "--checkpoint", str(checkpoint), "--identity", "C", "-o", str(archive), "--quiet"],
+        ["export", str(archive), "-o", str(boxes)],
+    )
+    assert "three_speakers" in printed
+    hparams = torch.load(checkpoint, weights_only=True)["hyper_parameters"]
+    assert hparams["_class_path"] == "facediff_example.model.AutoregressiveTransformer"
+    assert (hparams["dim"], hparams["num_layers"], hparams["protocol"]) == (16, 1, "paper")
+    assert hparams["audio_encoder"]["init_args"]["num_layers"]
+    table = np.loadtxt(boxes)
+    assert table.shape == (300, 6)
+    assert (table[:, :3] < table[:, 3:]).any(1).all()
+
+
+def test_a_model_of_its_own_needs_little_more_than_network_and_loss() -> None:
+    assert len((PROJECT / "facediff_example" / "model.py").read_text().splitlines()) <= 90
