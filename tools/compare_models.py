@@ -221,7 +221,7 @@ def opening(model: AnimationModel, motion: torch.Tensor, template: torch.Tensor)
 def deviation(motion: torch.Tensor, truth: torch.Tensor, upper: torch.Tensor) -> float:
     """Signed FDD of two motions that need not be equally long: spreads over time of the squared displacement.
 
-    As :func:`facediff.metrics.functional.face_dynamics_deviation` by default, which wants equal lengths.
+    As :func:`facediff.metrics.face_dynamics_deviation` by default, which wants equal lengths.
     """
     spreads = [each[:, upper].double().square().sum(-1).std(0, correction=0) for each in (motion, truth)]
     return float((spreads[1] - spreads[0]).mean())

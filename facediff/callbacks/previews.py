@@ -28,7 +28,7 @@ from facediff.data.audio import SAMPLE_RATE, fit_length, samples_for
 from facediff.data.corpus import Clip
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.metrics import Region, SequenceMetric
-from facediff.metrics.clips import align
+from facediff.metrics.base import align
 from facediff.models import AnimationModel
 from facediff.render import VIEWS, Renderer, comparison, contact_sheet, save_image, write_video
 
@@ -121,7 +121,7 @@ def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, f
         for name in ("lips", "upper_face")
     ]
     metrics = cast(Iterable[tuple[str, SequenceMetric]], protocol.build(*regions).items(copy_state=False))
-    (clip,) = align(motion[None], sample.motion[None], clip_names=[sample.name]).with_templates([None]).clips
+    (clip,) = align(motion[None], sample.motion[None], clip_names=[sample.name]).clips
     return {name: float(metric.clip_value(clip)) for name, metric in metrics}
 
 

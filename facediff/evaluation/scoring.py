@@ -18,9 +18,8 @@ from facediff.data.corpus import open_vertices
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import Pair
 from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMetric, VertexError
-from facediff.metrics.clips import Clips, align
+from facediff.metrics.base import Clips, LengthRule, Pooling, align
 from facediff.metrics.one_pass import one_pass
-from facediff.metrics.options import LengthRule, Pooling
 from facediff.utils.jobs import run_tasks
 
 NATIVE = (np.float16, np.float32, np.float64)
@@ -227,7 +226,7 @@ class Scorer:
             clips = align(prediction, truth, clip_names=[name], rule=column.rule)
         except ValueError as error:
             raise FaceDiffError(f"protocol {column.protocol}: {error}") from error
-        return clips.with_templates([template])
+        return clips.attach("template", [template])
 
 
 def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:

@@ -1,7 +1,7 @@
 """Metrics of speech-driven 3D facial animation, each a definition with named options.
 
 The same three letters mean different numbers in different projects: a `Protocol` is a named setting of the
-options and says in words what its numbers are. Needs torch and torchmetrics only.
+options and describes its numbers in words. Needs torch and torchmetrics only.
 
 >>> import torch
 >>> from facediff.metrics import Region, protocol
@@ -13,8 +13,8 @@ options and says in words what its numbers are. Needs torch and torchmetrics onl
 >>> print(metrics.summary())
 protocol paper: lips mouth (2 vertices, 83b97b85), upper brows (2 vertices, 46584c88); frames 5, sequences 1
 
-Every metric is a torchmetrics class and a function of the same name in lower case, which is the class used
-once; the class's docstring has the formula, its source, its unit, and what about it is a choice:
+Every metric is a torchmetrics class, a function made from it, and a name in the registry, both in snake case; the
+class's docstring has the formula, its source, its unit, and what about it is a choice:
 
 - distance from the truth: `MeanVertexError`, `LipVertexError`, `UpperFaceVertexError`
 - amount of movement: `FaceDynamicsDeviation`
@@ -28,44 +28,45 @@ once; the class's docstring has the formula, its source, its unit, and what abou
 
 Lengths or masks say what is padding, which is never read. NaN and infinity are refused with the clip's name.
 Sums are float64 whatever comes in, and processes with unequal numbers of sequences get what one would.
+
+A new metric is a `SequenceMetric` that defines `clip_value`, registered with ``@facediff.registry.metric.register``.
 """
 
-from facediff.metrics.base import ComparisonMetric, Coverage, SequenceMetric
-from facediff.metrics.closures import BilabialClosureRate, Closures, bilabial_closure_rate
-from facediff.metrics.correlation import (
+from facediff.metrics.base import Clip, Coverage, ExactMetric, SequenceMetric, align, functional
+from facediff.metrics.by_name import NEEDS, Context, Request, feed, parse
+from facediff.metrics.mouth import (
+    BilabialClosureRate,
+    Closures,
     LipOpeningCorrelation,
     LipSpeedCorrelation,
+    MouthOpeningDifference,
+    OpeningMetric,
+    bilabial_closure_rate,
     lip_opening_correlation,
     lip_speed_correlation,
+    mouth_opening_difference,
 )
-from facediff.metrics.diversity import IdentityDiversity, SampleDiversity, identity_diversity, sample_diversity
-from facediff.metrics.exact import ExactMetric
-from facediff.metrics.face_dynamics import FaceDynamicsDeviation
-from facediff.metrics.functional import (
-    face_dynamics_deviation,
-    lip_vertex_error,
-    mean_vertex_error,
-    upper_face_vertex_error,
-)
-from facediff.metrics.lip_pairs import LipPairs
-from facediff.metrics.mouth import MouthOpeningDifference, OpeningMetric, mouth_opening_difference
-from facediff.metrics.protocol_metrics import ProtocolMetrics, Summary
-from facediff.metrics.protocols import PROTOCOLS, Protocol, protocol
-from facediff.metrics.regions import Region
+from facediff.metrics.protocols import PROTOCOLS, Protocol, ProtocolMetrics, Summary, protocol
+from facediff.metrics.regions import TOPOLOGIES, LipPairs, Region, Topology, as_region
 from facediff.metrics.samples import (
     CoverageError,
+    IdentityDiversity,
     MeanEstimateError,
+    SampleDiversity,
     SamplesMetric,
     coverage_error,
+    identity_diversity,
     mean_estimate_error,
+    sample_diversity,
 )
 from facediff.metrics.speech import (
+    ClipSpeechLipCorrelation,
     FrameSpeechLipCorrelation,
     SpeechLipMetric,
+    clip_speech_lip_correlation,
     frame_speech_lip_correlation,
     speech_intensity,
 )
-from facediff.metrics.speech_clips import ClipSpeechLipCorrelation, clip_speech_lip_correlation
 from facediff.metrics.speed import RealTimeFactor, device_name, real_time_factor
 from facediff.metrics.style import StyleRetrievalAccuracy, style_retrieval_accuracy
 from facediff.metrics.timing import (
@@ -73,18 +74,29 @@ from facediff.metrics.timing import (
     TemporalMisalignment,
     lip_warping_distance,
     temporal_misalignment,
+    warp,
 )
-from facediff.metrics.topologies import TOPOLOGIES, Topology
-from facediff.metrics.vertex_errors import LipVertexError, MeanVertexError, UpperFaceVertexError, VertexError
-from facediff.metrics.warping import warp
+from facediff.metrics.vertex_errors import (
+    FaceDynamicsDeviation,
+    LipVertexError,
+    MeanVertexError,
+    UpperFaceVertexError,
+    VertexError,
+    face_dynamics_deviation,
+    lip_vertex_error,
+    mean_vertex_error,
+    upper_face_vertex_error,
+)
 
 __all__ = [
+    "NEEDS",
     "PROTOCOLS",
     "TOPOLOGIES",
     "BilabialClosureRate",
+    "Clip",
     "ClipSpeechLipCorrelation",
     "Closures",
-    "ComparisonMetric",
+    "Context",
     "Coverage",
     "CoverageError",
     "ExactMetric",
@@ -104,6 +116,7 @@ __all__ = [
     "ProtocolMetrics",
     "RealTimeFactor",
     "Region",
+    "Request",
     "SampleDiversity",
     "SamplesMetric",
     "SequenceMetric",
@@ -114,12 +127,16 @@ __all__ = [
     "Topology",
     "UpperFaceVertexError",
     "VertexError",
+    "align",
+    "as_region",
     "bilabial_closure_rate",
     "clip_speech_lip_correlation",
     "coverage_error",
     "device_name",
     "face_dynamics_deviation",
+    "feed",
     "frame_speech_lip_correlation",
+    "functional",
     "identity_diversity",
     "lip_opening_correlation",
     "lip_speed_correlation",
@@ -128,6 +145,7 @@ __all__ = [
     "mean_estimate_error",
     "mean_vertex_error",
     "mouth_opening_difference",
+    "parse",
     "protocol",
     "real_time_factor",
     "sample_diversity",

@@ -1,22 +1,403 @@
-"""What metrics over sequences share: states, pooling, counts and exact reduction over processes."""
+"""What all metrics share: options, aligned sequences, summed states, and the function that is made from each class."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import hashlib
+import inspect
+import re
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Literal, NoReturn, Self, TypedDict, Unpack, get_args
 
 import torch
 from torch import Tensor
+from torchmetrics import Metric
 
-from facediff.metrics.clips import Clip, Clips, Lengths, align
-from facediff.metrics.exact import ExactMetric
-from facediff.metrics.options import LENGTH_RULES, POOLINGS, LengthRule, Pooling, check_option
-from facediff.metrics.regions import Region
+from facediff.errors import choices
+from facediff.metrics.regions import Region, RegionLike, as_region
+
+# Options: the words that distinguish one definition of a metric from another.
+
+Reduction = Literal["mean", "max"]
+"""How the vertices of one frame become one number."""
+
+Pooling = Literal["frames", "sequences"]
+"""All frames of all sequences alike, or the mean of the sequences' means."""
+
+LengthRule = Literal["min", "error", "prediction"]
+"""What to do where prediction and truth differ in length: cut both to the shorter; refuse; or cut the
+prediction only and refuse a prediction that is shorter than the truth."""
+
+Sign = Literal["signed", "absolute"]
+"""Whether a deviation keeps its sign, so that sequences can cancel, or is made positive in each sequence."""
+
+Side = Literal["prediction", "truth", "gap"]
+"""Whose score: the prediction's, the truth's, with which a prediction can be compared, or the prediction's minus
+the truth's."""
+
+POOLING_WORDS: dict[Pooling, str] = {
+    "frames": "mean over the frames of all sequences",
+    "sequences": "mean over the frames of each sequence, then mean over sequences",
+}
+LENGTH_WORDS: dict[LengthRule, str] = {
+    "min": "prediction and truth are both cut to the shorter of the two",
+    "error": "prediction and truth must have the same number of frames",
+    "prediction": "the prediction is cut to the truth; a shorter prediction is an error",
+}
+SIDE_WORDS: dict[Side, str] = {
+    "prediction": "of the prediction",
+    "truth": "of the truth",
+    "gap": "of the prediction minus that of the truth",
+}
+
+
+def check_option(name: str, value: object, known: Any) -> None:  # noqa: ANN401 - a Literal has no type of its own
+    """Refuse a value that is not among the known ones.
+
+    Args:
+        name: The option.
+        value: The value given.
+        known: A ``Literal`` type, or a sequence of strings.
+
+    Raises:
+        ValueError: If ``value`` is not known; the message lists the known values and the nearest.
+
+    >>> check_option("pooling", "frame", Pooling)
+    Traceback (most recent call last):
+    ...
+    ValueError: unknown pooling 'frame': did you mean "frames"? known are frames, sequences
+    """
+    words = get_args(known) or tuple(known)
+    if value not in words:
+        raise ValueError(f"unknown {name} {value!r}: {choices(str(value), words)}")
+
+
+# From padded batches to pairs of sequences that can be compared frame by frame.
+
+Lengths = Tensor | Sequence[int] | int
+"""Valid frames of each sequence, (batch,) integers, or a boolean mask of them (batch, frames)."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One sequence to score, with what some metrics read in addition to it.
+
+    Args:
+        name: What messages call the sequence.
+        prediction: (frames, vertices, 3), a view; (frames, samples, vertices, 3) where there are several.
+        truth: (frames, vertices, 3), a view; the prediction itself where a metric has no truth.
+        template: Neutral vertices (vertices, 3), as the metric reads them.
+        speech: Intensity of the speech in each frame (frames,), float64; empty if none was given.
+        closures: Closures of the mouth, each a first frame and the frame after the last.
+        identity: Number of the identity.
+    """
+
+    name: str
+    prediction: Tensor
+    truth: Tensor
+    template: Tensor | None = None
+    speech: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.float64))
+    closures: tuple[tuple[int, int], ...] = ()
+    identity: int = 0
+
+    @property
+    def frames(self) -> int:
+        """How many frames are scored."""
+        return len(self.truth)
+
+
+@dataclass(frozen=True)
+class Clips:
+    """The sequences of one batch, and how many frames the length rule cut from either side."""
+
+    clips: tuple[Clip, ...]
+    cut_prediction: int
+    cut_truth: int
+    n_vertices: int
+
+    def attach(self, name: str, values: Sequence[Any]) -> Clips:
+        """The same sequences with one value each in the field ``name``."""
+        pairs = zip(self.clips, values, strict=True)
+        return replace(self, clips=tuple(replace(clip, **{name: value}) for clip, value in pairs))
+
+    def attach_templates(self, template: Tensor | None, name: str = "template") -> Clips:
+        """The same sequences with their neutral vertices.
+
+        Args:
+            template: (batch, vertices, 3), (vertices, 3) for all sequences, or None for none.
+            name: The caller's name for it.
+
+        Raises:
+            ValueError: If the shape does not fit or a template holds NaN or infinity.
+        """
+        if template is None:
+            return self
+        batch, vertices = len(self.clips), self.n_vertices
+        if template.shape not in ((batch, vertices, 3), (vertices, 3)):
+            raise ValueError(
+                f"{name} has shape {tuple(template.shape)}; expected {(batch, vertices, 3)} or {(vertices, 3)}"
+            )
+        each = list(template.detach().expand(batch, vertices, 3))
+        for clip, neutral in zip(self.clips, each, strict=True):
+            if not bool(neutral.isfinite().all()):
+                raise ValueError(f"the template of {clip.name} holds NaN or infinity; repair or omit this clip")
+        return self.attach("template", each)
+
+    def check_finite(self) -> None:
+        """Refuse NaN and infinity in the frames that are scored.
+
+        Raises:
+            ValueError: Naming the first clip concerned and the side.
+        """
+        sides = [
+            (clip.name, side, motion)
+            for clip in self.clips
+            for side, motion in (("truth", clip.truth), ("prediction", clip.prediction))
+            if side == "prediction" or motion is not clip.prediction
+        ]
+        if not sides:
+            return
+        # A sum is NaN or infinite if any term is, and costs a tenth of looking at every value. It can also
+        # overflow by itself, so suspicion is followed by the exact test. One transfer for the whole batch.
+        sums = torch.stack([motion.sum(dtype=_wide(motion.dtype)).double() for _, _, motion in sides])
+        for (name, side, motion), fine in zip(sides, sums.isfinite().tolist(), strict=True):
+            if not fine and not bool(motion.isfinite().all()):
+                bad = (~motion.isfinite()).flatten(1).any(1).nonzero()[0].item()
+                raise ValueError(
+                    f"the {side} of {name} holds NaN or infinity, first in frame {bad}; "
+                    "a score over it would mean nothing: repair or omit this clip"
+                )
+
+
+def _wide(dtype: torch.dtype) -> torch.dtype:
+    """A type in which to add up many values of ``dtype``."""
+    return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype
+
+
+def align(
+    prediction: Tensor,
+    truth: Tensor,
+    *,
+    lengths: Lengths | None = None,
+    prediction_lengths: Lengths | None = None,
+    clip_names: Sequence[str] | None = None,
+    rule: LengthRule = "min",
+) -> Clips:
+    """Remove padding and bring each prediction and its truth to one length.
+
+    Args:
+        prediction: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
+        truth: Likewise; its padded number of frames may differ.
+        lengths: Valid frames of the truth, and of the prediction unless ``prediction_lengths`` is given.
+            Without it every frame of either tensor is valid.
+        prediction_lengths: Valid frames of the prediction. Needed in addition to ``lengths`` if the two tensors
+            differ in their padded number of frames.
+        clip_names: One name per sequence, for messages.
+        rule: What to do where the lengths differ.
+
+    Raises:
+        ValueError: If shapes, types or lengths do not fit, a clip has no frame, or the rule refuses the
+            lengths.
+    """
+    check_option("length rule", rule, LengthRule)
+    prediction, truth = prediction.detach(), truth.detach()  # scores are read, not optimised: keep no graph
+    single = truth.ndim == 3
+    for name, motion in (("prediction", prediction), ("truth", truth)):
+        if motion.ndim not in (3, 4) or motion.ndim != truth.ndim or motion.shape[-1] != 3:
+            raise ValueError(
+                f"{name} has shape {tuple(motion.shape)}; prediction and truth must both be "
+                "(batch, frames, vertices, 3) or both (frames, vertices, 3)"
+            )
+        if motion.shape[-2] == 0:
+            raise ValueError(f"{name} has no vertex: shape {tuple(motion.shape)}")
+        if not motion.is_floating_point():
+            raise ValueError(f"{name} must be floating point, not {motion.dtype}")
+    if single:
+        prediction, truth = prediction[None], truth[None]
+    batch = len(truth)
+    if len(prediction) != batch or prediction.shape[2:] != truth.shape[2:]:
+        raise ValueError(
+            f"prediction {tuple(prediction.shape)} and truth {tuple(truth.shape)} must agree in batch and vertices"
+        )
+    if prediction.shape[1] != truth.shape[1] and lengths is not None and prediction_lengths is None:
+        raise ValueError(
+            f"prediction and truth are padded to {prediction.shape[1]} and {truth.shape[1]} frames, "
+            "so `lengths` cannot hold for both; give `prediction_lengths` too"
+        )
+    if clip_names is None:
+        names = ["the clip"] if single else [f"clip {place} of the batch" for place in range(batch)]
+    else:
+        names = [clip_names] if isinstance(clip_names, str) else list(clip_names)
+    if len(names) != batch:
+        raise ValueError(f"{len(names)} clip_names for {batch} sequences; give one per sequence")
+    valid = _valid_frames("lengths", lengths, truth)
+    given = prediction_lengths if prediction_lengths is not None else lengths
+    predicted = _valid_frames("prediction_lengths", given, prediction)
+    clips, cut_prediction, cut_truth = [], 0, 0
+    for place, (name, theirs, ours) in enumerate(zip(names, valid, predicted, strict=True)):
+        refused = ours < theirs if rule == "prediction" else ours != theirs
+        if rule != "min" and refused:
+            raise ValueError(
+                f"{name}: the prediction has {ours} frames, the truth {theirs}; the length rule {rule!r} refuses "
+                "this. Predict all frames, or choose a rule that cuts"
+            )
+        frames = min(ours, theirs)
+        if frames == 0:
+            raise ValueError(f"{name} has no frame to score: prediction {ours}, truth {theirs} frames; omit it")
+        cut_prediction += ours - frames
+        cut_truth += theirs - frames
+        clips.append(Clip(name, prediction[place, :frames], truth[place, :frames]))
+    return Clips(tuple(clips), cut_prediction, cut_truth, truth.shape[2])
+
+
+def _valid_frames(name: str, lengths: Lengths | None, motion: Tensor) -> list[int]:
+    """Valid frames of each sequence as plain integers, checked against the padded motion."""
+    batch, padded = motion.shape[:2]
+    if lengths is None:
+        return [padded] * batch
+    values = torch.as_tensor(lengths)
+    if values.dtype == torch.bool:
+        mask = values.reshape(-1, values.shape[-1]) if values.ndim else values
+        if mask.shape != (batch, padded):
+            raise ValueError(f"the mask {name} has shape {tuple(values.shape)}, not {(batch, padded)}")
+        values = mask.sum(1)
+        if not torch.equal(mask, torch.arange(padded, device=mask.device) < values[:, None]):
+            raise ValueError(f"the mask {name} must be true from the first frame on, without gaps")
+    if values.is_floating_point() or values.ndim > 1 or values.numel() != batch:
+        raise ValueError(f"{name} must hold {batch} whole numbers, one per sequence, not {tuple(values.shape)}")
+    found: list[int] = values.reshape(-1).tolist()
+    for value in found:
+        if not 0 <= value <= padded:
+            raise ValueError(f"{name} holds {value}; the motion has {padded} frames, so 0 to {padded} can be valid")
+    return found
+
+
+# The classes from which metrics are derived.
+
+
+class ProcessOptions(TypedDict, total=False):
+    """Options of every metric; those of `torchmetrics.Metric`.
+
+    Args:
+        sync_on_compute: Whether `compute` reduces the states over processes.
+        process_group: Over which processes; all if None.
+    """
+
+    sync_on_compute: bool
+    process_group: Any
+
+
+class SequenceOptions(ProcessOptions, total=False):
+    """Options of every metric that compares sequences.
+
+    Args:
+        length_rule: ``"min"`` cuts prediction and truth to the shorter of the two; ``"error"`` refuses different
+            lengths; ``"prediction"`` cuts the prediction and refuses one that is shorter than the truth.
+        check_finite: Whether `update` refuses NaN and infinity; off only where the caller has looked already.
+    """
+
+    length_rule: LengthRule
+    check_finite: bool
+
+
+class BatchOptions(TypedDict, total=False):
+    """What every `update` takes in addition to motion.
+
+    Args:
+        lengths: Valid frames (batch,) or a mask (batch, frames), of the truth and, unless the next is given, of the
+            prediction. Padding is never read.
+        prediction_lengths: Valid frames of the prediction.
+        clip_names: One name per sequence, for messages.
+    """
+
+    lengths: Lengths | None
+    prediction_lengths: Lengths | None
+    clip_names: Sequence[str] | None
+
+
+_PACKED = {each.__name__: each for each in (ProcessOptions, SequenceOptions, BatchOptions)}
+_PROCESS_DEFAULTS = {"sync_on_compute": True, "process_group": None}
+
+
+def _full_signature(cls: type, name: str) -> inspect.Signature:
+    """A method's signature in which ``**options: Unpack[…]`` is written out, with `SequenceMetric`'s defaults."""
+    signature = inspect.signature(vars(cls)[name])
+    written: list[inspect.Parameter] = []
+    for parameter in signature.parameters.values():
+        packed = _PACKED.get(str(parameter.annotation).rpartition("[")[2].rstrip("]").rpartition(".")[2])
+        if parameter.kind is not inspect.Parameter.VAR_KEYWORD or packed is None:
+            written.append(parameter)
+            continue
+        known = (
+            dict(inspect.signature(getattr(SequenceMetric, name)).parameters) if packed is not ProcessOptions else {}
+        )
+        for key, default in _PROCESS_DEFAULTS.items():
+            known.setdefault(key, inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default))
+        written += [known[key] for key in packed.__annotations__]
+    return signature.replace(parameters=written)
+
+
+Inferred = dict[str, Callable[[Mapping[str, Any]], Any]]
+
+
+class ExactMetric(Metric):
+    """A metric that describes its definition in words and whose sums stay in float64.
+
+    Args:
+        definition: The metric in plain words, with its options.
+        settings: Further options that distinguish the metric from others but need not be described.
+        **kwargs: For `torchmetrics.Metric`: those of `ProcessOptions` and others.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ()
+    """What a metric that is chosen by name needs of the corpus or the run, names of `facediff.metrics.NEEDS`."""
+
+    inferred: ClassVar[Inferred] = {}
+    """Constructor arguments that the functional form reads from the batch instead of being given them."""
+
+    full_state_update = False
+    is_differentiable = False
+
+    def __init__(self, *, definition: str, settings: str = "", **kwargs: object) -> None:
+        super().__init__(**kwargs)
+        self.definition = definition
+        # A MetricCollection merges metrics whose states have the same names and were nearly equal after the
+        # first batch; a signed and an absolute deviation would be merged. A state with a name of its own prevents
+        # this.
+        described = f"{type(self).__name__}: {definition}; {settings}"
+        mark = hashlib.sha256(described.encode()).hexdigest()[:16]
+        self.add_state(f"definition_{mark}", torch.zeros(1, dtype=torch.int64), dist_reduce_fx="sum")
+
+    def __init_subclass__(cls, **kwargs: object) -> None:
+        """List the options that ``**options`` and ``**batch`` stand for in the signatures that people and tools see."""
+        super().__init_subclass__(**kwargs)
+        for name in vars(cls).keys() & {"__init__", "update"}:
+            vars(cls)[name].__signature__ = _full_signature(cls, name)
+
+    def describe(self) -> str:
+        """The metric's definition in plain words."""
+        return self.definition
+
+    def leave_synchronised_state(self) -> None:
+        """To be called before `compute` raises: torchmetrics would keep the states of all processes."""
+        if self._is_synced:
+            self.unsync()
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = "") -> Self:
+        """Follow moves to another device but keep float64: ``.to(torch.bfloat16)`` would ruin the sums."""
+
+        def move_only(tensor: Tensor) -> Tensor:
+            moved = fn(tensor)
+            return moved if moved.dtype == tensor.dtype else tensor.to(moved.device)
+
+        super()._apply(move_only, exclude_state)
+        return self
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What a score was taken over, and what the length rule left out.
+    """What a score was taken over, and what the length rule cut.
 
     Args:
         frames: Frames scored. A metric that looks at some frames only counts those, see there.
@@ -34,22 +415,34 @@ class Coverage:
 
 
 class SequenceMetric(ExactMetric):
-    """Base of metrics that give each sequence one number and pool these.
+    """Base of metrics that give each sequence one number and pool these; a new metric defines `clip_value`.
 
     The states are sums (float64) and counts (int64) of fixed size, so that memory does not grow and processes
     that saw different numbers of sequences, or none, reduce to what one process gets. They stay in these
     types when the module that holds the metric is converted to another precision.
 
     Under several processes `compute` and `coverage` are collective: call them on every rank, also on one that
-    had no sequence (in Lightning from an ``on_…_epoch_end`` hook, not by logging from a step).
+    has no sequence (in Lightning from an ``on_…_epoch_end`` hook, not by logging from a step).
 
     Args:
-        definition: The metric in plain words, with all its options.
+        definition: The metric in plain words, with all its options. ``{region}`` in it becomes the region's name,
+            count and hash, ``{pooling}`` the pooling in words.
         pooling: All frames alike, or the mean of sequence means.
         region: Vertices that are looked at, None for all; motion of another mesh is refused.
         length_rule: What to do where prediction and truth differ in length.
         check_finite: Whether `update` refuses NaN and infinity; off only where the caller has looked already.
-        **kwargs: Passed on to `torchmetrics.Metric` (``process_group``, ``sync_on_compute`` …).
+        **kwargs: For `torchmetrics.Metric`: those of `ProcessOptions` and others.
+
+    Raises:
+        ValueError: If an option is unknown.
+
+    >>> class LastFrameError(SequenceMetric):
+    ...     def clip_value(self, clip):
+    ...         return (clip.prediction[-1] - clip.truth[-1]).double().norm(dim=-1).mean()
+    >>> metric = LastFrameError(definition="mean distance in the last frame [unit]")
+    >>> metric.update(torch.ones(2, 5, 7, 3), torch.zeros(2, 5, 7, 3), lengths=[5, 4])
+    >>> round(metric.compute().item(), 6)
+    1.732051
     """
 
     leaves_out = ""
@@ -65,21 +458,24 @@ class SequenceMetric(ExactMetric):
         self,
         *,
         definition: str,
-        pooling: Pooling,
-        region: Region | None = None,
+        pooling: Pooling = "sequences",
+        region: RegionLike | None = None,
         length_rule: LengthRule = "min",
         check_finite: bool = True,
         **kwargs: object,
     ) -> None:
-        check_option("pooling", pooling, POOLINGS)
-        check_option("length rule", length_rule, LENGTH_RULES)
-        super().__init__(definition=definition, settings=length_rule, **kwargs)
+        check_option("pooling", pooling, Pooling)
+        check_option("length rule", length_rule, LengthRule)
+        self_region = None if region is None else as_region(region, "vertices")
+        where = "all vertices" if self_region is None else str(self_region)
+        words = definition.replace("{pooling}", POOLING_WORDS[pooling]).replace("{region}", where)
+        super().__init__(definition=words, settings=length_rule, **kwargs)
         self.pooling: Pooling = pooling
         self.length_rule: LengthRule = length_rule
         self.check_finite = check_finite
-        self.region = region
-        self.latest: Tensor | None = None
-        self.register_buffer("indices", None if region is None else region.tensor(), persistent=False)
+        self.region: Region | None = self_region
+        self.latest = None
+        self.register_buffer("indices", None if self_region is None else self_region.tensor(), persistent=False)
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(5, dtype=torch.int64), dist_reduce_fx="sum")
 
@@ -96,7 +492,46 @@ class SequenceMetric(ExactMetric):
         if self.region is not None:
             self.region.check(n_vertices)
 
-    def _add(self, clips: Clips) -> None:
+    def update(
+        self,
+        prediction: Tensor,
+        truth: Tensor,
+        *,
+        lengths: Lengths | None = None,
+        prediction_lengths: Lengths | None = None,
+        clip_names: Sequence[str] | None = None,
+    ) -> None:
+        """Add a batch of sequences.
+
+        Args:
+            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
+            truth: Likewise.
+            lengths: Valid frames (batch,) or a mask (batch, frames), of the truth and, unless
+                ``prediction_lengths`` is given, of the prediction. Padding is never read.
+            prediction_lengths: Valid frames of the prediction.
+            clip_names: One name per sequence, for messages.
+
+        Raises:
+            ValueError: If shapes or lengths do not fit or the length rule refuses them, or a valid frame
+                holds NaN or infinity. Nothing is added then.
+        """
+        batch: BatchOptions = {
+            "lengths": lengths,
+            "prediction_lengths": prediction_lengths,
+            "clip_names": clip_names,
+        }
+        self.add(self.align(prediction, truth, **batch))
+
+    def align(self, prediction: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> Clips:
+        """The sequences of a batch as the metric's length rule cuts them; see `update`."""
+        return align(prediction, truth, rule=self.length_rule, **batch)
+
+    def add(self, clips: Clips) -> None:
+        """Check aligned sequences and add their values to the sums.
+
+        Raises:
+            ValueError: If they are of another mesh or hold NaN or infinity. Nothing is added then.
+        """
         self.check_vertices(clips.n_vertices)
         if self.check_finite:
             clips.check_finite()
@@ -127,8 +562,8 @@ class SequenceMetric(ExactMetric):
             self.refuse_to_compute(int(self.counts[4]))
         return self.total / (frames if self.pooling == "frames" else sequences)
 
-    def refuse_to_compute(self, left_out: int) -> None:
-        """Say that there is nothing to score.
+    def refuse_to_compute(self, left_out: int) -> NoReturn:
+        """Raise the error of a metric that has nothing to score.
 
         Raises:
             ValueError: Always; the message depends on whether sequences were left out.
@@ -147,42 +582,67 @@ class SequenceMetric(ExactMetric):
             return self.covered()
 
     def covered(self) -> Coverage:
-        """What the states say was scored, cut and left out."""
+        """What the states of this process count as scored, cut and left out."""
         return Coverage(*self.counts.tolist())
 
 
-class ComparisonMetric(SequenceMetric):
-    """Base of metrics that compare a prediction with its truth and need nothing beside."""
+# The functional form.
 
-    def update(
-        self,
-        prediction: Tensor,
-        truth: Tensor,
-        *,
-        lengths: Lengths | None = None,
-        prediction_lengths: Lengths | None = None,
-        clip_names: Sequence[str] | None = None,
-    ) -> None:
-        """Add a batch of sequences.
 
-        Args:
-            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: Likewise.
-            lengths: Valid frames (batch,) or a mask (batch, frames), of the truth and, unless
-                ``prediction_lengths`` is given, of the prediction. Padding is never read.
-            prediction_lengths: Valid frames of the prediction.
-            clip_names: One name a sequence, for messages.
+_NOT_IN_FUNCTIONS = {"check_finite", "sync_on_compute", "process_group", "kwargs"}
 
-        Raises:
-            ValueError: If shapes or lengths do not fit or the length rule refuses them, or a valid frame
-                holds NaN or infinity. Nothing is added then.
-        """
-        clips = align(
-            prediction,
-            truth,
-            lengths=lengths,
-            prediction_lengths=prediction_lengths,
-            clip_names=clip_names,
-            rule=self.length_rule,
-        )
-        self._add(clips)
+
+def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> Callable[..., Tensor]:
+    """The functional form of a metric: its class, used once on one sequence or one padded batch.
+
+    Both give the same number by construction. The function takes the motion that `update` takes, then what the class
+    is made of (regions, pairs), then the options of both by keyword. Processes are not brought together.
+
+    Args:
+        metric: The class; the function has its name in snake case.
+        positional: Keywords of `update` that the function also takes by position, after those of the class.
+
+    Returns:
+        A function of proper name, signature and docstring, which returns a float64 scalar.
+    """
+    made = inspect.signature(metric).parameters
+    updated = {name: p for name, p in inspect.signature(metric.update).parameters.items() if name != "self"}
+    by_place = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    order: dict[str, inspect.Parameter] = {name: p for name, p in updated.items() if p.kind is by_place}
+    order |= {name: p for name, p in made.items() if p.kind is by_place and name not in metric.inferred}
+    order |= {name: updated[name].replace(kind=by_place, default=inspect.Parameter.empty) for name in positional}
+    for name, parameter in (updated | made).items():
+        if name not in order and name not in metric.inferred and name not in _NOT_IN_FUNCTIONS:
+            order[name] = parameter
+    signature = inspect.Signature(list(order.values()), return_annotation=Tensor)
+
+    def function(*args: Any, **kwargs: Any) -> Tensor:  # noqa: ANN401
+        given = signature.bind(*args, **kwargs).arguments
+        options = {name: given[name] for name in given if name in made}
+        options |= {name: infer(given) for name, infer in metric.inferred.items()}
+        batch = {name: given[name] for name in given if name in updated}
+        device = next((value.device for value in batch.values() if isinstance(value, Tensor)), None)
+        one = metric(**options, sync_on_compute=False).to(device)
+        one.update(**batch)
+        return typing.cast(Tensor, one.compute())
+
+    name = re.sub(r"(?<!^)(?=[A-Z])", "_", metric.__name__).lower()
+    described = _arguments(SequenceOptions) | _arguments(BatchOptions) | _arguments(metric.update) | _arguments(metric)
+    summary, _, _ = (inspect.getdoc(metric) or "").partition("\n")
+    function.__name__ = function.__qualname__ = name
+    function.__module__ = metric.__module__
+    function.__doc__ = (
+        f"{summary}\n\nThe functional form of `{metric.__name__}`, whose docstring has formula, unit and source.\n\n"
+        "Args:\n"
+        + "\n".join(f"    {name}: {described.get(name, 'See the class.')}" for name in order)
+        + f"\n\nReturns:\n    Float64 scalar.\n\nRaises:\n    ValueError: As `{metric.__name__}` and its `update`.\n"
+    )
+    function.__signature__ = signature  # type: ignore[attr-defined]  # what help() and IDEs show
+    return function
+
+
+def _arguments(documented: object) -> dict[str, str]:
+    """What a docstring's section ``Args`` says of each name."""
+    section = re.search(r"^Args:\n((?:    .*\n?|\n)+)", inspect.getdoc(documented) or "", re.MULTILINE)
+    entries = re.findall(r"^    (\w+): ((?:.*\n?)(?:        .*\n?)*)", section[1] if section else "", re.MULTILINE)
+    return {name: text.rstrip() for name, text in entries}

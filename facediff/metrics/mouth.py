@@ -1,23 +1,99 @@
-"""The opening of the mouth: the base of metrics that read it, and the mouth-opening difference.
+"""The opening of the mouth and the speed of the lips: how far they are from the truth, and whether they follow it.
 
-The opening of a frame is the mean distance of named pairs of inner-lip vertices. It needs absolute vertices:
-of offsets alone the distance means nothing. So motion is taken as absolute unless ``offsets_from=`` gives the
-neutral vertices that it is offset from. (FDD's ``template=`` is the other way round; the two have different
+The opening of a frame is o[t] = mean over named pairs (a, b) of inner-lip vertices of ‖x[t, a] − x[t, b]‖₂. It needs
+absolute vertices: of offsets alone the distance means nothing. So motion is taken as absolute unless ``offsets_from=``
+gives the neutral vertices that it is offset from. (FDD's ``template=`` is the other way round; the two have different
 names so that a `torchmetrics.MetricCollection` can pass both.)
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar, Literal, Unpack
 
+import torch
 from torch import Tensor
 
-from facediff.metrics.base import SequenceMetric
-from facediff.metrics.clips import Clip, Lengths, align
-from facediff.metrics.face_dynamics import split_template
-from facediff.metrics.formulas import opening
-from facediff.metrics.lip_pairs import LipPairsLike, as_lip_pairs
-from facediff.metrics.options import POOLING_WORDS, POOLINGS, LengthRule, Pooling, check_option
+from facediff.metrics.base import (
+    SIDE_WORDS,
+    BatchOptions,
+    Clip,
+    Clips,
+    Pooling,
+    SequenceMetric,
+    SequenceOptions,
+    Side,
+    check_option,
+    functional,
+)
+from facediff.metrics.one_pass import frames_per_step, squared_norm
+from facediff.metrics.regions import LipPairsLike, RegionLike, as_lip_pairs, as_region
+from facediff.registry import metric
+
+
+def opening(motion: Tensor, offsets_from: Tensor | None, pairs: Tensor) -> Tensor:
+    """How far the mouth is open in each frame: the mean distance of the lip pairs.
+
+    Args:
+        motion: (frames, vertices, 3).
+        offsets_from: (vertices, 3) that ``motion`` is offsets from; None if it is absolute vertices.
+        pairs: (pairs, 2) int64, an upper and a lower vertex each.
+
+    Returns:
+        (frames,), float64, in the vertices' unit.
+    """
+    gap = motion.index_select(1, pairs[:, 0]).double() - motion.index_select(1, pairs[:, 1]).double()
+    if offsets_from is not None:
+        gap = gap + (offsets_from.index_select(0, pairs[:, 0]).double() - offsets_from.index_select(0, pairs[:, 1]))
+    return squared_norm(gap).sqrt().mean(1)
+
+
+def speed(motion: Tensor, indices: Tensor) -> Tensor:
+    """How far the vertices move from each frame to the next: m[t] = mean_v ‖x[t, v] − x[t − 1, v]‖₂.
+
+    Args:
+        motion: (frames, vertices, 3); a template would cancel.
+        indices: Vertices to look at, (region,) int64.
+
+    Returns:
+        (frames − 1,), float64, in the vertices' unit for each frame.
+    """
+    frames = len(motion)
+    out = torch.zeros(frames - 1, dtype=torch.float64, device=motion.device)
+    step = frames_per_step(motion, len(indices))
+    for start in range(0, frames - 1, step):
+        some = motion[start : start + step + 1].index_select(1, indices).double()
+        out[start : start + step] = squared_norm(some[1:] - some[:-1]).sqrt().mean(1)
+    return out
+
+
+def correlation(reference: Tensor, other: Tensor) -> Tensor:
+    """Pearson's correlation coefficient of two series of equal length.
+
+    A series varies if its range exceeds 1e-12 of its largest absolute value, which rounding alone does not
+    reach.
+
+    Args:
+        reference: (frames,) float64, what is to be followed.
+        other: (frames,) float64, what should follow it.
+
+    Returns:
+        Scalar, float64; 0 where ``other`` does not vary, NaN where ``reference`` does not.
+    """
+    if len(reference) < 2:
+        return torch.full((), torch.nan, dtype=torch.float64, device=reference.device)
+    first, second = reference - reference.mean(), other - other.mean()
+    scale = (first.square().sum() * second.square().sum()).sqrt()
+    found = ((first * second).sum() / scale).clamp(-1, 1)
+    return torch.where(_steady(reference), torch.nan, torch.where(_steady(other), 0.0, found))
+
+
+def _steady(series: Tensor) -> Tensor:
+    low, high = series.aminmax()
+    return high - low <= 1e-12 * torch.maximum(high.abs(), low.abs())
+
+
+# The opening against the truth's.
 
 
 class OpeningMetric(SequenceMetric):
@@ -27,30 +103,21 @@ class OpeningMetric(SequenceMetric):
         pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
         definition: The metric in words; ``{pairs}`` in it becomes the pairs' name, number and hash.
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`.
     """
+
+    needs: ClassVar[tuple[str, ...]] = ("lip_pairs",)
 
     def __init__(
         self,
         pairs: LipPairsLike,
         *,
         definition: str,
-        pooling: Pooling,
-        length_rule: LengthRule,
-        check_finite: bool,
-        **kwargs: object,
+        pooling: Pooling = "sequences",
+        **options: Unpack[SequenceOptions],
     ) -> None:
         named = as_lip_pairs(pairs)
-        super().__init__(
-            definition=definition.format(pairs=named),
-            pooling=pooling,
-            region=None,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
-        )
+        super().__init__(definition=definition.replace("{pairs}", str(named)), pooling=pooling, **options)
         self.pairs = named
         self.pair_indices: Tensor
         self.register_buffer("pair_indices", named.tensor(), persistent=False)
@@ -67,14 +134,7 @@ class OpeningMetric(SequenceMetric):
         return predicted, true
 
     def update(
-        self,
-        prediction: Tensor,
-        truth: Tensor,
-        *,
-        offsets_from: Tensor | None = None,
-        lengths: Lengths | None = None,
-        prediction_lengths: Lengths | None = None,
-        clip_names: Sequence[str] | None = None,
+        self, prediction: Tensor, truth: Tensor, *, offsets_from: Tensor | None = None, **batch: Unpack[BatchOptions]
     ) -> None:
         """Add a batch of sequences.
 
@@ -84,30 +144,20 @@ class OpeningMetric(SequenceMetric):
             offsets_from: Neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, that
                 prediction and truth are offsets from. **None means that they are absolute vertices**; offsets
                 without it give another, meaningless number.
-            lengths: As for `ComparisonMetric.update`.
-            prediction_lengths: As for `ComparisonMetric.update`.
-            clip_names: One name a sequence, for messages.
+            **batch: Those of `BatchOptions`.
 
         Raises:
-            ValueError: As for `ComparisonMetric.update`, and if ``offsets_from`` does not fit. Nothing is
+            ValueError: As for `SequenceMetric.update`, and if ``offsets_from`` does not fit. Nothing is
                 added then.
         """
-        clips = align(
-            prediction,
-            truth,
-            lengths=lengths,
-            prediction_lengths=prediction_lengths,
-            clip_names=clip_names,
-            rule=self.length_rule,
-        )
-        self._add(clips.with_templates(split_template(offsets_from, clips, "offsets_from")))
+        self.add(self.align(prediction, truth, **batch).attach_templates(offsets_from, "offsets_from"))
 
 
+@metric.register("mouth_opening_difference")
 class MouthOpeningDifference(OpeningMetric):
     r"""Mouth-opening difference (MOD): how far the openings of prediction and truth are apart.
 
-    With o[t] = mean over the pairs (a, b) of ‖x[t, a] − x[t, b]‖₂, the mean over frames of
-    \|o_g[t] − o_p[t]\|, in the vertices' unit.
+    The mean over frames of \|o_g[t] − o_p[t]\|, in the vertices' unit.
 
     The definition is a choice. DiffPoseTalk's paper brought the name up and released no formula; other
     projects of that name compute the root mean square over frames of the difference between two landmarks
@@ -117,9 +167,7 @@ class MouthOpeningDifference(OpeningMetric):
     Args:
         pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> metric = MouthOpeningDifference([(0, 1)])
@@ -132,25 +180,12 @@ class MouthOpeningDifference(OpeningMetric):
 
     higher_is_better = False
 
-    def __init__(
-        self,
-        pairs: LipPairsLike,
-        *,
-        pooling: Pooling = "frames",
-        length_rule: LengthRule = "min",
-        check_finite: bool = True,
-        **kwargs: object,
-    ) -> None:
-        check_option("pooling", pooling, POOLINGS)
-        super().__init__(
-            pairs,
-            definition="in each frame the difference between the openings of the mouth, an opening being the mean "
-            f"distance of {{pairs}}; {POOLING_WORDS[pooling]} [unit]",
-            pooling=pooling,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
+    def __init__(self, pairs: LipPairsLike, *, pooling: Pooling = "frames", **options: Unpack[SequenceOptions]) -> None:
+        words = (
+            "in each frame the difference between the openings of the mouth, an opening being the mean "
+            "distance of {pairs}; {pooling} [unit]"
         )
+        super().__init__(pairs, definition=words, pooling=pooling, **options)
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The difference of one sequence, mean over its frames."""
@@ -158,45 +193,267 @@ class MouthOpeningDifference(OpeningMetric):
         return (predicted - true).abs().mean()
 
 
-def mouth_opening_difference(
-    prediction: Tensor,
-    truth: Tensor,
-    pairs: LipPairsLike,
-    *,
-    offsets_from: Tensor | None = None,
-    pooling: Pooling = "frames",
-    length_rule: LengthRule = "min",
-    lengths: Lengths | None = None,
-    prediction_lengths: Lengths | None = None,
-    clip_names: Sequence[str] | None = None,
-) -> Tensor:
-    r"""Mouth-opening difference (MOD): mean over frames of \|o_g − o_p\|, o the mean distance of the pairs.
+_RULE = "a prediction that does not vary counts 0, a sequence whose truth does not vary is left out"
+
+
+@metric.register("lip_opening_correlation")
+class LipOpeningCorrelation(OpeningMetric):
+    """Lip PCC of the opening: does the mouth open when the truth's does, whatever the amount?
+
+    Per sequence Pearson's correlation over frames between o_g and o_p, the openings of the mouth (see
+    `MouthOpeningDifference`); then the mean over sequences. From −1 to 1, without unit; blind to the
+    size of the movement and to a constant gap.
+
+    A prediction that does not vary counts 0. A truth that does not vary, as in a clip of one frame, cannot be
+    followed: the sequence is left out and counted by `coverage`. Both are choices, as is the mean over sequences.
 
     Args:
-        prediction: (batch, frames, vertices, 3) or (frames, vertices, 3).
-        truth: Likewise.
         pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
-        offsets_from: Neutral vertices that prediction and truth are offsets from; None if they are absolute.
-        pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        lengths: Valid frames (batch,) or mask (batch, frames), of both sides unless the next is given.
-        prediction_lengths: Valid frames of the prediction.
-        clip_names: One name a sequence, for messages.
+        **options: Those of `SequenceOptions`.
 
-    Returns:
-        Float64 scalar in the vertices' unit.
+    >>> import torch
+    >>> truth = torch.tensor([0.0, 1.0, 0.0, 2.0])[:, None, None] * torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    >>> lip_opening_correlation(0.5 * truth, truth, [(0, 1)]).item()
+    1.0
+    """
+
+    higher_is_better = True
+    leaves_out = "the opening of the truth does not vary"
+
+    def __init__(self, pairs: LipPairsLike, **options: Unpack[SequenceOptions]) -> None:
+        words = (
+            "in each sequence the Pearson correlation over frames between the openings of the mouth, an "
+            f"opening being the mean distance of {{pairs}}; mean over sequences; {_RULE} [1]"
+        )
+        super().__init__(pairs, definition=words, **options)
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The correlation of one sequence, NaN if the truth does not vary."""
+        predicted, true = self.openings(clip)
+        return correlation(true, predicted)
+
+
+@metric.register("lip_speed_correlation")
+class LipSpeedCorrelation(SequenceMetric):
+    """Lip PCC of the speed: do the lips move fast when the truth's do?
+
+    With m[t] = mean_{v∈M} ‖x[t, v] − x[t − 1, v]‖₂, t from the second frame on, Pearson's correlation
+    over frames between m_g and m_p in each sequence; then the mean over sequences. From −1 to 1, without unit.
+    A template cancels. A prediction that does not vary counts 0; where the truth does not vary, or has fewer
+    than three frames, the sequence is left out and counted by `coverage`. The definition is ours.
+
+    Args:
+        lips: Lip vertices, a `Region` or indices.
+        **options: Those of `SequenceOptions`.
+    """
+
+    higher_is_better = True
+    leaves_out = "the speed of the truth's lips does not vary"
+    needs = ("lips",)
+    indices: Tensor
+
+    def __init__(self, lips: RegionLike, **options: Unpack[SequenceOptions]) -> None:
+        words = (
+            "in each sequence the Pearson correlation over frames between the mean speeds of {region}; "
+            f"mean over sequences; {_RULE} [1]"
+        )
+        super().__init__(definition=words, region=as_region(lips, "lips"), **options)
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The correlation of one sequence, NaN if the truth's speed does not vary."""
+        return correlation(speed(clip.truth, self.indices), speed(clip.prediction, self.indices))
+
+
+# Whether the mouth closes where speech has it closed.
+
+Interval = tuple[int, int]
+Closures = Tensor | Sequence[Sequence[Interval]] | Sequence[Interval]
+"""Known closures: a boolean mask (batch, frames), or for each sequence a list of intervals (first frame, frame
+after the last). For one sequence without batch axis a mask (frames,) or its list of intervals."""
+
+Counted = Literal["frames", "closures"]
+"""What a closure rate is a share of."""
+
+COUNTED_WORDS: dict[Counted, str] = {
+    "frames": "the frames of known closures in which the mouth is closed",
+    "closures": "the known closures in which the mouth is closed in at least one frame",
+}
+
+
+@metric.register("bilabial_closure_rate")
+class BilabialClosureRate(OpeningMetric):
+    """Bilabial-closure rate: how often the mouth is closed where speech has it closed (p, b, m).
+
+    The known closures come with each clip, usually from aligned phonemes. With o[t] the opening of the mouth
+    (see `MouthOpeningDifference`) and o_g the truth's, a frame is closed if
+
+        o[t] ≤ min_t o_g + threshold · (max_t o_g − min_t o_g).
+
+    The limit is thus a share of the range of the *truth's* opening in the same clip: it does not depend on
+    the unit or on the gap that a mesh keeps between closed lips, and the truth is always closed somewhere.
+    Definition and default threshold are choices; there is no usual formula. Captured truth may miss
+    closures too: give ``of="truth"`` next to the prediction's rate, or ``of="gap"``. From 0 to 1, a gap from −1 to 1.
+
+    A clip without a closure in its scored frames is left out; `coverage` counts, as ``frames``, what the rate
+    is a share of.
+
+    Args:
+        pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
+        threshold: Share of the truth's range up to which a mouth counts as closed, 0 to 1.
+        count: ``"frames"``: the share of all frames of closures in which the mouth is closed; ``"closures"``:
+            the share of closures in which it is closed in at least one frame.
+        of: ``"prediction"``, ``"truth"``, or ``"gap"``: prediction minus truth, negative where the prediction
+            closes less.
+        pooling: ``"frames"``: the frames (or closures) of all sequences alike; ``"sequences"``: the mean of
+            the sequences' rates.
+        **options: Those of `SequenceOptions`.
+
+    >>> import torch
+    >>> motion = torch.zeros(4, 2, 3)
+    >>> motion[:, 0, 1] = torch.tensor([1.0, 0.0, 0.1, 0.5])
+    >>> bilabial_closure_rate(motion, motion, [(0, 1)], [(1, 4)]).item()  # closed in 2 of the 3 frames
+    0.6666666666666666
+    """
+
+    leaves_out = "no closure lies in the frames that are scored"
+    needs: ClassVar[tuple[str, ...]] = ("lip_pairs", "closures")
+
+    def __init__(
+        self,
+        pairs: LipPairsLike,
+        *,
+        threshold: float = 0.2,
+        count: Counted = "frames",
+        of: Side = "prediction",
+        pooling: Pooling = "frames",
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        check_option("count", count, Counted)
+        check_option("of", of, Side)
+        if not 0 <= threshold <= 1:
+            raise ValueError(f"threshold is {threshold:g}; expected a share of the truth's opening range, 0 to 1")
+        over = "all sequences" if pooling == "frames" else "each sequence, then mean over sequences"
+        words = (
+            f"share of {COUNTED_WORDS[count]}, {SIDE_WORDS[of]}; closed is an opening (mean distance of {{pairs}}) up "
+            f"to the truth's smallest of the sequence plus {threshold:g} of its range; over {over} [1]"
+        )
+        super().__init__(pairs, definition=words, pooling=pooling, **options)
+        self.threshold = threshold
+        self.count: Counted = count
+        self.of: Side = of
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The rate of one sequence, NaN if it has no closure."""
+        predicted, true = self.openings(clip)
+        if not clip.closures:
+            return torch.full_like(true[0], torch.nan)
+        low, high = true.aminmax()
+        limit = low.lerp(high, self.threshold)  # exactly the widest opening at threshold 1
+        bounds = torch.tensor(clip.closures, device=true.device)
+
+        def rate(series: Tensor) -> Tensor:
+            before = torch.cat([bounds.new_zeros(1), (series <= limit).cumsum(0)])
+            hits = before[bounds[:, 1]] - before[bounds[:, 0]]  # closed frames of each closure
+            found = hits.sum() if self.count == "frames" else (hits > 0).sum()
+            return found.double() / self.clip_weight(clip)
+
+        if self.of == "gap":
+            return rate(predicted) - rate(true)
+        return rate(predicted if self.of == "prediction" else true)
+
+    def clip_weight(self, clip: Clip) -> int:
+        """Frames in closures, or closures, whichever are counted."""
+        return len(clip.closures) if self.count == "closures" else sum(end - start for start, end in clip.closures)
+
+    def update(
+        self,
+        prediction: Tensor,
+        truth: Tensor,
+        *,
+        closures: Closures | None = None,
+        offsets_from: Tensor | None = None,
+        **batch: Unpack[BatchOptions],
+    ) -> None:
+        """Add a batch of sequences.
+
+        Args:
+            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
+            truth: Likewise.
+            closures: Frames of the truth in which the mouth is known to close: a boolean mask (batch, frames),
+                a run of true frames being one closure, or for each sequence a list of intervals (first frame,
+                frame after the last) in order and without overlap. They must be given; frames that are not scored
+                do not count.
+            offsets_from: Neutral vertices that prediction and truth are offsets from; **None means that they
+                are absolute vertices**.
+            **batch: Those of `BatchOptions`.
+
+        Raises:
+            ValueError: As for `OpeningMetric.update`, and if the closures are missing or do not fit. Nothing is
+                added then.
+        """
+        if closures is None:
+            raise ValueError("closures= is missing; say in which frames the mouth is known to close")
+        clips = self.align(prediction, truth, **batch).attach_templates(offsets_from, "offsets_from")
+        self.add(_attach_closures(clips, closures, padded=truth.shape[-3], single=truth.ndim == 3))
+
+
+def _attach_closures(clips: Clips, closures: Closures, *, padded: int, single: bool) -> Clips:
+    """The sequences with their closures, as far as these lie in scored frames.
+
+    Args:
+        clips: The sequences.
+        closures: Masks or intervals.
+        padded: Frames of the truth with padding, which a mask must have too.
+        single: Whether the caller gave one sequence without batch axis.
 
     Raises:
-        ValueError: As `OpeningMetric.update`.
+        ValueError: If a mask has another shape, or intervals are no pairs of whole numbers, empty, negative,
+            out of order or overlapping; the message names the clip.
     """
-    metric = MouthOpeningDifference(pairs, pooling=pooling, length_rule=length_rule, sync_on_compute=False)
-    metric = metric.to(truth.device)
-    metric.update(
-        prediction,
-        truth,
-        offsets_from=offsets_from,
-        lengths=lengths,
-        prediction_lengths=prediction_lengths,
-        clip_names=clip_names,
-    )
-    return metric.compute()
+    count = len(clips.clips)
+    if isinstance(closures, Tensor):
+        shape = (padded,) if single else (count, padded)
+        if closures.dtype != torch.bool or closures.shape != shape:
+            raise ValueError(
+                f"closures must be a boolean mask of shape {shape} or lists of intervals, not "
+                f"{closures.dtype} of shape {tuple(closures.shape)}"
+            )
+        given: list[object] = [_runs(row) for row in closures.reshape(count, padded).tolist()]
+    else:
+        given = [closures] if single else list(closures)
+    if len(given) != count:
+        raise ValueError(f"closures of {len(given)} sequences for {count}; give a list of intervals for each")
+    checked = [_checked(clip, intervals) for clip, intervals in zip(clips.clips, given, strict=True)]
+    return clips.attach("closures", checked)
+
+
+def _checked(clip: Clip, intervals: object) -> tuple[Interval, ...]:
+    """The intervals of one clip, each checked, as far as they lie in its frames."""
+    found: list[Interval] = []
+    earlier = 0
+    for pair in intervals if isinstance(intervals, Sequence) else [intervals]:
+        if not isinstance(pair, Sequence) or [type(frame) for frame in pair] != [int, int]:
+            raise ValueError(f"the closures of {clip.name} must be a list of pairs of whole numbers (first frame, end)")
+        start, end = pair
+        if start < earlier or end <= start:
+            raise ValueError(
+                f"the closures of {clip.name} hold the interval {(start, end)}; expected intervals that are not empty, "
+                "in order and without overlap, each a first frame from 0 and the frame after the last"
+            )
+        earlier = end
+        if start < clip.frames:
+            found.append((start, min(end, clip.frames)))
+    return tuple(found)
+
+
+def _runs(mask: list[bool]) -> list[Interval]:
+    """Runs of true values as intervals."""
+    framed = [False, *mask, False]
+    edges = [place for place in range(len(mask) + 1) if framed[place] != framed[place + 1]]
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+mouth_opening_difference = functional(MouthOpeningDifference)
+lip_opening_correlation = functional(LipOpeningCorrelation)
+lip_speed_correlation = functional(LipSpeedCorrelation)
+bilabial_closure_rate = functional(BilabialClosureRate, positional=["closures"])

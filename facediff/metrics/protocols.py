@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Unpack, cast
 
-from facediff.metrics.options import (
-    LENGTH_RULES,
+from torch import Tensor
+from torchmetrics import Metric, MetricCollection
+
+from facediff.metrics.base import (
     LENGTH_WORDS,
-    POOLINGS,
-    REDUCTIONS,
-    SIGNS,
+    POOLING_WORDS,
+    BatchOptions,
+    Coverage,
     LengthRule,
     Pooling,
     Reduction,
+    SequenceMetric,
     Sign,
+    align,
     check_option,
+)
+from facediff.metrics.regions import Region, find_topology
+from facediff.metrics.vertex_errors import (
+    FaceDynamicsDeviation,
+    LipVertexError,
+    MeanVertexError,
     dynamics_words,
     vertex_error_words,
 )
-from facediff.metrics.protocol_metrics import ProtocolMetrics
-from facediff.metrics.regions import Region
-from facediff.metrics.topologies import find_topology
 
 
 @dataclass(frozen=True)
@@ -28,13 +37,13 @@ class Protocol:
     """A named setting of the metrics' options.
 
     Args:
-        name: What to print beside the numbers.
+        name: What to print next to the numbers.
         source: Where the setting comes from.
-        mve: Reduction over vertices of the mean vertex error; None leaves the metric out.
+        mve: Reduction over vertices of the mean vertex error; None omits the metric.
         mve_squared: Whether its distances are squared.
         lve_squared: Whether the lip vertex error's distances are squared.
         fdd: Signs of the face dynamics deviation to report; the first is called ``fdd``, a second
-            ``fdd_<sign>``; empty leaves the metric out.
+            ``fdd_<sign>``; empty omits the metric.
         pooling: Of MVE and LVE; FDD is always a mean over sequences.
         length_rule: What to do where prediction and truth differ in length.
         topology: Name of the mesh, one of `TOPOLOGIES`. Then regions and motion of another mesh are refused,
@@ -57,31 +66,33 @@ class Protocol:
     def __post_init__(self) -> None:
         """Check the options."""
         if self.mve is not None:
-            check_option("reduction", self.mve, REDUCTIONS)
+            check_option("reduction", self.mve, Reduction)
         for sign in self.fdd:
-            check_option("sign", sign, SIGNS)
+            check_option("sign", sign, Sign)
         if len(set(self.fdd)) != len(self.fdd):
             raise ValueError(f"protocol {self.name!r} names a sign of FDD twice: {self.fdd}")
-        check_option("pooling", self.pooling, POOLINGS)
-        check_option("length rule", self.length_rule, LENGTH_RULES)
+        check_option("pooling", self.pooling, Pooling)
+        check_option("length rule", self.length_rule, LengthRule)
         if self.topology is not None:
             find_topology(self.topology)
 
     def describe(self) -> str:
-        """The definition in plain words, one line a number."""
+        """The definition in plain words, one line per number."""
+        pooling = POOLING_WORDS[self.pooling]
         lines = [f"protocol {self.name}: {self.source}"]
         if self.mve is not None:
-            words = vertex_error_words(
-                "all vertices", reduction=self.mve, squared=self.mve_squared, pooling=self.pooling
-            )
-            lines.append(f"  mve: {words}")
-        words = vertex_error_words("the lip vertices", reduction="max", squared=self.lve_squared, pooling=self.pooling)
-        lines.append(f"  lve: {words}")
-        for place, sign in enumerate(self.fdd):
-            name = f"fdd_{sign}" if place else "fdd"
-            lines.append(f"  {name}: {dynamics_words('the upper-face vertices', sign=sign)}")
+            words = vertex_error_words(reduction=self.mve, squared=self.mve_squared)
+            lines.append(f"  mve: {words.format(region='all vertices', pooling=pooling)}")
+        words = vertex_error_words(reduction="max", squared=self.lve_squared)
+        lines.append(f"  lve: {words.format(region='the lip vertices', pooling=pooling)}")
+        for name, sign in self.deviations().items():
+            lines.append(f"  {name}: {dynamics_words(sign=sign).format(region='the upper-face vertices')}")
         lines.append(f"  lengths: {LENGTH_WORDS[self.length_rule]}")
         return "\n".join(lines)
+
+    def deviations(self) -> dict[str, Sign]:
+        """Sign of each face dynamics deviation by its name."""
+        return {f"fdd_{sign}" if place else "fdd": sign for place, sign in enumerate(self.fdd)}
 
     def build(self, lips: Region, upper: Region | None = None) -> ProtocolMetrics:
         """The metrics of this protocol for a topology.
@@ -99,22 +110,14 @@ class Protocol:
         return ProtocolMetrics(self, lips, upper)
 
 
+_PAPER = (
+    "the dual-path style diffusion paper, its text and its tables read together: the printed MVE is too far below the "
+    "root of the printed LVE to be a mean of per-frame maxima, so it is the mean over vertices"
+)
+_PAPER_TEXT = "the dual-path style diffusion paper, the formulas of its text to the letter"
 _SETTINGS = (
-    Protocol(
-        "paper",
-        "the dual-path style diffusion paper, its text and its tables read together: the printed MVE is too "
-        "far below the root of the printed LVE to be a mean of per-frame maxima, so it is the mean over "
-        "vertices",
-        mve="mean",
-        fdd=("absolute",),
-    ),
-    Protocol(
-        "paper_text",
-        "the dual-path style diffusion paper, the formulas of its text to the letter",
-        mve="max",
-        lve_squared=False,
-        fdd=("absolute",),
-    ),
+    Protocol("paper", _PAPER, mve="mean", fdd=("absolute",)),
+    Protocol("paper_text", _PAPER_TEXT, mve="max", lve_squared=False, fdd=("absolute",)),
     Protocol("codetalker", "CodeTalker's released script", fdd=("signed",), length_rule="prediction"),
     Protocol("facediffuser", "FaceDiffuser's released script", mve="mean", fdd=("signed", "absolute")),
     Protocol("diffspeaker", "DiffSpeaker's released code", fdd=("signed",), pooling="sequences"),
@@ -147,6 +150,150 @@ def protocol(name: str = "paper", *, topology: str | None = None) -> Protocol:
     protocol meshtalk: lips mine (2 vertices, 8944bbc1); frames 0, sequences 0;
     lips of 2 vertices are not usual on biwi (4996: lve.txt of BIWI)
     """
-    check_option("protocol", name, tuple(PROTOCOLS))
+    check_option("protocol", name, PROTOCOLS)
     setting = PROTOCOLS[name]
     return setting if topology is None else replace(setting, topology=topology)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What to print next to the scores.
+
+    Args:
+        protocol: The protocol's name.
+        lips: Lip region.
+        upper: Upper-face region, None if the protocol does not use one.
+        coverage: Frames and sequences scored, frames cut.
+        topology: The mesh's name, if the protocol was given one.
+    """
+
+    protocol: str
+    lips: Region
+    upper: Region | None
+    coverage: Coverage
+    topology: str | None = None
+
+    @property
+    def remarks(self) -> list[str]:
+        """Whether each region is one in use on the topology; empty where that is not known."""
+        if self.topology is None:
+            return []
+        found = [find_topology(self.topology).remark("lips", self.lips)]
+        return found if self.upper is None else [*found, find_topology(self.topology).remark("upper", self.upper)]
+
+    def __str__(self) -> str:
+        """One line for people."""
+        regions = f"lips {self.lips}" + (f", upper {self.upper}" if self.upper else "")
+        covered = self.coverage
+        text = f"protocol {self.protocol}: {regions}; frames {covered.frames}, sequences {covered.sequences}"
+        if covered.cut_prediction or covered.cut_truth:
+            text += f"; frames cut: prediction {covered.cut_prediction}, truth {covered.cut_truth}"
+        return "; ".join([text, *self.remarks])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON: protocol, regions (name, count, hash, duplicates), coverage, topology."""
+        parts = {"lips": self.lips, "upper": self.upper}
+        regions = {part: region.as_dict() for part, region in parts.items() if region is not None}
+        covered = asdict(self.coverage)
+        del covered["left_out"]  # the metrics of protocols have a value on every sequence
+        mesh = {} if self.topology is None else {"topology": self.topology, "remarks": self.remarks}
+        return {"protocol": self.protocol, "regions": regions} | covered | mesh
+
+
+class ProtocolMetrics(MetricCollection):
+    """The metrics of one protocol, updated together, as a `torchmetrics.MetricCollection`.
+
+    `compute` gives a flat dictionary: ``mve``, ``lve``, ``fdd`` as far as the protocol has them; a second
+    sign of FDD is called ``fdd_absolute`` or ``fdd_signed``. Under several processes `compute` and `summary`
+    are collective: call them on every rank, also on one that had no sequence.
+
+    Args:
+        protocol: The setting; usually made by `Protocol.build`.
+        lips: Lip vertices.
+        upper: Upper-face vertices; may be None if the protocol has no FDD.
+
+    Raises:
+        ValueError: If the protocol needs an upper face and none is given.
+    """
+
+    def __init__(self, protocol: Protocol, lips: Region, upper: Region | None = None) -> None:
+        if protocol.fdd and upper is None:
+            raise ValueError(f"protocol {protocol.name!r} includes FDD; give the upper-face region")
+        # Metrics with equal states must not be merged, and the inputs are checked here once for all of them.
+        super().__init__({}, compute_groups=False)
+        self.protocol = protocol
+        self.lips = lips
+        self.upper = upper if protocol.fdd else None
+        rule, pooling = protocol.length_rule, protocol.pooling
+        scores: dict[str, Metric] = {}
+        if protocol.mve is not None:
+            scores["mve"] = MeanVertexError(
+                reduction=protocol.mve,
+                squared=protocol.mve_squared,
+                pooling=pooling,
+                length_rule=rule,
+                check_finite=False,
+            )
+        scores["lve"] = LipVertexError(
+            lips, squared=protocol.lve_squared, pooling=pooling, length_rule=rule, check_finite=False
+        )
+        for name, sign in protocol.deviations().items():
+            scores[name] = FaceDynamicsDeviation(cast(Region, upper), sign=sign, length_rule=rule, check_finite=False)
+        for name, score in scores.items():  # one by one: a dictionary would be sorted by name
+            self.add_metrics({name: score})
+
+    def update(  # type: ignore[override]  # it is ModuleDict.update that torchmetrics has redefined
+        self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[BatchOptions]
+    ) -> None:
+        """Add a batch of sequences to every metric.
+
+        Args:
+            prediction: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
+            truth: Likewise.
+            template: Neutral vertices (batch, vertices, 3) or (vertices, 3) if the motion is absolute; None
+                if prediction and truth are offsets from the template already.
+            **batch: ``lengths``, ``prediction_lengths`` and ``clip_names`` as for `SequenceMetric.update`.
+
+        Raises:
+            ValueError: As `SequenceMetric.update`; no metric has changed then.
+        """
+        self._check(prediction, truth, template, batch)
+        super().update(prediction, truth, template=template, **batch)
+
+    def forward(
+        self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[BatchOptions]
+    ) -> dict[str, Tensor]:
+        """Add a batch like `update` and return the scores of this batch alone."""
+        self._check(prediction, truth, template, batch)
+        return cast(dict[str, Tensor], super().forward(prediction, truth, template=template, **batch))
+
+    def compute(self) -> dict[str, Tensor]:
+        """The scores over all sequences so far, by name.
+
+        Raises:
+            ValueError: If no process had any sequence.
+        """
+        return cast(dict[str, Tensor], super().compute())
+
+    def summary(self) -> Summary:
+        """Regions, frames, sequences and cut frames behind the scores, over all processes."""
+        first = next(iter(self.scores().values()))
+        return Summary(self.protocol.name, self.lips, self.upper, first.coverage(), self.protocol.topology)
+
+    def scores(self) -> dict[str, SequenceMetric]:
+        """The metrics by name, not copies of them."""
+        return dict(cast(Sequence[tuple[str, SequenceMetric]], self.items(copy_state=False)))
+
+    def describe(self) -> str:
+        """The definition of every number, with the regions."""
+        return "\n".join(f"{name}: {metric.describe()}" for name, metric in self.scores().items())
+
+    def _check(self, prediction: Tensor, truth: Tensor, template: Tensor | None, batch: BatchOptions) -> None:
+        """Find every fault of a batch before it is added to the first metric."""
+        clips = align(prediction, truth, rule=self.protocol.length_rule, **batch)
+        for region in (self.lips, self.upper):
+            if region is not None:
+                region.check(clips.n_vertices)
+        if self.upper is not None:
+            clips.attach_templates(template)
+        clips.check_finite()

@@ -1,4 +1,8 @@
-"""Named sets of vertices, so that a score can say exactly which vertices it was taken over."""
+"""Named sets of vertices, so that a score can say exactly which vertices it was taken over.
+
+A `Region` is a set of vertices, `LipPairs` are pairs of an upper and a lower lip vertex, and a `Topology` knows which
+regions are in use on the meshes of the field's data sets.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,19 @@ import math
 import operator
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
+
+from facediff.errors import choices
+
+
+def _short_hash(words: Iterable[str]) -> str:
+    return hashlib.sha256(",".join(words).encode("ascii")).hexdigest()[:8]
 
 
 @dataclass(frozen=True)
@@ -24,7 +35,7 @@ class Region:
     ``first | second`` is the union of two regions.
 
     Args:
-        name: What the region is called beside a score, for example ``"biwi/lve"``.
+        name: What the region is called next to a score, for example ``"biwi/lve"``.
         indices: Vertex indices from 0, strictly increasing.
         n_vertices: Vertices of the mesh that the region belongs to, if known; it is then refused on others.
         duplicates: How many repeated indices the source held.
@@ -53,7 +64,7 @@ class Region:
             self._check_range(self.n_vertices)
 
     def __str__(self) -> str:
-        """Name, vertex count and hash, as printed beside a score."""
+        """Name, vertex count and hash, as printed next to a score."""
         return f"{self.name} ({self.count} vertices, {self.hash})"
 
     @property
@@ -71,12 +82,15 @@ class Region:
         >>> Region.from_indices("lips", [3, 1, 2, 1]).hash
         '8a6ae151'
         """
-        text = ",".join(map(str, self.indices))
-        return hashlib.sha256(text.encode("ascii")).hexdigest()[:8]
+        return _short_hash(map(str, self.indices))
 
     def tensor(self) -> Tensor:
         """The indices as an int64 tensor of shape (count,)."""
         return torch.tensor(self.indices, dtype=torch.int64)
+
+    def as_dict(self) -> dict[str, str | int]:
+        """Name, vertex count, hash and repeated indices, as plain data for reports."""
+        return {"name": self.name, "count": self.count, "hash": self.hash, "duplicates": self.duplicates}
 
     def check(self, n_vertices: int) -> None:
         """Refuse a mesh that this region cannot belong to.
@@ -143,10 +157,11 @@ class Region:
             ValueError: If the file cannot be read or is not a list of indices; the message names the file.
         """
         path = Path(path)
+        indices = read_indices(path)
         try:
-            return cls.from_indices(name or path.stem, read_indices(path), n_vertices=n_vertices)
+            return cls.from_indices(name or path.stem, indices, n_vertices=n_vertices)
         except ValueError as error:
-            raise ValueError(_naming(path, error)) from error
+            raise ValueError(f"{path}: {error}") from error
 
     @classmethod
     def from_weights(
@@ -158,9 +173,9 @@ class Region:
         the forehead where it is above 0.4.
 
         Args:
-            weights: One finite weight for each vertex of the mesh, (vertices,), or a text file of them, one a
+            weights: One finite weight for each vertex of the mesh, (vertices,), or a text file of them, one per
                 line.
-            threshold: Vertices of exactly this weight are left out.
+            threshold: Vertices of exactly this weight do not belong to the region.
             name: What to call the region; by default the file's name without its ending, or "weights", with
                 the threshold.
 
@@ -199,14 +214,147 @@ class Region:
         parts = (self, *others)
         meshes = {part.n_vertices for part in parts} - {None}
         if len(meshes) > 1:
-            told = ", ".join(f"{part} of {part.n_vertices}" for part in parts)
-            raise ValueError(f"regions of different meshes cannot be united: {told} vertices")
+            listed = ", ".join(f"{part} of {part.n_vertices}" for part in parts)
+            raise ValueError(f"regions of different meshes cannot be united: {listed} vertices")
         indices = (index for part in parts for index in part.indices)
         title = name or " + ".join(part.name for part in parts)
         return Region.from_indices(title, indices, n_vertices=meshes.pop() if meshes else None)
 
     def __or__(self, other: Region) -> Region:
         return self.union(other)
+
+
+RegionLike = Region | Sequence[int] | Tensor
+"""A `Region`, or bare indices, which become a region with a general name."""
+
+
+def as_region(region: RegionLike, name: str) -> Region:
+    """The region itself, or a region called ``name`` from bare indices."""
+    return region if isinstance(region, Region) else Region.from_indices(name, region)
+
+
+@dataclass(frozen=True)
+class LipPairs:
+    """Named pairs of an upper and a lower vertex of the inner lips, sorted and distinct.
+
+    The distance of a pair shows how far the mouth is open. Make them with `LipPairs.from_pairs` or
+    `LipPairs.from_file`. Which vertices to pair is the user's choice and part of every number: the released script
+    of the MTM metric uses the one pair (3531, 3504) of FLAME, the middle of the outer lips.
+
+    Args:
+        name: What the pairs are called next to a score, for example ``"flame/inner lips"``.
+        pairs: Two different vertex indices each, the smaller first; the pairs strictly increasing.
+        duplicates: How many repeated pairs the source held.
+
+    Raises:
+        ValueError: If there is no pair, or they are not as described.
+    """
+
+    name: str
+    pairs: tuple[tuple[int, int], ...] = field(repr=False)
+    duplicates: int = field(default=0, compare=False)
+
+    def __post_init__(self) -> None:
+        """Check the pairs."""
+        if not self.pairs:
+            raise ValueError(f"lip pairs {self.name!r} are empty; give at least one pair of vertices")
+        for first, second in self.pairs:
+            if first < 0:
+                raise ValueError(f"lip pairs {self.name!r} hold the index {first}; indices count from 0 upwards")
+            if first == second:
+                raise ValueError(f"lip pairs {self.name!r} pair vertex {first} with itself")
+        if list(self.pairs) != sorted({(min(pair), max(pair)) for pair in self.pairs}):
+            raise ValueError(f"lip pairs {self.name!r} are not sorted and distinct; use LipPairs.from_pairs")
+
+    def __str__(self) -> str:
+        """Name, number of pairs and hash, as printed next to a score."""
+        return f"{self.name} ({self.count} pairs, {self.hash})"
+
+    @property
+    def count(self) -> int:
+        """How many distinct pairs there are."""
+        return len(self.pairs)
+
+    @property
+    def hash(self) -> str:
+        """First 8 hexadecimal digits of the SHA-256 of the pairs.
+
+        Written like ``3504-3531`` with the smaller index first, sorted by number, joined by commas.
+        """
+        return _short_hash(f"{first}-{second}" for first, second in self.pairs)
+
+    def tensor(self) -> Tensor:
+        """The pairs as an int64 tensor of shape (count, 2)."""
+        return torch.tensor(self.pairs, dtype=torch.int64)
+
+    def as_dict(self) -> dict[str, str | int]:
+        """Name, number of pairs, hash and repeated pairs, as plain data for reports."""
+        return {"name": self.name, "count": self.count, "hash": self.hash, "duplicates": self.duplicates}
+
+    def check(self, n_vertices: int) -> None:
+        """Refuse a mesh that these pairs cannot belong to.
+
+        Raises:
+            ValueError: If an index is not below ``n_vertices``.
+        """
+        largest = max(second for _, second in self.pairs)
+        if largest >= n_vertices:
+            raise ValueError(
+                f"lip pairs {self} hold the index {largest}, a mesh of {n_vertices} vertices ends at "
+                f"{n_vertices - 1}; use the pairs of the motion's own topology"
+            )
+
+    @classmethod
+    def from_pairs(cls, name: str, pairs: Iterable[Iterable[int]] | Tensor) -> LipPairs:
+        """Pairs in any order, repeated or not, either vertex first.
+
+        Args:
+            name: What to call them.
+            pairs: Two integers each, or an integer tensor (pairs, 2).
+
+        Raises:
+            ValueError: If a pair is not two integers, or as for `LipPairs`.
+
+        >>> print(LipPairs.from_pairs("middle", [(3531, 3504), (3504, 3531)]))
+        middle (1 pairs, de4cd82d)
+        """
+        given = [list(pair) for pair in (pairs.tolist() if isinstance(pairs, Tensor) else pairs)]
+        if any(len(pair) != 2 or any(type(index) is not int for index in pair) for pair in given):
+            raise ValueError(f"lip pairs {name!r} must be pairs of two whole numbers, vertex indices")
+        distinct = sorted({(min(pair), max(pair)) for pair in given})
+        return cls(name, tuple(distinct), duplicates=len(given) - len(distinct))
+
+    @classmethod
+    def from_file(cls, path: str | PathLike[str], *, name: str | None = None) -> LipPairs:
+        """Pairs of a text file: indices separated by commas, blanks or line ends, each two of them a pair.
+
+        Args:
+            path: The file.
+            name: What to call them; the file's name without its ending by default.
+
+        Raises:
+            ValueError: If the file cannot be read or is not a list of pairs; the message names the file.
+        """
+        path = Path(path)
+        indices = read_indices(path)
+        if len(indices) % 2:
+            raise ValueError(f"{path}: holds {len(indices)} indices, an odd number; expected two for each pair")
+        try:
+            return cls.from_pairs(name or path.stem, zip(indices[::2], indices[1::2], strict=True))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+
+LipPairsLike = LipPairs | Iterable[Iterable[int]] | Tensor
+"""`LipPairs`, or bare pairs of indices, which get a general name."""
+
+
+def as_lip_pairs(pairs: LipPairsLike) -> LipPairs:
+    """The pairs themselves, or named ones from bare indices."""
+    return pairs if isinstance(pairs, LipPairs) else LipPairs.from_pairs("lip pairs", pairs)
+
+
+# Files of indices and of weights.
 
 
 def read_indices(path: Path) -> list[int]:
@@ -227,13 +375,13 @@ def read_indices(path: Path) -> list[int]:
 
 def _read_weights(path: Path) -> list[float]:
     found = []
-    for place, word in enumerate(_read_text(path, "one weight a line").split(), start=1):
+    for place, word in enumerate(_read_text(path, "one weight per line").split(), start=1):
         try:
             value = float(word)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise ValueError(f"{path}: entry {place} is {word[:40]!r}; expected one finite weight a line")
+            raise ValueError(f"{path}: entry {place} is {word[:40]!r}; expected one finite weight per line")
         found.append(value)
     return found
 
@@ -248,15 +396,78 @@ def _read_text(path: Path, expected: str) -> str:
         raise ValueError(f"{path} is not text; expected {expected}") from None
 
 
-def _naming(path: Path, error: ValueError) -> str:
-    """The error's message, with the file in front unless it is named already."""
-    return str(error) if str(path) in str(error) else f"{path}: {error}"
+# How many vertices the usual regions of the usual meshes have, to tell a usual region from another. Counts are facts
+# about files that circulate; the files themselves belong to their data sets and are not bundled.
+
+Part = Literal["lips", "upper"]
 
 
-RegionLike = Region | Sequence[int] | Tensor
-"""A `Region`, or bare indices, which become a region with a general name."""
+@dataclass(frozen=True)
+class Topology:
+    """A mesh and the regions in use on it.
+
+    Args:
+        name: The name of the data set.
+        n_vertices: Vertices of the mesh.
+        lips: What a lip region with that many distinct vertices is.
+        upper: Likewise for the upper face.
+    """
+
+    name: str
+    n_vertices: int
+    lips: dict[int, str]
+    upper: dict[int, str]
+
+    def bind(self, region: Region) -> Region:
+        """The region as one of this mesh, so that motion of another mesh is refused.
+
+        Raises:
+            ValueError: If the region is known to belong to another mesh, or reaches beyond this one.
+        """
+        region.check(self.n_vertices)
+        return replace(region, n_vertices=self.n_vertices)
+
+    def remark(self, part: Part, region: Region) -> str:
+        """What is known of a region by its vertex count: whose it is, or that it is not a usual one.
+
+        >>> TOPOLOGIES["biwi"].remark("lips", Region.from_indices("mine", [1, 2]))
+        'lips of 2 vertices are not usual on biwi (4996: lve.txt of BIWI)'
+        """
+        usual = self.lips if part == "lips" else self.upper
+        verb = "are" if part == "lips" else "is"
+        if region.count in usual:
+            return f"{part} of {region.count} vertices {verb} usual on {self.name}: {usual[region.count]}"
+        known = "; ".join(f"{count}: {words}" for count, words in usual.items())
+        return f"{part} of {region.count} vertices {verb} not usual on {self.name} ({known})"
 
 
-def as_region(region: RegionLike, name: str) -> Region:
-    """The region itself, or a region called ``name`` from bare indices."""
-    return region if isinstance(region, Region) else Region.from_indices(name, region)
+_FLAME_LIPS = {
+    250: "lips of FLAME's masks, as DiffSpeaker",
+    428: "lve.txt of FaceDiffuser and ProbTalk3D",
+    648: "lip.txt of TalkingStyle",
+}
+_FLAME_UPPER = {
+    827: "forehead and eye region of FLAME's masks, as DiffSpeaker",
+    1501: "fdd.txt of FaceDiffuser and ProbTalk3D",
+}
+_MULTIFACE_LIPS = {1438: "mouth weights above 0.1, as FaceDiffuser's script", 1035: "lve.txt of FaceDiffuser"}
+_MULTIFACE_UPPER = {656: "forehead weights above 0.4, as FaceDiffuser's script", 1529: "fdd.txt of FaceDiffuser"}
+
+TOPOLOGIES: dict[str, Topology] = {
+    "biwi": Topology("biwi", 23370, {4996: "lve.txt of BIWI"}, {7784: "fdd.txt of BIWI"}),
+    "vocaset": Topology("vocaset", 5023, _FLAME_LIPS, _FLAME_UPPER),
+    "mead3d": Topology("mead3d", 5023, _FLAME_LIPS, _FLAME_UPPER),
+    "multiface": Topology("multiface", 6172, _MULTIFACE_LIPS, _MULTIFACE_UPPER),
+}
+"""Every known mesh by the name of its data set."""
+
+
+def find_topology(name: str) -> Topology:
+    """The topology of that name.
+
+    Raises:
+        ValueError: If there is none; the message lists them and the nearest.
+    """
+    if name not in TOPOLOGIES:
+        raise ValueError(f"unknown topology {name!r}: {choices(name, TOPOLOGIES)}")
+    return TOPOLOGIES[name]

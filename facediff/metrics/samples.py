@@ -1,18 +1,36 @@
-"""Metrics of a stochastic model that predicts several samples of each sequence, against the truth."""
+"""Several predictions of each sequence: error of their mean and of the best, and how much they differ.
+
+Predictions are the samples of a stochastic model, which differ by their noise, or predictions in the styles of several
+identities.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Any, ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
 
-from facediff.metrics.base import SequenceMetric
-from facediff.metrics.clips import Clip, Clips, Lengths, align
-from facediff.metrics.formulas import vertex_error
-from facediff.metrics.options import POOLING_WORDS, POOLINGS, LengthRule, Pooling, check_option
+from facediff.metrics.base import (
+    BatchOptions,
+    Clip,
+    Clips,
+    Inferred,
+    LengthRule,
+    Lengths,
+    Pooling,
+    ProcessOptions,
+    SequenceMetric,
+    SequenceOptions,
+    align,
+    check_option,
+    functional,
+)
+from facediff.metrics.one_pass import ErrorOf, one_pass
 from facediff.metrics.regions import RegionLike, as_region
+from facediff.registry import metric
 
 
 def align_samples(
@@ -20,10 +38,8 @@ def align_samples(
     truth: Tensor | None,
     *,
     n_samples: int | None,
-    lengths: Lengths | None,
-    prediction_lengths: Lengths | None,
-    clip_names: Sequence[str] | None,
-    rule: LengthRule,
+    rule: LengthRule = "min",
+    **batch: Unpack[BatchOptions],
 ) -> Clips:
     """As `align`, for several predictions of each sequence.
 
@@ -31,10 +47,8 @@ def align_samples(
         samples: (batch, samples, frames, vertices, 3), or (samples, frames, vertices, 3) of one sequence.
         truth: (batch, frames, vertices, 3) or (frames, vertices, 3); None if there is none.
         n_samples: How many samples there must be; None for any number.
-        lengths: As for `align`.
-        prediction_lengths: As for `align`; the samples of a sequence are equally long.
-        clip_names: One name a sequence, for messages.
         rule: What to do where the lengths differ.
+        **batch: As for `align`; the samples of a sequence are equally long.
 
     Returns:
         Sequences whose predictions are (frames, samples, vertices, 3).
@@ -53,20 +67,20 @@ def align_samples(
             "number it is another metric: set n_samples"
         )
     first = samples.select(-4, 0)
-    clips = align(
-        first,
-        first if truth is None else truth,
-        lengths=lengths,
-        prediction_lengths=prediction_lengths,
-        clip_names=clip_names,
-        rule=rule,
-    )
+    clips = align(first, first if truth is None else truth, rule=rule, **batch)
     each = [samples] if samples.ndim == 4 else list(samples)
-    found = []
-    for clip, several in zip(clips.clips, each, strict=True):
-        prediction = several.detach()[:, : clip.frames].transpose(0, 1)
-        found.append(replace(clip, prediction=prediction, truth=prediction if truth is None else clip.truth))
-    return replace(clips, clips=tuple(found))
+    predictions = [
+        several.detach()[:, : clip.frames].transpose(0, 1) for clip, several in zip(clips.clips, each, strict=True)
+    ]
+    clips = clips.attach("prediction", predictions)
+    return clips if truth is not None else clips.attach("truth", predictions)
+
+
+def _sample_count(given: Mapping[str, Any]) -> int:
+    return given["samples"].shape[-4] if given["samples"].ndim > 3 else 2
+
+
+_INFERRED: Inferred = {"n_samples": _sample_count}
 
 
 class SamplesMetric(SequenceMetric):
@@ -74,16 +88,16 @@ class SamplesMetric(SequenceMetric):
 
     Args:
         lips: Lip vertices, a `Region` or indices.
-        definition: The metric in words; ``{lips}`` and ``{samples}`` are filled in.
-        n_samples: How many samples there are of each sequence.
-        squared: Whether distances are squared.
+        definition: Of what the lip vertex error is taken, in words.
+        n_samples: How many samples there are of each sequence; other numbers are refused.
+        squared: Whether distances are squared; the score is then in the vertices' unit squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`.
     """
 
     higher_is_better = False
+    needs = ("lips", "samples")
+    inferred: ClassVar[Inferred] = _INFERRED
     indices: Tensor
 
     def __init__(
@@ -94,77 +108,51 @@ class SamplesMetric(SequenceMetric):
         n_samples: int,
         squared: bool,
         pooling: Pooling,
-        length_rule: LengthRule,
-        check_finite: bool,
-        **kwargs: object,
+        **options: Unpack[SequenceOptions],
     ) -> None:
-        check_option("pooling", pooling, POOLINGS)
         if n_samples < 1:
             raise ValueError(f"n_samples is {n_samples}; expected at least 1")
-        region = as_region(lips, "lips")
         distance, unit = ("squared distance", "unit²") if squared else ("distance", "unit")
-        told = definition.format(lips=region, samples=n_samples, distance=distance)
-        super().__init__(
-            definition=f"{told}; {POOLING_WORDS[pooling]} [{unit}]",
-            pooling=pooling,
-            region=region,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
-        )
+        words = f"{definition}, in each frame the largest {distance} over {{region}}; {{pooling}} [{unit}]"
+        super().__init__(definition=words, pooling=pooling, region=as_region(lips, "lips"), **options)
         self.n_samples = n_samples
         self.squared = squared
 
-    def update(
-        self,
-        samples: Tensor,
-        truth: Tensor,
-        *,
-        lengths: Lengths | None = None,
-        prediction_lengths: Lengths | None = None,
-        clip_names: Sequence[str] | None = None,
-    ) -> None:
+    def update(self, samples: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> None:
         """Add a batch of sequences.
 
         Args:
             samples: Predictions (batch, samples, frames, vertices, 3), or of one sequence (samples, frames,
                 vertices, 3), floating point.
             truth: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
-            lengths: As for `ComparisonMetric.update`.
-            prediction_lengths: Valid frames of the predictions, the same for all samples of a sequence.
-            clip_names: One name a sequence, for messages.
+            **batch: Those of `BatchOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
 
         Raises:
-            ValueError: As for `ComparisonMetric.update`, and if there are not ``n_samples`` samples. Nothing
+            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples. Nothing
                 is added then.
         """
-        clips = align_samples(
-            samples,
-            truth,
-            n_samples=self.n_samples,
-            lengths=lengths,
-            prediction_lengths=prediction_lengths,
-            clip_names=clip_names,
-            rule=self.length_rule,
-        )
-        self._add(clips)
+        self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
 
 
+@metric.register("mean_estimate_error")
 class MeanEstimateError(SamplesMetric):
     """Mean estimate error (MEE): the lip vertex error of the mean of several samples.
 
     The vertex-wise mean of the N samples is scored as one prediction: in each frame the largest (squared)
     distance over the lip vertices, pooled over frames. Source: ProbTalk3D's script (N = 10, squared, pooled by
-    frames). The number depends on N.
+    frames). The number depends on N. In the vertices' unit squared, or in the unit if not ``squared``.
 
     Args:
         lips: Lip vertices, a `Region` or indices.
         n_samples: N; other numbers of samples are refused.
-        squared: Whether distances are squared; the score is then in the vertices' unit squared.
+        squared: Whether distances are squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`.
+
+    >>> import torch
+    >>> samples = torch.stack([torch.ones(4, 2, 3), -torch.ones(4, 2, 3)])
+    >>> mean_estimate_error(samples, torch.zeros(4, 2, 3), [0]).item()
+    0.0
     """
 
     def __init__(
@@ -174,20 +162,10 @@ class MeanEstimateError(SamplesMetric):
         n_samples: int = 10,
         squared: bool = True,
         pooling: Pooling = "frames",
-        length_rule: LengthRule = "min",
-        check_finite: bool = True,
-        **kwargs: object,
+        **options: Unpack[SequenceOptions],
     ) -> None:
-        super().__init__(
-            lips,
-            definition="of the mean of {samples} samples, in each frame the largest {distance} over {lips}",
-            n_samples=n_samples,
-            squared=squared,
-            pooling=pooling,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
-        )
+        words = f"of the mean of {n_samples} samples"
+        super().__init__(lips, definition=words, n_samples=n_samples, squared=squared, pooling=pooling, **options)
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The error of the mean of one sequence's samples."""
@@ -195,24 +173,29 @@ class MeanEstimateError(SamplesMetric):
         lips = torch.zeros_like(truth, dtype=torch.float64)
         for sample in clip.prediction.unbind(1):
             lips += sample.index_select(1, self.indices)
-        return vertex_error(lips / self.n_samples, truth, None, reduction="max", squared=self.squared)
+        return one_pass(lips / self.n_samples, truth, errors=[ErrorOf(None, "max", self.squared)])[0][0]
 
 
+@metric.register("coverage_error")
 class CoverageError(SamplesMetric):
     """Coverage error (CE): the lip vertex error of the best of several samples of each sequence.
 
     Of the N samples of a sequence the one with the smallest sum over frames of the largest (squared) distance
     over the lip vertices is taken, and its frames are pooled. Source: ProbTalk3D's script (N = 10, squared,
-    pooled by frames). The number falls with N, so errors over different N cannot be compared.
+    pooled by frames). The number falls with N, so errors over different N cannot be compared. In the vertices' unit
+    squared, or in the unit if not ``squared``.
 
     Args:
         lips: Lip vertices, a `Region` or indices.
         n_samples: N; other numbers of samples are refused.
-        squared: Whether distances are squared; the score is then in the vertices' unit squared.
+        squared: Whether distances are squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`.
+
+    >>> import torch
+    >>> samples = torch.stack([torch.ones(4, 2, 3), 2 * torch.ones(4, 2, 3)])
+    >>> coverage_error(samples, torch.zeros(4, 2, 3), [0]).item()
+    3.0
     """
 
     def __init__(
@@ -222,126 +205,196 @@ class CoverageError(SamplesMetric):
         n_samples: int = 10,
         squared: bool = True,
         pooling: Pooling = "frames",
-        length_rule: LengthRule = "min",
-        check_finite: bool = True,
-        **kwargs: object,
+        **options: Unpack[SequenceOptions],
     ) -> None:
-        super().__init__(
-            lips,
-            definition="of the best of {samples} samples of each sequence, in each frame the largest {distance} over "
-            "{lips}",
-            n_samples=n_samples,
-            squared=squared,
-            pooling=pooling,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
-        )
+        words = f"of the best of {n_samples} samples of each sequence"
+        super().__init__(lips, definition=words, n_samples=n_samples, squared=squared, pooling=pooling, **options)
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The error of the best of one sequence's samples."""
-        errors = [
-            vertex_error(sample, clip.truth, self.indices, reduction="max", squared=self.squared)
-            for sample in clip.prediction.unbind(1)
-        ]
+        lips = ErrorOf(self.indices, "max", self.squared)
+        errors = [one_pass(sample, clip.truth, errors=[lips])[0][0] for sample in clip.prediction.unbind(1)]
         return torch.stack(errors).amin()
 
 
-def mean_estimate_error(
-    samples: Tensor,
-    truth: Tensor,
-    lips: RegionLike,
-    *,
-    squared: bool = True,
-    pooling: Pooling = "frames",
-    length_rule: LengthRule = "min",
-    lengths: Lengths | None = None,
-    prediction_lengths: Lengths | None = None,
-    clip_names: Sequence[str] | None = None,
-) -> Tensor:
-    """Mean estimate error (MEE): lip vertex error of the mean of the samples, see `MeanEstimateError`.
+# How much predictions of one sequence differ.
+
+Pairing = Literal["shuffled", "all"]
+"""Which samples are compared: a random half with the other half, or each with each."""
+
+
+class Diversity(SequenceMetric):
+    """Base of diversities: mean over pairs of predictions of one sequence of mean_t mean_v ‖a − b‖₂ (not squared).
+
+    In the vertices' unit; a template cancels. There is no best value: noise is diverse too.
 
     Args:
-        samples: Predictions (batch, samples, frames, vertices, 3) or (samples, frames, vertices, 3).
-        truth: (batch, frames, vertices, 3) or (frames, vertices, 3).
-        lips: Lip vertices, a `Region` or indices.
-        squared: Whether distances are squared.
+        region: Vertices to look at; None for all.
+        definition: Which predictions are compared, in words.
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        lengths: Valid frames (batch,) or mask (batch, frames), of both sides unless the next is given.
-        prediction_lengths: Valid frames of the predictions.
-        clip_names: One name a sequence, for messages.
-
-    Returns:
-        Float64 scalar in the vertices' unit squared, or in the unit if not ``squared``.
-
-    Raises:
-        ValueError: As `SamplesMetric.update`.
-
-    >>> import torch
-    >>> samples = torch.stack([torch.ones(4, 2, 3), -torch.ones(4, 2, 3)])
-    >>> mean_estimate_error(samples, torch.zeros(4, 2, 3), [0]).item()
-    0.0
+        check_finite: Whether NaN and infinity are refused.
+        **options: Those of `ProcessOptions`.
     """
-    metric = MeanEstimateError(
-        lips,
-        n_samples=_count(samples),
-        squared=squared,
-        pooling=pooling,
-        length_rule=length_rule,
-        sync_on_compute=False,
-    ).to(truth.device)
-    metric.update(samples, truth, lengths=lengths, prediction_lengths=prediction_lengths, clip_names=clip_names)
-    return metric.compute()
+
+    def __init__(
+        self,
+        region: RegionLike | None,
+        *,
+        definition: str,
+        pooling: Pooling,
+        check_finite: bool,
+        **options: Unpack[ProcessOptions],
+    ) -> None:
+        words = f"{definition}, the mean distance over {{region}}; {{pooling}} [unit]"
+        super().__init__(definition=words, pooling=pooling, region=region, check_finite=check_finite, **options)
+
+    def pairs(self, count: int) -> list[tuple[int, int]]:
+        """Which of ``count`` predictions are compared."""
+        return list(combinations(range(count), 2))
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The diversity of one sequence's predictions."""
+        several, error = clip.prediction, ErrorOf(self.indices, "mean", squared=False)
+        distances = [
+            one_pass(several[:, one], several[:, other], errors=[error])[0][0]
+            for one, other in self.pairs(several.shape[1])
+        ]
+        if not distances:
+            return torch.full((), torch.nan, dtype=torch.float64, device=several.device)
+        return torch.stack(distances).mean()
 
 
-def coverage_error(
-    samples: Tensor,
-    truth: Tensor,
-    lips: RegionLike,
-    *,
-    squared: bool = True,
-    pooling: Pooling = "frames",
-    length_rule: LengthRule = "min",
-    lengths: Lengths | None = None,
-    prediction_lengths: Lengths | None = None,
-    clip_names: Sequence[str] | None = None,
-) -> Tensor:
-    """Coverage error (CE): lip vertex error of the best sample of each sequence, see `CoverageError`.
+@metric.register("sample_diversity")
+class SampleDiversity(Diversity):
+    """Diversity over samples: how much the predictions of one sequence differ from one noise to another.
+
+    ``pairing="shuffled"`` is ProbTalk3D's: the N samples are put in random order and the first half is compared
+    with the second, N / 2 pairs. Here the order is drawn from ``seed`` alone and is the same for every
+    sequence, so that the score does not depend on the order of sequences, batches or processes; the script
+    goes on drawing from one sequence to the next. ``pairing="all"`` compares all N (N − 1) / 2 pairs and
+    has the same expectation with less chance in it.
+
+    The score is the mean over pairs of mean_t mean_v ‖a − b‖₂ (not squared), mean over sequences, in the
+    vertices' unit. A template cancels. The pairs' expectation does not depend on N.
 
     Args:
-        samples: Predictions (batch, samples, frames, vertices, 3) or (samples, frames, vertices, 3).
-        truth: (batch, frames, vertices, 3) or (frames, vertices, 3).
-        lips: Lip vertices, a `Region` or indices.
-        squared: Whether distances are squared.
-        pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        lengths: Valid frames (batch,) or mask (batch, frames), of both sides unless the next is given.
-        prediction_lengths: Valid frames of the predictions.
-        clip_names: One name a sequence, for messages.
-
-    Returns:
-        Float64 scalar in the vertices' unit squared, or in the unit if not ``squared``.
+        region: Vertices to look at, a `Region` or indices; None for all.
+        pairing: ``"shuffled"`` as in ProbTalk3D's script, or ``"all"``.
+        n_samples: N; other numbers of samples are refused. Even for ``"shuffled"``.
+        seed: Of the order; not used with ``"all"``.
+        pooling: ``"sequences"`` as in the script, or ``"frames"``.
+        check_finite: Whether NaN and infinity are refused.
+        **options: Those of `ProcessOptions`.
 
     Raises:
-        ValueError: As `SamplesMetric.update`.
+        ValueError: If an option is unknown, or ``n_samples`` cannot be paired.
 
-    >>> import torch
-    >>> samples = torch.stack([torch.ones(4, 2, 3), 2 * torch.ones(4, 2, 3)])
-    >>> coverage_error(samples, torch.zeros(4, 2, 3), [0]).item()
-    3.0
+    >>> samples = torch.stack([torch.zeros(4, 2, 3), torch.ones(4, 2, 3)])
+    >>> round(sample_diversity(samples).item(), 4)
+    1.7321
     """
-    metric = CoverageError(
-        lips,
-        n_samples=_count(samples),
-        squared=squared,
-        pooling=pooling,
-        length_rule=length_rule,
-        sync_on_compute=False,
-    ).to(truth.device)
-    metric.update(samples, truth, lengths=lengths, prediction_lengths=prediction_lengths, clip_names=clip_names)
-    return metric.compute()
+
+    needs = ("samples",)
+    inferred: ClassVar[Inferred] = _INFERRED
+
+    def __init__(
+        self,
+        region: RegionLike | None = None,
+        *,
+        pairing: Pairing = "shuffled",
+        n_samples: int = 10,
+        seed: int = 1234,
+        pooling: Pooling = "sequences",
+        check_finite: bool = True,
+        **options: Unpack[ProcessOptions],
+    ) -> None:
+        check_option("pairing", pairing, Pairing)
+        if n_samples < 2 or (pairing == "shuffled" and n_samples % 2):
+            raise ValueError(
+                f"n_samples is {n_samples}; expected at least 2, and an even number to compare halves of them"
+            )
+        how = f"a random half with the other (seed {seed})" if pairing == "shuffled" else "all pairs"
+        words = f"of {n_samples} samples, {how}"
+        super().__init__(region, definition=words, pooling=pooling, check_finite=check_finite, **options)
+        self.pairing: Pairing = pairing
+        self.n_samples = n_samples
+        self.seed = seed
+
+    def pairs(self, count: int) -> list[tuple[int, int]]:
+        """Which of ``count`` samples are compared."""
+        if self.pairing == "all":
+            return super().pairs(count)
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(self.seed)).tolist()
+        return list(zip(order[: count // 2], order[count // 2 :], strict=True))
+
+    def update(  # type: ignore[override]  # there is no truth
+        self, samples: Tensor, *, lengths: Lengths | None = None, clip_names: Sequence[str] | None = None
+    ) -> None:
+        """Add a batch of sequences.
+
+        Args:
+            samples: (batch, samples, frames, vertices, 3), or of one sequence (samples, frames, vertices, 3),
+                floating point.
+            lengths: Valid frames of each sequence (batch,), or a mask (batch, frames).
+            clip_names: One name per sequence, for messages.
+
+        Raises:
+            ValueError: If shapes or lengths do not fit, there are not ``n_samples`` samples, or a valid frame
+                holds NaN or infinity. Nothing is added then.
+        """
+        self.add(align_samples(samples, None, n_samples=self.n_samples, lengths=lengths, clip_names=clip_names))
 
 
-def _count(samples: Tensor) -> int:
-    return samples.shape[-4] if samples.ndim > 3 else 1
+@metric.register("identity_diversity")
+class IdentityDiversity(Diversity):
+    """Diversity over identities: how much the predictions of one sequence differ from one style to another.
+
+    The same speech is predicted in the style of several identities; the score is the mean over all unordered
+    pairs of identities of mean_t mean_v ‖a − b‖₂ (not squared), mean over sequences, in the vertices' unit.
+    Source: FaceDiffuser's script. All predictions must be on the same template, or be offsets from their
+    own. A sequence with a single identity is left out, as there; the number of identities may differ between
+    sequences.
+
+    Args:
+        region: Vertices to look at, a `Region` or indices; None for all.
+        pooling: ``"sequences"`` as in the script, or ``"frames"``.
+        check_finite: Whether NaN and infinity are refused.
+        **options: Those of `ProcessOptions`.
+    """
+
+    leaves_out = "each was predicted for one identity only"
+    needs = ("conditions",)
+
+    def __init__(
+        self,
+        region: RegionLike | None = None,
+        *,
+        pooling: Pooling = "sequences",
+        check_finite: bool = True,
+        **options: Unpack[ProcessOptions],
+    ) -> None:
+        words = "of predictions for several identities, all pairs"
+        super().__init__(region, definition=words, pooling=pooling, check_finite=check_finite, **options)
+
+    def update(  # type: ignore[override]  # there is no truth
+        self, predictions: Tensor, *, lengths: Lengths | None = None, clip_names: Sequence[str] | None = None
+    ) -> None:
+        """Add a batch of sequences.
+
+        Args:
+            predictions: (batch, identities, frames, vertices, 3), or of one sequence (identities, frames,
+                vertices, 3), floating point.
+            lengths: Valid frames of each sequence (batch,), or a mask (batch, frames).
+            clip_names: One name per sequence, for messages.
+
+        Raises:
+            ValueError: If shapes or lengths do not fit, or a valid frame holds NaN or infinity. Nothing is
+                added then.
+        """
+        self.add(align_samples(predictions, None, n_samples=None, lengths=lengths, clip_names=clip_names))
+
+
+mean_estimate_error = functional(MeanEstimateError)
+coverage_error = functional(CoverageError)
+sample_diversity = functional(SampleDiversity)
+identity_diversity = functional(IdentityDiversity)

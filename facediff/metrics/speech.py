@@ -1,154 +1,33 @@
-"""Do the lips move much when the voice is loud? Correlation of the intensities of speech and lips."""
+"""Do the lips move much when the voice is loud? Correlation of the intensities of speech and lips (SLCC).
+
+The intensity of speech s[t] is the root mean square of the samples of frame t; that of the lips
+m[t] = mean_{v∈M} ‖x[t, v] − x[t − 1, v]‖₂ is their mean speed, t from the second frame on.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor
 
-from facediff.metrics.base import SequenceMetric
-from facediff.metrics.clips import Clip, Clips, Lengths, align
-from facediff.metrics.formulas import correlation, speed
-from facediff.metrics.options import SUBJECT_WORDS, SUBJECTS, LengthRule, Subject, check_option
-from facediff.metrics.regions import Region, RegionLike, as_region
-
-
-class SpeechLipMetric(SequenceMetric):
-    """Base of metrics that hold the lips' motion against the intensity of the speech.
-
-    The intensity of speech s[t] is the root mean square of the samples of frame t; that of the lips
-    m[t] = mean_{v∈M} ‖x[t, v] − x[t − 1, v]‖₂ is their mean speed, t from the second frame on.
-
-    Args:
-        lips: Lip vertices.
-        of: Whose lips.
-        definition: The metric in words.
-        sample_rate: Samples of the speech a second, if sound is given rather than intensities.
-        frames_per_second: Of the motion, likewise.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
-    """
-
-    indices: Tensor
-
-    def __init__(
-        self,
-        lips: Region,
-        *,
-        of: Subject,
-        definition: str,
-        sample_rate: int | None,
-        frames_per_second: float | None,
-        length_rule: LengthRule,
-        check_finite: bool,
-        **kwargs: object,
-    ) -> None:
-        check_option("of", of, SUBJECTS)
-        if (sample_rate is None) != (frames_per_second is None):
-            raise ValueError("sample_rate and frames_per_second belong together; give both, or none with intensities")
-        if sample_rate is not None and frames_per_second is not None and not 0 < frames_per_second <= sample_rate:
-            raise ValueError(f"{frames_per_second} frames a second do not fit {sample_rate} samples a second")
-        super().__init__(
-            definition=definition,
-            pooling="sequences",
-            region=lips,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
-        )
-        self.of: Subject = of
-        self.sample_rate = sample_rate
-        self.frames_per_second = frames_per_second
-
-    def update(
-        self,
-        prediction: Tensor,
-        truth: Tensor,
-        *,
-        waveform: Tensor | None = None,
-        intensity: Tensor | None = None,
-        lengths: Lengths | None = None,
-        prediction_lengths: Lengths | None = None,
-        clip_names: Sequence[str] | None = None,
-    ) -> None:
-        """Add a batch of sequences with their speech.
-
-        Args:
-            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: Likewise.
-            waveform: The sound (batch, samples), or (samples,) of one sequence, at the metric's
-                ``sample_rate``, beginning with the first frame. Samples beyond the scored frames are not read.
-            intensity: Instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
-            lengths: As for `ComparisonMetric.update`.
-            prediction_lengths: As for `ComparisonMetric.update`.
-            clip_names: One name a sequence, for messages.
-
-        Raises:
-            ValueError: As for `ComparisonMetric.update`, and if the speech is missing, given twice, too short
-                or not finite. Nothing is added then.
-        """
-        clips = align(
-            prediction,
-            truth,
-            lengths=lengths,
-            prediction_lengths=prediction_lengths,
-            clip_names=clip_names,
-            rule=self.length_rule,
-        )
-        self._add(self.with_speech(clips, waveform, intensity, single=truth.ndim == 3))
-
-    def with_speech(self, clips: Clips, waveform: Tensor | None, intensity: Tensor | None, *, single: bool) -> Clips:
-        """The sequences with the intensity of their speech.
-
-        Args:
-            clips: The sequences.
-            waveform: As for `update`.
-            intensity: As for `update`.
-            single: Whether the caller gave one sequence without batch axis.
-
-        Raises:
-            ValueError: As `update`.
-        """
-        if waveform is not None and intensity is None:
-            name, given = "waveform", waveform
-        elif intensity is not None and waveform is None:
-            name, given = "intensity", intensity
-        else:
-            raise ValueError("give the speech once: as waveform= or as intensity=")
-        count = len(clips.clips)
-        fits = given.ndim == 1 if single else given.ndim == 2 and len(given) == count
-        if not fits or not given.is_floating_point():
-            raise ValueError(
-                f"{name} has shape {tuple(given.shape)} and type {given.dtype}; expected floating-point numbers, one "
-                f"row for each of {count} sequences"
-            )
-        read = self._intensity if name == "waveform" else self._cut
-        given = given.detach()
-        rows = [given] if single else list(given)
-        spoken = (
-            replace(clip, speech=read(clip, row).to(clip.truth.device))
-            for clip, row in zip(clips.clips, rows, strict=True)
-        )
-        return replace(clips, clips=tuple(spoken))
-
-    def _intensity(self, clip: Clip, waveform: Tensor) -> Tensor:
-        if self.sample_rate is None or self.frames_per_second is None:
-            raise ValueError("speech as a waveform needs sample_rate= and frames_per_second= of the metric")
-        try:
-            return speech_intensity(waveform, clip.frames, self.sample_rate, self.frames_per_second)
-        except ValueError as error:
-            raise ValueError(f"{clip.name}: {error}") from error
-
-    def _cut(self, clip: Clip, intensity: Tensor) -> Tensor:
-        if len(intensity) < clip.frames:
-            raise ValueError(f"{clip.name}: intensity of {len(intensity)} frames for {clip.frames} frames of motion")
-        found = intensity[: clip.frames].double()
-        if not bool(found.isfinite().all()):
-            raise ValueError(f"the intensity of {clip.name} holds NaN or infinity; repair or leave out this clip")
-        return found
+from facediff.metrics.base import (
+    SIDE_WORDS,
+    BatchOptions,
+    Clip,
+    Clips,
+    Coverage,
+    Inferred,
+    SequenceMetric,
+    SequenceOptions,
+    Side,
+    check_option,
+    functional,
+)
+from facediff.metrics.mouth import correlation, speed
+from facediff.metrics.regions import RegionLike, as_region
+from facediff.registry import metric
 
 
 def speech_intensity(waveform: Tensor, frames: int, sample_rate: int, frames_per_second: float) -> Tensor:
@@ -159,8 +38,8 @@ def speech_intensity(waveform: Tensor, frames: int, sample_rate: int, frames_per
     Args:
         waveform: (samples,), floating point; samples beyond the last frame are not read.
         frames: How many frames.
-        sample_rate: Samples a second.
-        frames_per_second: Frames a second.
+        sample_rate: Samples per second.
+        frames_per_second: Frames per second.
 
     Returns:
         (frames,), float64, in the waveform's unit.
@@ -180,22 +59,131 @@ def speech_intensity(waveform: Tensor, frames: int, sample_rate: int, frames_per
     bounds[-1] = min(bounds[-1], len(waveform))
     power = waveform[: bounds[-1]].double().square()
     if not bool(power.isfinite().all()):
-        raise ValueError("the speech holds NaN or infinity; repair or leave out this clip")
+        raise ValueError("the speech holds NaN or infinity; repair or omit this clip")
     lengths = torch.tensor(bounds, device=waveform.device).diff()
     frame_of_sample = torch.repeat_interleave(torch.arange(frames, device=waveform.device), lengths)
     return (torch.zeros_like(lengths, dtype=torch.float64).index_add_(0, frame_of_sample, power) / lengths).sqrt()
 
 
+class SpeechLipMetric(SequenceMetric):
+    """Base of metrics that compare the lips' motion with the intensity of the speech.
+
+    Args:
+        lips: Lip vertices, a `Region` or indices.
+        definition: The metric in words.
+        of: Whose lips: ``"prediction"``, ``"truth"`` or ``"gap"``, the prediction's minus the truth's.
+        sample_rate: Samples of the speech per second; needed for waveforms, not for intensities.
+        frames_per_second: Of the motion; likewise.
+        **options: Those of `SequenceOptions`; NaN and infinity in the speech are always refused.
+
+    Raises:
+        ValueError: If an option is unknown, or only one of the rates is given, or they do not fit.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ("lips", "speech")
+    indices: Tensor
+
+    def __init__(
+        self,
+        lips: RegionLike,
+        *,
+        definition: str,
+        of: Side,
+        sample_rate: int | None,
+        frames_per_second: float | None,
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        check_option("of", of, Side)
+        if (sample_rate is None) != (frames_per_second is None):
+            raise ValueError("sample_rate and frames_per_second belong together; give both, or none with intensities")
+        if sample_rate is not None and frames_per_second is not None and not 0 < frames_per_second <= sample_rate:
+            raise ValueError(f"{frames_per_second} frames a second do not fit {sample_rate} samples a second")
+        super().__init__(definition=definition, region=as_region(lips, "lips"), **options)
+        self.of: Side = of
+        self.sample_rate = sample_rate
+        self.frames_per_second = frames_per_second
+
+    def update(
+        self,
+        prediction: Tensor,
+        truth: Tensor,
+        *,
+        waveform: Tensor | None = None,
+        intensity: Tensor | None = None,
+        **batch: Unpack[BatchOptions],
+    ) -> None:
+        """Add a batch of sequences with their speech.
+
+        Args:
+            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
+            truth: Likewise.
+            waveform: The sound (batch, samples), or (samples,) of one sequence, at the metric's
+                ``sample_rate``, beginning with the first frame. Samples beyond the scored frames are not read.
+            intensity: Instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
+            **batch: Those of `BatchOptions`.
+
+        Raises:
+            ValueError: As for `SequenceMetric.update`, and if the speech is missing, given twice, too short
+                or not finite. Nothing is added then.
+        """
+        clips = self.align(prediction, truth, **batch)
+        self.add(self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3))
+
+    def attach_speech(self, clips: Clips, waveform: Tensor | None, intensity: Tensor | None, *, single: bool) -> Clips:
+        """The sequences with the intensity of their speech.
+
+        Args:
+            clips: The sequences.
+            waveform: As for `update`.
+            intensity: As for `update`.
+            single: Whether the caller gave one sequence without batch axis.
+
+        Raises:
+            ValueError: As `update`.
+        """
+        given = intensity if waveform is None else waveform
+        if given is None or (waveform is not None and intensity is not None):
+            raise ValueError("give the speech once: as waveform= or as intensity=")
+        name, read = ("intensity", self._cut) if waveform is None else ("waveform", self._intensity)
+        count = len(clips.clips)
+        fits = given.ndim == 1 if single else given.ndim == 2 and len(given) == count
+        if not fits or not given.is_floating_point():
+            raise ValueError(
+                f"{name} has shape {tuple(given.shape)} and type {given.dtype}; expected floating-point numbers, one "
+                f"row for each of {count} sequences"
+            )
+        rows = [given.detach()] if single else list(given.detach())
+        spoken = [read(clip, row).to(clip.truth.device) for clip, row in zip(clips.clips, rows, strict=True)]
+        return clips.attach("speech", spoken)
+
+    def _intensity(self, clip: Clip, waveform: Tensor) -> Tensor:
+        if self.sample_rate is None or self.frames_per_second is None:
+            raise ValueError("speech as a waveform needs sample_rate= and frames_per_second= of the metric")
+        try:
+            return speech_intensity(waveform, clip.frames, self.sample_rate, self.frames_per_second)
+        except ValueError as error:
+            raise ValueError(f"{clip.name}: {error}") from error
+
+    def _cut(self, clip: Clip, intensity: Tensor) -> Tensor:
+        if len(intensity) < clip.frames:
+            raise ValueError(f"{clip.name}: intensity of {len(intensity)} frames for {clip.frames} frames of motion")
+        found = intensity[: clip.frames].double()
+        if not bool(found.isfinite().all()):
+            raise ValueError(f"the intensity of {clip.name} holds NaN or infinity; repair or omit this clip")
+        return found
+
+
+@metric.register("frame_speech_lip_correlation")
 class FrameSpeechLipCorrelation(SpeechLipMetric):
     """Speech–lip intensity correlation (SLCC) over the frames of each sequence.
 
     Per sequence Pearson's correlation over frames, from the second on, between the speech's intensity s[t] and
-    the lips' m[t] (see `SpeechLipMetric`); then the mean over sequences. From −1 to 1, without unit; the
+    the lips' m[t] (see `facediff.metrics.speech`); then the mean over sequences. From −1 to 1, without unit; the
     scale of sound and mesh does not matter, nor does a template.
 
     ``of="gap"`` is the prediction's minus the truth's: negative where the lips follow loudness less
     than the truth's. Lips that do not vary count 0; a sequence whose speech does not vary, or with fewer
-    than three frames, is left out, and `coverage` says so.
+    than three frames, is left out and counted by `coverage`.
 
     The SLCC of "Perceptually Accurate 3D Talking Head Generation" (Chae-Yeon et al., CVPR 2025) is taken
     over clips instead: `ClipSpeechLipCorrelation`. This one asks the same within a sentence; the definition is ours.
@@ -203,11 +191,15 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
     Args:
         lips: Lip vertices, a `Region` or indices.
         of: ``"prediction"``, ``"truth"`` or ``"gap"``.
-        sample_rate: Samples of the speech a second; needed for waveforms, not for intensities.
+        sample_rate: Samples of the speech per second; needed for waveforms, not for intensities.
         frames_per_second: Of the motion; likewise.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity in the motion are refused; in the speech they always are.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`; NaN and infinity in the speech are always refused.
+
+    >>> import torch
+    >>> loudness = torch.tensor([0.0, 1.0, 3.0, 2.0])
+    >>> motion = loudness.cumsum(0)[:, None, None].expand(4, 5, 3)
+    >>> round(frame_speech_lip_correlation(motion, motion, [0, 1], intensity=loudness).item(), 6)
+    1.0
     """
 
     leaves_out = "the intensity of the speech does not vary"
@@ -216,26 +208,19 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
         self,
         lips: RegionLike,
         *,
-        of: Subject = "prediction",
+        of: Side = "prediction",
         sample_rate: int | None = None,
         frames_per_second: float | None = None,
-        length_rule: LengthRule = "min",
-        check_finite: bool = True,
-        **kwargs: object,
+        **options: Unpack[SequenceOptions],
     ) -> None:
-        check_option("of", of, SUBJECTS)
-        region = as_region(lips, "lips")
+        check_option("of", of, Side)
+        words = (
+            "in each sequence the Pearson correlation over frames between the intensity of the speech (root "
+            f"mean square of a frame) and the mean speed of {{region}}, {SIDE_WORDS[of]}; mean over sequences; lips "
+            "that do not vary count 0, a sequence whose speech does not vary is left out [1]"
+        )
         super().__init__(
-            region,
-            of=of,
-            definition="in each sequence the Pearson correlation over frames between the intensity of the speech (root "
-            f"mean square of a frame) and the mean speed of {region}, {SUBJECT_WORDS[of]}; mean over sequences; lips "
-            "that do not vary count 0, a sequence whose speech does not vary is left out [1]",
-            sample_rate=sample_rate,
-            frames_per_second=frames_per_second,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
+            lips, definition=words, of=of, sample_rate=sample_rate, frames_per_second=frames_per_second, **options
         )
 
     def clip_value(self, clip: Clip) -> Tensor:
@@ -249,64 +234,187 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
         return follow(clip.prediction if self.of == "prediction" else clip.truth)
 
 
-def frame_speech_lip_correlation(
-    prediction: Tensor,
-    truth: Tensor,
-    lips: RegionLike,
-    *,
-    waveform: Tensor | None = None,
-    intensity: Tensor | None = None,
-    of: Subject = "prediction",
-    sample_rate: int | None = None,
-    frames_per_second: float | None = None,
-    length_rule: LengthRule = "min",
-    lengths: Lengths | None = None,
-    prediction_lengths: Lengths | None = None,
-    clip_names: Sequence[str] | None = None,
-) -> Tensor:
-    """Speech–lip intensity correlation over frames, see `FrameSpeechLipCorrelation`.
+# Columns of the sums that are kept for each identity; for the lips the sum, sum of squares, and sum of products with
+# the speech.
+_CLIPS, _FRAMES, _SPEECH, _SPEECH_SQUARED = range(4)
+_LIPS = {"prediction": (4, 5, 6), "truth": (7, 8, 9)}
+
+
+def _identity_count(given: Mapping[str, Any]) -> int:
+    identities = given.get("identities")
+    return 1 if identities is None else int(torch.as_tensor(identities).max()) + 1
+
+
+@metric.register("clip_speech_lip_correlation")
+class ClipSpeechLipCorrelation(SpeechLipMetric):
+    """Speech–lip intensity correlation coefficient (SLCC) over clips.
+
+    Each clip gives one intensity of its speech, S = √(mean_t s[t]²), and one of its lips,
+    L = √(mean_t m[t]²) (s and m as in `facediff.metrics.speech`). Both are standardised within each identity,
+    and SLCC is Pearson's correlation over all clips, which is Σ_k (n_k − 1) r_k / Σ_k (n_k − 1) with n_k clips
+    and the correlation r_k of identity k. From −1 to 1, without unit.
+
+    Definition and name are those of "Perceptually Accurate 3D Talking Head Generation" (Chae-Yeon et al., CVPR 2025)
+    and its released scripts, which take S over the whole sound; that is the same where every frame
+    holds the same number of samples. The paper reports it next to the truth's: ``of="truth"``, and
+    ``of="gap"`` for the prediction's minus the truth's.
+
+    Choices where the scripts are silent: an identity with one clip, or whose speech is as loud in every
+    clip, does not enter, and one whose lips do not vary counts 0 (the scripts drop it). A clip of one frame has
+    no motion and is left out. `coverage` counts all these.
+
+    Memory grows with ``n_identities``, not with clips or frames.
 
     Args:
-        prediction: (batch, frames, vertices, 3) or (frames, vertices, 3).
-        truth: Likewise.
         lips: Lip vertices, a `Region` or indices.
-        waveform: The sound (batch, samples) or (samples,); needs the two rates.
-        intensity: Instead: intensity of the speech in each frame, (batch, frames) or (frames,).
+        n_identities: How many identities there are; 1 standardises over all clips together.
         of: ``"prediction"``, ``"truth"`` or ``"gap"``.
-        sample_rate: Samples of the waveform a second.
-        frames_per_second: Of the motion.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        lengths: Valid frames (batch,) or mask (batch, frames), of both sides unless the next is given.
-        prediction_lengths: Valid frames of the prediction.
-        clip_names: One name a sequence, for messages.
-
-    Returns:
-        Float64 scalar, −1 to 1; a gap −2 to 2.
-
-    Raises:
-        ValueError: As `SpeechLipMetric.update`, and if no speech varies.
+        sample_rate: Samples of the speech per second; needed for waveforms, not for intensities.
+        frames_per_second: Of the motion; likewise.
+        **options: Those of `SequenceOptions`; NaN and infinity in the speech are always refused.
 
     >>> import torch
-    >>> loudness = torch.tensor([0.0, 1.0, 3.0, 2.0])
-    >>> motion = loudness.cumsum(0)[:, None, None].expand(4, 5, 3)
-    >>> round(frame_speech_lip_correlation(motion, motion, [0, 1], intensity=loudness).item(), 6)
+    >>> loudness = torch.tensor([[1.0], [2.0], [4.0]]).expand(3, 5)
+    >>> motion = (loudness.cumsum(1))[..., None, None].expand(3, 5, 2, 3)
+    >>> round(clip_speech_lip_correlation(motion, -motion, [0, 1], intensity=loudness).item(), 6)
     1.0
     """
-    metric = FrameSpeechLipCorrelation(
-        lips,
-        of=of,
-        sample_rate=sample_rate,
-        frames_per_second=frames_per_second,
-        length_rule=length_rule,
-        sync_on_compute=False,
-    ).to(truth.device)
-    metric.update(
-        prediction,
-        truth,
-        waveform=waveform,
-        intensity=intensity,
-        lengths=lengths,
-        prediction_lengths=prediction_lengths,
-        clip_names=clip_names,
-    )
-    return metric.compute()
+
+    leaves_out = "no identity has two clips of two frames that are not equally loud"
+    needs: ClassVar[tuple[str, ...]] = ("lips", "speech", "identities")
+    inferred: ClassVar[Inferred] = {"n_identities": _identity_count}
+    moments: Tensor
+
+    def __init__(
+        self,
+        lips: RegionLike,
+        *,
+        n_identities: int = 1,
+        of: Side = "prediction",
+        sample_rate: int | None = None,
+        frames_per_second: float | None = None,
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        check_option("of", of, Side)
+        if n_identities < 1:
+            raise ValueError(f"n_identities is {n_identities}; expected at least 1")
+        words = (
+            "Pearson correlation over clips between the intensity of the speech and the root mean square "
+            f"over frames of the mean speed of {{region}}, each standardised within {n_identities} identities, "
+            f"{SIDE_WORDS[of]} [1]"
+        )
+        super().__init__(
+            lips, definition=words, of=of, sample_rate=sample_rate, frames_per_second=frames_per_second, **options
+        )
+        self.n_identities = n_identities
+        self.add_state("moments", torch.zeros(n_identities, 10, dtype=torch.float64), dist_reduce_fx="sum")
+
+    def update(
+        self,
+        prediction: Tensor,
+        truth: Tensor,
+        *,
+        identities: Tensor | Sequence[int] | None = None,
+        waveform: Tensor | None = None,
+        intensity: Tensor | None = None,
+        **batch: Unpack[BatchOptions],
+    ) -> None:
+        """Add a batch of sequences with their speech.
+
+        Args:
+            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
+            truth: Likewise.
+            identities: Number of each sequence's identity, below ``n_identities``; needed unless there is one.
+            waveform: The sound (batch, samples); needs the two rates.
+            intensity: Instead: intensity of the speech in each frame, (batch, frames).
+            **batch: Those of `BatchOptions`.
+
+        Raises:
+            ValueError: As for `SpeechLipMetric.update`, and if the identities are missing or do not fit.
+                Nothing is added then.
+        """
+        clips = self.align(prediction, truth, **batch)
+        clips = self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3)
+        self.add(clips.attach("identity", self._numbers(identities, len(clips.clips))))
+
+    def _numbers(self, identities: Tensor | Sequence[int] | None, count: int) -> list[int]:
+        if identities is None:
+            if self.n_identities > 1:
+                raise ValueError(f"identities= is missing; the metric was made for {self.n_identities}")
+            return [0] * count
+        values = torch.as_tensor(identities).reshape(-1)
+        if len(values) != count or values.is_floating_point() or values.dtype == torch.bool:
+            raise ValueError(f"identities must be {count} whole numbers, one per sequence")
+        numbers: list[int] = values.tolist()
+        if any(not 0 <= number < self.n_identities for number in numbers):
+            raise ValueError(f"identities hold {max(numbers)}; the metric was made for 0 to {self.n_identities - 1}")
+        return numbers
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """Intensities of speech, predicted lips and true lips, (3,) float64; NaN for a clip of one frame."""
+        lips = [speed(motion, self.indices).square().mean().sqrt() for motion in (clip.prediction, clip.truth)]
+        return torch.stack([clip.speech.square().mean().sqrt(), *lips])
+
+    def add(self, clips: Clips) -> None:
+        """Add each clip's intensities to the sums of its identity; see `SequenceMetric.add`."""
+        self.check_vertices(clips.n_vertices)
+        if self.check_finite:
+            clips.check_finite()
+        sums = torch.zeros(self.moments.shape, dtype=torch.float64)
+        left_out = 0
+        for clip in clips.clips:
+            if clip.frames < 2:
+                left_out += 1
+                continue
+            speech, predicted, true = self.clip_value(clip).tolist()
+            row = [1, clip.frames, speech, speech**2]
+            row += [power for lips in (predicted, true) for power in (lips, lips**2, lips * speech)]
+            sums[clip.identity] += torch.tensor(row, dtype=torch.float64)
+        cut = torch.tensor([0, 0, clips.cut_prediction, clips.cut_truth, left_out])
+        self.moments = self.moments + sums.to(self.moments.device)
+        self.counts = self.counts + cut.to(self.counts.device)
+
+    def _enter(self) -> Tensor:
+        """Which identities have clips that differ in loudness, (n_identities,) bool."""
+        return (self.moments[:, _CLIPS] > 1) & (_deviation(self.moments, _SPEECH, _SPEECH_SQUARED) > 0)
+
+    def compute(self) -> Tensor:
+        """The correlation over all clips so far, a float64 scalar.
+
+        Raises:
+            ValueError: If no process had any sequence, or no identity enters.
+        """
+        moments = self.moments[self._enter()]
+        if not len(moments):
+            self.refuse_to_compute(self.covered().left_out)
+        if self.of == "gap":
+            return _standardised_correlation(moments, "prediction") - _standardised_correlation(moments, "truth")
+        return _standardised_correlation(moments, self.of)
+
+    def covered(self) -> Coverage:
+        """What the states of this process count as scored, cut and left out."""
+        moments, all_clips = self.moments[self._enter()], int(self.moments[:, _CLIPS].sum())
+        sequences, frames = int(moments[:, _CLIPS].sum()), int(moments[:, _FRAMES].sum())
+        cut_prediction, cut_truth, left_out = self.counts[2:].tolist()
+        return Coverage(frames, sequences, cut_prediction, cut_truth, left_out + all_clips - sequences)
+
+
+def _standardised_correlation(moments: Tensor, side: str) -> Tensor:
+    """Σ_k (n_k − 1) r_k / Σ_k (n_k − 1), with r_k = 0 for lips that do not vary."""
+    total, squared, product = _LIPS[side]
+    covariance = moments[:, product] - moments[:, _SPEECH] * moments[:, total] / moments[:, _CLIPS]
+    lips = _deviation(moments, total, squared)
+    scale = (_deviation(moments, _SPEECH, _SPEECH_SQUARED) * lips).sqrt()
+    each = torch.where(lips > 0, (covariance / scale).clamp(-1, 1), 0.0)
+    weights = moments[:, _CLIPS] - 1
+    return (weights * each).sum() / weights.sum()
+
+
+def _deviation(moments: Tensor, total: int, squared: int) -> Tensor:
+    """Sum of squared deviations from the mean; 0 where they are no more than rounding."""
+    found = moments[:, squared] - moments[:, total].square() / moments[:, _CLIPS].clamp(min=1)
+    return torch.where(found > 1e-12 * moments[:, squared], found, 0.0)
+
+
+frame_speech_lip_correlation = functional(FrameSpeechLipCorrelation)
+clip_speech_lip_correlation = functional(ClipSpeechLipCorrelation)

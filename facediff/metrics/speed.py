@@ -6,15 +6,18 @@ import platform
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import ClassVar, Unpack
 
 import torch
 from torch import Tensor
 
-from facediff.metrics.exact import ExactMetric
+from facediff.metrics.base import ExactMetric, Inferred, ProcessOptions, functional
+from facediff.registry import metric
 
 
+@metric.register("real_time_factor")
 class RealTimeFactor(ExactMetric):
-    """Real-time factor (RTF): seconds of computing over seconds of speech, added up over clips.
+    """Real-time factor (RTF): seconds of computing over seconds of speech, summed over clips.
 
     RTF = Σ computing / Σ speech over all clips: below 1 is faster than speech. Clips count by their length;
     it is no mean of factors. Over several processes the times of all are added, so the factor is that of one
@@ -24,7 +27,7 @@ class RealTimeFactor(ExactMetric):
 
     Args:
         hardware: What it was computed on, for the summary: see `device_name`.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `ProcessOptions`.
 
     Raises:
         ValueError: If the hardware is not named.
@@ -39,13 +42,15 @@ class RealTimeFactor(ExactMetric):
     """
 
     higher_is_better = False
+    needs = ("time",)
+    inferred: ClassVar[Inferred] = {"hardware": lambda _: "unknown hardware"}
     seconds: Tensor
 
-    def __init__(self, hardware: str, **kwargs: object) -> None:
+    def __init__(self, hardware: str, **options: Unpack[ProcessOptions]) -> None:
         if not hardware.strip():
             raise ValueError("hardware is empty; name what computes, a factor means nothing without it")
         words = f"seconds of computing for one second of speech, added up over clips, on {hardware} [1]"
-        super().__init__(definition=words, settings="", **kwargs)
+        super().__init__(definition=words, **options)
         self.hardware = hardware
         self.add_state("seconds", torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
 
@@ -70,7 +75,7 @@ class RealTimeFactor(ExactMetric):
 
     @contextmanager
     def measure(self, speech: float) -> Iterator[None]:
-        """Time what happens inside ``with`` and add it; work on GPUs is waited for before and after.
+        """Time the body of ``with`` and add it; work on GPUs is waited for before and after.
 
         Args:
             speech: Seconds of speech that it is computed for.
@@ -97,25 +102,7 @@ class RealTimeFactor(ExactMetric):
         return computing / speech
 
 
-def real_time_factor(computing: float | Tensor, speech: float | Tensor) -> Tensor:
-    """Real-time factor: seconds of computing over seconds of speech, each added up over clips.
-
-    Args:
-        computing: Seconds it took, a number or one for each clip.
-        speech: Seconds of speech; likewise.
-
-    Returns:
-        Float64 scalar.
-
-    Raises:
-        ValueError: As `RealTimeFactor.update`.
-
-    >>> real_time_factor(torch.tensor([1.0, 2.0]), torch.tensor([10.0, 2.0])).item()
-    0.25
-    """
-    metric = RealTimeFactor("unknown hardware", sync_on_compute=False)
-    metric.update(computing, speech)
-    return metric.compute()
+real_time_factor = functional(RealTimeFactor)
 
 
 def device_name(device: torch.device | str) -> str:
@@ -134,7 +121,7 @@ def device_name(device: torch.device | str) -> str:
 
 
 def _processor() -> str:
-    """The processor's product name where the model tells it."""
+    """The processor's product name where the system reports it."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:
             for line in lines:

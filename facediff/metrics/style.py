@@ -1,29 +1,29 @@
-"""Style retrieval accuracy: are style embeddings of one person closer together than those of different people?"""
+"""Style retrieval accuracy: are style embeddings of one speaker closer together than those of different speakers?"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Literal, Unpack
 
 import torch
 from torch import Tensor
 
-from facediff.metrics.exact import ExactMetric
-from facediff.metrics.options import check_option
+from facediff.metrics.base import ExactMetric, ProcessOptions, check_option, functional
+from facediff.registry import metric
 
 Closeness = Literal["cosine", "euclidean"]
 """How the nearest embedding is found: largest cosine similarity, or smallest Euclidean distance."""
 
-CLOSENESSES: tuple[Closeness, ...] = get_args(Closeness)
 _ROWS = 1024
 
 
+@metric.register("style_retrieval_accuracy")
 class StyleRetrievalAccuracy(ExactMetric):
     """Style retrieval accuracy: share of style embeddings whose nearest other one has the same label.
 
-    Leave one out: each embedding asks for the nearest among all others, and is right if that one carries its
-    label, for example the person. Where several are equally near it is right by their share, so that order
-    does not matter. An embedding whose label no other carries cannot be right and does not ask, but may be
+    Leave one out: each embedding is a query for the nearest among all others, and is right if that one carries its
+    label, for example the speaker. Where several are equally near it is right by their share, so that order
+    does not matter. An embedding whose label no other carries cannot be right and is no query, but may be
     found. From 0 to 1; guessing gives about the share of embeddings with the same label.
 
     The accuracy is a common test of speaker embeddings; nearest neighbour, leaving one out and counting ties
@@ -35,7 +35,7 @@ class StyleRetrievalAccuracy(ExactMetric):
 
     Args:
         closeness: ``"cosine"`` or ``"euclidean"``.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `ProcessOptions`.
 
     Raises:
         ValueError: If the closeness is unknown.
@@ -47,18 +47,18 @@ class StyleRetrievalAccuracy(ExactMetric):
     """
 
     higher_is_better = True
+    needs = ("style",)
     embeddings: list[Tensor]
     labels: list[Tensor]
     width: Tensor
 
-    def __init__(self, *, closeness: Closeness = "cosine", **kwargs: object) -> None:
-        check_option("closeness", closeness, CLOSENESSES)
+    def __init__(self, *, closeness: Closeness = "cosine", **options: Unpack[ProcessOptions]) -> None:
+        check_option("closeness", closeness, Closeness)
         measure = "largest cosine similarity" if closeness == "cosine" else "smallest Euclidean distance"
         super().__init__(
             definition=f"share of style embeddings whose nearest other ({measure}) has the same label, ties by share, "
             "among those whose label another carries [1]",
-            settings="",
-            **kwargs,
+            **options,
         )
         self.closeness: Closeness = closeness
         # Flat, and never an empty list: torchmetrics gathers a process without data as one flat float32 tensor.
@@ -85,7 +85,7 @@ class StyleRetrievalAccuracy(ExactMetric):
         Args:
             embeddings: (batch, dim), floating point.
             labels: Whole numbers (batch,): whose style it is.
-            clip_names: One name an embedding, for messages.
+            clip_names: One name per embedding, for messages.
 
         Raises:
             ValueError: If shapes or types do not fit, or an embedding holds NaN or infinity, or is zero and
@@ -97,7 +97,7 @@ class StyleRetrievalAccuracy(ExactMetric):
         numbers = torch.as_tensor(labels, device=self.width.device)
         whole = not (numbers.is_floating_point() or numbers.dtype == torch.bool)
         if numbers.shape != (count,) or (count and not whole):
-            raise ValueError(f"labels must be {count} whole numbers, one an embedding")
+            raise ValueError(f"labels must be {count} whole numbers, one per embedding")
         if clip_names is not None and len(clip_names) != count:
             raise ValueError(f"{len(clip_names)} clip_names for {count} embeddings; give one each")
         if int(self.width) not in (0, width):
@@ -109,7 +109,7 @@ class StyleRetrievalAccuracy(ExactMetric):
         if bool(bad.any()):
             place = int(bad.nonzero()[0])
             name = f"embedding {place} of the batch" if clip_names is None else f"the embedding of {clip_names[place]}"
-            raise ValueError(f"{name} holds NaN or infinity, or is all zero; repair it or leave it out")
+            raise ValueError(f"{name} holds NaN or infinity, or is all zero; repair it or omit it")
         if not count:
             return
         self.width = torch.full_like(self.width, width)
@@ -117,11 +117,11 @@ class StyleRetrievalAccuracy(ExactMetric):
         self.labels.append(numbers.to(torch.int64))
 
     def queries(self) -> int:
-        """How many embeddings ask for their nearest, over all processes."""
+        """How many embeddings are queries, over all processes."""
         if self._is_synced:
-            return int(_asks(self._gathered()[1]).sum())
+            return int(_is_query(self._gathered()[1]).sum())
         with self.sync_context(dist_sync_fn=self.dist_sync_fn, should_sync=self.sync_on_compute):
-            return int(_asks(self._gathered()[1]).sum())
+            return int(_is_query(self._gathered()[1]).sum())
 
     def compute(self) -> Tensor:
         """The accuracy over all embeddings so far, a float64 scalar.
@@ -131,20 +131,20 @@ class StyleRetrievalAccuracy(ExactMetric):
                 sizes.
         """
         flat, labels = self._gathered()
-        asks = _asks(labels)
-        if len(flat) != len(labels) * int(self.width) or not bool(asks.any()):
+        queries = _is_query(labels)
+        if len(flat) != len(labels) * int(self.width) or not bool(queries.any()):
             self.leave_synchronised_state()
             raise ValueError(
-                f"{len(labels)} style embeddings, {int(asks.sum())} of them with another of the same label and size; "
-                "give at least two of one label"
+                f"{len(labels)} style embeddings, {int(queries.sum())} of them with another of the same label and "
+                "size; give at least two of one label"
             )
         points = flat.view(len(labels), -1)
         if self.closeness == "cosine":  # the nearest of unit vectors is the one with the largest cosine
             points = points / points.norm(dim=1, keepdim=True)
         right = torch.zeros((), dtype=torch.float64, device=points.device)
-        for rows in torch.split(asks.nonzero().flatten(), _ROWS):
+        for rows in torch.split(queries.nonzero().flatten(), _ROWS):
             right += _shares(points, labels, rows).sum()
-        return right / asks.sum()
+        return right / queries.sum()
 
     def _gathered(self) -> tuple[Tensor, Tensor]:
         """All embeddings, flat, and their labels; after a reduction over processes these are no lists."""
@@ -154,7 +154,7 @@ class StyleRetrievalAccuracy(ExactMetric):
         return embeddings, labels
 
 
-def _asks(labels: Tensor) -> Tensor:
+def _is_query(labels: Tensor) -> Tensor:
     """Which embeddings have another of their label."""
     _, places, counts = torch.unique(labels, return_inverse=True, return_counts=True)
     return counts[places] > 1
@@ -170,25 +170,4 @@ def _shares(points: Tensor, labels: Tensor, rows: Tensor) -> Tensor:
     return (nearest & same).sum(1).double() / nearest.sum(1)
 
 
-def style_retrieval_accuracy(
-    embeddings: Tensor, labels: Tensor | Sequence[int], *, closeness: Closeness = "cosine"
-) -> Tensor:
-    """Style retrieval accuracy: share of embeddings whose nearest other has the same label.
-
-    Args:
-        embeddings: (count, dim), floating point.
-        labels: Whole numbers (count,).
-        closeness: ``"cosine"`` or ``"euclidean"``.
-
-    Returns:
-        Float64 scalar, 0 to 1; see `StyleRetrievalAccuracy`.
-
-    Raises:
-        ValueError: As `StyleRetrievalAccuracy.update` and ``compute``.
-
-    >>> style_retrieval_accuracy(torch.tensor([[0.0], [1.0], [5.0], [6.0]]), [0, 0, 1, 1], closeness="euclidean").item()
-    1.0
-    """
-    metric = StyleRetrievalAccuracy(closeness=closeness, sync_on_compute=False).to(embeddings.device)
-    metric.update(embeddings, labels)
-    return metric.compute()
+style_retrieval_accuracy = functional(StyleRetrievalAccuracy)

@@ -1,40 +1,50 @@
-"""Mean vertex error and lip vertex error as metrics that accumulate over batches."""
+"""Distance of the vertices from the truth (MVE, LVE, UVE), and how much the upper face moves (FDD).
+
+g and p are truth and prediction (frames, vertices, 3), and e²[t, v] = Σ_c (g[t, v, c] − p[t, v, c])². The arithmetic,
+in float64 and in one pass over the frames, is in `facediff.metrics.one_pass`.
+"""
 
 from __future__ import annotations
 
+from typing import Unpack
+
 from torch import Tensor
 
-from facediff.metrics.base import ComparisonMetric
-from facediff.metrics.clips import Clip
-from facediff.metrics.formulas import vertex_error
-from facediff.metrics.one_pass import ErrorOf
-from facediff.metrics.options import (
-    POOLINGS,
-    REDUCTIONS,
-    LengthRule,
+from facediff.metrics.base import (
+    BatchOptions,
+    Clip,
     Pooling,
     Reduction,
+    SequenceMetric,
+    SequenceOptions,
+    Sign,
     check_option,
-    vertex_error_words,
+    functional,
 )
+from facediff.metrics.one_pass import ErrorOf, one_pass
 from facediff.metrics.regions import RegionLike, as_region
+from facediff.registry import metric
 
 
-class VertexError(ComparisonMetric):
+def vertex_error_words(*, reduction: Reduction, squared: bool) -> str:
+    """The definition of a vertex error in plain words, in which region and pooling are still to be filled in."""
+    distance, unit = ("squared distance", "unit²") if squared else ("distance", "unit")
+    which = "mean" if reduction == "mean" else "largest"
+    return f"in each frame the {which} {distance} over {{region}}; {{pooling}} [{unit}]"
+
+
+class VertexError(SequenceMetric):
     """Distance between predicted and true vertices, over a region or the whole mesh.
 
-    With e²[t, v] = Σ_c (g[t, v, c] − p[t, v, c])² of truth g and prediction p, each frame gives the mean or
-    the maximum over v of e² (squared) or √e²; frames are then pooled. Absolute vertices and offsets from the
-    template give the same number, since the template cancels.
+    Each frame gives the mean or the maximum over v of e² (squared) or √e²; frames are then pooled. Absolute vertices
+    and offsets from the template give the same number, since the template cancels.
 
     Args:
         region: Vertices to look at, a `Region` or indices; None for all.
         reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
         squared: Whether distances are squared; the score is then in the vertices' unit squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`.
 
     Raises:
         ValueError: If an option is unknown.
@@ -49,22 +59,11 @@ class VertexError(ComparisonMetric):
         reduction: Reduction = "mean",
         squared: bool = False,
         pooling: Pooling = "frames",
-        length_rule: LengthRule = "min",
-        check_finite: bool = True,
-        **kwargs: object,
+        **options: Unpack[SequenceOptions],
     ) -> None:
-        check_option("reduction", reduction, REDUCTIONS)
-        check_option("pooling", pooling, POOLINGS)
-        named = None if region is None else as_region(region, "vertices")
-        where = "all vertices" if named is None else str(named)
-        super().__init__(
-            definition=vertex_error_words(where, reduction=reduction, squared=squared, pooling=pooling),
-            pooling=pooling,
-            region=named,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
-        )
+        check_option("reduction", reduction, Reduction)
+        words = vertex_error_words(reduction=reduction, squared=squared)
+        super().__init__(definition=words, pooling=pooling, region=region, **options)
         self.reduction: Reduction = reduction
         self.squared = squared
 
@@ -74,23 +73,22 @@ class VertexError(ComparisonMetric):
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The error of one sequence, mean over its frames."""
-        return vertex_error(clip.prediction, clip.truth, self.indices, reduction=self.reduction, squared=self.squared)
+        return one_pass(clip.prediction, clip.truth, errors=[self.wanted()])[0][0]
 
 
+@metric.register("mean_vertex_error")
 class MeanVertexError(VertexError):
-    """Mean vertex error (MVE) over the whole mesh.
+    """Mean vertex error (MVE): mean over frames of the mean or largest √e² over all vertices.
 
     ``reduction="mean"``, unsquared, pooled by frames is FaceDiffuser's script: mean over frames and vertices
     of √e². ``reduction="max"`` is the text of the dual-path style diffusion paper: the largest √e² of each
-    frame, averaged over frames.
+    frame, averaged over frames. In the vertices' unit, squared if ``squared``.
 
     Args:
         reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
-        squared: Whether distances are squared.
+        squared: Whether e² replaces √e².
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> metric = MeanVertexError()
@@ -105,21 +103,12 @@ class MeanVertexError(VertexError):
         reduction: Reduction = "mean",
         squared: bool = False,
         pooling: Pooling = "frames",
-        length_rule: LengthRule = "min",
-        check_finite: bool = True,
-        **kwargs: object,
+        **options: Unpack[SequenceOptions],
     ) -> None:
-        super().__init__(
-            None,
-            reduction=reduction,
-            squared=squared,
-            pooling=pooling,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
-        )
+        super().__init__(None, reduction=reduction, squared=squared, pooling=pooling, **options)
 
 
+@metric.register("lip_vertex_error")
 class LipVertexError(VertexError):
     """Lip vertex error (LVE): the largest error among the lip vertices of each frame, averaged.
 
@@ -128,58 +117,46 @@ class LipVertexError(VertexError):
 
     Args:
         lips: Lip vertices, a `Region` or indices.
-        squared: Whether distances are squared.
+        squared: Whether distances are squared, e² instead of √e².
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> metric = LipVertexError([1, 2])
     >>> metric.update(torch.ones(4, 3, 3), torch.zeros(4, 3, 3))
     >>> metric.compute().item()
     3.0
+    >>> lip_vertex_error(torch.ones(4, 3, 3), torch.zeros(4, 3, 3), [0, 2], squared=True).item()
+    3.0
     """
 
+    needs = ("lips",)
+
     def __init__(
-        self,
-        lips: RegionLike,
-        *,
-        squared: bool = True,
-        pooling: Pooling = "frames",
-        length_rule: LengthRule = "min",
-        check_finite: bool = True,
-        **kwargs: object,
+        self, lips: RegionLike, *, squared: bool = True, pooling: Pooling = "frames", **options: Unpack[SequenceOptions]
     ) -> None:
-        super().__init__(
-            as_region(lips, "lips"),
-            reduction="max",
-            squared=squared,
-            pooling=pooling,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
-        )
+        super().__init__(as_region(lips, "lips"), reduction="max", squared=squared, pooling=pooling, **options)
 
 
+@metric.register("upper_face_vertex_error")
 class UpperFaceVertexError(VertexError):
     """Upper-face vertex error (UVE): how far the vertices of the upper face are from the truth.
 
     The mean over frames of the mean (or largest) distance √e² over the upper-face vertices: what MVE is for
     the whole mesh. There is no usual formula of that name; the mean of unsquared distances is a choice, and
-    ``reduction="max", squared=True`` is what LVE's formula gives on this region. Unlike FDD it tells a brow
-    that moves at the wrong moment from one that moves rightly, and so counts against a face whose upper part
-    is plausible but not the truth's.
+    ``reduction="max", squared=True`` is what LVE's formula gives on this region. Unlike FDD it distinguishes a brow
+    that moves at the wrong moment from one that moves correctly, and so counts against a face whose upper part
+    is plausible but not the truth's. In the vertices' unit, squared if ``squared``.
 
     Args:
         upper: Upper-face vertices, a `Region` or indices.
         reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
         squared: Whether distances are squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        length_rule: ``"min"``, ``"error"`` or ``"prediction"``.
-        check_finite: Whether NaN and infinity are refused.
-        **kwargs: For `torchmetrics.Metric`.
+        **options: Those of `SequenceOptions`.
     """
+
+    needs = ("upper_face",)
 
     def __init__(
         self,
@@ -188,16 +165,82 @@ class UpperFaceVertexError(VertexError):
         reduction: Reduction = "mean",
         squared: bool = False,
         pooling: Pooling = "frames",
-        length_rule: LengthRule = "min",
-        check_finite: bool = True,
-        **kwargs: object,
+        **options: Unpack[SequenceOptions],
     ) -> None:
-        super().__init__(
-            as_region(upper, "upper"),
-            reduction=reduction,
-            squared=squared,
-            pooling=pooling,
-            length_rule=length_rule,
-            check_finite=check_finite,
-            **kwargs,
-        )
+        super().__init__(as_region(upper, "upper"), reduction=reduction, squared=squared, pooling=pooling, **options)
+
+
+def dynamics_words(*, sign: Sign) -> str:
+    """The definition of the face dynamics deviation in plain words, in which the region is still to be filled in."""
+    kept = "signed, positive where the prediction moves less" if sign == "signed" else "its absolute value"
+    return (
+        "in each sequence the mean over {region} of the standard deviation over time (population) of the "
+        f"squared offset from the template, truth minus prediction, {kept}; mean over sequences [unit²]"
+    )
+
+
+@metric.register("face_dynamics_deviation")
+class FaceDynamicsDeviation(SequenceMetric):
+    r"""Face dynamics deviation (FDD): how much the upper face varies over time, truth against prediction.
+
+    Per sequence d = mean_{v∈U} std_t ‖g − τ‖² − mean_{v∈U} std_t ‖p − τ‖² with truth g, prediction p, the
+    speaker's neutral template τ and the population standard deviation (ddof 0); FDD is the mean over
+    sequences of d (``"signed"``: CodeTalker's script; sequences of opposite sign cancel) or of \|d\|
+    (``"absolute"``: FaceDiffuser's second figure). The score is in the vertices' unit squared. Sequences
+    count alike whatever their length; a sequence of one frame does not vary and gives 0.
+
+    Args:
+        upper: Upper-face vertices, a `Region` or indices.
+        sign: ``"signed"`` or ``"absolute"`` in each sequence.
+        **options: Those of `SequenceOptions`.
+
+    Raises:
+        ValueError: If an option is unknown.
+
+    >>> import torch
+    >>> truth = torch.zeros(2, 1, 3)
+    >>> truth[1] = 2.0  # the squared offset is 0, then 12: its standard deviation is 6
+    >>> metric = FaceDynamicsDeviation([0], sign="signed")
+    >>> metric.update(torch.zeros(2, 1, 3), truth)
+    >>> metric.compute().item()
+    6.0
+    """
+
+    # No higher_is_better: a signed deviation is best at zero.
+    needs = ("upper_face", "template")
+    indices: Tensor
+
+    def __init__(self, upper: RegionLike, *, sign: Sign = "absolute", **options: Unpack[SequenceOptions]) -> None:
+        check_option("sign", sign, Sign)
+        super().__init__(definition=dynamics_words(sign=sign), region=as_region(upper, "upper"), **options)
+        self.sign: Sign = sign
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The deviation of one sequence."""
+        value = one_pass(clip.prediction, clip.truth, template=clip.template, uppers=[self.indices])[1][0]
+        return value if self.sign == "signed" else value.abs()
+
+    def update(
+        self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[BatchOptions]
+    ) -> None:
+        """Add a batch of sequences.
+
+        Args:
+            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
+            truth: Likewise.
+            template: Neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, when
+                prediction and truth are absolute vertices. **None means that they are offsets from the
+                template already**; absolute vertices without a template give another, meaningless number.
+            **batch: Those of `BatchOptions`.
+
+        Raises:
+            ValueError: As for `SequenceMetric.update`, and if the template does not fit. Nothing is added
+                then.
+        """
+        self.add(self.align(prediction, truth, **batch).attach_templates(template))
+
+
+mean_vertex_error = functional(MeanVertexError)
+lip_vertex_error = functional(LipVertexError)
+upper_face_vertex_error = functional(UpperFaceVertexError)
+face_dynamics_deviation = functional(FaceDynamicsDeviation)

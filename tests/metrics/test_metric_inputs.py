@@ -117,7 +117,7 @@ def test_a_region_of_a_larger_mesh_is_refused() -> None:
 
 
 def test_unknown_options_are_refused_with_the_nearest() -> None:
-    with pytest.raises(ValueError, match="Did you mean 'mean'"):
+    with pytest.raises(ValueError, match='did you mean "mean"'):
         MeanVertexError(reduction="meen")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="unknown pooling"):
         MeanVertexError(pooling="x")  # type: ignore[arg-type]

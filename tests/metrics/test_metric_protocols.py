@@ -56,7 +56,7 @@ def test_scores_follow_the_definitions(
 def test_there_are_six_and_paper_is_the_default() -> None:
     assert list(PROTOCOLS) == list(SCORES)
     assert protocol() is PROTOCOLS["paper"]
-    with pytest.raises(ValueError, match=r"unknown protocol 'codtalker'.*meshtalk\. Did you mean 'codetalker'"):
+    with pytest.raises(ValueError, match=r'unknown protocol .codtalker.: did you mean "codetalker".*meshtalk\'):
         protocol("codtalker")
 
 
@@ -126,7 +126,7 @@ def test_a_topology_refuses_regions_and_motion_of_another() -> None:
     metrics = flame.build(Region("lips", (1,)))
     with pytest.raises(ValueError, match="belongs to a mesh of 5023 vertices, the motion has 40"):
         metrics.update(torch.zeros(2, 40, 3), torch.zeros(2, 40, 3))
-    with pytest.raises(ValueError, match="unknown topology 'biwy'.*Did you mean 'biwi'"):
+    with pytest.raises(ValueError, match='unknown topology .biwy.: did you mean "biwi"'):
         protocol("meshtalk", topology="biwy")
 
 

@@ -20,7 +20,7 @@ from facediff.metrics import (
     lip_vertex_error,
     mean_vertex_error,
 )
-from facediff.metrics.options import Pooling, Reduction, Sign
+from facediff.metrics.base import Pooling, Reduction, Sign
 
 Corpus = Any  # the class of that name in conftest.py, which test files cannot import
 BATCHINGS = ([[0], [1], [2], [3], [4]], [[0, 1, 2, 3, 4]], [[4, 2], [0, 3, 1]])

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from facediff.metrics.functional import face_dynamics_deviation
+from facediff.metrics import face_dynamics_deviation
 from tools import compare_models
 
 

@@ -32,7 +32,7 @@ from facediff.evaluation.figures.page import (
     text_width,
 )
 from facediff.metrics import LipPairs
-from facediff.metrics.formulas import opening
+from facediff.metrics.mouth import opening
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

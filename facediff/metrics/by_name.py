@@ -1,0 +1,181 @@
+"""Metrics by name: ``lip_vertex_error:squared=false`` becomes a metric that is made for a corpus and fed from it.
+
+A metric states as class data what it ``needs`` (the lips, the speech, several samples …). Whoever scores says in a
+`Context` what the corpus or the run has; `Request.build` brings the two together, and `feed` hands each metric those of
+a batch's inputs that its `update` takes.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+from torchmetrics import Metric
+
+from facediff.errors import FaceDiffError, choices
+from facediff.metrics.regions import Region
+from facediff.registry import metric as metrics
+
+NEEDS: dict[str, str] = {
+    "lips": "the lip vertices",
+    "upper_face": "the upper-face vertices",
+    "lip_pairs": "pairs of inner-lip vertices",
+    "template": "each speaker's neutral face",
+    "closures": "the times of bilabial phonemes",
+    "speech": "the speech of each clip",
+    "identities": "who speaks in each clip",
+    "samples": "several samples of each clip",
+    "conditions": "predictions of each clip in the styles of several identities",
+    "style": "style vectors",
+    "time": "how long inference took",
+}
+"""What a metric may need, in words.
+
+The first three come as the constructor's ``lips``, ``upper`` and ``pairs``; ``speech`` as ``sample_rate`` and
+``frames_per_second``, ``identities`` as ``n_identities``, ``time`` as ``hardware``. With each batch come ``template``
+(of absolute vertices) or ``offsets_from``, ``closures``, ``waveform``, ``identities``, ``samples``, ``predictions`` (in
+several styles), ``embeddings`` with ``labels``, and ``computing`` with ``speech``, both in seconds.
+"""
+
+_NOT_CHOSEN = {"check_finite", "sync_on_compute", "process_group", "n_identities", "sample_rate"}
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a corpus or a run has for metrics.
+
+    Args:
+        has: By need, the constructor arguments that meet it; empty where the need is met with each batch.
+        missing: By need, what to do to have it, or why it cannot be had.
+    """
+
+    has: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Request:
+    """A metric that was asked for.
+
+    Args:
+        text: As it was written; the score's name.
+        name: The registered name.
+        options: Its options.
+    """
+
+    text: str
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What the metric needs, words of `NEEDS`."""
+        return tuple(getattr(metrics.get(self.name), "needs", ()))
+
+    def build(self, context: Context) -> Metric:
+        """The metric, made for a corpus.
+
+        Raises:
+            FaceDiffError: If the corpus lacks something that the metric needs, naming all of it, or an option is
+                refused.
+        """
+        lacking = [need for need in self.needs if need not in context.has]
+        if lacking:
+            reasons = "; ".join(
+                f"{NEEDS.get(need, need)} ({context.missing.get(need, 'not available here')})" for need in lacking
+            )
+            raise FaceDiffError(f"metric {self.text}: needs {reasons}")
+        implementation = metrics.get(self.name)
+        accepted = inspect.signature(implementation).parameters
+        given = {key: value for need in self.needs for key, value in context.has[need].items() if key in accepted}
+        options = dict(self.options)
+        if isinstance(options.get("region"), str):
+            options["region"] = self._region(options["region"], context)
+        try:
+            return cast(Metric, implementation(**given | options))
+        except (TypeError, ValueError) as error:
+            raise FaceDiffError(f"metric {self.text}: {error}") from error
+
+    def _region(self, name: str, context: Context) -> Region:
+        """A region that is given as an option by the name of its need."""
+        regions = {need: value for need in ("lips", "upper_face") for value in context.has.get(need, {}).values()}
+        if name not in regions:
+            raise FaceDiffError(f"metric {self.text}: there is no region {name!r}: {choices(name, regions)}")
+        return cast(Region, regions[name])
+
+
+def parse(text: str) -> Request:
+    """Read ``NAME:option=value,option=value``.
+
+    Args:
+        text: A registered name, which may be followed by options of the metric.
+
+    Raises:
+        FaceDiffError: If there is no such metric or option, or a value is of another kind; with the nearest name.
+
+    >>> parse("temporal_misalignment:at=path,smoothing=1.5").options
+    {'at': 'path', 'smoothing': 1.5}
+    """
+    text = text.replace(" ", "")
+    name, _, rest = text.partition(":")
+    known = {
+        option: parameter.default
+        for option, parameter in inspect.signature(metrics.get(name)).parameters.items()
+        if parameter.default is not inspect.Parameter.empty and option not in _NOT_CHOSEN
+    }
+    options = {}
+    for word in filter(None, rest.split(",")):
+        option, equals, value = word.partition("=")
+        if option not in known:
+            offered = choices(option, known) if known else "it has none"
+            raise FaceDiffError(f"metric {text}: {name} has no option {option!r}: {offered}")
+        if not equals or not value:
+            raise FaceDiffError(f"metric {text}: option {option} has no value; write {option}=VALUE")
+        try:
+            options[option] = _value(value, known[option])
+        except ValueError as error:
+            raise FaceDiffError(f"metric {text}: option {option} is {value!r}; expected {error}") from error
+    return Request(text, name, options)
+
+
+def _value(text: str, default: object) -> object:
+    """A word as a value of the kind of the option's default.
+
+    Raises:
+        ValueError: With the kind that was expected.
+    """
+    if isinstance(default, bool):
+        if text.lower() not in ("true", "false"):
+            raise ValueError("true or false")
+        return text.lower() == "true"
+    if isinstance(default, str):
+        return text
+    kind = int if isinstance(default, int) else float
+    try:
+        return kind(text)
+    except ValueError:
+        if default is None:
+            return None if text.lower() == "none" else text
+        raise ValueError("a whole number" if kind is int else "a number") from None
+
+
+def feed(metric: Metric, inputs: Mapping[str, Any]) -> None:
+    """Update a metric with those of the inputs that it takes.
+
+    Args:
+        metric: The metric.
+        inputs: By parameter of `update`: see `NEEDS`.
+    """
+    taken = inspect.signature(type(metric).update).parameters
+    metric.update(**{name: value for name, value in inputs.items() if name in taken})
+
+
+def parse_all(texts: Sequence[str]) -> list[Request]:
+    """Read several metrics, each once.
+
+    Raises:
+        FaceDiffError: As `parse`.
+    """
+    return list({request.text: request for request in map(parse, texts)}.values())
