@@ -56,7 +56,7 @@ def test_scores_follow_the_definitions(
 def test_there_are_six_and_paper_is_the_default() -> None:
     assert list(PROTOCOLS) == list(SCORES)
     assert protocol() is PROTOCOLS["paper"]
-    with pytest.raises(ValueError, match=r'unknown protocol .codtalker.: did you mean "codetalker".*meshtalk\'):
+    with pytest.raises(ValueError, match=r'unknown protocol .codtalker.: did you mean "codetalker".*meshtalk'):
         protocol("codtalker")
 
 
