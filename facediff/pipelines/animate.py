@@ -281,7 +281,7 @@ class AnimationPipeline:
         seeds = [seed + i for i in range(self.args.takes)]
         # In whole frames, as the model counts: else speech of just about the limit would be made in another way here.
         rate = self.model.frame_rate
-        short = self.model.windows.at_once(round(len(speech) * rate / SAMPLE_RATE), rate)
+        short = self.model.windows.in_one_pass(round(len(speech) * rate / SAMPLE_RATE), rate)
         # On the disk that the result goes to, which is the one that has room for it.
         spool: AbstractContextManager[str | None] = nullcontext() if short else self._folder(output)
         with spool as folder:
@@ -347,7 +347,7 @@ class AnimationPipeline:
         progress = None if self.args.quiet else partial(track, description="seconds of speech")
         template = self.model.assets.template(self.identity)
         writers = [MotionWriter(folder / f"{seed}.npy", tuple(template.shape)) for seed in seeds]
-        for part in stream.over(torch.from_numpy(speech).to(self.model.device), progress=progress):
+        for part in stream.parts(torch.from_numpy(speech).to(self.model.device), progress=progress):
             for writer, motion in zip(writers, part, strict=True):
                 writer.write((motion.cpu() + template).numpy())
         for writer in writers:

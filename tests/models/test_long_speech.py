@@ -1,4 +1,4 @@
-"""Speech of any length: windows that join in every step, the same for a file and for a microphone."""
+"""Speech of any length: windows that are blended in every step, the same for a file and for a microphone."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ SAMPLERS = {
         ("style_content", {}),
     ],
 )
-def test_a_microphone_gives_what_the_file_gives(ready: Ready, name: str, options: dict[str, object]) -> None:
+def test_stream_gives_what_the_file_gives(ready: Ready, name: str, options: dict[str, object]) -> None:
     model, whole = ready(name, **options), speech(5.3)
-    offline = torch.cat(list(model.stream(identity="A", seeds=[3]).over(whole)), 1)
+    offline = torch.cat(list(model.stream(identity="A", seeds=[3]).parts(whole)), 1)
     assert offline.shape == (1, round(5.3 * 25), VERTICES, 3)
     assert torch.isfinite(offline).all()
     for seed in (0, 1):
@@ -93,7 +93,7 @@ def test_a_microphone_gives_what_the_file_gives(ready: Ready, name: str, options
     assert torch.equal(vertices, offline[0] + model.assets.templates["A"])
 
 
-def test_a_frame_comes_when_it_is_certain_and_no_later_than_promised(ready: Ready) -> None:
+def test_stream_gives_a_frame_when_it_is_certain_and_no_later_than_promised(ready: Ready) -> None:
     model, whole = ready(), speech(6)
     stream, given = model.stream(identity="A"), 0
     for sample in range(0, len(whole), 160):
@@ -109,7 +109,7 @@ def test_a_frame_comes_when_it_is_certain_and_no_later_than_promised(ready: Read
 
 
 @pytest.mark.parametrize("frames", [1, 3, 29, 30, 31, 35, 36, 40, 49, 50, 51, 55, 59, 60, 61, 70, 71])
-def test_every_frame_is_there_whatever_the_length(ready: Ready, frames: int) -> None:
+def test_stream_gives_every_frame_whatever_the_length(ready: Ready, frames: int) -> None:
     """Around the ends of windows (every 20 frames), of their overlaps and of what is heard after them."""
     model = ready()
     stream = model.stream(identity="A")
@@ -123,7 +123,7 @@ def test_every_frame_is_there_whatever_the_length(ready: Ready, frames: int) -> 
             more()
 
 
-def test_without_a_limit_all_speech_is_made_at_once(ready: Ready) -> None:
+def test_window_limit_of_infinity_gives_one_pass(ready: Ready) -> None:
     model = ready()
     model.windows = replace(PLAN, above=float("inf"))
     vertices = model.animate(speech(3), identity="A").vertices
@@ -131,14 +131,14 @@ def test_without_a_limit_all_speech_is_made_at_once(ready: Ready) -> None:
     assert torch.equal(vertices, model.generate_clips(clip)[0] + clip.template[0])
 
 
-def test_a_stream_cannot_take_frames_back(ready: Ready) -> None:
+def test_stream_cannot_take_frames_back(ready: Ready) -> None:
     stream = ready().stream(identity="A")
     given = stream.feed(speech(4)).shape[1]
     with pytest.raises(FaceDiffError, match=f"frames: 5 are fewer than the {given} that have been given out"):
         stream.finish(5)
 
 
-def test_memory_does_not_grow_with_the_speech(ready: Ready) -> None:
+def test_stream_memory_does_not_grow_with_the_speech(ready: Ready) -> None:
     model = ready()
     stream = model.stream(identity="A")
     held = []
@@ -148,7 +148,7 @@ def test_memory_does_not_grow_with_the_speech(ready: Ready) -> None:
     assert max(held[20:]) <= max(held[:20])
 
 
-def test_short_clips_are_made_at_once_and_long_ones_by_windows(ready: Ready, tiny: Tiny) -> None:
+def test_generate_takes_short_clips_in_one_pass_and_long_ones_by_windows(ready: Ready, tiny: Tiny) -> None:
     model = ready()
     samples = [tiny.dataset("train")[0], tiny.dataset("train")[3]]
     long = samples[1]
@@ -165,13 +165,13 @@ def test_short_clips_are_made_at_once_and_long_ones_by_windows(ready: Ready, tin
     assert not made[0, alone.shape[1] :].any()
     assert torch.equal(alone, model.generate_clips(collate([samples[0]]), seed=4))
     clip = collate([long])
-    parts = list(SpeechStream(model, clip, seeds=[4]).over(clip.audio[0]))
+    parts = list(SpeechStream(model, clip, seeds=[4]).parts(clip.audio[0]))
     assert torch.equal(made[1], torch.cat(parts, 1)[0])
     assert not torch.allclose(made[1], model.generate_clips(clip, seed=4)[0], atol=1e-3)
 
 
-def test_the_first_shared_frame_is_the_old_windows_in_every_step(ready: Ready) -> None:
-    """Then the new window starts from the very motion that the old one has, and no joint can be seen."""
+def test_window_overlap_starts_with_the_old_windows_frame_in_every_step(ready: Ready) -> None:
+    """Then the new window starts from the very motion that the old one has, and the boundary cannot be seen."""
     model = ready(sampler=partial(registry.sampler.ddpm, steps=6))
     made = []
     generate_clips = model.generate_window
@@ -182,7 +182,7 @@ def test_the_first_shared_frame_is_the_old_windows_in_every_step(ready: Ready) -
         return motion, tail
 
     model.generate_window = watched  # type: ignore[method-assign,assignment]
-    list(model.stream(identity="A").over(speech(4)))
+    list(model.stream(identity="A").parts(speech(4)))
     assert len(made) > 3
     size = made[0].std()
     for old, new in zip(made, made[1:], strict=False):
@@ -191,7 +191,7 @@ def test_the_first_shared_frame_is_the_old_windows_in_every_step(ready: Ready) -
         assert (new[:, 9] - old[:, 29]).abs().mean() > 0.01 * size
 
 
-def test_a_seam_blends_each_step_with_its_own() -> None:
+def test_window_overlap_blends_each_step_with_its_own() -> None:
     before = [torch.randn(2, 4, 3) for _ in range(2)]
     overlap_blend = WindowOverlap(before, kept=2)
     for step in range(2):
@@ -204,28 +204,28 @@ def test_a_seam_blends_each_step_with_its_own() -> None:
         assert torch.equal(overlap_blend.features[step], blended[:, -2:])
 
 
-def test_a_crossfade_of_equals_changes_nothing() -> None:
+def test_crossfade_of_equals_changes_nothing() -> None:
     motion = torch.randn(1, 9, 5, 3)
     torch.testing.assert_close(crossfaded(motion[:, :4], motion), motion)
 
 
-def test_takes_are_what_their_seeds_give_and_the_speech_is_encoded_once(ready: Ready) -> None:
+def test_samples_are_what_their_seeds_give_and_the_speech_is_encoded_once(ready: Ready) -> None:
     model = ready(sampler=partial(registry.sampler.ddpm, steps=5))
     heard = []
     encoder = model.speech_encoder
     encoder.register_forward_hook(lambda *_: heard.append(1))
     for seconds in (1.5, 4.0):
         heard.clear()
-        takes = model.animate_samples(speech(seconds), identity="B", seeds=[7, 8, 9])
+        samples = model.animate_samples(speech(seconds), identity="B", seeds=[7, 8, 9])
         once = len(heard)
         single = [model.animate(speech(seconds), identity="B", seed=seed) for seed in (7, 8, 9)]
         assert len(heard) == 4 * once
-        for animation, alone in zip(takes, single, strict=True):
-            torch.testing.assert_close(animation.vertices, alone.vertices, rtol=0, atol=1e-5)
-        assert (takes[0].vertices - takes[1].vertices).abs().max() > 1e-4
+        for sample, alone in zip(samples, single, strict=True):
+            torch.testing.assert_close(sample.vertices, alone.vertices, rtol=0, atol=1e-5)
+        assert (samples[0].vertices - samples[1].vertices).abs().max() > 1e-4
 
 
-def test_the_level_is_that_of_all_that_was_heard() -> None:
+def test_level_is_that_of_all_that_was_heard() -> None:
     level, whole = Level(), speech(2).double() + 0.1
     for piece in pieces(whole, 5):
         level.hear(piece)
@@ -234,7 +234,7 @@ def test_the_level_is_that_of_all_that_was_heard() -> None:
     np.testing.assert_allclose(level.deviation, whole.numpy().std(), rtol=1e-9)
 
 
-def test_the_level_needs_no_float64_where_the_speech_is() -> None:
+def test_level_needs_no_float64_where_the_speech_is() -> None:
     class Narrow(Tensor):
         """As on Apple's accelerators."""
 
@@ -253,7 +253,7 @@ def test_the_level_needs_no_float64_where_the_speech_is() -> None:
     assert (level.mean, level.deviation) == (2.0, 1.0)
 
 
-def test_an_encoder_hears_a_piece_as_loud_as_in_the_whole(ready: Ready) -> None:
+def test_audio_encoder_hears_a_piece_as_loud_as_in_the_whole(ready: Ready) -> None:
     encoder = ready().speech_encoder
     whole = speech(3)
     length = torch.tensor([16000])
@@ -275,19 +275,19 @@ def test_an_encoder_hears_a_piece_as_loud_as_in_the_whole(ready: Ready) -> None:
         ({"seconds": 1.0, "overlap": 0.6}, "overlap: 0.6 s is impossible"),
         ({"overlap": 0.0}, "overlap: 0 s is impossible"),
         ({"overlap": float("nan")}, "overlap: nan s is impossible"),
-        ({"before": float("inf")}, "nor for ever"),
-        ({"above": float("nan")}, "cannot last less than 0 s"),
-        ({"after": -1.0}, "cannot last less than 0 s"),
+        ({"before": float("inf")}, "window: the speech before and after"),
+        ({"above": float("nan")}, "window: the speech before and after"),
+        ({"after": -1.0}, "window: the speech before and after"),
         ({"seconds": float("nan")}, "window: nan s is impossible"),
     ],
 )
-def test_impossible_windows(change: dict[str, float], sentence: str) -> None:
+def test_window_plan_refuses_impossible_lengths(change: dict[str, float], sentence: str) -> None:
     with pytest.raises(FaceDiffError, match=sentence.replace(".", r"\.")):
         WindowPlan(**change)
 
 
 @pytest.mark.parametrize("rate", [24.0, 25.0, 30.0, 60.0])
-def test_any_window_may_share_half_of_itself(rate: float) -> None:
+def test_window_plan_may_share_half_of_a_window(rate: float) -> None:
     """Also where half of it is rounded up and all of it down."""
     for hundredths in range(20, 300):
         plan = WindowPlan(seconds=hundredths / 100, overlap=hundredths / 200).in_frames(rate)
@@ -296,12 +296,12 @@ def test_any_window_may_share_half_of_itself(rate: float) -> None:
         assert 0 < 2 * plan.overlap <= plan.frames
 
 
-def test_windows_of_too_few_frames(ready: Ready) -> None:
+def test_window_plan_refuses_too_few_frames(ready: Ready) -> None:
     with pytest.raises(FaceDiffError, match="too few frames at 25 a second"):
         ready().stream(identity="A", plan=WindowPlan(seconds=0.1, overlap=0.05))
 
 
-def test_speech_without_a_frame_is_refused(ready: Ready) -> None:
+def test_stream_refuses_speech_without_a_frame(ready: Ready) -> None:
     stream = ready().stream(identity="A")
     stream.feed(torch.zeros(100))
     with pytest.raises(FaceDiffError, match="shorter than one frame"):

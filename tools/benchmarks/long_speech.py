@@ -103,7 +103,7 @@ def material(model: AnimationModel, identity: str, seconds: float) -> Material:
 def by_windows(model: AnimationModel, clip: Batch, plan: WindowPlan) -> torch.Tensor:
     """Motion (T, V, 3)."""
     stream = SpeechStream(model, clip, plan=plan)
-    return torch.cat([part[0] for part in stream.over(clip.audio[0], frames=clip.motion.shape[1])])
+    return torch.cat([part[0] for part in stream.parts(clip.audio[0], frames=clip.motion.shape[1])])
 
 
 def hard_cut(model: AnimationModel, clip: Batch, plan: WindowPlan) -> torch.Tensor:
@@ -248,7 +248,7 @@ def sized(seconds: float, vertices: int) -> None:
     stream = SpeechStream(model, clip)
     print(f"model: {vertices} vertices, HuBERT base, random weights; {seconds:.0f} s of noise")
     start = time.perf_counter()
-    frames = sum(part.shape[1] for part in stream.over(speech))
+    frames = sum(part.shape[1] for part in stream.parts(speech))
     took = time.perf_counter() - start
     print(f"{frames} frames in {took:.1f} s, real-time factor {took / seconds:.3f}; peak {peak():.2f} GiB resident")
 
