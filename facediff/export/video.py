@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +40,10 @@ class Mp4(Format):
         """
         from facediff.render import write_video
 
-        frames: Iterable[Frame] = drawn_frames(animations, options)
-        if not options.quiet:
-            longest = max(len(animation.vertices) for animation in animations)
-            frames = track(frames, f"drawing {path.name}", total=longest)
+        longest = max(len(animation.vertices) for animation in animations)
+        frames = track(
+            drawn_frames(animations, options), f"drawing {path.name}", total=longest, shown=not options.quiet
+        )
         speaking = next((animation for animation in animations if animation.speech is not None), animations[0])
         sound = speaking.sound() if options.speech else None
         write_video(path, frames, speaking.frame_rate, sound, speaking.sample_rate)

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import secrets
-import shutil
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +15,7 @@ from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.export.format import ExportOptions, Format, folder_of
 from facediff.export.sequences import RECORD
-from facediff.utils.files import check_writable
+from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
 
 class _Formats(Mapping[str, Format]):
@@ -76,15 +72,24 @@ def write_animations(path: Path, animations: Sequence[Animation], options: Expor
     speech_files = [
         _speech_file(target, form, group[0], options) for target, group in zip(targets, groups, strict=True)
     ]
-    with _staged(path) as hidden:
-        for target, group, speech_file in zip(targets, groups, speech_files, strict=True):
-            staged = hidden / target.name
-            form.write(staged, group, replace(options, speech_file=speech_file))
-            if speech_file is not None:
-                write_wav((folder_of(staged) if form.is_folder else hidden) / speech_file, group[0])
-        written = {file.name for file in hidden.iterdir()}
+    with scratch_folder(path) as hidden:
+        try:
+            for target, group, speech_file in zip(targets, groups, speech_files, strict=True):
+                staged = hidden / target.name
+                form.write(staged, group, replace(options, speech_file=speech_file))
+                if speech_file is not None:
+                    write_wav((folder_of(staged) if form.is_folder else hidden) / speech_file, group[0])
+        except FaceDiffError as error:
+            # The format's writer names the hidden folder, which the user has never seen.
+            raise FaceDiffError(str(error).replace(str(hidden), str(path.parent))) from error
+        written = sorted(hidden.iterdir())
+        for file in written:
+            if (goal := path.with_name(file.name)).exists() and goal.is_dir() != file.is_dir():
+                raise FaceDiffError(f"{goal}: is in the way; move it, or choose another -o")
+        for file in written:
+            put_in_place(file, path.with_name(file.name))
     first = [(folder_of(target) if form.is_folder else target).name for target in targets]
-    return [path.with_name(name) for name in [*first, *sorted(written - set(first))]]
+    return [path.with_name(name) for name in [*first, *(file.name for file in written if file.name not in first)]]
 
 
 def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> None:
@@ -233,56 +238,3 @@ def check_free(path: Path) -> None:
         raise FaceDiffError(
             f"{path}: {what} that facediff did not write, and would be replaced; choose another -o, or move it"
         )
-
-
-@contextmanager
-def _staged(path: Path) -> Iterator[Path]:
-    """A hidden folder next to ``path``; at the end its content moves next to ``path``, all of it or nothing.
-
-    Raises:
-        FaceDiffError: if the place cannot be written, the disk is full, or a folder is in the way.
-    """
-    parent = path.parent
-    made = [folder for folder in (parent, *parent.parents) if not folder.exists()]
-    hidden = parent / f".{path.stem}.partial-{os.getpid()}-{secrets.token_hex(4)}"
-    done = False
-    try:
-        parent.mkdir(parents=True, exist_ok=True)
-        hidden.mkdir()
-        yield hidden
-        arrivals = sorted(hidden.iterdir())
-        for arrival in arrivals:
-            if (parent / arrival.name).is_dir() != arrival.is_dir() and (parent / arrival.name).exists():
-                raise FaceDiffError(f"{parent / arrival.name}: is in the way; move it, or choose another -o")
-        for arrival in arrivals:
-            _move(arrival, parent / arrival.name)
-        done = True
-    except OSError as error:
-        raise FaceDiffError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space or choose another folder. "
-            f"Nothing was left there"
-        ) from error
-    except FaceDiffError as error:
-        # The format's writer names the hidden folder, which the user has never seen.
-        if str(hidden) not in str(error):
-            raise
-        raise FaceDiffError(str(error).replace(str(hidden), str(parent))) from error
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
-        for folder in [] if done else made:
-            with suppress(OSError):
-                folder.rmdir()
-
-
-def _move(source: Path, target: Path) -> None:
-    """Rename; a folder of an earlier export is renamed first and removed afterwards."""
-    if not target.is_dir():
-        os.replace(source, target)
-        return
-    aside = source.with_name(f"{source.name}.old")
-    os.rename(target, aside)
-    try:
-        os.rename(source, target)
-    except OSError:
-        os.rename(aside, target)
-        raise
