@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import struct
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,9 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.errors import FaceDiffError
 from facediff.render.rasteriser import face_outward, to_linear, vertex_normals
 
 Up = Literal["y", "z"]
+
+MARK = b"facediff"
+"""Stands near the start of every file that is written without having been named by the user."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +158,24 @@ class Space:
         return (self.place(np.asarray(frame)) for frame in animation.frames())
 
 
+def check_animation(animation: Animation, *, needs_mesh: bool = True) -> None:
+    """Refuse an animation that would make a broken file.
+
+    Raises:
+        FaceDiffError: naming the animation and what is wrong with it.
+    """
+    animation.refuse_not_finite()
+    if not np.isfinite(animation.template).all():
+        raise FaceDiffError(f"{animation.name}: its template holds NaN or infinity; give a mesh without them")
+    if animation.colours is not None and animation.colours.shape != animation.template.shape:
+        raise FaceDiffError(
+            f"{animation.name}: its vertex colours have shape {animation.colours.shape}; expected "
+            f"{animation.template.shape}"
+        )
+    if needs_mesh:
+        _ = animation.triangles
+
+
 def facts(animation: Animation, space: Space) -> dict[str, object]:
     """The facts that are written into every file which has room for text."""
     return {
@@ -188,3 +211,28 @@ def linear_colours(colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
 def folder_of(path: Path) -> Path:
     """The folder of a sequence that was asked for as a file: ``hello.obj`` gives ``hello_obj``."""
     return path.with_name(f"{path.stem}_{path.suffix[1:]}")
+
+
+def speech_wav(animation: Animation) -> bytes | None:
+    """The speech as a .wav file of 16 bits, exactly as long as the motion; None for a silent animation.
+
+    Raises:
+        FaceDiffError: if the speech is not finite.
+    """
+    sound = animation.sound()
+    if sound is None:
+        return None
+    if not np.isfinite(sound).all():
+        raise FaceDiffError(f"{animation.name}: its speech holds NaN or infinity; read the recording again")
+    # Readers divide by 32768, so that a 16-bit recording comes back bit by bit.
+    data = np.clip(np.rint(sound * 32768), -32768, 32767).astype("<i2").tobytes()
+    rate = animation.sample_rate
+    # The standard library's module wave cannot write the entry ISFT (software). It stands before the samples, where it
+    # is looked for before a file is replaced: an export replaces its own .wav but never a recording of the user's.
+    chunks = [
+        (b"fmt ", struct.pack("<HHIIHH", 1, 1, rate, 2 * rate, 2, 16)),
+        (b"LIST", b"INFOISFT" + struct.pack("<I", 10) + MARK + b"\0\0"),
+        (b"data", data),
+    ]
+    body = b"WAVE" + b"".join(name + struct.pack("<I", len(content)) + content for name, content in chunks)
+    return b"RIFF" + struct.pack("<I", len(body)) + body

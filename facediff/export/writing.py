@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
-import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from facediff import registry
 from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError, MissingExtraError, choices
-from facediff.export.format import ExportOptions, Format, folder_of
+from facediff.export.format import MARK, ExportOptions, Format, check_animation, folder_of, speech_wav
 from facediff.export.sequences import RECORD
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
@@ -63,7 +60,7 @@ def write_animations(path: Path, animations: Sequence[Animation], options: Expor
     check_export(path, options, len(animations))
     form = FORMATS[path.suffix]
     for animation in animations:
-        check_animation(animation, form)
+        check_animation(animation, needs_mesh=form.needs_mesh)
     targets = _targets(path, form, len(animations))
     groups = [animations] if form.holds_several else [[animation] for animation in animations]
     for target, group in zip(targets, groups, strict=True):
@@ -77,8 +74,8 @@ def write_animations(path: Path, animations: Sequence[Animation], options: Expor
             for target, group, speech_file in zip(targets, groups, speech_files, strict=True):
                 staged = hidden / target.name
                 form.write(staged, group, replace(options, speech_file=speech_file))
-                if speech_file is not None:
-                    write_wav((folder_of(staged) if form.is_folder else hidden) / speech_file, group[0])
+                if speech_file is not None and (wav := speech_wav(group[0])) is not None:
+                    ((folder_of(staged) if form.is_folder else hidden) / speech_file).write_bytes(wav)
         except FaceDiffError as error:
             # The format's writer names the hidden folder, which the user has never seen.
             raise FaceDiffError(str(error).replace(str(hidden), str(path.parent))) from error
@@ -140,24 +137,6 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
             check_free(folder_of(target))
 
 
-def check_animation(animation: Animation, form: Format) -> None:
-    """Refuse an animation that would make a broken file.
-
-    Raises:
-        FaceDiffError: naming the animation and what is wrong with it.
-    """
-    animation.refuse_not_finite()
-    if not np.isfinite(animation.template).all():
-        raise FaceDiffError(f"{animation.name}: its template holds NaN or infinity; give a mesh without them")
-    if animation.colours is not None and animation.colours.shape != animation.template.shape:
-        raise FaceDiffError(
-            f"{animation.name}: its vertex colours have shape {animation.colours.shape}; expected "
-            f"{animation.template.shape}"
-        )
-    if form.needs_mesh:
-        _ = animation.triangles
-
-
 def _targets(path: Path, form: Format, count: int) -> list[Path]:
     """The files that the user asked for."""
     if form.holds_several or count == 1:
@@ -175,35 +154,6 @@ def _speech_file(path: Path, form: Format, animation: Animation, options: Export
     other = path.with_name(f"{path.stem}_speech.wav")
     check_free(other)
     return other.name
-
-
-def write_wav(path: Path, animation: Animation) -> None:
-    """Write the speech as 16-bit PCM, exactly as long as the motion; nothing for a silent animation.
-
-    Raises:
-        FaceDiffError: if the speech is not finite.
-    """
-    sound = animation.sound()
-    if sound is None:
-        return
-    if not np.isfinite(sound).all():
-        raise FaceDiffError(f"{animation.name}: its speech holds NaN or infinity; read the recording again")
-    # Readers divide by 32768, so that a 16-bit recording comes back bit by bit.
-    data = np.clip(np.rint(sound * 32768), -32768, 32767).astype("<i2").tobytes()
-    rate = animation.sample_rate
-    # The standard library's module wave cannot write the entry ISFT (software). It stands before the samples, where
-    # is_free finds it, so that an export replaces its own .wav but never a recording of the user's.
-    chunks = [
-        (b"fmt ", struct.pack("<HHIIHH", 1, 1, rate, 2 * rate, 2, 16)),
-        (b"LIST", b"INFOISFT" + struct.pack("<I", 10) + b"facediff\0\0"),
-        (b"data", data),
-    ]
-    body = b"WAVE" + b"".join(name + struct.pack("<I", len(content)) + content for name, content in chunks)
-    path.write_bytes(b"RIFF" + struct.pack("<I", len(body)) + body)
-
-
-MARK = b"facediff"
-"""Stands near the start of every file that is written without having been named by the user."""
 
 
 def is_free(path: Path) -> bool:

@@ -21,7 +21,7 @@ def rectangle(left: float, right: float, bottom: float, top: float, depth: float
 
 
 def clicks(*, speech: bool = True, name: str = "clicks", lower: float = 0.0) -> Animation:
-    """The take: blue throat behind red lips; in an open frame the lower lip is `OPENING` mm further down.
+    """The animation: blue throat behind red lips; in an open frame the lower lip is `OPENING` mm further down.
 
     The middle of the picture shows the lower lip while the mouth is closed, and the throat while it is open.
     """

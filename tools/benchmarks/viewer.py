@@ -83,12 +83,12 @@ def processor_seconds(browser: Chromium) -> float:
     return float(sum(each["cpuTime"] for each in browser.send("SystemInfo.getProcessInfo")["processInfo"]))
 
 
-def line(label: str, takes: list[Animation], folder: Path, browser: Chromium | None, watch: float) -> str:
+def line(label: str, animations: list[Animation], folder: Path, browser: Chromium | None, watch: float) -> str:
     """One row of the table: write a page, and play it where there is a browser."""
     page = folder / "page.html"
     started = time.perf_counter()
-    options: dict[str, Any] = {"truth": 0} if len(takes) > 1 else {}
-    write_page(page, takes, max_mb=1000, **options)
+    options: dict[str, Any] = {"truth": 0} if len(animations) > 1 else {}
+    write_page(page, animations, max_mb=1000, **options)
     row = f"{label:<42}{page.stat().st_size / 1e6:7.1f}{time.perf_counter() - started:9.1f}"
     if browser is not None:
         rate, late, ready, work = played(browser, page, watch)
@@ -100,7 +100,7 @@ def main(words: list[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--vertices", type=int, nargs="+", default=[5023, 23370])
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of the takes")
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of the animations")
     parser.add_argument("--watch", type=float, default=8.0, help="seconds that are played")
     args = parser.parse_args(words)
     program = find_chromium()

@@ -1,4 +1,4 @@
-"""One HTML file that plays takes in any browser: pictures in WebGL 2, speech as their clock, nothing from a network.
+"""One HTML file that plays animations in any browser: pictures in WebGL 2, the speech as their clock, no network.
 
 Importing this costs NumPy only; the colours of the heat map come from :mod:`facediff.render`, which needs OpenCV.
 

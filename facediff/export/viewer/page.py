@@ -1,4 +1,4 @@
-"""The page: template, style, script and data put together in one file."""
+"""The page: template, style, script and data put together in one HTML file."""
 
 from __future__ import annotations
 
@@ -17,72 +17,24 @@ import numpy as np
 
 from facediff.animation import Animation
 from facediff.errors import FaceDiffError
-from facediff.export.format import ExportOptions, Format
+from facediff.export.format import ExportOptions, Format, check_animation, outward, speech_wav
 from facediff.export.viewer.packing import (
     CHUNK_FRAMES,
     STEP,
     Blobs,
     bounds,
-    check_animations,
-    comparable,
-    first_sound,
+    heat_scale_end,
     millimetres,
-    opening,
+    mouth_opening,
     pack_motion,
-    scale_end,
 )
 from facediff.registry import export_format
 from facediff.utils.files import atomic, check_writable
 
 FORMAT = "facediff page 1"
-SCRIPTS = (
-    "motion.js",
-    "surface.js",
-    "clock.js",
-    "camera.js",
-    "scene.js",
-    "curve.js",
-    "dialogs.js",
-    "panels.js",
-    "player.js",
-)
+MOST_ANIMATIONS = 4
+SCRIPTS = ("motion", "surface", "clock", "camera", "scene", "curve", "dialogs", "panels", "player")
 """Parts of the script; each uses only what stands before it."""
-MEGABYTE = 1_000_000
-
-
-def write_page(path: Path, takes: Sequence[Animation], *, max_mb: float = 30.0, truth: int | None = None) -> None:
-    """Write one self-contained HTML file that plays takes side by side with their speech.
-
-    It loads nothing: no script, font or picture from elsewhere; its content security policy forbids it. Positions are
-    rounded by at most 0.0433 mm. It needs a browser with WebGL 2 and ``DecompressionStream``: Chrome or Edge 111,
-    Firefox 113, Safari 16.4 or newer.
-
-    Args:
-        path: the .html file.
-        takes: 1 to 4 takes of one frame rate and one length, each with its own mesh. The speech is that of the first
-            take that has any.
-        max_mb: the largest file that is written, in megabytes (10⁶ bytes).
-        truth: number of the take, from 0, that the others are compared with; those of its topology get a heat map of
-            the Euclidean distance of each vertex from it.
-
-    Raises:
-        FaceDiffError: if the takes do not make a page, or the file would be too large or cannot be written. Nothing
-            is left half-written.
-        MissingExtraError: for a heat map without OpenCV.
-    """
-    check_writable(path)
-    check_animations(takes, truth)
-    blobs = Blobs()
-    facts = page_facts(takes, truth, blobs)
-    parts = page_parts(facts, blobs)
-    size = sum(len(part.encode()) for part in parts) / MEGABYTE
-    if size > max_mb:
-        raise FaceDiffError(
-            f"{path}: would have {size:.1f} MB, more than the limit of {max_mb:g} MB; show fewer or shorter takes, or "
-            f"raise the limit (`facediff view --max-mb`)"
-        )
-    with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
-        stream.writelines(parts)
 
 
 @export_format.register("html")
@@ -97,54 +49,120 @@ class Page(Format):
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write a page that shows all animations next to each other."""
-        write_page(path, [a if options.speech else replace(a, speech=None) for a in animations])
+        write_page(path, [each if options.speech else replace(each, speech=None) for each in animations])
 
 
-def page_facts(takes: Sequence[Animation], truth: int | None, blobs: Blobs) -> dict[str, Any]:
-    """What the script reads: numbers and names, and under which numbers arrays are among the blobs."""
-    sound = first_sound(takes)
-    alike = [
-        number
-        for number, animation in enumerate(takes)
-        if truth is not None and number != truth and comparable(animation, takes[truth])
-    ]
+def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 30.0, truth: int | None = None) -> None:
+    """Write one self-contained HTML file that plays animations side by side with their speech.
+
+    It loads nothing: no script, font or picture from elsewhere; its content security policy forbids it. Positions are
+    rounded by at most 0.0433 mm. It needs a browser with WebGL 2 and ``DecompressionStream``: Chrome or Edge 111,
+    Firefox 113, Safari 16.4 or newer.
+
+    Args:
+        path: the .html file.
+        animations: 1 to 4 animations of one frame rate and one length, each with its own mesh. The speech is that of
+            the first animation that has any.
+        max_mb: the largest file that is written, in megabytes (10⁶ bytes).
+        truth: number of the animation, from 0, that the others are compared with; those of its topology get a heat map
+            of the Euclidean distance of each vertex from it.
+
+    Raises:
+        FaceDiffError: if the animations do not make a page, or the file would be too large or cannot be written; no
+            half-written file is left.
+        MissingExtraError: for a heat map without OpenCV.
+    """
+    check_writable(path)
+    _check(animations, truth)
+    blobs = Blobs()
+    parts = _page_parts(_page_facts(animations, truth, blobs), blobs)
+    size = sum(len(part.encode()) for part in parts) / 1_000_000
+    if size > max_mb:
+        raise FaceDiffError(
+            f"{path}: would have {size:.1f} MB, more than the limit of {max_mb:g} MB; show fewer or shorter "
+            f"animations, or raise the limit (`facediff view --max-mb`)"
+        )
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.writelines(parts)
+
+
+def _check(animations: Sequence[Animation], truth: int | None) -> None:
+    """Refuse animations that do not make a page."""
+    if not 1 <= len(animations) <= MOST_ANIMATIONS:
+        raise FaceDiffError(
+            f"a page shows 1 to {MOST_ANIMATIONS} animations side by side, not {len(animations)}; choose among them"
+        )
+    if truth is not None and not 0 <= truth < len(animations):
+        raise FaceDiffError(f"truth is number {truth} of {len(animations)} animations; number them from 0")
+    first = animations[0]
+    for animation in animations:
+        name, count = animation.name, len(animation.template)
+        if animation.frame_rate != first.frame_rate:
+            raise FaceDiffError(
+                f"{name}: has {animation.frame_rate:g} frames a second and {first.name} {first.frame_rate:g}; "
+                f"animations on one page need the same frame rate"
+            )
+        if len(animation.vertices) != len(first.vertices):
+            raise FaceDiffError(
+                f"{name}: has {len(animation.vertices)} frames and {first.name} {len(first.vertices)}; animations on "
+                f"one page need the same length: cut them, as `facediff view --shortest` does"
+            )
+        check_animation(animation)
+        pairs = animation.inner_lip_pairs
+        if pairs is None or not len(pairs):
+            continue
+        if pairs.ndim != 2 or pairs.shape[1] != 2 or not 0 <= pairs.min() <= pairs.max() < count:
+            raise FaceDiffError(
+                f"{name}: its pairs of inner lips have shape {pairs.shape} and go up to vertex {int(pairs.max())} of "
+                f"{count}; expected (pairs, 2) of this mesh"
+            )
+
+
+def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs) -> dict[str, Any]:
+    """The JSON that the script reads: numbers, names, and the numbers of arrays among the blobs."""
+    speaking = next((animation for animation in animations if animation.speech is not None), None)
+    sound = None if speaking is None else speech_wav(speaking)
+    compared: list[int] = []
+    heat = None
+    if truth is not None:
+        # Only vertices of the truth's own topology have a distance from it.
+        compared = [
+            number
+            for number, animation in enumerate(animations)
+            if number != truth and np.array_equal(animation.triangles, animations[truth].triangles)
+        ]
+    if truth is not None and compared:
+        from facediff.render.panels import heat_ramp
+
+        end = heat_scale_end(animations[truth], [animations[number] for number in compared])
+        heat = {"ramp": blobs.add(heat_ramp().tobytes()), "highest": end}
     return {
         "format": FORMAT,
-        "frameRate": takes[0].frame_rate,
-        "frames": len(takes[0].vertices),
+        "frameRate": animations[0].frame_rate,
+        "frames": len(animations[0].vertices),
         "step": STEP,
         "chunkFrames": CHUNK_FRAMES,
         "sound": None if sound is None else blobs.add(sound),
         "truth": truth,
-        "heat": None if truth is None or not alike else heat_facts(takes[truth], [takes[i] for i in alike], blobs),
-        "takes": [animation_facts(animation, number in alike, blobs) for number, animation in enumerate(takes)],
+        "heat": heat,
+        "animations": [_animation_facts(each, number in compared, blobs) for number, each in enumerate(animations)],
     }
 
 
-def heat_facts(truth: Animation, others: Sequence[Animation], blobs: Blobs) -> dict[str, Any]:
-    """The heat map's scale, and its 256 colours as bytes of sRGB."""
-    from facediff.render.panels import heat_ramp
-
-    return {"ramp": blobs.add(heat_ramp().tobytes()), "highest": scale_end(truth, others)}
-
-
-def animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict[str, Any]:
-    """One take: its arrays in mm among the blobs, and words about it."""
-    from facediff.render.rasteriser import face_outward
-
-    # The script takes what is wound clockwise for the hollow of the mouth.
-    outside = face_outward(animation.triangles.astype(np.int32), np.asarray(animation.template, np.float64))
+def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict[str, Any]:
+    """One animation: its arrays in mm among the blobs, and its names and numbers."""
     centre, extent = bounds(animation)
-    curve = opening(animation)
+    opening = mouth_opening(animation)
     template = np.asarray(animation.template, np.float64) * millimetres(animation)
     return {
         "name": animation.name,
         "vertices": len(animation.template),
         "triangles": len(animation.triangles),
         "template": blobs.add(template.astype("<f4").tobytes()),
-        "faces": blobs.add(outside.astype("<u4").tobytes()),
+        # Outward, since the script shows the back of a triangle as the hollow of the mouth.
+        "faces": blobs.add(outward(animation).astype("<u4").tobytes()),
         "colours": None if animation.colours is None else blobs.add(animation.colours.astype(np.uint8).tobytes()),
-        "opening": None if curve is None else blobs.add(curve.astype("<f4").tobytes()),
+        "opening": None if opening is None else blobs.add(opening.astype("<f4").tobytes()),
         "chunks": pack_motion(animation, blobs),
         "centre": centre,
         "extent": extent,
@@ -153,48 +171,35 @@ def animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict[
     }
 
 
-def page_parts(facts: dict[str, Any], blobs: Blobs) -> list[str]:
+def _page_parts(facts: dict[str, Any], blobs: Blobs) -> list[str]:
     """The text of the page in pieces, in order."""
-    style = read_text("style.css")
-    script = "(() => {\n" + "\n".join(read_text(name) for name in SCRIPTS) + "\n})();\n"
+    style = _asset("style.css")
+    script = "(() => {\n" + "\n".join(_asset(f"{name}.js") for name in SCRIPTS) + "\n})();\n"
+    # JSON that cannot end the element it stands in, whatever names are in it; without characters beyond ASCII.
+    data = json.dumps(facts, allow_nan=False)
+    data = data.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     values = {
-        "title": html.escape(" · ".join(animation["name"] for animation in facts["takes"])),
-        "policy": policy(script, style),
+        "title": html.escape(" · ".join(animation["name"] for animation in facts["animations"])),
+        # Lets this script and this style run, and nothing be loaded.
+        "policy": f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; "
+        f"img-src data:; media-src blob:; base-uri 'none'; form-action 'none'",
         "style": style,
-        "facts": safe_json(facts),
+        "facts": data,
         "script": script,
     }
-    before, after = read_text("page.html").split("{{blobs}}")
-    data = [
-        f'<script type="text/plain" id="blob-{number}">{text}</script>\n' for number, text in enumerate(blobs.texts)
-    ]
-    return [fill(before, values), *data, fill(after, values)]
-
-
-def fill(template: str, values: dict[str, str]) -> str:
-    """Put values into the places {{name}}; what stands in a value is not looked at again."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
-
-
-def policy(script: str, style: str) -> str:
-    """A content security policy that lets this script and this style run, and nothing be loaded."""
-    return (
-        f"default-src 'none'; script-src '{digest(script)}'; style-src '{digest(style)}'; "
-        f"img-src data:; media-src blob:; base-uri 'none'; form-action 'none'"
+    # Values are put into the places {{name}} in one pass, so that what stands in a value is never taken for a place.
+    before, after = (
+        re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], part)
+        for part in _asset("page.html").split("{{blobs}}")
     )
+    texts = enumerate(blobs.texts)
+    return [before, *(f'<script type="text/plain" id="blob-{n}">{text}</script>\n' for n, text in texts), after]
 
 
-def digest(text: str) -> str:
+def _digest(text: str) -> str:
     """A text's hash as a content security policy names it."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
 
 
-def safe_json(value: object) -> str:
-    """JSON that cannot end the element it stands in, whatever names are in it."""
-    text = json.dumps(value, allow_nan=False)  # without characters beyond ASCII
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def read_text(name: str) -> str:
-    """A file of the page."""
+def _asset(name: str) -> str:
     return resources.files("facediff.export.viewer").joinpath("assets", name).read_text(encoding="utf-8")

@@ -68,10 +68,15 @@ def show(browser: Chromium, tmp_path: Path) -> Iterator[Show]:
     pages: list[Page] = []
 
     def shown(
-        takes: list[Animation], *, truth: int | None = None, width: int = 1280, height: int = 800, dark: bool = False
+        animations: list[Animation],
+        *,
+        truth: int | None = None,
+        width: int = 1280,
+        height: int = 800,
+        dark: bool = False,
     ) -> Page:
         path = tmp_path / f"page {len(pages)}.html"
-        write_page(path, takes, truth=truth)
+        write_page(path, animations, truth=truth)
         page = browser.open(path.as_uri(), width=width, height=height, dark=dark)
         pages.append(page)
         page.wait_for("window.facediff && facediff.ready")

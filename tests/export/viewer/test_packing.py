@@ -67,7 +67,7 @@ class Written:
 
     def motion(self, number: int) -> np.ndarray:
         """Positions (T, V, 3) in mm, as the page's script has to make them."""
-        facts, animation = self.facts, self.facts["takes"][number]
+        facts, animation = self.facts, self.facts["animations"][number]
         template = np.frombuffer(self.blob(animation["template"]), "<f4").reshape(-1, 3).astype(np.float64)
         chunks = []
         for place, blob in enumerate(animation["chunks"]):
@@ -112,28 +112,28 @@ def test_positions_come_back_within_the_bound_that_is_stated(
 
 
 def test_a_mesh_that_is_wound_inside_out_is_turned(tmp_path: Path) -> None:
-    """The picture's script takes what is wound clockwise for the dark hollow of the mouth."""
+    """The picture's script treats what is wound clockwise for the dark hollow of the mouth."""
     animation = clicks()
     write_page(tmp_path / "a.html", [animation, replace(animation, faces=animation.triangles[:, ::-1])])
     page = Written(tmp_path / "a.html")
-    for facts in page.facts["takes"]:
+    for facts in page.facts["animations"]:
         assert np.array_equal(np.frombuffer(page.blob(facts["faces"]), "<u4").reshape(-1, 3), animation.triangles)
 
 
-def test_a_page_of_several_takes_keeps_each_mesh_and_equal_parts_once(tmp_path: Path) -> None:
+def test_a_page_of_several_animations_keeps_each_mesh_and_equal_parts_once(tmp_path: Path) -> None:
     first, second = random_animation(0), random_animation(1, vertices=12)
     write_page(tmp_path / "a.html", [first, second, replace(first, name="again")])
     page = Written(tmp_path / "a.html")
-    assert [animation["name"] for animation in page.facts["takes"]] == ["random 0", "random 1", "again"]
+    assert [animation["name"] for animation in page.facts["animations"]] == ["random 0", "random 1", "again"]
     for number, animation in enumerate([first, second, first]):
-        facts = page.facts["takes"][number]
+        facts = page.facts["animations"][number]
         assert np.allclose(page.motion(number), animation.vertices * 1000.0, atol=0.05)
         faces = np.frombuffer(page.blob(facts["faces"]), "<u4").reshape(-1, 3)
         assert any(np.array_equal(faces, wound) for wound in (animation.triangles, animation.triangles[:, ::-1]))
         low, high = animation.template.min(0) * 1000, animation.template.max(0) * 1000
         assert np.allclose(facts["centre"], (low + high) / 2, atol=1e-2)
         assert np.allclose(facts["extent"], (high - low) / 2, atol=1e-2)
-    assert page.facts["takes"][0]["chunks"] == page.facts["takes"][2]["chunks"]
+    assert page.facts["animations"][0]["chunks"] == page.facts["animations"][2]["chunks"]
     assert page.facts["sound"] is None
     assert page.facts["heat"] is None
 
@@ -148,7 +148,7 @@ def test_the_clicks_stand_at_the_samples_of_their_frames_and_the_curve_shows_the
     loud = np.flatnonzero(sound)
     starts = loud[np.diff(loud, prepend=-1000) > 1]
     assert (starts * RATE / SAMPLE_RATE).tolist() == list(OPEN_FRAMES)
-    curve = np.frombuffer(page.blob(page.facts["takes"][0]["opening"]), "<f4")
+    curve = np.frombuffer(page.blob(page.facts["animations"][0]["opening"]), "<f4")
     assert np.flatnonzero(curve).tolist() == list(OPEN_FRAMES)
     assert curve.max() == pytest.approx(OPENING)
 
@@ -159,7 +159,7 @@ def test_the_heat_map_has_the_renderers_colours_and_only_where_topologies_agree(
     write_page(tmp_path / "a.html", [truth, near, other], truth=0)
     page = Written(tmp_path / "a.html")
     assert page.facts["truth"] == 0
-    assert [animation["compared"] for animation in page.facts["takes"]] == [False, True, False]
+    assert [animation["compared"] for animation in page.facts["animations"]] == [False, True, False]
     assert np.array_equal(np.frombuffer(page.blob(page.facts["heat"]["ramp"]), np.uint8).reshape(-1, 3), heat_ramp())
     assert page.facts["heat"]["highest"] in (3, 4)  # 3 mm but for float32
     write_page(tmp_path / "b.html", [truth, other], truth=0)
@@ -169,8 +169,8 @@ def test_the_heat_map_has_the_renderers_colours_and_only_where_topologies_agree(
 def test_hostile_names_stay_words_and_the_page_refers_to_nothing(tmp_path: Path) -> None:
     write_page(tmp_path / "a.html", [replace(clicks(name=HOSTILE), metadata={HOSTILE: HOSTILE})])
     page = Written(tmp_path / "a.html")
-    assert page.facts["takes"][0]["name"] == HOSTILE
-    assert page.facts["takes"][0]["metadata"] == {HOSTILE: HOSTILE}
+    assert page.facts["animations"][0]["name"] == HOSTILE
+    assert page.facts["animations"][0]["metadata"] == {HOSTILE: HOSTILE}
     programs = [text for attributes, text in page.reader.scripts if "type" not in attributes]
     assert len(programs) == 1
     assert "hacked" not in programs[0]
@@ -199,10 +199,10 @@ def nan_at(animation: Animation, frame: int) -> Animation:
 
 
 @pytest.mark.parametrize(
-    ("takes", "words"),
+    ("animations", "words"),
     [
-        ([], "1 to 4 takes side by side, not 0"),
-        ([random_animation(0)] * 5, "1 to 4 takes side by side, not 5"),
+        ([], "1 to 4 animations side by side, not 0"),
+        ([random_animation(0)] * 5, "1 to 4 animations side by side, not 5"),
         ([replace(random_animation(0), faces=None)], "random 0: comes without a mesh"),
         ([nan_at(random_animation(0), 41)], "random 0: frame 41 holds NaN"),
         (
@@ -220,9 +220,11 @@ def nan_at(animation: Animation, frame: int) -> Animation:
         ([random_animation(0, unit="1000")], "away from its template; give the unit"),
     ],
 )
-def test_what_cannot_be_shown_is_one_sentence_and_no_file(tmp_path: Path, takes: list[Animation], words: str) -> None:
+def test_what_cannot_be_shown_is_one_sentence_and_no_file(
+    tmp_path: Path, animations: list[Animation], words: str
+) -> None:
     with pytest.raises(FaceDiffError, match=words) as error:
-        write_page(tmp_path / "a.html", takes)
+        write_page(tmp_path / "a.html", animations)
     assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == []
 

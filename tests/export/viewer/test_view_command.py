@@ -37,11 +37,11 @@ def test_a_bare_truth_borrows_the_mesh_and_stands_first(files: Path, capsys: pyt
     page = files / "page.html"
     assert main(["view", str(files / "guess.npz"), "--truth", str(files / "true.npy"), "-o", str(page)]) == 0
     read = facts(page)
-    assert [animation["name"] for animation in read["takes"]] == ["true", "guess"]
+    assert [animation["name"] for animation in read["animations"]] == ["true", "guess"]
     assert read["truth"] == 0
     assert read["heat"]["highest"] in (3, 4)
     assert read["frameRate"] == 25
-    assert read["takes"][0]["opening"] is not None
+    assert read["animations"][0]["opening"] is not None
     assert read["sound"] is not None
     assert re.search(r"page.html: 75 frames of 2 take\(s\), 0\.\d MB", capsys.readouterr().out)
 
@@ -66,19 +66,19 @@ def test_a_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
     page, words = files / "page.html", ["--checkpoint", "c.ckpt", "-o", str(files / "page.html")]
     assert main(["view", str(files / "guess.npz"), *words]) == 0
     assert facts(page)["frameRate"] == 25
-    assert facts(page)["takes"][0]["centre"] == [0, 0, -2.5]
+    assert facts(page)["animations"][0]["centre"] == [0, 0, -2.5]
     assert main(["view", str(files / "true.npy"), *words]) == 0
     assert facts(page)["frameRate"] == 50
-    assert facts(page)["takes"][0]["centre"] == [500, 500, 475]
+    assert facts(page)["animations"][0]["centre"] == [500, 500, 475]
     assert main(["view", str(files / "guess.npz"), "--identity", "second", *words]) == 0
-    assert facts(page)["takes"][0]["centre"] == [100, 100, 97.5]
+    assert facts(page)["animations"][0]["centre"] == [100, 100, 97.5]
 
 
-def test_takes_of_one_recording_are_told_apart_by_their_files(files: Path) -> None:
+def test_animations_of_one_recording_are_told_apart_by_their_files(files: Path) -> None:
     write_archive(files / "other.npz", clicks(name="guess", lower=5))
     page = files / "page.html"
     assert main(["view", str(files / "guess.npz"), str(files / "other.npz"), "-o", str(page)]) == 0
-    assert [animation["name"] for animation in facts(page)["takes"]] == ["guess", "other"]
+    assert [animation["name"] for animation in facts(page)["animations"]] == ["guess", "other"]
 
 
 def test_labels_the_shortest_and_the_browser(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +89,7 @@ def test_labels_the_shortest_and_the_browser(files: Path, monkeypatch: pytest.Mo
     page = files / "page.html"
     words = ["view", str(files / "guess.npz"), str(files / "short.npz"), "-o", str(page), "--open", "--shortest"]
     assert main([*words, "--labels", "Ä <b>", "two"]) == 0
-    assert [animation["name"] for animation in facts(page)["takes"]] == ["Ä <b>", "two"]
+    assert [animation["name"] for animation in facts(page)["animations"]] == ["Ä <b>", "two"]
     assert facts(page)["frames"] == 40
     assert opened == [page.resolve().as_uri()]
 

@@ -58,7 +58,7 @@ class SoundClock {
   }
 }
 
-/** The same for takes without sound. */
+/** The same for animations without sound. */
 class SilentClock {
   constructor(seconds) {
     this.seconds = seconds;

@@ -1,4 +1,4 @@
-// The mouth's opening over time, one line for each take that knows it, with a cursor at the shown frame.
+// The mouth's opening over time, one line for each animation that knows it, with a cursor at the shown frame.
 
 const MARGIN = { left: 46, right: 14, top: 10, bottom: 22 };
 
@@ -12,7 +12,7 @@ function ticks(end, wanted) {
 }
 
 class Curve {
-  /** Lines are {values, number}: openings in mm by frame, and the number of the take. */
+  /** Lines are {values, number}: openings in mm by frame, and the number of the animation. */
   constructor(canvas, cursor, lines, facts, onSeek) {
     Object.assign(this, { canvas, cursor, lines, facts });
     this.seconds = facts.frames / facts.frameRate;
@@ -71,7 +71,7 @@ class Curve {
     pen.lineWidth = 1.75;
     pen.lineJoin = "round";
     for (const line of this.lines) {
-      pen.strokeStyle = colour(`--take-${line.number + 1}`);
+      pen.strokeStyle = colour(`--line-${line.number + 1}`);
       pen.beginPath();
       // A frame's value stands in the middle of the time in which the frame is shown.
       line.values.forEach((value, frame) => pen.lineTo(this.x((frame + 0.5) / this.facts.frameRate), y(value)));

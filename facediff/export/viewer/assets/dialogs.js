@@ -1,4 +1,4 @@
-// Words about the takes and about the page. Names come from files: they are set as text, never as markup.
+// Words about the animations and about the page. Names come from files: they are set as text, never as markup.
 
 /** A new element with classes and text. */
 function make(tag, classes, text) {
@@ -17,15 +17,15 @@ function describe(rows) {
   return list;
 }
 
-/** Fill the panel with what is known about each take, and how exact the page is. */
+/** Fill the panel with what is known about each animation, and how exact the page is. */
 function fillInformation(place, facts) {
-  for (const take of facts.takes) {
+  for (const animation of facts.animations) {
     const rows = [
-      ["mesh", `${take.vertices} vertices, ${take.triangles} triangles`],
+      ["mesh", `${animation.vertices} vertices, ${animation.triangles} triangles`],
       ["length", `${facts.frames} frames, ${facts.frameRate} a second`],
-      ...Object.entries(take.metadata),
+      ...Object.entries(animation.metadata),
     ];
-    place.append(make("h3", "", take.name), describe(rows));
+    place.append(make("h3", "", animation.name), describe(rows));
   }
   const largest = ((Math.sqrt(3) / 2) * facts.step).toFixed(3);
   place.append(
@@ -34,9 +34,9 @@ function fillInformation(place, facts) {
   );
 }
 
-/** What is said of a take under its name; what was not learned is marked. */
-function captions(take) {
-  const { identity, style, corpus, procedural } = take.metadata;
+/** What is said of an animation under its name; what was not learned is marked. */
+function captions(animation) {
+  const { identity, style, corpus, procedural } = animation.metadata;
   const words = [];
   if (identity) words.push(`identity ${identity}`);
   if (style) words.push(`style of ${style}`);

@@ -48,11 +48,11 @@ async function unfold(packed, vertices, frames) {
   return steps;
 }
 
-/** One take's motion: offsets from the template by frame, unpacked chunk by chunk; a few chunks are kept. */
+/** One animation's motion: offsets from the template by frame, unpacked chunk by chunk; a few chunks are kept. */
 class Motion {
-  constructor(facts, take, onError) {
-    this.numbers = take.chunks;
-    this.vertices = take.vertices;
+  constructor(facts, animation, onError) {
+    this.numbers = animation.chunks;
+    this.vertices = animation.vertices;
     this.frames = facts.frames;
     this.chunkFrames = facts.chunkFrames;
     this.onError = onError;
@@ -103,5 +103,5 @@ class Motion {
   }
 }
 
-/** Bytes of unpacked motion that are kept for one take. */
+/** Bytes of unpacked motion that are kept for one animation. */
 Motion.MEMORY = 24e6;

@@ -16,21 +16,21 @@ function columnsFor(count, width, height) {
 class Panels {
   constructor(facts, onChange) {
     this.facts = facts;
-    this.boxes = facts.takes.map((take, number) => this.label(take, number));
+    this.boxes = facts.animations.map((animation, number) => this.label(animation, number));
     find("panels").append(...this.boxes.map(({ box }) => box));
     new ResizeObserver(() => {
       const { clientWidth, clientHeight } = find("stage");
-      find("panels").style.setProperty("--columns", columnsFor(facts.takes.length, clientWidth, clientHeight));
+      find("panels").style.setProperty("--columns", columnsFor(facts.animations.length, clientWidth, clientHeight));
       onChange();
     }).observe(find("stage"));
   }
 
-  label(take, number) {
+  label(animation, number) {
     const box = make("div", "panel");
     const head = make("div", "name");
-    head.append(make("i", `swatch take-${number + 1}`), make("b", "", take.name));
-    if (number === this.facts.truth && take.name.toLowerCase() !== "truth") head.append(make("span", "mark", "truth"));
-    const { words, marks } = captions(take);
+    head.append(make("i", `swatch line-${number + 1}`), make("b", "", animation.name));
+    if (number === this.facts.truth && animation.name.toLowerCase() !== "truth") head.append(make("span", "mark", "truth"));
+    const { words, marks } = captions(animation);
     const error = make("p", "error");
     const foot = make("div", "marks"); // below the face: what is procedural or synthetic is said, but hides nothing
     foot.append(...marks.map((mark) => make("p", "mark", mark)));
@@ -77,7 +77,7 @@ class Panels {
     player.faces.forEach((face, number) => {
       if (!face.opening) return;
       const entry = make("span", "entry");
-      entry.append(make("i", `swatch take-${number + 1}`), make("span", "", face.take.name), this.boxes[number].opening);
+      entry.append(make("i", `swatch line-${number + 1}`), make("span", "", face.animation.name), this.boxes[number].opening);
       this.boxes[number].opening.hidden = false;
       find("legend").append(entry);
     });

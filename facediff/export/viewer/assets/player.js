@@ -15,20 +15,20 @@ addEventListener("error", (event) => report(event.error ?? event.message));
 addEventListener("unhandledrejection", (event) => report(event.reason));
 addEventListener("securitypolicyviolation", (event) => report(`refused by the page's policy: ${event.blockedURI}`));
 
-/** One take, ready to be drawn. */
-async function readFace(facts, take) {
-  const positions = new Float32Array(await readBlob(take.template));
+/** One animation, ready to be drawn. */
+async function readFace(facts, animation) {
+  const positions = new Float32Array(await readBlob(animation.template));
   return {
-    take,
+    animation,
     template: positions.slice(),
     positions,
     normals: new Float32Array(positions.length),
-    faces: new Uint32Array(await readBlob(take.faces)),
-    colours: take.colours === null ? null : new Uint8Array(await readBlob(take.colours)),
-    opening: take.opening === null ? null : new Float32Array(await readBlob(take.opening)),
-    distances: take.compared ? new Float32Array(take.vertices) : null,
-    centre: take.centre,
-    motion: new Motion(facts, take, report),
+    faces: new Uint32Array(await readBlob(animation.faces)),
+    colours: animation.colours === null ? null : new Uint8Array(await readBlob(animation.colours)),
+    opening: animation.opening === null ? null : new Float32Array(await readBlob(animation.opening)),
+    distances: animation.compared ? new Float32Array(animation.vertices) : null,
+    centre: animation.centre,
+    motion: new Motion(facts, animation, report),
   };
 }
 
@@ -46,7 +46,7 @@ class Player {
     this.waiting = [];
     this.stats = { shown: 0, late: 0, workMs: 0 };
     this.pace = new Pace(facts.frameRate);
-    this.extent = [0, 1, 2].map((axis) => Math.max(...facts.takes.map((take) => take.extent[axis])));
+    this.extent = [0, 1, 2].map((axis) => Math.max(...facts.animations.map((animation) => animation.extent[axis])));
     this.clock = new SilentClock(facts.frames / facts.frameRate);
     this.scene = new Scene(find("view"), faces, ramp);
     this.camera = new Camera(find("stage"), () => {
@@ -142,7 +142,7 @@ class Player {
     });
   }
 
-  /** Bring a frame of every take to the graphics card; false while one is still being unpacked. */
+  /** Bring a frame of every animation to the graphics card; false while one is still being unpacked. */
   prepare(frame) {
     const steps = this.faces.map((face) => face.motion.at(frame));
     if (steps.some((each) => !each)) {
@@ -187,15 +187,15 @@ async function start() {
     seek: (frame) => player.current.seek(frame),
     heat: (on) => player.current.setHeat(on),
     turn: (yaw, pitch) => player.current.camera.turn(yaw, pitch),
-    positions: (take) => player.current.faces[take].positions,
-    distances: (take) => player.current.faces[take].distances,
+    positions: (number) => player.current.faces[number].positions,
+    distances: (number) => player.current.faces[number].distances,
   };
   fillInformation(find("about"), facts);
   connectDialogs();
   if (typeof DecompressionStream === "undefined") {
     throw new Error("this browser is too old for this page: use Chrome or Edge 111, Firefox 113, Safari 16.4 or newer");
   }
-  const faces = await Promise.all(facts.takes.map((take) => readFace(facts, take)));
+  const faces = await Promise.all(facts.animations.map((animation) => readFace(facts, animation)));
   const ramp = facts.heat ? new Uint8Array(await readBlob(facts.heat.ramp)) : null;
   player.current = new Player(facts, faces, ramp);
   player.current.panels.connect(player.current, ramp);

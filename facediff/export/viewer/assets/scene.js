@@ -1,4 +1,4 @@
-// Drawing in WebGL 2: one canvas, one panel for each take. Lights are far away and fixed to the camera.
+// Drawing in WebGL 2: one canvas, one panel for each animation. Lights are far away and fixed to the camera.
 
 const VERTEX_SHADER = `#version 300 es
 layout(location = 0) in vec3 position;
@@ -126,9 +126,9 @@ class Scene {
   }
 
   /**
-   * Draw all takes.
+   * Draw all animations.
    *
-   * Args: rectangles in shares of the canvas (left, top, width, height), one a take; the camera; the extent that all
+   * Args: rectangles in shares of the canvas (left, top, width, height), one for each animation; the camera; the extent that all
    * share, so that they appear at one scale; the heat map's end in mm, or 0 for none.
    */
   draw(rectangles, camera, extent, highest) {
