@@ -12,10 +12,10 @@ import numpy as np
 
 from facediff.errors import FaceDiffError
 
-# What NumPy's own classes are replaced by when a pickle from elsewhere is opened.
+# What replaces NumPy's own classes when a pickle from elsewhere is opened.
 #
-# NumPy trusts the state that a pickle gives its types: a crafted dtype turns bytes into object pointers. Here a dtype is
-# kept as words until it is known to be a plain number or text, and only then made.
+# NumPy trusts the state that a pickle gives its types: a crafted dtype turns bytes into object pointers. Here a dtype
+# is kept as text until it is known to be a plain number or text, and only then created.
 
 PLAIN = re.compile(r"[<>|=]?(?:[biufc]\d{1,2}|[SU]\d+|\?)")
 

@@ -43,18 +43,14 @@ from facediff.data.person.motion import (
 from facediff.data.prepare.motion import resample_frames, resampled_length
 from facediff.data.prepare.runner import (
     MANIFEST,
-    motion_file,
-    speech_file,
     version,
-    write_motion,
-    write_record,
-    write_speech,
+    write_clip,
     write_templates,
 )
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, stable_vertices
 from facediff.mesh.alignment import chunks
-from facediff.utils.files import check_writable, describe_files
+from facediff.utils.files import check_writable, describe_files, write_json
 
 # Writing a person's corpus entry: all of it, or nothing.
 
@@ -148,11 +144,9 @@ def write_entry(
     # 16-bit sound ends at full scale: turn down a recording that goes beyond as a whole.
     speech = speech / max(1.0, float(np.abs(speech).max(initial=0.0)))
     for clip in clips:
-        write_motion(motion_file(folder, clip.name), frames[clip.start : clip.stop])
         first = samples_for(clip.start, frame_rate)
-        write_speech(
-            speech_file(folder, clip.name), fit_length(speech[first:], samples_for(clip.stop, frame_rate) - first)
-        )
+        part = fit_length(speech[first:], samples_for(clip.stop, frame_rate) - first)
+        write_clip(folder, clip.name, frames[clip.start : clip.stop], part)
     write_templates(folder / "templates.pkl", {name: template.astype(np.float32)})
     with (folder / "clips.csv").open("w", newline="", encoding="utf-8") as stream:
         table = csv.writer(stream, lineterminator="\n")
@@ -160,9 +154,7 @@ def write_entry(
         table.writerows([clip.name, name, clip.name.rpartition("_")[2], clip.split] for clip in clips)
     written = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     files = describe_files(folder, written, workers=2)
-    write_record(
-        folder / MANIFEST, {"facediff": version(), "corpus": "person", "person": name, **facts, "files": files}
-    )
+    write_json(folder / MANIFEST, {"facediff": version(), "corpus": "person", "person": name, **facts, "files": files})
 
 
 # What an import did, for people and for the manifest.

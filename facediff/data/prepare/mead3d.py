@@ -2,12 +2,11 @@
 
 Source of the data: the videos of MEAD (Wang et al., ECCV 2020) as reconstructed for EMOTE (Daněček et al., SIGGRAPH
 Asia 2023). The raw folder holds EMOTE's ``<speaker>/front/<emotion>/level_<k>/<number>/shape_pose_cam.hdf5``, with
-MEAD's own sound beside it or elsewhere; or ProbTalk3D's ``param/<clip>.npy`` and ``wav/<clip>.wav``.
+MEAD's own sound in the same folders or elsewhere; or ProbTalk3D's ``param/<clip>.npy`` and ``wav/<clip>.wav``.
 """
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from typing import Literal, NamedTuple, NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.prepare.motion import Parameters, read_parameters
+from facediff.data.prepare.motion import read_parameters
 from facediff.data.prepare.runner import (
     Job,
     Plan,
@@ -26,33 +25,42 @@ from facediff.data.prepare.runner import (
     copy_files,
     find_file,
     find_regions,
-    motion_file,
-    region_files,
-    speech_file,
-    write_motion,
-    write_speech,
+    nothing_to_prepare,
+    write_clip,
+    write_mesh,
     write_templates,
 )
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.mesh.flame import SHAPES, Flame
-from facediff.utils.files import atomic, sha256
+from facediff.utils.files import sha256, write_rows
 from facediff.utils.pickles import load_pickle
 from facediff.utils.progress import track
-
-# Finding 3DMEAD's clips and MEAD's sound in raw folders.
 
 EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry", "contempt")
 """In the order of the index in clip names."""
 LEVELS = (1, 2, 3)
 RECONSTRUCTION = "shape_pose_cam.hdf5"
 SOUND_SUFFIXES = (".wav", ".flac", ".m4a", ".mp4", ".aac", ".mp3", ".ogg")
-"""The first that is there is taken: what is converted already comes first."""
+"""The first that is there is used, converted files before MEAD's own."""
 DEPTH = 3
-"""Folders in folders that are looked into, as ``processed/reconstructions/EMICA-MEAD_flame2020`` of inferno."""
+"""Levels of folders that are searched, as ``processed/reconstructions/EMICA-MEAD_flame2020`` of inferno."""
 
 SPEAKER = re.compile(r"[MW]\d{3}")
 NUMBER = re.compile(r"\d{1,3}")
 CLIP = re.compile(r"([MW]\d{3})_(\d{3})_([0-7])_([0-2])")
+
+FRAME_RATE = 25.0
+MESH_FILE = "FLAME.ply"
+MASKS_FILE = "FLAME_masks.pkl"
+REGION_FILES = ("lve.txt", "fdd.txt")
+MISSING_REGION = (
+    "expected in a folder given by --regions; the ProbTalk3D repository has it in datasets/regions; not needed in "
+    "addition to FLAME_masks.pkl"
+)
+MISSING_MASKS = "expected in the raw folder or next to the FLAME model; from flame.is.tue.mpg.de (FLAME vertex masks)"
+
+Shape = Literal["subject", "clip"]
+Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, order=True)
@@ -69,12 +77,12 @@ class Recording:
 
     @property
     def subject(self) -> str:
-        """Who speaks."""
+        """The speaker."""
         return self.name[:4]
 
     @property
     def sequence(self) -> str:
-        """Three digits. The same number says the same words within one emotion only."""
+        """Three digits. The same number stands for the same sentence within one emotion only."""
         return self.name[5:8]
 
     @property
@@ -91,138 +99,6 @@ class Recording:
     def sound(self) -> str:
         """Where MEAD has its sound, below the folder with the speakers."""
         return f"{self.subject}/audio/{self.emotion}/level_{self.level}/{self.sequence}.m4a"
-
-
-@dataclass
-class Found:
-    """What a raw folder holds.
-
-    Attributes:
-        base: the folder with the speakers' folders, or with ``param/``.
-        recordings: every clip, sorted by name.
-        missing: clips without parameters, and where they were expected.
-    """
-
-    base: Path
-    recordings: list[Recording] = field(default_factory=list)
-    missing: dict[str, str] = field(default_factory=dict)
-
-
-def find_recordings(raw: Path) -> Found:
-    """Every clip of a raw folder, which holds EMOTE's distribution or ProbTalk3D's; they are told apart by looking.
-
-    Raises:
-        FaceDiffError: if there is neither, or more than one.
-    """
-    places = [folder for folder in folders(raw) if _is_emote(folder) or _is_probtalk3d(folder)]
-    if not places:
-        raise FaceDiffError(
-            f"{raw}: holds no reconstructions of MEAD; expected <speaker>/front/<emotion>/level_<k>/<number>/"
-            f"{RECONSTRUCTION} as EMOTE's authors give them out, or param/<speaker>_<number>_<emotion>_<intensity>.npy "
-            f"of ProbTalk3D"
-        )
-    if len(places) > 1:
-        raise FaceDiffError(
-            f"{raw}: holds reconstructions in {places[0]} and in {places[1]}; give one of these folders instead"
-        )
-    found = _probtalk3d(places[0]) if _is_probtalk3d(places[0]) else _emote(places[0])
-    found.recordings = sorted({recording.name: recording for recording in found.recordings}.values())
-    return found
-
-
-def folders(root: Path, depth: int = DEPTH) -> Iterator[Path]:
-    """A folder and those in it, but not what lies in a speaker's folder or in a hidden one.
-
-    Raises:
-        FaceDiffError: if there is no such folder or it cannot be read.
-    """
-    if not root.is_dir():
-        raise FaceDiffError(f"{root}: no such folder; expected the data as it was distributed, unpacked")
-    try:
-        inner = sorted(path for path in root.iterdir() if path.is_dir())
-    except OSError as error:
-        raise FaceDiffError(f"{root}: cannot be read ({error.strerror}); check its permissions") from error
-    yield root
-    for folder in inner if depth else ():
-        if not folder.name.startswith(".") and not SPEAKER.fullmatch(folder.name):
-            yield from folders(folder, depth - 1)
-
-
-def speakers(folder: Path) -> list[Path]:
-    """The speakers' folders in a folder, sorted."""
-    return sorted(path for path in folder.iterdir() if SPEAKER.fullmatch(path.name) and path.is_dir())
-
-
-def _is_emote(folder: Path) -> bool:
-    return any((speaker / "front").is_dir() for speaker in speakers(folder))
-
-
-def _is_probtalk3d(folder: Path) -> bool:
-    return any(CLIP.fullmatch(path.stem) for path in folder.glob("param/*.npy"))
-
-
-def _probtalk3d(base: Path) -> Found:
-    files = (path for path in base.glob("param/*.npy") if CLIP.fullmatch(path.stem) and path.is_file())
-    return Found(base, [Recording(path.stem, path) for path in files])
-
-
-def _emote(base: Path) -> Found:
-    found = Found(base)
-    for speaker in speakers(base):
-        for name, folder in _numbered(speaker / "front", speaker.name):
-            file = folder / RECONSTRUCTION
-            if file.is_file():
-                found.recordings.append(Recording(name, file))
-            elif folder.is_dir():
-                found.missing[name] = f"expected {file}"
-    return found
-
-
-def _numbered(place: Path, speaker: str) -> Iterator[tuple[str, Path]]:
-    """What lies in ``<emotion>/level_<k>/`` below a place and is named by a number, with its clip's name."""
-    for index, emotion in enumerate(EMOTIONS):
-        for level in LEVELS:
-            folder = place / emotion / f"level_{level}"
-            for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-                if NUMBER.fullmatch(path.stem):
-                    yield f"{speaker}_{int(path.stem):03d}_{index}_{level - 1}", path
-
-
-def find_sounds(place: Path) -> dict[str, Path]:
-    """Sound of every clip below a folder, by the clip's name.
-
-    MEAD has it in ``<speaker>/audio/<emotion>/level_<k>/<number>.m4a``; converted files may lie in the same place, in
-    ``<speaker>/<emotion>/level_<k>/``, or under the clip's name in one folder.
-
-    Raises:
-        FaceDiffError: if there is no such folder or it cannot be read.
-    """
-    best: dict[str, tuple[int, Path]] = {}
-    for folder in folders(place):
-        named = [(path.stem, path) for path in sorted(folder.iterdir()) if CLIP.fullmatch(path.stem)]
-        for speaker in speakers(folder):
-            for inner in (speaker / "audio", speaker):
-                named += _numbered(inner, speaker.name)
-        for name, path in named:
-            suffix = path.suffix.lower()
-            if suffix in SOUND_SUFFIXES and path.is_file():
-                best[name] = min(best.get(name, (len(SOUND_SUFFIXES), path)), (SOUND_SUFFIXES.index(suffix), path))
-    return {name: path for name, (_, path) in best.items()}
-
-
-__all__ = ["Parameters", "plan", "read_parameters", "write_clip"]
-
-FRAME_RATE = 25.0
-MESH_FILE = "FLAME.ply"
-MASKS_FILE = "FLAME_masks.pkl"
-REGION_FILES = ("lve.txt", "fdd.txt")
-REGIONS = (
-    "expected in a folder given by --regions; the ProbTalk3D repository has it in datasets/regions; not needed beside "
-    "FLAME_masks.pkl"
-)
-
-Shape = Literal["subject", "clip"]
-Array = npt.NDArray[np.float64]
 
 
 class Survey(NamedTuple):
@@ -255,7 +131,7 @@ def plan(
     Args:
         raw: EMOTE's or ProbTalk3D's folder, or a folder above it.
         flame: the user's own FLAME model file; FLAME 2020's, as the parameters are for that model.
-        audio: where MEAD's sound lies; in the raw folder if None.
+        audio: folder with MEAD's sound; the raw folder if None.
         shape: whose shape the vertices of a clip have: the speaker's mean, as the template has, so that offsets from
             the template are motion alone; or the clip's own, as in EMOTE, so that they differ by identity too.
         dtype: of the motion on disk.
@@ -267,53 +143,50 @@ def plan(
         FaceDiffError: if there is no usable clip, a speaker is unknown, or the model file is none.
     """
     model = load_flame(flame)
-    found_regions = find_regions(raw, regions)
+    region_files = find_regions(raw, regions)
     found = find_recordings(raw)
-    there = sorted({recording.subject for recording in found.recordings})
-    chosen = _chosen(subjects, there)
+    speakers = sorted({recording.subject for recording in found.recordings})
+    chosen = _chosen(subjects, speakers)
     recordings = [recording for recording in found.recordings if recording.subject in chosen]
     missing = {name: text for name, text in found.missing.items() if name[:4] in chosen}
-    place = raw if audio is None else audio
-    sounds = find_sounds(place)
-    for recording in recordings:
-        if recording.name not in sounds:
-            missing[recording.name] = (
-                f"expected its sound, {recording.name}.wav or {recording.sound}, in {place}; --audio says where"
-            )
+    sounds = find_sounds(raw if audio is None else audio)
     survey = _survey(recordings, quiet)
-    jobs = [
-        _job(recording, sounds[recording.name], survey, flame, shape, dtype)
-        for recording in recordings
-        if recording.name in sounds
-    ]
+    jobs = []
+    for recording in recordings:
+        name = recording.name
+        if name not in sounds:
+            missing[name] = (
+                f"expected its sound, {name}.wav or {recording.sound}, in {raw if audio is None else audio}; --audio "
+                f"names another folder"
+            )
+        elif name in survey.problems:
+            jobs.append(Job(name, partial(refuse, survey.problems[name])))
+        else:
+            mean = survey.shapes[recording.subject] if shape == "subject" else None
+            work = partial(prepare_clip, name, recording.file, sounds[name], flame, mean, dtype)
+            jobs.append(Job(name, work, survey.frames[name]))
     if not jobs:
-        reasons = "; ".join(f"{name}: {text}" for name, text in list(missing.items())[:3])
-        raise FaceDiffError(f"{raw}: no clip of 3DMEAD can be prepared ({reasons or 'there is none'})")
-    extras = [path for path in (find_file(raw, MASKS_FILE), flame.parent / MASKS_FILE) if path and path.is_file()][:1]
-    _miss_regions(found_regions, extras, missing)
-    notes = _miss_speakers(there, found.base, missing) if subjects is None else []
+        raise nothing_to_prepare(raw, "3DMEAD", missing)
+    masks = [path for path in (find_file(raw, MASKS_FILE), flame.parent / MASKS_FILE) if path and path.is_file()][:1]
+    if not masks:
+        there = {path.name for path in region_files}
+        missing |= {f"regions/{name}": MISSING_REGION for name in REGION_FILES if name not in there}
+        missing[MASKS_FILE] = MISSING_MASKS
+    digest = f"a model with SHA-256 {sha256(flame)[:16]}"
     return Plan(
         corpus="mead3d",
         frame_rate=FRAME_RATE,
         unit="m",
         n_vertices=model.n_vertices,
-        options={"shape": shape, "dtype": dtype, "subjects": chosen if subjects else "all", "flame": _digest(flame)},
+        options={"shape": shape, "dtype": dtype, "subjects": chosen if subjects else "all", "flame": digest},
         jobs=jobs,
-        shared=partial(_write_shared, flame, recordings, survey.shapes, extras, found_regions),
+        shared=partial(_write_shared, flame, recordings, survey.shapes, masks, region_files),
         missing=missing,
-        notes=notes,
+        notes=_compare_speakers(speakers, found.base, missing) if subjects is None else [],
     )
 
 
-def _job(recording: Recording, sound: Path, survey: Survey, flame: Path, shape: Shape, dtype: Precision) -> Job:
-    name = recording.name
-    if name in survey.problems:
-        return Job(name, partial(refuse, survey.problems[name]))
-    whose = survey.shapes[recording.subject] if shape == "subject" else None
-    return Job(name, partial(write_clip, name, recording.file, sound, flame, whose, dtype), survey.frames[name])
-
-
-def write_clip(
+def prepare_clip(
     name: str, file: Path, sound: Path, model: Path, shape: Array | None, dtype: Precision, out: Path
 ) -> int:
     """Write one clip and return its number of frames.
@@ -333,16 +206,13 @@ def write_clip(
     from facediff.data.audio import read_speech
 
     parameters = read_parameters(file)
-    whose = parameters.shape if shape is None else shape
-    vertices = load_flame(model).vertices(whose, parameters.expression, parameters.jaw)
-    speech = read_speech(sound)
-    write_motion(motion_file(out, name), vertices, dtype)
-    write_speech(speech_file(out, name), speech)
-    return len(vertices)
+    shape = parameters.shape if shape is None else shape
+    vertices = load_flame(model).vertices(shape, parameters.expression, parameters.jaw)
+    return write_clip(out, name, vertices, read_speech(sound), dtype)
 
 
 def refuse(problem: str, out: Path) -> NoReturn:
-    """Stand for a clip whose parameters cannot be read.
+    """The work for a clip whose parameters cannot be read.
 
     Raises:
         FaceDiffError: always.
@@ -377,62 +247,51 @@ def _survey(recordings: Sequence[Recording], quiet: bool) -> Survey:
     return survey
 
 
-def _chosen(subjects: Sequence[str] | None, there: list[str]) -> list[str]:
+def _chosen(subjects: Sequence[str] | None, speakers: list[str]) -> list[str]:
     if subjects is not None and not subjects:
         raise FaceDiffError("--subjects: names nobody; expected e.g. M003,W009")
     for subject in subjects or ():
-        if subject not in there:
-            raise FaceDiffError(f'--subjects: the raw folder has no "{subject}": {choices(subject, there)}')
-    return [subject for subject in there if subjects is None or subject in subjects]
+        if subject not in speakers:
+            raise FaceDiffError(f'--subjects: the raw folder has no "{subject}": {choices(subject, speakers)}')
+    return [subject for subject in speakers if subjects is None or subject in subjects]
 
 
-def _miss_speakers(there: list[str], base: Path, missing: dict[str, str]) -> list[str]:
-    """Record which of the data set's speakers are not there; returns a note on those who are not the data set's."""
+def _compare_speakers(speakers: list[str], base: Path, missing: dict[str, str]) -> list[str]:
+    """Record which of the data set's speakers are missing; returns a note on those who are not the data set's."""
     from facediff.data.mead3d import TEST, TRAIN, VALIDATION
 
     everyone = sorted((*TRAIN, *VALIDATION, *TEST))
-    missing.update({subject: f"no clip of this speaker in {base}" for subject in everyone if subject not in there})
-    others = [subject for subject in there if subject not in everyone]
-    return [f"{', '.join(others)}: in no split of the field; prepared all the same"] if others else []
-
-
-def _miss_regions(regions: Path | None, extras: Sequence[Path], missing: dict[str, str]) -> None:
-    if extras:
-        return
-    there = {path.name for path in region_files(regions)}
-    missing.update({f"regions/{name}": REGIONS for name in REGION_FILES if name not in there})
-    missing[MASKS_FILE] = (
-        "expected in the raw folder or beside the FLAME model; from flame.is.tue.mpg.de (FLAME vertex masks)"
-    )
-
-
-def _digest(path: Path) -> str:
-    return f"a model with SHA-256 {sha256(path)[:16]}"
+    missing.update({subject: f"no clip of this speaker in {base}" for subject in everyone if subject not in speakers})
+    others = [subject for subject in speakers if subject not in everyone]
+    return [f"{', '.join(others)}: in no published split; prepared all the same"] if others else []
 
 
 def _write_shared(
     model: Path,
     recordings: Sequence[Recording],
     shapes: dict[str, Array],
-    extras: Sequence[Path],
-    regions: Path | None,
+    masks: Sequence[Path],
+    region_files: Sequence[Path],
     out: Path,
 ) -> list[str]:
     flame = load_flame(model)
     templates = {subject: flame.shaped(shape) for subject, shape in shapes.items()}
     _refuse_other_templates(templates, out)
     write_templates(out / "templates.pkl", templates)
-    _write_mesh(flame, out / MESH_FILE)
-    with (
-        atomic(out / "clips.csv") as temporary,
-        temporary.open("w", newline="", encoding="utf-8") as stream,
-    ):
-        rows = csv.writer(stream, lineterminator="\n")
-        rows.writerow(["clip", "subject", "sentence", "emotion", "intensity"])
-        for clip in recordings:
-            rows.writerow([clip.name, clip.subject, f"{clip.emotion}_{clip.sequence}", clip.emotion, clip.level])
+    write_mesh(out / MESH_FILE, flame.template, flame.faces)
+    rows = [
+        {
+            "clip": clip.name,
+            "subject": clip.subject,
+            "sentence": f"{clip.emotion}_{clip.sequence}",
+            "emotion": clip.emotion,
+            "intensity": clip.level,
+        }
+        for clip in recordings
+    ]
+    write_rows(out / "clips.csv", rows, line_end="\n")
     written = ["templates.pkl", MESH_FILE, "clips.csv"]
-    return [*written, *copy_files(extras, out), *copy_files(region_files(regions), out, "regions")]
+    return [*written, *copy_files(masks, out), *copy_files(region_files, out, "regions")]
 
 
 def _refuse_other_templates(templates: dict[str, Array], out: Path) -> None:
@@ -450,11 +309,110 @@ def _refuse_other_templates(templates: dict[str, Array], out: Path) -> None:
             )
 
 
-def _write_mesh(flame: Flame, path: Path) -> None:
+# Finding clips and sound in the raw folders.
+
+
+@dataclass
+class Found:
+    """What a raw folder holds.
+
+    Attributes:
+        base: the folder with the speakers' folders, or with ``param/``.
+        recordings: every clip, sorted by name.
+        missing: clips without parameters, and where they were expected.
+    """
+
+    base: Path
+    recordings: list[Recording] = field(default_factory=list)
+    missing: dict[str, str] = field(default_factory=dict)
+
+
+def find_recordings(raw: Path) -> Found:
+    """Every clip of a raw folder, which holds EMOTE's distribution or ProbTalk3D's; the folder's layout says which.
+
+    Raises:
+        FaceDiffError: if there is neither, or more than one.
+    """
+    bases = [folder for folder in _folders(raw) if _is_emote(folder) or _is_probtalk3d(folder)]
+    if not bases:
+        raise FaceDiffError(
+            f"{raw}: holds no reconstructions of MEAD; expected <speaker>/front/<emotion>/level_<k>/<number>/"
+            f"{RECONSTRUCTION} as EMOTE's authors distribute them, or param/<speaker>_<number>_<emotion>_<intensity>."
+            f"npy of ProbTalk3D"
+        )
+    if len(bases) > 1:
+        raise FaceDiffError(
+            f"{raw}: holds reconstructions in {bases[0]} and in {bases[1]}; give one of these folders instead"
+        )
+    found = Found(bases[0])
+    if _is_probtalk3d(found.base):
+        files = (path for path in found.base.glob("param/*.npy") if CLIP.fullmatch(path.stem) and path.is_file())
+        found.recordings = [Recording(path.stem, path) for path in files]
+    else:
+        for speaker in _speakers(found.base):
+            for name, folder in _numbered(speaker / "front", speaker.name):
+                file = folder / RECONSTRUCTION
+                if file.is_file():
+                    found.recordings.append(Recording(name, file))
+                elif folder.is_dir():
+                    found.missing[name] = f"expected {file}"
+    found.recordings = sorted({recording.name: recording for recording in found.recordings}.values())
+    return found
+
+
+def find_sounds(root: Path) -> dict[str, Path]:
+    """Sound of every clip below a folder, by the clip's name.
+
+    MEAD has it in ``<speaker>/audio/<emotion>/level_<k>/<number>.m4a``; converted files may lie in the same place, in
+    ``<speaker>/<emotion>/level_<k>/``, or under the clip's name in one folder.
+
+    Raises:
+        FaceDiffError: if there is no such folder or it cannot be read.
+    """
+    best: dict[str, tuple[int, Path]] = {}
+    for folder in _folders(root):
+        named = [(path.stem, path) for path in sorted(folder.iterdir()) if CLIP.fullmatch(path.stem)]
+        for speaker in _speakers(folder):
+            for inner in (speaker / "audio", speaker):
+                named += _numbered(inner, speaker.name)
+        for name, path in named:
+            suffix = path.suffix.lower()
+            if suffix in SOUND_SUFFIXES and path.is_file():
+                best[name] = min(best.get(name, (len(SOUND_SUFFIXES), path)), (SOUND_SUFFIXES.index(suffix), path))
+    return {name: path for name, (_, path) in best.items()}
+
+
+def _folders(root: Path, depth: int = DEPTH) -> Iterator[Path]:
+    """A folder and those in it, but neither speakers' folders nor hidden ones."""
+    if not root.is_dir():
+        raise FaceDiffError(f"{root}: no such folder; expected the data as it was distributed, unpacked")
     try:
-        import trimesh
-    except ImportError as error:
-        raise MissingExtraError("trimesh", "prepare", "writing a mesh") from error
-    mesh = trimesh.Trimesh(flame.template, flame.faces, process=False)
-    with atomic(path) as temporary:
-        temporary.write_bytes(mesh.export(file_type="ply"))
+        inner = sorted(path for path in root.iterdir() if path.is_dir())
+    except OSError as error:
+        raise FaceDiffError(f"{root}: cannot be read ({error.strerror}); check its permissions") from error
+    yield root
+    for folder in inner if depth else ():
+        if not folder.name.startswith(".") and not SPEAKER.fullmatch(folder.name):
+            yield from _folders(folder, depth - 1)
+
+
+def _speakers(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if SPEAKER.fullmatch(path.name) and path.is_dir())
+
+
+def _is_emote(folder: Path) -> bool:
+    return any((speaker / "front").is_dir() for speaker in _speakers(folder))
+
+
+def _is_probtalk3d(folder: Path) -> bool:
+    return any(CLIP.fullmatch(path.stem) for path in folder.glob("param/*.npy"))
+
+
+def _numbered(folder: Path, speaker: str) -> Iterator[tuple[str, Path]]:
+    """The clip's name and path of everything with a number for a name in ``<emotion>/level_<k>/`` below a folder."""
+    for index, emotion in enumerate(EMOTIONS):
+        for level in LEVELS:
+            inner = folder / emotion / f"level_{level}"
+            for path in sorted(inner.iterdir()) if inner.is_dir() else ():
+                if NUMBER.fullmatch(path.stem):
+                    yield f"{speaker}_{int(path.stem):03d}_{index}_{level - 1}", path

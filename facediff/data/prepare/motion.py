@@ -1,9 +1,4 @@
-"""FLAME parameters of one clip as reconstruction projects write them: EMOTE's HDF5 files and ProbTalk3D's arrays.
-
-EMOTE (Daněček et al. 2023, the inferno repository) has the datasets ``shape`` (1, T, 300), ``exp`` (1, T, 100) and
-``jaw`` (1, T, 3); older files were written by hickle, which puts them into the group ``data`` and quotes their names.
-ProbTalk3D (Wu et al. 2024) has one array (1, T, 403) with the three side by side.
-"""
+"""Motion of other projects: changing its frame rate, and reading its FLAME parameters."""
 
 from __future__ import annotations
 
@@ -18,35 +13,12 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.flame import EXPRESSIONS, SHAPES
-from facediff.mesh.mesh import surface_area
 
 if TYPE_CHECKING:
     import h5py
 
 
-# The normalisation of BIWI that CodeTalker introduced and that most later work takes over.
-#
-# Source: the preprocessing published with CodeTalker (Xing et al., CVPR 2023; repository Doubiiu/CodeTalker).
-
-
-def codetalker(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
-    """Turn a frame (V, 3) by pi about x, centre it on its own mean vertex, scale it to a surface area of one.
-
-    Mean and area are the frame's own. An opening jaw moves the mean and enlarges the area, so a part of its motion
-    becomes a shift and a scale of the whole face; what was published on BIWI contains this, and so must this.
-
-    Raises:
-        ValueError: if the mesh has no area, or a vertex is not finite.
-    """
-    turned = np.asarray(vertices, np.float64) * (1.0, -1.0, -1.0)
-    centred = turned - turned.mean(axis=0)
-    area = surface_area(centred, faces)
-    if not (np.isfinite(area) and area > 0):
-        raise ValueError(f"a surface area of {area}")
-    return centred / np.sqrt(area)
-
-
-# Changing the frame rate of motion without aliases.
+# Changing the frame rate of motion without aliasing.
 
 CROSSINGS = 24
 """Zero crossings of the filter on each side."""
@@ -55,7 +27,7 @@ BAND = 0.9
 KAISER = 8.0
 """Shape of the window: the stop band lies 80 dB down, the transition is a tenth of the Nyquist frequency wide."""
 BLOCK = 64
-"""Frames that are made at a time."""
+"""Frames that are computed at a time."""
 
 
 def resampled_length(frames: int, rate_in: float, rate_out: float) -> int:
@@ -74,8 +46,8 @@ def resample_frames(
 
     Frame 0 stays frame 0. The filter is a sinc under a Kaiser window (Smith, "Digital Audio Resampling", 2002),
     evaluated at every output frame's exact time, so any ratio of rates will do (29.97 to 25), and constants are kept.
-    Beyond its ends the motion goes on reflected in its first and last frame, which keeps its slope there. ``motion``
-    and ``out`` may be memory-mapped: a block of frames is in memory at a time.
+    Beyond its ends the motion is continued by reflection in its first and last frame, which keeps its slope there.
+    ``motion`` and ``out`` may be memory-mapped: a block of frames is in memory at a time.
 
     Args:
         motion: (T, C) coordinates over time; further dimensions are allowed.
@@ -87,7 +59,7 @@ def resample_frames(
         the resampled motion.
 
     Raises:
-        FaceDiffError: if a rate is not positive, or there is no frame to give out.
+        FaceDiffError: if a rate is not positive, or the result would have no frame.
     """
     if not (rate_in > 0 and rate_out > 0 and math.isfinite(rate_in) and math.isfinite(rate_out)):
         raise FaceDiffError(f"frame rates {rate_in:g} and {rate_out:g}: expected positive numbers of frames a second")
@@ -105,16 +77,16 @@ def resample_frames(
         for first in range(0, length, BLOCK):
             out[first : first + BLOCK] = motion[first : first + BLOCK]
         return out
-    for made, used, weights in _blocks(len(motion), length, rate_in, rate_out):
+    for written, used, weights in _blocks(len(motion), length, rate_in, rate_out):
         rows = np.asarray(motion[used], np.float64)
-        out[made] = (weights @ rows.reshape(len(rows), -1)).reshape(-1, *motion.shape[1:])
+        out[written] = (weights @ rows.reshape(len(rows), -1)).reshape(-1, *motion.shape[1:])
     return out
 
 
 def _blocks(
     frames: int, length: int, rate_in: float, rate_out: float
 ) -> Iterator[tuple[slice, slice, npt.NDArray[np.float64]]]:
-    """Frames to make, frames to make them from, and the matrix that does it."""
+    """Frames to write, frames that they depend on, and the matrix from these to those."""
     step = rate_in / rate_out
     band = BAND * min(1.0, rate_out / rate_in)
     reach = CROSSINGS / band
@@ -140,7 +112,7 @@ def _reflected(
 ) -> tuple[slice, npt.NDArray[np.float64]]:
     """Weights of frames that exist: a frame beyond an end is twice the end minus its mirror image.
 
-    What reaches beyond the other end, in motion shorter than the filter, stops there.
+    In motion shorter than the filter, a mirror image beyond the other end is clipped to that end.
     """
     last = frames - 1
     mirrored = np.where(sources < 0, -sources, np.where(sources > last, 2 * last - sources, sources)).clip(0, last)
@@ -159,6 +131,12 @@ def _reflected(
         folded[:, -1] += 2.0 * weights[:, after].sum(axis=1)
     return slice(first, stop), folded
 
+
+# FLAME parameters of one clip as reconstruction projects write them.
+#
+# EMOTE (Daněček et al. 2023, the inferno repository) has the datasets ``shape`` (1, T, 300), ``exp`` (1, T, 100) and
+# ``jaw`` (1, T, 3); older files were written by hickle, which puts them into the group ``data`` and quotes their names.
+# ProbTalk3D (Wu et al. 2024) has one array (1, T, 403) with the three side by side.
 
 WIDTHS = {"shape": SHAPES, "exp": EXPRESSIONS, "jaw": 3}
 ALL = sum(WIDTHS.values())
@@ -186,8 +164,8 @@ class Parameters:
 def read_parameters(path: Path) -> Parameters:
     """Read a clip's parameters: ``shape_pose_cam.hdf5`` of EMOTE (flat or by hickle), or ProbTalk3D's ``.npy``.
 
-    The shape is averaged over all frames alike: which frames a face was well seen in is not in these files. Rotation
-    of the head and the camera are left out.
+    The shape is the mean over all frames with equal weights, since these files do not say how well the face was seen
+    in each. Rotation of the head and the camera are left out.
 
     Raises:
         FaceDiffError: if the file is missing or damaged, lacks something, or holds NaN.
@@ -201,12 +179,12 @@ def read_parameters(path: Path) -> Parameters:
         if bad.any():
             raise FaceDiffError(
                 f"{path}: frame {int(np.argmax(bad))} (counted from 0) of {name} holds NaN or infinity; leave the clip "
-                f"out or get it anew"
+                f"out or get it again"
             )
     frames = len(parts["exp"])
     if len(parts["jaw"]) != frames or len(parts["shape"]) not in (1, frames):
         counts = ", ".join(f"{len(values)} of {name}" for name, values in parts.items())
-        raise FaceDiffError(f"{path}: its frames do not agree ({counts}); get it anew")
+        raise FaceDiffError(f"{path}: its frames do not agree ({counts}); get it again")
     return Parameters(parts["shape"].mean(axis=0), parts["exp"], parts["jaw"])
 
 
@@ -214,7 +192,7 @@ def _read_array(path: Path) -> dict[str, Array]:
     try:
         array = np.load(path, allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
-        raise FaceDiffError(f"{path}: not a readable NumPy array, perhaps truncated ({error}); get it anew") from error
+        raise FaceDiffError(f"{path}: not a readable NumPy array, perhaps truncated ({error}); get it again") from error
     if not isinstance(array, np.ndarray) or array.dtype.kind != "f" or array.shape[-1:] != (ALL,):
         kind = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else "an archive"
         raise FaceDiffError(f"{path}: holds {kind}; expected floats of shape (1, frames, {ALL}), FLAME parameters")
@@ -231,7 +209,7 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
     try:
         with h5py.File(path, "r") as file:
             holder = file if "exp" in file else file.get("data", file)
-            # hickle has the key with its quotes as a name.
+            # hickle keeps the quotes of a key as part of its name.
             names = {name.strip("\"'"): name for name in holder} if isinstance(holder, h5py.Group) else {}
             absent = [name for name in WIDTHS if name not in names]
             if absent:
@@ -241,7 +219,7 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
                 )
             return {name: _dataset(holder, names[name], width, path) for name, width in WIDTHS.items()}
     except (OSError, KeyError, RuntimeError, ValueError) as error:
-        raise FaceDiffError(f"{path}: not a readable HDF5 file, perhaps truncated ({error}); get it anew") from error
+        raise FaceDiffError(f"{path}: not a readable HDF5 file, perhaps truncated ({error}); get it again") from error
 
 
 def _dataset(holder: h5py.Group, name: str, most: int, path: Path) -> Array:
@@ -251,7 +229,7 @@ def _dataset(holder: h5py.Group, name: str, most: int, path: Path) -> Array:
     link, dataset = holder.get(name, getlink=True), holder.get(name)
     if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiu":
         raise FaceDiffError(f"{where} holds no numbers; expected floats of shape (1, frames, up to {most})")
-    # A file from elsewhere has no business to read other files of this machine.
+    # A file from elsewhere must not make facediff read other files of this machine.
     if isinstance(link, h5py.ExternalLink) or dataset.external or dataset.is_virtual:
         raise FaceDiffError(f"{where} lies in another file; expected a file that holds its own data")
     if max(dataset.shape, default=0) > MOST_FRAMES:

@@ -1,4 +1,4 @@
-"""Carrying out a plan: resumable after a kill at any moment, in parallel, with a manifest at the end."""
+"""Writing a corpus folder: what a plan is, how it is carried out and resumed, and how the files are written."""
 
 from __future__ import annotations
 
@@ -19,76 +19,29 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.batch import run_batch
-from facediff.utils.files import atomic, check_writable, describe_files, locked, remove_partial, same_sizes
+from facediff.utils.files import (
+    atomic,
+    check_writable,
+    describe_files,
+    locked,
+    remove_partial,
+    same_sizes,
+    write_json,
+)
 from facediff.utils.jobs import processors
 from facediff.utils.progress import progress_bar
-
-# Finding and copying files of a raw folder, which may hold the data set or the folder that an archive unpacked to.
-
-
-def bases(raw: Path) -> list[Path]:
-    """The raw folder and the folders in it, sorted: places where a data set may begin.
-
-    Raises:
-        FaceDiffError: if there is no such folder or it cannot be read.
-    """
-    if not raw.is_dir():
-        raise FaceDiffError(f"{raw}: no such folder; expected the raw data set as it was distributed")
-    return [raw, *folders_in(raw)]
-
-
-def folders_in(folder: Path) -> list[Path]:
-    """Folders in a folder, sorted, without hidden ones.
-
-    Raises:
-        FaceDiffError: if it cannot be read.
-    """
-    try:
-        return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
-    except OSError as error:
-        raise FaceDiffError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
-
-
-def find_file(raw: Path, name: str) -> Path | None:
-    """A file of this name in the raw folder or one folder deeper; None if there is none."""
-    return next((path for base in bases(raw) if (path := base / name).is_file()), None)
-
-
-def find_regions(raw: Path, given: Path | None) -> Path | None:
-    """The folder with the lists of vertices: the one given, else ``regions/`` of the raw folder if there is one.
-
-    Raises:
-        FaceDiffError: if the one given is no folder or holds no list.
-    """
-    if given is None:
-        return next((path for base in bases(raw) if (path := base / "regions").is_dir()), None)
-    if not region_files(given):
-        raise FaceDiffError(f"{given}: expected a folder with lists of vertices, e.g. lve.txt and fdd.txt")
-    return given
-
-
-def region_files(folder: Path | None) -> list[Path]:
-    """The lists of vertices in a folder."""
-    return [] if folder is None else sorted(path for path in folder.glob("*.txt") if path.is_file())
-
-
-def copy_files(sources: Sequence[Path], out: Path, folder: str = "") -> list[str]:
-    """Copy files into the output folder (or a folder in it) under their own names; returns their relative paths."""
-    written = []
-    for source in sources:
-        target = out / folder / source.name
-        with atomic(target) as temporary:
-            shutil.copyfile(source, temporary)
-        written.append(target.relative_to(out).as_posix())
-    return written
-
-
-# What preparing a corpus consists of: the clips to write, and how their files are written.
 
 Precision = Literal["float32", "float64"]
 """How motion is stored; float32 takes half the disk."""
 
+STATE = "prepare.json"
+"""In the output folder while preparation is running or was interrupted."""
+MANIFEST = "manifest.json"
+"""In the output folder when preparation has ended: what was written, what is missing, what failed."""
+LOCK = ".prepare.lock"
 CLIP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,199}")
+WAV_HEADER = 44
+"""Bytes."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +50,8 @@ class Job:
 
     Attributes:
         name: the clip's name, e.g. ``F2_e01``.
-        work: gets the output folder, writes ``vertices_npy/<name>.npy`` and ``wav/<name>.wav``, each atomically, and
-            returns the number of frames. Must be picklable: a ``functools.partial`` of a function of a module.
+        work: gets the output folder, writes the clip with :func:`write_clip` and returns its number of frames. Must be
+            picklable: a ``functools.partial`` of a function of a module.
         frames: number of frames if that is known cheaply, for the estimate of the disk space.
 
     Raises:
@@ -118,7 +71,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Plan:
-    """What there is to do, made by a quick scan of the raw folder.
+    """What is to be written, found by a quick scan of the raw folder.
 
     Attributes:
         corpus: ``biwi``, ``vocaset`` or ``mead3d``.
@@ -129,7 +82,7 @@ class Plan:
         jobs: one for each clip.
         shared: writes what clips share (``templates.pkl``, mesh, ``regions/``, ``clips.csv``) and returns the paths of
             those files, relative to the output folder. Runs in the calling process; may run again.
-        missing: what is not there: clip or file, and what was expected where.
+        missing: what the raw folder lacks: clip or file, and what was expected where.
         notes: other remarks for the user, one sentence each.
     """
 
@@ -143,167 +96,20 @@ class Plan:
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the motion on disk."""
+        return np.dtype(self.options.get("dtype", "float32"))
 
-def motion_file(out: Path, clip: str) -> Path:
-    """Where a clip's vertices go."""
-    return out / "vertices_npy" / f"{clip}.npy"
-
-
-def speech_file(out: Path, clip: str) -> Path:
-    """Where a clip's speech goes."""
-    return out / "wav" / f"{clip}.wav"
-
-
-def write_motion(path: Path, vertices: npt.NDArray[np.floating], dtype: Precision = "float32") -> None:
-    """Write absolute vertices (T, V, 3) as a (T, 3V) array, atomically.
-
-    Raises:
-        FaceDiffError: if there is no frame, a value is not finite, or the file cannot be written.
-    """
-    frames = len(vertices)
-    if not frames:
-        raise FaceDiffError(f"{path.stem}: has no frame; expected at least one")
-    finite = np.isfinite(vertices).reshape(frames, -1).all(axis=1)
-    if not finite.all():
-        raise FaceDiffError(
-            f"{path.stem}: frame {int(np.argmin(finite))} (counted from 0) holds NaN or infinity; leave the clip out "
-            f"or get it anew"
-        )
-    rows = np.ascontiguousarray(vertices.reshape(frames, -1), dtype=dtype)
-    with atomic(path) as temporary:
-        np.save(temporary, rows, allow_pickle=False)
-
-
-def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
-    """Write speech (S,) in -1 … 1 as 16 kHz mono 16-bit wav, atomically; what exceeds the range is clipped.
-
-    Reading it back gives ``round(32768 x) / 32768``: 16-bit speech at 16 kHz goes through unchanged.
-    """
-    try:
-        import soundfile
-    except ImportError as error:
-        raise MissingExtraError("soundfile", "audio", "writing speech") from error
-    from facediff.data.audio import SAMPLE_RATE
-
-    whole = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)
-    with atomic(path) as temporary:
-        soundfile.write(temporary, whole, SAMPLE_RATE, subtype="PCM_16")
-
-
-def write_templates(path: Path, templates: Mapping[str, npt.NDArray[np.floating]]) -> None:
-    """Write neutral faces (V, 3) by subject as the pickle of NumPy arrays that the field's loaders open.
-
-    Equal faces give equal bytes: each array gets NumPy's own instance of its type, because a pickle also records which
-    arrays share a type's instance, and that depends on where they came from.
-    """
-    plain: dict[str, npt.NDArray[np.floating]] = {}
-    for name, vertices in templates.items():
-        plain[str(name)] = np.empty(vertices.shape, np.dtype(vertices.dtype.str))
-        plain[str(name)][...] = vertices
-    with atomic(path) as temporary:
-        temporary.write_bytes(pickle.dumps(plain, protocol=4))
-
-
-# The records that preparing keeps in its output folder: one while it is at work, one when it has ended.
-
-STATE = "prepare.json"
-"""There while preparing is at work or was cut short."""
-MANIFEST = "manifest.json"
-"""There when it has ended: what was written, what is missing, what failed."""
-
-
-def version() -> str:
-    """Version of the installed facediff."""
-    try:
-        return metadata.version("facediff")
-    except metadata.PackageNotFoundError:  # run from a source tree on the path
-        return "unknown"
-
-
-def recipe(plan: Plan) -> dict[str, Any]:
-    """What decides the bytes that are written; a run may be taken up only with the same."""
-    return {"facediff": version(), "corpus": plan.corpus, "options": json.loads(json.dumps(plan.options))}
-
-
-def read_record(path: Path) -> dict[str, Any] | None:
-    """A record, or None if there is none.
-
-    Raises:
-        FaceDiffError: if the file is no record of this program.
-    """
-    if not path.is_file():
-        return None
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise FaceDiffError(
-            f"{path}: cannot be read ({error}); remove {path.parent}, or choose another folder"
-        ) from error
-    if not isinstance(record, dict) or not {"corpus", "options"} <= set(record):
-        raise FaceDiffError(f"{path}: not written by `facediff data prepare`; choose another folder to write to")
-    return record
-
-
-def write_record(path: Path, record: dict[str, Any]) -> None:
-    """Write a record atomically."""
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def refuse_other_recipe(out: Path, record: dict[str, Any], plan: Plan) -> None:
-    """Refuse to mix what was written with other options, or by another version, with what this plan writes.
-
-    Raises:
-        FaceDiffError: naming what differs.
-    """
-    now = recipe(plan)
-    before: dict[str, Any] = {"facediff": record.get("facediff"), "corpus": record["corpus"]}
-    wanted = {"facediff": now["facediff"], "corpus": now["corpus"]}
-    before |= {f"--{name.replace('_', '-')}": value for name, value in dict(record["options"]).items()}
-    wanted |= {f"--{name.replace('_', '-')}": value for name, value in now["options"].items()}
-    differ = [name for name in {**before, **wanted} if before.get(name) != wanted.get(name)]
-    if differ:
-        words = "; ".join(f"{name} was {_word(before.get(name))} and is {_word(wanted.get(name))}" for name in differ)
-        raise FaceDiffError(
-            f"{out}: was begun with other settings ({words}); use the same, choose another folder, or remove this one"
-        )
-
-
-def _word(value: object) -> str:
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def manifest(
-    plan: Plan, clips: dict[str, int], failed: dict[str, str], files: dict[str, dict[str, int | str]]
-) -> dict[str, Any]:
-    """The final record. Nothing in it depends on the time or the way in which the files were made."""
-    frames = sum(clips.values())
-    return {
-        **recipe(plan),
-        "frame_rate": plan.frame_rate,
-        "unit": plan.unit,
-        "n_vertices": plan.n_vertices,
-        "totals": {
-            "clips": len(clips),
-            "frames": frames,
-            "seconds": round(frames / plan.frame_rate, 3),
-            "bytes": sum(int(facts["bytes"]) for facts in files.values()),
-        },
-        "clips": dict(sorted(clips.items())),
-        "missing": plan.missing,
-        "failed": dict(sorted(failed.items())),
-        "notes": plan.notes,
-        "files": files,
-    }
-
-
-LOCK = ".prepare.lock"
-WAV_HEADER = 44
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What decides the bytes that are written; a run may be resumed only with the same."""
+        return {"facediff": version(), "corpus": self.corpus, "options": json.loads(json.dumps(self.options))}
 
 
 @dataclass(frozen=True)
 class Report:
-    """What preparing did.
+    """What preparation did.
 
     Attributes:
         out: the corpus folder.
@@ -332,8 +138,8 @@ class Report:
 def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = False) -> Report:
     """Write a corpus folder.
 
-    A run that was killed is taken up where it was: clips whose two files are there are kept. A second run over a
-    complete folder changes nothing. A clip that fails does not stop the others.
+    A run that was killed is resumed: clips whose two files are there are kept. A second run over a complete folder
+    changes nothing. A clip that fails does not stop the others.
 
     Args:
         plan: what to write.
@@ -345,97 +151,156 @@ def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = 
         FaceDiffError: if the folder cannot be written, holds something else or was begun with other options, if the
             disk is too small, or if another run is at work in it.
     """
-    workers = processors() if workers is None else workers
-    if workers < 1:
+    if workers is not None and workers < 1:
         raise FaceDiffError(f"--workers: is {workers}; expected 1 or more")
     if out.exists() and not out.is_dir():
         raise FaceDiffError(f"{out}: is a file; expected a folder to write the corpus to")
     check_writable(out / STATE)
     with locked(out / LOCK, "facediff data prepare"):
-        before = read_record(out / MANIFEST)
-        begun = read_record(out / STATE) or before
+        manifest = _read_record(out / MANIFEST)
+        begun = _read_record(out / STATE) or manifest
         if begun is None:
             _refuse_foreign(out)
         finished = {job.name: frames for job in plan.jobs if (frames := finished_frames(plan, job, out))}
-        if (
-            before is not None
-            and not (out / STATE).exists()
-            and _says(before, plan, finished)
-            and same_sizes(out, before.get("files", {}))
-        ):
-            return _report(plan, out, before, 0)
+        if manifest is not None and not (out / STATE).exists() and _is_complete(plan, finished, out, manifest):
+            return _report(plan, out, manifest, 0)
         if begun is not None:
-            refuse_other_recipe(out, begun, plan)
+            _refuse_other_recipe(plan, out, begun)
         _refuse_strays(plan, out)
         pending = [job for job in plan.jobs if job.name not in finished]
         _check_space(plan, pending, out)
-        write_record(out / STATE, recipe(plan))
+        write_json(out / STATE, plan.recipe)
         remove_partial(out, recursive=True)
-        return _carry_out(plan, pending, finished, out, workers, quiet)
+        return _write_all(plan, pending, finished, out, workers, quiet)
 
 
-def _carry_out(
-    plan: Plan, pending: list[Job], finished: dict[str, int], out: Path, workers: int, quiet: bool
+def _write_all(
+    plan: Plan, pending: list[Job], finished: dict[str, int], out: Path, workers: int | None, quiet: bool
 ) -> Report:
     shared = plan.shared(out)
     clips, failed = dict(finished), {}
     bar = progress_bar(plan.corpus, len(plan.jobs), done=len(finished), shown=not quiet)
-    outcomes = run_batch(partial(_write, out), pending, name=_clip_name, workers=workers)
+    outcomes = run_batch(partial(_do, out), pending, name=_name, workers=workers)
     with bar as step, closing(outcomes):
         for job, outcome in outcomes:
             if outcome.result is None:
                 failed[job.name] = outcome.problem
-                for file in _files(out, job.name):  # damaged ones of an earlier run
+                for file in clip_files(out, job.name):  # damaged ones of an earlier run
                     file.unlink(missing_ok=True)
             else:
                 clips[job.name] = outcome.result
             step()
-    files = [*shared, *(file.relative_to(out).as_posix() for name in clips for file in _files(out, name))]
-    checksums = describe_files(out, files, workers=workers, progress="" if quiet else "checksums")
-    record = manifest(plan, clips, failed, checksums)
-    write_record(out / MANIFEST, record)
+    names = [*shared, *(file.relative_to(out).as_posix() for name in clips for file in clip_files(out, name))]
+    files = describe_files(out, names, workers=workers or processors(), progress="" if quiet else "checksums")
+    manifest = _manifest(plan, clips, failed, files)
+    write_json(out / MANIFEST, manifest)
     (out / STATE).unlink()
-    return _report(plan, out, record, len(clips) - len(finished))
+    return _report(plan, out, manifest, len(clips) - len(finished))
 
 
-def _write(out: Path, job: Job) -> int:
+def _do(out: Path, job: Job) -> int:
     return job.work(out)
 
 
-def _clip_name(job: Job) -> str:
+def _name(job: Job) -> str:
     return f"clip {job.name}"
+
+
+def _manifest(
+    plan: Plan, clips: dict[str, int], failed: dict[str, str], files: dict[str, dict[str, int | str]]
+) -> dict[str, Any]:
+    """The final record. Nothing in it depends on the time or the order in which the files were made."""
+    frames = sum(clips.values())
+    return {
+        **plan.recipe,
+        "frame_rate": plan.frame_rate,
+        "unit": plan.unit,
+        "n_vertices": plan.n_vertices,
+        "totals": {
+            "clips": len(clips),
+            "frames": frames,
+            "seconds": round(frames / plan.frame_rate, 3),
+            "bytes": sum(int(facts["bytes"]) for facts in files.values()),
+        },
+        "clips": dict(sorted(clips.items())),
+        "missing": plan.missing,
+        "failed": dict(sorted(failed.items())),
+        "notes": plan.notes,
+        "files": files,
+    }
+
+
+def _report(plan: Plan, out: Path, manifest: dict[str, Any], written: int) -> Report:
+    return Report(out, manifest["clips"], written, manifest["failed"], plan.missing, plan.notes, manifest["totals"])
+
+
+def version() -> str:
+    """Version of the installed facediff."""
+    try:
+        return metadata.version("facediff")
+    except metadata.PackageNotFoundError:  # run from a source tree on the path
+        return "unknown"
+
+
+# What an earlier run has left in the folder.
 
 
 def finished_frames(plan: Plan, job: Job, out: Path) -> int | None:
     """Frames of a clip whose motion and speech are both there and whole; None for any other."""
-    motion, speech = _files(out, job.name)
+    motion, speech = clip_files(out, job.name)
     try:
         if speech.stat().st_size <= WAV_HEADER:
             return None
         array = np.load(motion, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError):
         return None
-    whole = array.ndim == 2 and array.shape[1] == 3 * plan.n_vertices and array.dtype == _dtype(plan)
+    whole = array.ndim == 2 and array.shape[1] == 3 * plan.n_vertices and array.dtype == plan.dtype
     return len(array) if whole else None
 
 
-def _files(out: Path, name: str) -> tuple[Path, Path]:
-    return motion_file(out, name), speech_file(out, name)
+def _is_complete(plan: Plan, finished: dict[str, int], out: Path, manifest: dict[str, Any]) -> bool:
+    """Whether the manifest records just this plan, carried out without a failure, and all its files are there."""
+    expected = {name: value for name, value in plan.recipe.items() if name != "facediff"}
+    expected |= {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": finished}
+    return (
+        len(finished) == len(plan.jobs)
+        and all(manifest.get(name) == value for name, value in expected.items())
+        and same_sizes(out, manifest.get("files", {}))
+    )
 
 
-def _dtype(plan: Plan) -> np.dtype[Any]:
-    return np.dtype(plan.options.get("dtype", "float32"))
+def _read_record(path: Path) -> dict[str, Any] | None:
+    """The manifest or the state of a run; None if there is none."""
+    if not path.is_file():
+        return None
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise FaceDiffError(
+            f"{path}: cannot be read ({error}); remove {path.parent}, or choose another folder"
+        ) from error
+    if not isinstance(record, dict) or not {"corpus", "options"} <= set(record):
+        raise FaceDiffError(f"{path}: not written by `facediff data prepare`; choose another folder to write to")
+    return record
 
 
-def _says(record: dict[str, Any], plan: Plan, finished: dict[str, int]) -> bool:
-    """Whether a manifest records just this plan, carried out without a failure."""
-    same = all(record.get(key) == value for key, value in recipe(plan).items() if key != "facediff")
-    wanted = {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": finished}
-    return same and len(finished) == len(plan.jobs) and all(record.get(key) == value for key, value in wanted.items())
+def _refuse_other_recipe(plan: Plan, out: Path, record: dict[str, Any]) -> None:
+    """Refuse to mix what was written with other options, or by another version, with what this plan writes."""
 
+    def settings(recipe: Mapping[str, Any]) -> dict[str, Any]:
+        options = {f"--{name.replace('_', '-')}": value for name, value in dict(recipe["options"]).items()}
+        return {"facediff": recipe.get("facediff"), "corpus": recipe["corpus"], **options}
 
-def _report(plan: Plan, out: Path, record: dict[str, Any], written: int) -> Report:
-    return Report(out, record["clips"], written, record["failed"], plan.missing, plan.notes, record["totals"])
+    def words(value: object) -> str:
+        return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+    before, now = settings(record), settings(plan.recipe)
+    changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    if changed:
+        shown = "; ".join(f"{name} was {words(before.get(name))} and is {words(now.get(name))}" for name in changed)
+        raise FaceDiffError(
+            f"{out}: was begun with other settings ({shown}); use the same, choose another folder, or remove this one"
+        )
 
 
 def _refuse_foreign(out: Path) -> None:
@@ -448,7 +313,7 @@ def _refuse_foreign(out: Path) -> None:
 
 
 def _refuse_strays(plan: Plan, out: Path) -> None:
-    """A clip that the raw folder has no more would be read as a part of the corpus, unseen by the manifest."""
+    """A clip that the raw folder no longer has would be read as part of the corpus without being in the manifest."""
     names = {job.name for job in plan.jobs}
     for path in (*sorted(out.glob("vertices_npy/*.npy")), *sorted(out.glob("wav/*.wav"))):
         if not path.name.startswith(".") and path.stem not in names:
@@ -462,10 +327,161 @@ def _check_space(plan: Plan, pending: list[Job], out: Path) -> None:
     if not known:
         return
     frames = sum(known) / len(known) * len(pending)
-    need = frames * (3 * plan.n_vertices * _dtype(plan).itemsize + 2 * 16_000 / plan.frame_rate)
+    need = frames * (3 * plan.n_vertices * plan.dtype.itemsize + 2 * 16_000 / plan.frame_rate)
     free = shutil.disk_usage(out).free
     if need > free:
         raise FaceDiffError(
             f"{out}: about {need / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free; make room, choose another "
             f"disk, or prepare fewer subjects"
         )
+
+
+# The files of a corpus folder.
+
+
+def clip_files(out: Path, clip: str) -> tuple[Path, Path]:
+    """Where a clip's vertices and its speech lie."""
+    return out / "vertices_npy" / f"{clip}.npy", out / "wav" / f"{clip}.wav"
+
+
+def write_clip(
+    out: Path,
+    clip: str,
+    vertices: npt.NDArray[np.floating],
+    speech: npt.NDArray[np.floating],
+    dtype: Precision = "float32",
+) -> int:
+    """Write vertices (T, V, 3) and speech (S,) of a clip, and return the number of frames.
+
+    Raises:
+        FaceDiffError: as :func:`write_motion`.
+    """
+    motion_file, speech_file = clip_files(out, clip)
+    write_motion(motion_file, vertices, dtype)
+    write_speech(speech_file, speech)
+    return len(vertices)
+
+
+def write_motion(path: Path, vertices: npt.NDArray[np.floating], dtype: Precision = "float32") -> None:
+    """Write absolute vertices (T, V, 3) as a (T, 3V) array, atomically.
+
+    Raises:
+        FaceDiffError: if there is no frame, a value is not finite, or the file cannot be written.
+    """
+    frames = len(vertices)
+    if not frames:
+        raise FaceDiffError(f"{path.stem}: has no frame; expected at least one")
+    finite = np.isfinite(vertices).reshape(frames, -1).all(axis=1)
+    if not finite.all():
+        raise FaceDiffError(
+            f"{path.stem}: frame {int(np.argmin(finite))} (counted from 0) holds NaN or infinity; leave the clip out "
+            f"or get it again"
+        )
+    rows = np.ascontiguousarray(vertices.reshape(frames, -1), dtype=dtype)
+    with atomic(path) as temporary:
+        np.save(temporary, rows, allow_pickle=False)
+
+
+def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
+    """Write speech (S,) in -1 … 1 as 16 kHz mono 16-bit wav, atomically; values beyond the range are clipped.
+
+    Reading it back gives ``round(32768 x) / 32768``: 16-bit speech at 16 kHz goes through unchanged.
+    """
+    try:
+        import soundfile
+    except ImportError as error:
+        raise MissingExtraError("soundfile", "audio", "writing speech") from error
+    from facediff.data.audio import SAMPLE_RATE
+
+    whole = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)
+    with atomic(path) as temporary:
+        soundfile.write(temporary, whole, SAMPLE_RATE, subtype="PCM_16")
+
+
+def write_templates(path: Path, templates: Mapping[str, npt.NDArray[np.floating]]) -> None:
+    """Write neutral faces (V, 3) by subject as the pickle of NumPy arrays that the field's loaders open.
+
+    Equal faces give equal bytes: each array gets NumPy's own instance of its type, because a pickle also records which
+    arrays share a type's instance, and that depends on where they came from.
+    """
+    plain: dict[str, npt.NDArray[np.floating]] = {}
+    for name, vertices in templates.items():
+        plain[str(name)] = np.empty(vertices.shape, np.dtype(vertices.dtype.str))
+        plain[str(name)][...] = vertices
+    with atomic(path) as temporary:
+        temporary.write_bytes(pickle.dumps(plain, protocol=4))
+
+
+def write_mesh(path: Path, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> None:
+    """Write vertices (V, 3) and triangles (F, 3) as binary PLY, atomically.
+
+    Raises:
+        MissingExtraError: if trimesh is not installed.
+    """
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MissingExtraError("trimesh", "prepare", "writing a mesh") from error
+    with atomic(path) as temporary:
+        temporary.write_bytes(trimesh.Trimesh(vertices, faces, process=False).export(file_type="ply"))
+
+
+def copy_files(sources: Sequence[Path], out: Path, folder: str = "") -> list[str]:
+    """Copy files into the output folder (or a folder in it) under their own names; returns their relative paths."""
+    written = []
+    for source in sources:
+        target = out / folder / source.name
+        with atomic(target) as temporary:
+            shutil.copyfile(source, temporary)
+        written.append(target.relative_to(out).as_posix())
+    return written
+
+
+# Looking into a raw folder, which may hold the data set itself or the folder that an archive unpacked to.
+
+
+def bases(raw: Path) -> list[Path]:
+    """The raw folder and the folders in it, sorted and without hidden ones: where a data set may begin.
+
+    Raises:
+        FaceDiffError: if there is no such folder or it cannot be read.
+    """
+    if not raw.is_dir():
+        raise FaceDiffError(f"{raw}: no such folder; expected the raw data set as it was distributed, unpacked")
+    return [raw, *folders_in(raw)]
+
+
+def folders_in(folder: Path) -> list[Path]:
+    """Folders in a folder, sorted, without hidden ones.
+
+    Raises:
+        FaceDiffError: if it cannot be read.
+    """
+    try:
+        return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    except OSError as error:
+        raise FaceDiffError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
+
+
+def find_file(raw: Path, name: str) -> Path | None:
+    """A file with this name or relative path in the raw folder or one folder deeper; None if there is none."""
+    return next((path for base in bases(raw) if (path := base / name).is_file()), None)
+
+
+def find_regions(raw: Path, given: Path | None) -> list[Path]:
+    """The lists of vertices in the folder given, else in ``regions/`` of the raw folder if there is one.
+
+    Raises:
+        FaceDiffError: if the folder given holds no list.
+    """
+    folder = given or next((path for base in bases(raw) if (path := base / "regions").is_dir()), None)
+    files = [] if folder is None else sorted(path for path in folder.glob("*.txt") if path.is_file())
+    if given is not None and not files:
+        raise FaceDiffError(f"{given}: expected a folder with lists of vertices, e.g. lve.txt and fdd.txt")
+    return files
+
+
+def nothing_to_prepare(raw: Path, corpus: str, missing: Mapping[str, str]) -> FaceDiffError:
+    """The error for a raw folder without a complete clip."""
+    reasons = "; ".join(f"{name}: {text}" for name, text in list(missing.items())[:3])
+    return FaceDiffError(f"{raw}: no clip of {corpus} can be prepared ({reasons or 'there is none'})")

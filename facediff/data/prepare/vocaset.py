@@ -7,7 +7,7 @@ frame), ``raw_audio_fixed.pkl`` and ``templates.pkl``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.prepare.motion import resample_frames
 from facediff.data.prepare.runner import (
     Job,
     Plan,
@@ -22,11 +23,8 @@ from facediff.data.prepare.runner import (
     copy_files,
     find_file,
     find_regions,
-    motion_file,
-    region_files,
-    speech_file,
-    write_motion,
-    write_speech,
+    nothing_to_prepare,
+    write_clip,
     write_templates,
 )
 from facediff.errors import FaceDiffError
@@ -40,7 +38,7 @@ OPTIONAL = {
     "FLAME_sample.ply": "the mesh, for drawing; the VOCA repository has it in template/",
     "FLAME_masks.pkl": "lips and upper face; from flame.is.tue.mpg.de (FLAME vertex masks)",
 }
-LISTS = "not needed beside FLAME_masks.pkl; the FaceDiffuser repository has it in data/vocaset/regions/"
+LISTS = "not needed in addition to FLAME_masks.pkl; the FaceDiffuser repository has it in data/vocaset/regions/"
 FULL_SCALE = 32768.0
 """Of 16-bit samples."""
 SAMPLE_RATES = (8_000, 192_000)
@@ -50,12 +48,12 @@ Array = npt.NDArray[np.float64]
 
 
 class Recording(NamedTuple):
-    """What the raw files say of one clip.
+    """One clip of the raw data.
 
     Attributes:
         rows: row of ``data_verts.npy`` for each frame, in the order of the frames.
         audio: the entry of ``raw_audio_fixed.pkl``: ``{"audio": samples, "sample_rate": …}``.
-        where: names the clip in messages.
+        where: how errors call the clip.
     """
 
     rows: npt.NDArray[np.int64]
@@ -76,53 +74,23 @@ def plan(
     Args:
         raw: the folder, or the folder above it.
         frame_rate: 30, which every published model uses; or 60, as in the raw files, for other projects' loaders
-        decimate: how 60 becomes 30: ``every_second`` frame, beginning with the first, as published work has it; or
-            ``filtered``, which takes away first what would alias
+        decimate: how 60 becomes 30: ``every_second`` frame, beginning with the first, as in published work; or
+            ``filtered``, which first removes the frequencies that would alias
         dtype: of the motion on disk
         regions: folder with lists of vertices; regions/ of the raw folder if not given
 
     Raises:
         FaceDiffError: if a file is missing or is not what it should be, or no clip is complete.
     """
-    vertices, templates_path = _need(raw, VERTICES), _need(raw, TEMPLATES)
+    vertices, templates_file = _need(raw, VERTICES), _need(raw, TEMPLATES)
     row_map, sounds = _nested(_need(raw, ROWS)), _nested(_need(raw, AUDIO))
-    shape = open_vertices(vertices).shape
-    templates = _read_templates(templates_path, shape[1], vertices)
-    missing: dict[str, str] = {}
-    notes: list[str] = []
+    n_vertices = open_vertices(vertices).shape[1]
+    templates = _read_templates(templates_file, n_vertices, vertices)
     extras = [path for name in OPTIONAL if (path := find_file(raw, name)) is not None]
-    found_regions = find_regions(raw, regions)
-    _miss_extras(extras, found_regions, missing)
+    region_files = find_regions(raw, regions)
+    missing = _missing_extras([*extras, *region_files])
+    notes: list[str] = []
     jobs = []
-    for name, recording in _complete(row_map, sounds, templates, missing, notes):
-        frames = len(recording.rows) if frame_rate == RAW_RATE else -(-len(recording.rows) // 2)
-        jobs.append(Job(name, partial(write_clip, name, recording, vertices, frame_rate, decimate, dtype), frames))
-    if len(row_map) < SUBJECTS:
-        notes.append(f"{ROWS} has {len(row_map)} of the {SUBJECTS} subjects")
-    if not jobs:
-        reasons = "; ".join(f"{name}: {text}" for name, text in list(missing.items())[:3])
-        raise FaceDiffError(f"{raw}: no clip of VOCASET can be prepared ({reasons or 'the files name none'})")
-    return Plan(
-        corpus="vocaset",
-        frame_rate=float(frame_rate),
-        unit="m",
-        n_vertices=shape[1],
-        options={"frame_rate": frame_rate, "decimate": decimate, "dtype": dtype},
-        jobs=jobs,
-        shared=partial(_write_shared, templates, extras, found_regions),
-        missing=missing,
-        notes=notes,
-    )
-
-
-def _complete(
-    row_map: dict[str, dict[str, Any]],
-    sounds: dict[str, dict[str, Any]],
-    templates: dict[str, Array],
-    missing: dict[str, str],
-    notes: list[str],
-) -> Iterator[tuple[str, Recording]]:
-    """Name and recording of every clip that has motion, sound and a template; the others go to ``missing``."""
     for subject in sorted({*row_map, *sounds}):
         if subject not in templates:
             missing[f"template of {subject}"] = f"expected in {TEMPLATES}; no clip of {subject} is written without it"
@@ -133,12 +101,29 @@ def _complete(
             lacking = [file for file, there in ((ROWS, rows_of), (AUDIO, sound_of)) if there.get(sentence) is None]
             if lacking:
                 missing[name] = f"not in {' nor in '.join(lacking)}; the distribution lacks some"
-            else:
-                rows = _rows(rows_of[sentence], name, notes)
-                yield name, Recording(rows, sound_of[sentence], f"{subject} {sentence}")
+                continue
+            recording = Recording(_rows(rows_of[sentence], name, notes), sound_of[sentence], f"{subject} {sentence}")
+            frames = len(recording.rows) if frame_rate == RAW_RATE else -(-len(recording.rows) // 2)
+            work = partial(prepare_clip, name, recording, vertices, frame_rate, decimate, dtype)
+            jobs.append(Job(name, work, frames))
+    if len(row_map) < SUBJECTS:
+        notes.append(f"{ROWS} has {len(row_map)} of the {SUBJECTS} subjects")
+    if not jobs:
+        raise nothing_to_prepare(raw, "VOCASET", missing)
+    return Plan(
+        corpus="vocaset",
+        frame_rate=float(frame_rate),
+        unit="m",
+        n_vertices=n_vertices,
+        options={"frame_rate": frame_rate, "decimate": decimate, "dtype": dtype},
+        jobs=jobs,
+        shared=partial(_write_shared, templates, extras, region_files),
+        missing=missing,
+        notes=notes,
+    )
 
 
-def write_clip(
+def prepare_clip(
     name: str, recording: Recording, vertices: Path, frame_rate: int, decimate: Decimation, dtype: Precision, out: Path
 ) -> int:
     """Write one clip and return its number of frames.
@@ -155,7 +140,7 @@ def write_clip(
         out: the corpus folder.
 
     Raises:
-        FaceDiffError: if a row is not there or holds NaN, or the sound cannot be used.
+        FaceDiffError: if a row is missing or holds NaN, or the sound cannot be used.
     """
     from facediff.data.audio import to_speech
 
@@ -182,17 +167,13 @@ def write_clip(
         raise FaceDiffError(f"{recording.where}: frame {frame}, row {rows[frame]} of {vertices}, holds NaN or infinity")
     motion = halved(motion, decimate) if frame_rate != RAW_RATE else motion
     speech = to_speech(samples, rate, recording.where)
-    write_motion(motion_file(out, name), motion, dtype)
-    write_speech(speech_file(out, name), speech)
-    return len(motion)
+    return write_clip(out, name, motion, speech, dtype)
 
 
 def halved(motion: npt.NDArray[np.floating], decimate: Decimation) -> npt.NDArray[np.floating]:
     """Motion (T, V, 3) at half its frame rate; frame k of the result is frame 2 k."""
     if decimate == "every_second":
         return motion[::2]
-    from facediff.data.prepare.motion import resample_frames
-
     return resample_frames(motion.reshape(len(motion), -1), RAW_RATE, RAW_RATE // 2).reshape(-1, *motion.shape[1:])
 
 
@@ -238,7 +219,7 @@ def open_vertices(path: Path) -> npt.NDArray[np.floating]:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise FaceDiffError(f"{path}: not a readable NumPy array, perhaps truncated ({error}); get it anew") from error
+        raise FaceDiffError(f"{path}: not a readable NumPy array, perhaps truncated ({error}); get it again") from error
     if array.ndim == 2 and array.shape[1] % 3 == 0:
         array = array.reshape(len(array), -1, 3)
     if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind != "f" or not array.size:
@@ -251,7 +232,7 @@ def _need(raw: Path, name: str) -> Path:
     if path is None:
         raise FaceDiffError(
             f"{raw / name}: no such file; expected {VERTICES}, {ROWS}, {AUDIO} and {TEMPLATES} as voca.is.tue.mpg.de "
-            f"gives them out"
+            f"distributes them"
         )
     return path
 
@@ -260,7 +241,7 @@ def _nested(path: Path) -> dict[str, dict[str, Any]]:
     """A pickle with a dict from subject to a dict by sentence."""
     loaded = load_pickle(path)
     if not isinstance(loaded, dict) or not all(isinstance(inner, dict) for inner in loaded.values()):
-        raise FaceDiffError(f"{path}: expected a dict from subject to a dict by sentence; get the file anew")
+        raise FaceDiffError(f"{path}: expected a dict from subject to a dict by sentence; get the file again")
     return {str(subject): {str(key): value for key, value in inner.items()} for subject, inner in loaded.items()}
 
 
@@ -277,7 +258,7 @@ def _read_templates(path: Path, n_vertices: int, vertices: Path) -> dict[str, Ar
                 f"{n_vertices} vertices; expected the same mesh everywhere"
             )
         if not np.isfinite(array).all():
-            raise FaceDiffError(f"{path}: the template of {subject} holds NaN or infinity; get the file anew")
+            raise FaceDiffError(f"{path}: the template of {subject} holds NaN or infinity; get the file again")
         templates[str(subject)] = array.reshape(-1, 3).astype(np.float64)
     return templates
 
@@ -288,23 +269,24 @@ def _rows(frames: object, name: str, notes: list[str]) -> npt.NDArray[np.int64]:
         pairs = sorted((int(frame), int(row)) for frame, row in dict(frames).items())  # type: ignore[call-overload]
     except (TypeError, ValueError) as error:
         raise FaceDiffError(
-            f"{ROWS}: {name}: expected a dict from frame to row ({error}); get the file anew"
+            f"{ROWS}: {name}: expected a dict from frame to row ({error}); get the file again"
         ) from error
     if pairs and pairs[-1][0] != len(pairs) - 1:
         notes.append(f"{name}: {ROWS} leaves out some of the frames up to {pairs[-1][0]}; it is written without them")
     return np.array([row for _, row in pairs], np.int64)
 
 
-def _miss_extras(extras: list[Path], regions: Path | None, missing: dict[str, str]) -> None:
-    there = {path.name for path in (*extras, *region_files(regions))}
-    missing.update(
-        {name: f"no such file in the raw folder: {text}" for name, text in OPTIONAL.items() if name not in there}
-    )
-    for name in ("lve.txt", "fdd.txt"):
-        if name not in there and "FLAME_masks.pkl" not in there:
-            missing[f"regions/{name}"] = f"no such file in the raw folder: {LISTS}"
+def _missing_extras(found: Sequence[Path]) -> dict[str, str]:
+    there = {path.name for path in found}
+    missing = {name: f"no such file in the raw folder: {text}" for name, text in OPTIONAL.items() if name not in there}
+    if "FLAME_masks.pkl" not in there:
+        lists = (name for name in ("lve.txt", "fdd.txt") if name not in there)
+        missing |= {f"regions/{name}": f"no such file in the raw folder: {LISTS}" for name in lists}
+    return missing
 
 
-def _write_shared(templates: dict[str, Array], extras: list[Path], regions: Path | None, out: Path) -> list[str]:
+def _write_shared(
+    templates: dict[str, Array], extras: Sequence[Path], region_files: Sequence[Path], out: Path
+) -> list[str]:
     write_templates(out / "templates.pkl", templates)
-    return ["templates.pkl", *copy_files(extras, out), *copy_files(region_files(regions), out, "regions")]
+    return ["templates.pkl", *copy_files(extras, out), *copy_files(region_files, out, "regions")]
