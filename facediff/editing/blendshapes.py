@@ -1,176 +1,50 @@
-"""From a take to weights of blendshapes: one bounded least-squares problem over all frames."""
+"""From an animation to weights of blendshapes: one bounded least-squares problem over all frames, and its tables."""
 
 from __future__ import annotations
 
 import csv
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.shapes import ARKIT, ROTATIONS, ShapeSet, absent_from, beyond_arkit, live_link_name, mirror_pairs
 from facediff.errors import FaceDiffError, choices
+from facediff.mesh.mesh import triangle_areas
 from facediff.utils.files import atomic, check_writable
 
-# Box-bounded quadratic programs over a whole take: projected Newton with block-tridiagonal steps.
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
-SUFFICIENT = 1e-4
-"""Share of the promised decrease that a step must bring (Armijo)."""
-SHORTEST = 1e-12
-NEAR = 1e-3
-"""How near a bound counts as on it, at most; less near the solution."""
-JITTER = 1e-10
-"""Added to the diagonal, which is one, of the matrix of a step only: dependent shapes leave it singular."""
-
-
-@dataclass(frozen=True)
-class Problem:
-    """½ Σ_t x_tᵀ M x_t − Σ_t r_tᵀ x_t + ½ c Σ_t ‖x_t − x_{t−1}‖², lower ≤ x_t ≤ upper; float64 throughout.
-
-    Attributes:
-        matrix: M (K, K), symmetric, positive semi-definite, with a diagonal of about one.
-        right: r (T, K).
-        coupling: c, not negative.
-        lower: (K,).
-        upper: (K,).
-    """
-
-    matrix: Tensor
-    right: Tensor
-    coupling: float
-    lower: Tensor
-    upper: Tensor
-
-    def clip(self, x: Tensor) -> Tensor:
-        """The nearest point of the box."""
-        return torch.minimum(torch.maximum(x, self.lower), self.upper)
-
-    def gradient(self, x: Tensor) -> Tensor:
-        """Of the objective, (T, K)."""
-        slope = x @ self.matrix - self.right
-        step = self.coupling * (x[1:] - x[:-1])
-        slope[1:] += step
-        slope[:-1] -= step
-        return slope
-
-    def change(self, slope: Tensor, moved: Tensor) -> float:
-        """How the objective changes when x with this gradient moves; free of the cancellation of a difference."""
-        curve = (moved @ self.matrix * moved).sum() + self.coupling * (moved[1:] - moved[:-1]).square().sum()
-        return float((slope * moved).sum() + 0.5 * curve)
-
-    def residual(self, x: Tensor) -> Tensor:
-        """|x − clip(x − gradient)|, (T, K): zero exactly where the optimality (KKT) conditions hold."""
-        return (x - self.clip(x - self.gradient(x))).abs()
-
-
-def minimise(problem: Problem, tolerance: Tensor, max_iterations: int) -> tuple[Tensor, bool]:
-    """The box's point of least value.
-
-    Bertsekas, "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 1982:
-    variables on a bound whose gradient pushes outwards follow the gradient, the others take Newton's step; both are
-    clipped to the box, and the step is shortened until the objective falls enough, which makes it converge from
-    anywhere. The free variables of all frames are solved for at once.
-
-    Args:
-        problem: the program.
-        tolerance: (K,) what may be left of :meth:`Problem.residual`.
-        max_iterations: steps at most.
-
-    Returns:
-        x (T, K), and whether it met the tolerance.
-    """
-    free = torch.ones_like(problem.right, dtype=torch.bool)
-    x = problem.clip(_newton(problem, problem.right, free))
-    width = float((problem.upper - problem.lower).min())
-    for _ in range(max_iterations):
-        left = problem.residual(x)
-        if bool((left <= tolerance).all()):
-            return x, True
-        slope = problem.gradient(x)
-        near = min(NEAR * width, float(left.max()))
-        held = ((x <= problem.lower + near) & (slope > 0)) | ((x >= problem.upper - near) & (slope < 0))
-        direction = torch.where(held, -slope, _newton(problem, torch.where(held, 0.0, -slope), ~held))
-        following = _step(problem, x, slope, direction, held)
-        if following is None:
-            break
-        x = following
-    return x, bool((problem.residual(x) <= tolerance).all())
-
-
-def _step(problem: Problem, x: Tensor, slope: Tensor, direction: Tensor, held: Tensor) -> Tensor | None:
-    """The longest sufficient step along the clipped direction; None where rounding lets the objective fall no more."""
-    length = 1.0
-    promise = -float((slope * torch.where(held, 0.0, direction)).sum())
-    while length > SHORTEST:
-        following = problem.clip(x + length * direction)
-        moved = following - x
-        wanted = length * promise - float((slope * torch.where(held, moved, 0.0)).sum())
-        if problem.change(slope, moved) <= -SUFFICIENT * wanted:
-            return following if bool(moved.any()) else None
-        length /= 2
-    return None
-
-
-def _newton(problem: Problem, right: Tensor, free: Tensor) -> Tensor:
-    """Solve for the free variables, the others being zero: (T, K).
-
-    The matrix is block-tridiagonal, M + c·(number of neighbours) on the diagonal and −c beside it; block elimination
-    goes once forth and once back over the frames.
-    """
-    frames, count = right.shape
-    eye = torch.eye(count, dtype=right.dtype)
-    both = free[:, :, None] & free[:, None, :]
-    neighbours = torch.full((frames,), 2.0, dtype=right.dtype)
-    neighbours[0] -= 1
-    neighbours[-1] -= 1
-    extra = problem.coupling * neighbours[:, None] + JITTER
-    # Variables that are held get a row of the identity.
-    blocks = torch.where(both, problem.matrix, 0.0) + torch.diag_embed(torch.where(free, extra, 1.0))
-    if not problem.coupling:
-        return torch.linalg.solve(blocks, right[..., None])[..., 0] * free
-    beside = problem.coupling * (free[1:] & free[:-1]).to(right.dtype)
-    solved = torch.empty_like(right)
-    factors: list[Tensor] = []
-    for t in range(frames):
-        block, goal = blocks[t], right[t]
-        if t:
-            inverse = torch.cholesky_solve(eye, factors[-1])
-            block = block - beside[t - 1][:, None] * inverse * beside[t - 1]
-            goal = goal + beside[t - 1] * (inverse @ solved[t - 1])
-        factors.append(torch.linalg.cholesky(block))
-        solved[t] = goal
-    for t in reversed(range(frames)):
-        goal = solved[t] if t == frames - 1 else solved[t] + beside[t] * solved[t + 1]
-        solved[t] = torch.cholesky_solve(goal[:, None], factors[t])[:, 0]
-    return solved * free
-
-
-# How weights are solved for.
+CHUNK_BYTES = 32 * 2**20
+STATED_RATE = 30.0
+"""Frames a second for which the smoothness is stated."""
 
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """Choices of a solve; all strengths are shares of a shape's own energy, so that they mean the same for every shape.
+    """Options of a solve; all strengths are shares of a shape's own energy, so that they mean the same for every shape.
 
     Attributes:
         smoothness: how much a weight's change from frame to frame costs; at 0.02, a movement to and fro five times a
-            second keeps 98 % of its size. Stated for 30 frames a second and converted to the take's frame rate.
+            second keeps 98 % of its size. Stated for 30 frames a second and converted to the animation's frame rate.
         symmetry: how much a difference between the weights of a left shape and its right one costs.
         ridge: how much weights cost by themselves, which chooses the smallest among equally good ones.
         lower: least weight.
         upper: greatest weight.
-        region: name of the take's region that is looked at; None for the whole face.
+        region: name of the animation's region that is looked at; None for the whole face.
         area_weighted: count vertices by the area around them, so that finely meshed places do not count for more;
             without triangles, all count alike.
         tolerance: what may be left of the optimality conditions, in weights.
         max_iterations: of Newton's method.
+
+    Raises:
+        FaceDiffError: if a strength is negative, or a bound, tolerance or count is impossible.
     """
 
     smoothness: float = 0.02
@@ -195,24 +69,19 @@ class SolveOptions:
             )
 
 
-# Weights of blendshapes, frame by frame.
-
-Array = npt.NDArray[np.float64]
-
-
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """What :func:`facediff.editing.blendshapes` found.
+    """Weights of blendshapes, frame by frame, as :func:`solve` finds them.
 
     Attributes:
         names: K names.
         values: (T, K) weights.
-        residual_rms_mm: (T,) root-mean-square distance that each frame's vertices are left with, in millimetres.
+        residual_rms_mm: (T,) root-mean-square distance of each frame's vertices that is left, in millimetres.
         residual_max_mm: (T,) greatest such distance.
         amplitude_mm: the motion's own size: root-mean-square distance of all vertices in all frames from the template.
         frame_rate: frames a second.
         still: names whose shape moves no vertex, and whose weight therefore says nothing.
-        metadata: the take's, and how the weights were solved for.
+        metadata: the animation's, and how the weights were solved for.
     """
 
     names: tuple[str, ...]
@@ -242,102 +111,76 @@ class Weights:
         return self.residual_rms_mm / self.amplitude_mm
 
 
-# Weights as CSV.
+def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None = None) -> Weights:
+    """Weights w_t that bring the shapes nearest to an animation.
 
-FORMAT = "facediff blendshape weights 1"
-DAY = 24 * 3600
+    Minimises Σ_t ½‖Σ_k w_tk d_k − (x_t − template)‖² + ½λ Σ_t Σ_k e_k (w_tk − w_{t−1,k})² + ½σ Σ_t Σ_(l,r) ½(e_l + e_r)
+    (w_tl − w_tr)² + ½ρ Σ_t Σ_k e_k w_tk² with lower ≤ w ≤ upper, where d_k are the displacements of shape k, norms are
+    means over vertices weighted by area, and e_k = ‖d_k‖² makes the strengths λ (smoothness), σ (symmetry) and ρ
+    (ridge) the same for shapes that move much and little. All frames are solved for together.
 
-
-def write_live_link(path: Path, weights: Weights) -> None:
-    """Write a table as Epic's app Live Link Face records it, and what it cannot say beside it.
-
-    A row for each frame: timecode, number of values (61), ARKit's 52 names in order, turns of head and eyes. Names
-    without a shape and all turns are 0; ``<name>.json`` declares them, and holds the frame rate and each frame's
-    residual. Both files appear whole or not at all.
-
-    Raises:
-        FaceDiffError: if a file cannot be written.
-    """
-    column = {name: index for index, name in enumerate(weights.names)}
-    header = ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
-    rows = (
-        [
-            timecode(frame, weights.frame_rate),
-            str(len(ARKIT) + len(ROTATIONS)),
-            *(f"{values[column[name]]:.8f}" if name in column else "0.00000000" for name in ARKIT),
-            *("0.00000000" for _ in ROTATIONS),
-        ]
-        for frame, values in enumerate(weights.values)
-    )
-    _write_both(path, header, rows, _about(weights, in_table=ARKIT, rotations=True))
-
-
-def write_weights(path: Path, weights: Weights) -> None:
-    """Write a plain table, and ``<name>.json`` beside it: time in seconds, every weight, residuals in millimetres.
+    Args:
+        animation: with V vertices and T frames.
+        shapes: of the animation's topology.
+        options: the usual ones if None.
 
     Raises:
-        FaceDiffError: if a file cannot be written.
+        FaceDiffError: if the topologies differ, a frame is not finite, the region is unknown, or no shape moves
+            anything.
+
+    Example:
+        >>> from facediff.animation import Animation
+        >>> from facediff.editing.shapes import ShapeSet
+        >>> rest = np.random.default_rng(0).normal(size=(9, 3))
+        >>> shapes = ShapeSet(("jawOpen",), rest, np.full((1, 9, 3), 0.01))
+        >>> half_open = Animation("hello", (rest + 0.005)[None], rest, frame_rate=30.0)
+        >>> solve(half_open, shapes).values.round(3)
+        array([[0.5]])
     """
-    header = ["time", *weights.names, "residual_rms_mm", "residual_max_mm"]
-    rows = (
-        [
-            f"{frame / weights.frame_rate:.6f}",
-            *(f"{value:.8f}" for value in values),
-            f"{weights.residual_rms_mm[frame]:.6f}",
-            f"{weights.residual_max_mm[frame]:.6f}",
-        ]
-        for frame, values in enumerate(weights.values)
-    )
-    _write_both(path, header, rows, _about(weights, in_table=weights.names, rotations=False))
-
-
-def timecode(frame: int, frame_rate: float) -> str:
-    """HH:MM:SS:FF.mmm of a frame, from midnight on; a broken frame rate counts as the next whole one (no frame drops).
-
-    Frames are counted within the second, and the digits after the point are thousandths of a frame, always 0 here.
-    """
-    whole = max(1, round(frame_rate))
-    seconds = frame // whole % DAY
-    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}:{frame % whole:02d}.000"
-
-
-def _about(weights: Weights, in_table: Sequence[str], *, rotations: bool) -> dict[str, object]:
-    """What a table does not say."""
-    return {
-        "format": FORMAT,
-        "frame_rate": weights.frame_rate,
-        "frames": len(weights.values),
-        "absent": list(weights.absent),
-        "absent_means": "no shape was given under these names: their weights are 0 and say nothing",
-        "still": list(weights.still),
-        "not_in_table": [name for name in weights.names if name not in in_table],
-        **(
-            {"rotations": "head and eyes were not solved for: their columns are 0 and say nothing"} if rotations else {}
-        ),
-        "amplitude_mm": round(weights.amplitude_mm, 6),
-        "residual_rms_mm": [round(float(value), 6) for value in weights.residual_rms_mm],
-        "residual_max_mm": [round(float(value), 6) for value in weights.residual_max_mm],
-        "metadata": dict(weights.metadata),
+    options = options or SolveOptions()
+    if shapes.deltas.shape[1] != len(animation.template):
+        raise FaceDiffError(
+            f"{animation.name}: has {len(animation.template)} vertices and the shapes {shapes.deltas.shape[1]}; give "
+            f"shapes of the same mesh, or carry them over with `facediff blendshapes --carry`"
+        )
+    moving = _moving(animation, shapes, options)
+    # In weights times the root of each shape's energy, the matrix of the problem has ones on its diagonal.
+    scale = np.sqrt(moving.energy)
+    weighted = moving.deltas * np.repeat(moving.area, 3) / scale[:, None]
+    right, amplitude = _products(animation, moving, weighted)
+    matrix = weighted @ (moving.deltas / scale[:, None]).T + options.ridge * np.eye(len(scale))
+    for left, other in mirror_pairs(tuple(shapes.names[k] for k in moving.places)):
+        cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[other] ** 2)
+        row = np.zeros(len(scale))
+        row[left], row[other] = 1.0 / scale[left], -1.0 / scale[other]
+        matrix += cost * np.outer(row, row)
+    # A movement that takes as many seconds takes more steps at a higher frame rate, each the smaller.
+    coupling = options.smoothness * (animation.frame_rate / STATED_RATE) ** 2
+    problem = Problem(0.5 * (matrix + matrix.T), right, coupling, options.lower * scale, options.upper * scale)
+    found, converged = minimise(problem, options.tolerance * scale, options.max_iterations)
+    values = np.full((len(right), len(shapes.names)), np.clip(0.0, options.lower, options.upper))
+    # Division may lead past a bound by a rounding error.
+    values[:, moving.places] = np.clip(found / scale, options.lower, options.upper)
+    rms, most = _residuals(animation, moving, values[:, moving.places])
+    millimetres = 1000.0 * metres_per_unit(animation.unit)
+    about = {
+        "smoothness": f"{options.smoothness:g}",
+        "symmetry": f"{options.symmetry:g}",
+        "ridge": f"{options.ridge:g}",
+        "bounds": f"{options.lower:g} {options.upper:g}",
+        "region": options.region or "whole face",
+        "converged": "yes" if converged else f"no, after {options.max_iterations} iterations",
     }
-
-
-def _write_both(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]], about: dict[str, object]) -> None:
-    if path.suffix.lower() != ".csv":
-        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a table .csv')
-    # Both, before one is there.
-    for file in (path, path.with_suffix(".json")):
-        check_writable(file)
-    with atomic(path.with_suffix(".json")) as beside, atomic(path) as temporary:
-        with temporary.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(header)
-            writer.writerows(rows)
-        beside.write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-CHUNK_BYTES = 32 * 2**20
-STATED_RATE = 30.0
-"""Frames a second for which the smoothness is stated."""
+    return Weights(
+        names=shapes.names,
+        values=values,
+        residual_rms_mm=millimetres * rms,
+        residual_max_mm=millimetres * most,
+        amplitude_mm=millimetres * amplitude,
+        frame_rate=animation.frame_rate,
+        still=tuple(name for k, name in enumerate(shapes.names) if k not in moving.places),
+        metadata={**animation.metadata, **{f"solve {key}": value for key, value in about.items()}},
+    )
 
 
 @dataclass(frozen=True)
@@ -359,75 +202,11 @@ class _Moving:
     energy: Array
 
 
-def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None = None) -> Weights:
-    """Weights w_t that bring the shapes nearest to a take.
-
-    Minimises Σ_t ½‖Σ_k w_tk d_k − (x_t − template)‖² + ½λ Σ_t Σ_k e_k (w_tk − w_{t−1,k})² + ½σ Σ_t Σ_(l,r) ½(e_l + e_r)
-    (w_tl − w_tr)² + ½ρ Σ_t Σ_k e_k w_tk² with lower ≤ w ≤ upper, where d_k are the displacements of shape k, norms are
-    means over vertices weighted by area, and e_k = ‖d_k‖² makes the strengths λ (smoothness), σ (symmetry) and ρ
-    (ridge) the same for shapes that move much and little. All frames are solved for together.
-
-    Args:
-        animation: the performance.
-        shapes: of the take's topology.
-        options: the usual ones if None.
-
-    Raises:
-        FaceDiffError: if the topologies differ, a frame is not finite, the region is unknown, or no shape moves
-            anything.
-    """
-    options = options or SolveOptions()
-    if shapes.deltas.shape[1] != len(animation.template):
-        raise FaceDiffError(
-            f"{animation.name}: has {len(animation.template)} vertices and the shapes {shapes.deltas.shape[1]}; give "
-            f"shapes of the same mesh, or carry them over with `facediff blendshapes --carry`"
-        )
-    moving = _moving(animation, shapes, options)
-    scale = np.sqrt(moving.energy)
-    weighted = moving.deltas * np.repeat(moving.area, 3) / scale[:, None]
-    right, amplitude = _products(animation, moving, weighted)
-    gram = weighted @ (moving.deltas / scale[:, None]).T
-    problem = _problem(gram, right, scale, [shapes.names[k] for k in moving.places], options, animation.frame_rate)
-    found, converged = minimise(problem, torch.from_numpy(options.tolerance * scale), options.max_iterations)
-    values = np.zeros((len(right), len(shapes.names)))
-    values[:] = np.clip(0.0, options.lower, options.upper)
-    # Division may lead past a bound by a rounding error.
-    values[:, moving.places] = np.clip(found.numpy() / scale, options.lower, options.upper)
-    rms, most = _residuals(animation, moving, values[:, moving.places])
-    millimetres = 1000.0 * metres_per_unit(animation.unit)
-    told = {
-        "smoothness": f"{options.smoothness:g}",
-        "symmetry": f"{options.symmetry:g}",
-        "ridge": f"{options.ridge:g}",
-        "bounds": f"{options.lower:g} {options.upper:g}",
-        "region": options.region or "whole face",
-        "converged": "yes" if converged else f"no, after {options.max_iterations} iterations",
-    }
-    return Weights(
-        names=shapes.names,
-        values=values,
-        residual_rms_mm=millimetres * rms,
-        residual_max_mm=millimetres * most,
-        amplitude_mm=millimetres * amplitude,
-        frame_rate=animation.frame_rate,
-        still=tuple(name for k, name in enumerate(shapes.names) if k not in moving.places),
-        metadata={**animation.metadata, **{f"solve {key}": value for key, value in told.items()}},
-    )
-
-
-def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Array:
-    """A third of the area of every triangle around each vertex, (V,)."""
-    a, b, c = (np.asarray(vertices, np.float64)[faces[:, corner]] for corner in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
-    total: Array = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices)).astype(np.float64)
-    return total
-
-
 def _moving(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> _Moving:
     used = np.arange(len(animation.template))
     if options.region is not None:
         if not animation.regions:
-            raise FaceDiffError(f"{animation.name}: has no regions; give --checkpoint, or leave the region away")
+            raise FaceDiffError(f"{animation.name}: has no regions; give --checkpoint, or omit the region")
         if options.region not in animation.regions:
             raise FaceDiffError(
                 f'{animation.name}: has no region "{options.region}"; {choices(options.region, animation.regions)}'
@@ -449,27 +228,29 @@ def _moving(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> _M
     return _Moving(places, used, area, deltas[places], energy[places])
 
 
-def _displacements(animation: Animation, moving: _Moving, frames: slice) -> Array:
-    """Displacements (frames, N, 3) from the template; refuses what is not finite."""
-    chunk = np.asarray(animation.vertices[frames], np.float64)
-    finite = np.isfinite(chunk).all(axis=(1, 2))
-    if not finite.all():
-        bad = frames.start + int(np.argmin(finite))
-        raise FaceDiffError(f"{animation.name}: frame {bad} holds NaN or infinity; make the motion anew")
-    moved: Array = (chunk - np.asarray(animation.template, np.float64))[:, moving.vertices]
-    return moved
+def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Array:
+    """A third of the area of every triangle around each vertex, (V,)."""
+    total: Array = np.bincount(faces.ravel(), np.repeat(triangle_areas(vertices, faces) / 3.0, 3), len(vertices))
+    return total
 
 
-def _slices(animation: Animation) -> list[slice]:
+def _displacements(animation: Animation, moving: _Moving) -> Iterator[tuple[slice, Array]]:
+    """Displacements (frames, N, 3) from the template, some frames at a time; refuses what is not finite."""
     step = max(1, CHUNK_BYTES // (24 * len(animation.template)))
-    return [slice(first, first + step) for first in range(0, len(animation.vertices), step)]
+    for first in range(0, len(animation.vertices), step):
+        chunk = np.asarray(animation.vertices[first : first + step], np.float64)
+        finite = np.isfinite(chunk).all(axis=(1, 2))
+        if not finite.all():
+            bad = first + int(np.argmin(finite))
+            raise FaceDiffError(f"{animation.name}: frame {bad} holds NaN or infinity; generate the motion again")
+        moved = (chunk - np.asarray(animation.template, np.float64))[:, moving.vertices]
+        yield slice(first, first + len(chunk)), moved
 
 
 def _products(animation: Animation, moving: _Moving, weighted: Array) -> tuple[Array, float]:
     """Each frame's products with the weighted shapes (T, K), and the motion's root mean square."""
     products, square = [], 0.0
-    for frames in _slices(animation):
-        moved = _displacements(animation, moving, frames)
+    for _, moved in _displacements(animation, moving):
         products.append(moved.reshape(len(moved), -1) @ weighted.T)
         square += float(np.square(moved).sum())
     return np.concatenate(products), float(np.sqrt(square / (len(animation.vertices) * len(moving.vertices))))
@@ -478,29 +259,222 @@ def _products(animation: Animation, moving: _Moving, weighted: Array) -> tuple[A
 def _residuals(animation: Animation, moving: _Moving, values: Array) -> tuple[Array, Array]:
     """Root mean square and maximum (T,) over the vertices of the distances that are left."""
     rms, most = [], []
-    for frames in _slices(animation):
-        moved = _displacements(animation, moving, frames)
+    for frames, moved in _displacements(animation, moving):
         square = np.square(moved - (values[frames] @ moving.deltas).reshape(moved.shape)).sum(axis=-1)
         rms.append(np.sqrt(square.mean(axis=-1)))
         most.append(np.sqrt(square.max(axis=-1)))
     return np.concatenate(rms), np.concatenate(most)
 
 
-def _problem(
-    gram: Array, right: Array, scale: Array, names: list[str], options: SolveOptions, frame_rate: float
-) -> Problem:
-    """The quadratic program in weights times the root of each shape's energy, whose matrix has ones on its diagonal."""
-    matrix = gram + options.ridge * np.eye(len(scale))
-    for left, other in mirror_pairs(tuple(names)):
-        cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[other] ** 2)
-        row = np.zeros(len(scale))
-        row[left], row[other] = 1.0 / scale[left], -1.0 / scale[other]
-        matrix += cost * np.outer(row, row)
-    return Problem(
-        torch.from_numpy(0.5 * (matrix + matrix.T)),
-        torch.from_numpy(right),
-        # A movement that takes as many seconds takes more steps at a higher frame rate, each the smaller.
-        options.smoothness * (frame_rate / STATED_RATE) ** 2,
-        torch.from_numpy(options.lower * scale),
-        torch.from_numpy(options.upper * scale),
+# A box-bounded quadratic program over all frames, solved by projected Newton steps. scipy's bounded solvers either know
+# no banded matrices or stop far from the 1e-8 that is promised for weights; its banded Cholesky solver takes the steps.
+
+SUFFICIENT = 1e-4
+"""Share of the promised decrease that a step must bring (Armijo)."""
+SHORTEST = 1e-12
+NEAR = 1e-3
+"""How near a bound counts as on it, at most; less near the solution."""
+JITTER = 1e-10
+"""Added to the diagonal, which is one, of the matrix of a step only: dependent shapes leave it singular."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """½ Σ_t x_tᵀ M x_t − Σ_t r_tᵀ x_t + ½ c Σ_t ‖x_t − x_{t−1}‖², lower ≤ x_t ≤ upper; float64 throughout.
+
+    Attributes:
+        matrix: M (K, K), symmetric, positive semi-definite, with a diagonal of about one.
+        right: r (T, K).
+        coupling: c, not negative.
+        lower: (K,).
+        upper: (K,).
+    """
+
+    matrix: Array
+    right: Array
+    coupling: float
+    lower: Array
+    upper: Array
+
+    def clip(self, x: Array) -> Array:
+        """The nearest point of the box."""
+        return np.clip(x, self.lower, self.upper)
+
+    def gradient(self, x: Array) -> Array:
+        """Of the objective, (T, K)."""
+        slope = x @ self.matrix - self.right
+        step = self.coupling * np.diff(x, axis=0)
+        slope[1:] += step
+        slope[:-1] -= step
+        return slope
+
+    def change(self, slope: Array, moved: Array) -> float:
+        """How the objective changes when x with this gradient moves; free of the cancellation of a difference."""
+        curve = (moved @ self.matrix * moved).sum() + self.coupling * np.square(np.diff(moved, axis=0)).sum()
+        return float((slope * moved).sum() + 0.5 * curve)
+
+    def residual(self, x: Array) -> Array:
+        """|x − clip(x − gradient)|, (T, K): zero exactly where the optimality (KKT) conditions hold."""
+        return np.abs(x - self.clip(x - self.gradient(x)))
+
+
+def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[Array, bool]:
+    """The box's point of least value.
+
+    Bertsekas, "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 1982:
+    variables on a bound whose gradient pushes outwards follow the gradient, the others take Newton's step; both are
+    clipped to the box, and the step is shortened until the objective falls enough, which makes it converge from
+    anywhere. The free variables of all frames are solved for together.
+
+    Args:
+        problem: the program.
+        tolerance: (K,) what may be left of :meth:`Problem.residual`.
+        max_iterations: steps at most.
+
+    Returns:
+        x (T, K), and whether it meets the tolerance.
+    """
+    x = problem.clip(_newton(problem, problem.right, np.ones(problem.right.shape, bool)))
+    width = float((problem.upper - problem.lower).min())
+    for _ in range(max_iterations):
+        left = problem.residual(x)
+        if (left <= tolerance).all():
+            return x, True
+        slope = problem.gradient(x)
+        near = min(NEAR * width, float(left.max()))
+        held = ((x <= problem.lower + near) & (slope > 0)) | ((x >= problem.upper - near) & (slope < 0))
+        direction = np.where(held, -slope, _newton(problem, -slope, ~held))
+        following = _step(problem, x, slope, direction, held)
+        if following is None:
+            break
+        x = following
+    return x, bool((problem.residual(x) <= tolerance).all())
+
+
+def _step(problem: Problem, x: Array, slope: Array, direction: Array, held: Mask) -> Array | None:
+    """The longest sufficient step along the clipped direction; None where rounding lets the objective fall no more."""
+    length = 1.0
+    promise = -float((slope * direction)[~held].sum())
+    while length > SHORTEST:
+        following = problem.clip(x + length * direction)
+        moved = following - x
+        wanted = length * promise - float((slope * moved)[held].sum())
+        if problem.change(slope, moved) <= -SUFFICIENT * wanted:
+            return following if moved.any() else None
+        length /= 2
+    return None
+
+
+def _newton(problem: Problem, right: Array, free: Mask) -> Array:
+    """Solve for the free variables, the others being zero: (T, K)."""
+    from scipy.linalg import solveh_banded
+
+    frames, count = right.shape
+    neighbours = np.full((frames, 1), 2.0)
+    neighbours[0] -= 1
+    neighbours[-1] -= 1
+    # M + c · (number of neighbours) on the block diagonal and −c next to it make a band of K below the diagonal, stored
+    # as LAPACK expects it: the last axis counts how far below. The lower form is some twenty times faster than the
+    # upper one, whose small products OpenBLAS spreads over threads. A variable that is held gets a row of the identity.
+    rows = max(count, 2) + 1  # scipy fails on a single variable with a narrower band
+    band = np.zeros((frames, count, rows))
+    band[:, :, 0] = np.where(free, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
+    for d in range(1, count):
+        band[:, :-d, d] = np.where(free[:, d:] & free[:, :-d], np.diagonal(problem.matrix, d), 0.0)
+    band[:-1, :, count] = np.where(free[1:] & free[:-1], -problem.coupling, 0.0)
+    goal = np.where(free, right, 0.0).ravel()
+    solved = solveh_banded(band.reshape(-1, rows).T, goal, overwrite_ab=True, lower=True, check_finite=False)
+    return np.where(free, solved.reshape(frames, count), 0.0)
+
+
+# Weights as CSV, with a JSON file next to the table for what a table cannot say.
+
+FORMAT = "facediff blendshape weights 1"
+DAY = 24 * 3600
+
+
+def write_live_link(path: Path, weights: Weights) -> None:
+    """Write a table as Epic's app Live Link Face records it, and ``<name>.json`` next to it.
+
+    A row for each frame: timecode, number of values (61), ARKit's 52 names in order, rotations of head and eyes. Names
+    without a shape and all rotations are 0; the JSON file declares them, and holds the frame rate and each frame's
+    residual. Both files appear whole or not at all.
+
+    Raises:
+        FaceDiffError: if a file cannot be written.
+    """
+    column = {name: index for index, name in enumerate(weights.names)}
+    header = ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
+    rows = (
+        [
+            timecode(frame, weights.frame_rate),
+            str(len(ARKIT) + len(ROTATIONS)),
+            *(f"{values[column[name]]:.8f}" if name in column else "0.00000000" for name in ARKIT),
+            *("0.00000000" for _ in ROTATIONS),
+        ]
+        for frame, values in enumerate(weights.values)
     )
+    rotations = {"rotations": "head and eyes were not solved for: their columns are 0 and say nothing"}
+    _write_both(path, header, rows, _about(weights, in_table=ARKIT, more=rotations))
+
+
+def write_weights(path: Path, weights: Weights) -> None:
+    """Write a plain table and ``<name>.json`` next to it: time in seconds, every weight, residuals in millimetres.
+
+    Raises:
+        FaceDiffError: if a file cannot be written.
+    """
+    header = ["time", *weights.names, "residual_rms_mm", "residual_max_mm"]
+    rows = (
+        [
+            f"{frame / weights.frame_rate:.6f}",
+            *(f"{value:.8f}" for value in values),
+            f"{weights.residual_rms_mm[frame]:.6f}",
+            f"{weights.residual_max_mm[frame]:.6f}",
+        ]
+        for frame, values in enumerate(weights.values)
+    )
+    _write_both(path, header, rows, _about(weights, in_table=weights.names, more={}))
+
+
+def timecode(frame: int, frame_rate: float) -> str:
+    """HH:MM:SS:FF.mmm of a frame, from midnight on; a fractional frame rate counts as the nearest whole one.
+
+    Frames are counted within the second and none is dropped; the digits after the point are thousandths of a frame,
+    always 0 here.
+    """
+    whole = max(1, round(frame_rate))
+    seconds = frame // whole % DAY
+    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}:{frame % whole:02d}.000"
+
+
+def _about(weights: Weights, *, in_table: Sequence[str], more: Mapping[str, str]) -> dict[str, object]:
+    """What a table does not say."""
+    return {
+        "format": FORMAT,
+        "frame_rate": weights.frame_rate,
+        "frames": len(weights.values),
+        "absent": list(weights.absent),
+        "absent_means": "no shape was given under these names: their weights are 0 and say nothing",
+        "still": list(weights.still),
+        "not_in_table": [name for name in weights.names if name not in in_table],
+        **more,
+        "amplitude_mm": round(weights.amplitude_mm, 6),
+        "residual_rms_mm": [round(float(value), 6) for value in weights.residual_rms_mm],
+        "residual_max_mm": [round(float(value), 6) for value in weights.residual_max_mm],
+        "metadata": dict(weights.metadata),
+    }
+
+
+def _write_both(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]], about: dict[str, object]) -> None:
+    if path.suffix.lower() != ".csv":
+        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a table .csv')
+    # Both names are checked before either file is written.
+    for file in (path, path.with_suffix(".json")):
+        check_writable(file)
+    with atomic(path.with_suffix(".json")) as companion, atomic(path) as temporary:
+        with temporary.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(header)
+            writer.writerows(rows)
+        companion.write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
