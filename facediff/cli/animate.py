@@ -38,7 +38,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     written, animation = AnimationPipeline(args).write(speech, args.speech[0].stem, args.output, seed=args.seed)
     told = f"{len(animation.vertices)} frames, identity {animation.metadata['identity']}, style of {animation.metadata['style']}"
     procedural = "".join(
-        f", {name}: {animation.metadata[name]}" for name in ("directed", "procedural") if name in animation.metadata
+        f", {name}: {animation.metadata[name]}" for name in ("edited", "procedural") if name in animation.metadata
     )
     for path in written:
         print(f"{path}: {told}{procedural}")

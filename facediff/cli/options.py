@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from facediff.animation.files import Surroundings
     from facediff.data import Assets
     from facediff.editing.correspondence import Correspondence
-    from facediff.editing.procedural import Eyes
+    from facediff.editing.eyes import Eyes
 
 
 # The options by which a command gets a take: a motion file, and what the file does not say.
@@ -224,7 +224,7 @@ def needed_eyes(
     Raises:
         FaceDiffError: if blinks or gaze are asked for and nothing says where the eyes are.
     """
-    from facediff.editing.eyes_files import eyes_for
+    from facediff.editing.eyes import eyes_for
 
     asking = next((f"--{name}" for name in ("blinks", "gaze") if getattr(args, name) is not None), None)
     if asking is None and args.expressiveness is None:
@@ -233,7 +233,7 @@ def needed_eyes(
     if asking is None:
         return eyes
     if eyes is None:
-        from facediff.editing.procedural import GIVE
+        from facediff.editing.eyes import GIVE
 
         raise FaceDiffError(f"{asking}: {NEEDS}; {GIVE}")
     if args.blinks is not None:

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from facediff.data.audio import ArrayStore, read_stretch, samples_for
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError
+from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh, read_mesh
 from facediff.metrics import Region
 from facediff.utils.files import cache_dir
@@ -71,31 +72,6 @@ def find_region(root: Path, sources: Sequence[str], name: str, n_vertices: int, 
         f"{root}: nothing says which vertices are the {name.replace('_', ' ')}; looked for {looked}. {help_text} "
         f"To train and score on all vertices instead, set data.{name}={ALL}"
     )
-
-
-def read_masks(path: Path, names: str) -> list[int]:
-    """Indices of one or several masks ("lips", "forehead+eye_region") of a pickle; its whole list if no name is given.
-
-    Raises:
-        FaceDiffError: if the file holds something else, or has no mask of that name.
-    """
-    loaded = load_pickle(path)
-    if not names:
-        chosen = [loaded]
-    else:
-        if not isinstance(loaded, dict):
-            raise FaceDiffError(f"{path}: expected a dict from mask to vertex indices, got {type(loaded).__name__}")
-        for name in names.split("+"):
-            if name not in loaded:
-                raise FaceDiffError(f'{path}: has no mask "{name}": {choices(name, list(map(str, loaded)))}')
-        chosen = [loaded[name] for name in names.split("+")]
-    try:
-        arrays = [np.asarray(mask) for mask in chosen]
-    except ValueError as error:
-        raise FaceDiffError(f"{path}: expected lists of vertex indices ({error})") from error
-    if any(array.ndim != 1 or not np.issubdtype(array.dtype, np.integer) for array in arrays):
-        raise FaceDiffError(f"{path}: expected lists of whole numbers, the vertex indices")
-    return [int(index) for array in arrays for index in array]
 
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")

@@ -230,8 +230,8 @@ def _moving(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> _M
 
 def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Array:
     """A third of the area of every triangle around each vertex, (V,)."""
-    total: Array = np.bincount(faces.ravel(), np.repeat(triangle_areas(vertices, faces) / 3.0, 3), len(vertices))
-    return total
+    thirds = np.repeat(triangle_areas(vertices, faces) / 3.0, 3)
+    return np.bincount(faces.ravel(), thirds, len(vertices)).astype(np.float64)
 
 
 def _displacements(animation: Animation, moving: _Moving) -> Iterator[tuple[slice, Array]]:

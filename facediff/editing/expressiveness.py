@@ -1,4 +1,4 @@
-"""Larger or smaller motion, region by region, without seams."""
+"""Larger or smaller motion, region by region, with soft borders between regions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.editing.procedural import DIRECTED, Array, Eyes, noted, room_for, smooth_step
+from facediff.editing.eyes import Array, Eyes, Indices, smooth_step
+from facediff.editing.procedural import EDITED, noted, room_for
 from facediff.errors import FaceDiffError, choices
 
 ALL = "all"
@@ -17,15 +18,18 @@ ALL = "all"
 FALL_OFF = 0.06
 """Width of a region's soft border, as a share of the face's size (the diagonal of its box): about 2 cm on a head."""
 HIGHEST = 4.0
-"""Motion more than this many times as large is no face's any more."""
-CHUNK = 1024
+"""Motion more than this many times as large does not look like a face's any more."""
 
 
 def read_factors(words: str) -> dict[str, float]:
-    """Factors by region from a command line's words: ``1.2`` (all), or ``upper_face=1.5,lips=0.9``.
+    """Factors by region from the command line: ``1.2`` (all), or ``upper_face=1.5,lips=0.9``.
 
     Raises:
-        FaceDiffError: if they are neither, a name comes twice, or a factor is not in 0 … 4.
+        FaceDiffError: if the words are neither, a name comes twice, or a factor is not in 0 … 4.
+
+    Example:
+        >>> read_factors("upper_face=1.5,all=1.1")
+        {'upper_face': 1.5, 'all': 1.1}
     """
     factors: dict[str, float] = {}
     for word in words.split(","):
@@ -47,7 +51,7 @@ def read_factors(words: str) -> dict[str, float]:
 
 
 def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], name: str) -> None:
-    """Refuse a region that there is not.
+    """Refuse a region that does not exist.
 
     Raises:
         FaceDiffError: naming the regions that ``name`` has.
@@ -62,25 +66,30 @@ def scale_regions(animation: Animation, factors: Mapping[str, float], eyes: Eyes
 
     Args:
         animation: its head must not sway yet.
-        factors: by region of the take; ``all`` stands for every vertex that no other name covers. 1 changes nothing.
+        factors: by region of the animation; ``all`` stands for every vertex that no other name covers. 1 changes
+            nothing.
         eyes: where they are known, the closing of the lids is left as it is: a blink stays a blink, and lids that meet
             do not run through each other.
 
     Raises:
-        FaceDiffError: if the take has no such region.
+        FaceDiffError: if the animation has no such region.
     """
     factor = region_factors(animation.template, animation.regions, factors, animation.name).astype(np.float32)
     vertices = room_for(animation.vertices)
-    lids, closing = eyes.lids() if eyes is not None and eyes.closing is not None else (np.zeros(0, np.int64), None)
+    lids: Indices = np.zeros(0, np.int64)
+    closing = None
+    if eyes is not None and eyes.closing is not None:
+        lids, closing = eyes.lids()
     for index, frame in enumerate(animation.vertices):
         offsets = frame - animation.template
         scaled = factor[:, None] * offsets
         if closing is not None:
+            # Vertices of the lids get back what scaling took from their closing, or lose what it added.
             share = np.clip((offsets[lids] * closing).sum(-1) / (closing**2).sum(-1), 0.0, 1.0)
             scaled[lids] += ((1.0 - factor[lids]) * share)[:, None] * closing
         vertices[index] = animation.template + scaled
-    told = ", ".join(f"{name} {value:g}" for name, value in factors.items())
-    return noted(animation, vertices, DIRECTED, f"expressiveness ({told})")
+    words = ", ".join(f"{name} {value:g}" for name, value in factors.items())
+    return noted(animation, vertices, EDITED, f"expressiveness ({words})")
 
 
 def region_factors(
@@ -94,15 +103,15 @@ def region_factors(
 
     A region weighs 1 on its own vertices and falls to 0 over ``fall_off`` outside of it, by the distance d in the
     neutral face: 1 − s(d / fall_off) with s(t) = 3t² − 2t³. Where weights sum to more than 1 they are divided by their
-    sum, and what lacks to 1 belongs to ``all``: together they are a partition of unity. Between a region's factor f and
-    that of the rest, g, vertices at x and y differ by no more than 1.5 |f − g| |x − y| / fall_off, since a distance
+    sum, and the remainder to 1 belongs to ``all``: together they are a partition of unity. Between a region's factor f
+    and that of the rest, g, vertices at x and y differ by no more than 1.5 |f − g| |x − y| / fall_off, since a distance
     changes no faster than its place, and s no faster than 1.5.
 
     Args:
         template: (V, 3) the neutral face.
         regions: vertex indices by name.
         factors: by region, or ``all`` (1 if absent).
-        name: what lacks a region, for the message.
+        name: what has the regions, for the message.
         fall_off: in the template's unit; 0.06 of the face's size if None.
 
     Raises:
@@ -123,15 +132,9 @@ def region_factors(
 
 
 def _distances(places: Array, region: npt.NDArray[np.integer], limit: float) -> Array:
-    """Distance of every vertex (V,) from the nearest one of a region; beyond ``limit`` it may be infinite."""
-    found = np.full(len(places), np.inf)
+    """Distance of every vertex (V,) from the nearest one of a region; infinite from ``limit`` on."""
+    from scipy.spatial import cKDTree
+
     if not len(region):  # as of a face that was carried to a mesh without it
-        return found
-    chosen = places[region]
-    near = np.flatnonzero(((places > chosen.min(0) - limit) & (places < chosen.max(0) + limit)).all(axis=1))
-    for first in range(0, len(near), CHUNK):
-        some = near[first : first + CHUNK]
-        square = (places[some] ** 2).sum(1)[:, None] + (chosen**2).sum(1) - 2.0 * places[some] @ chosen.T
-        found[some] = np.sqrt(np.maximum(square.min(axis=1), 0.0))
-    found[region] = 0.0  # rounding leaves a little
-    return found
+        return np.full(len(places), np.inf)
+    return np.asarray(cKDTree(places[region]).query(places, distance_upper_bound=limit)[0])

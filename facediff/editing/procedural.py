@@ -1,4 +1,4 @@
-"""Procedural head sway: slow, small turns and shifts of the whole head."""
+"""Procedural blinks, gaze and head sway: motion made by rules on top of a finished animation, and not learnt."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import secrets
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -14,211 +14,28 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
+from facediff.editing.eyes import GIVE, Array, Eyes, smooth_step
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import rotations
 
-# What all changes to a take have in common: random numbers of their own, smooth steps, a note in the metadata.
-
-Array = npt.NDArray[np.float64]
-
 PROCEDURAL = "procedural"
-"""Metadata key: what was added by a program, not learnt from anybody."""
-DIRECTED = "directed"
-"""Metadata key: how the take's own motion was changed."""
+"""Metadata key: what was added by rules."""
+EDITED = "edited"
+"""Metadata key: how the animation's own motion was changed."""
 SWAYS = "head sway"
-"""How a swaying head is called in the metadata; such a take moves as a whole, so nothing can be laid on it any more."""
-
-CHUNK = 256
-"""Frames that are worked on at a time where not one by one."""
+"""Name of a swaying head in the metadata; such an animation moves as a whole, so that nothing can be added any more."""
 
 Layer = Literal["blinks", "gaze", "sway"]
 STREAMS: dict[Layer, int] = {"blinks": 1, "gaze": 2, "sway": 3}
 
 
 def random_of(layer: Layer, seed: int) -> np.random.Generator:
-    """Random numbers of a layer: adding or leaving away another layer does not change them."""
+    """Random numbers of a layer: adding or omitting another layer does not change them."""
     return np.random.default_rng([seed, STREAMS[layer]])
 
 
-def smooth_step(values: npt.ArrayLike) -> Array:
-    """3t² − 2t³ of values limited to 0 … 1: from 0 to 1 with flat ends."""
-    t = np.clip(np.asarray(values, np.float64), 0.0, 1.0)
-    return np.asarray(t * t * (3.0 - 2.0 * t))
-
-
-def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """An array of the same shape to write to: in memory, or on disk where the vertices are a memory map themselves.
-
-    A file on disk lies beside the map's, or where temporary files go if that folder cannot be written, and vanishes
-    with the array.
-    """
-    if not isinstance(vertices, np.memmap):
-        return np.empty(vertices.shape, np.float32)
-    beside = Path(vertices.filename).parent if vertices.filename is not None else Path(tempfile.gettempdir())
-    name = f".facediff-{secrets.token_hex(8)}.partial"
-    try:
-        path = beside / name
-        made = np.memmap(path, np.float32, "w+", shape=vertices.shape)
-    except OSError:
-        path = Path(tempfile.gettempdir()) / name
-        made = np.memmap(path, np.float32, "w+", shape=vertices.shape)
-    with suppress(OSError):  # Windows keeps a file that is in use
-        path.unlink()
-    return made
-
-
-def parts(frames: int) -> Iterator[slice]:
-    """Consecutive frames, some at a time."""
-    return (slice(first, first + CHUNK) for first in range(0, frames, CHUNK))
-
-
-def copied(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """A copy to work on, see :func:`room_for`."""
-    made = room_for(vertices)
-    for part in parts(len(vertices)):
-        made[part] = vertices[part]
-    return made
-
-
-def noted(animation: Animation, vertices: npt.NDArray[np.float32], key: str, words: str) -> Animation:
-    """The take with other vertices (T, V, 3), and words added to an entry of its metadata."""
-    before = animation.metadata.get(key)
-    told = words if before is None else f"{before}; {words}"
-    return replace(animation, vertices=vertices, metadata={**animation.metadata, key: told})
-
-
-# Where a topology's eyelids and eyeballs are, and how the lids shut.
-
-Indices = npt.NDArray[np.int64]
-
-GIVE = (
-    "give --eyes FILE, which says where lids and eyeballs are (docs/directing.md shows one for FLAME and for any mesh)"
-)
-STILL = 0.01
-"""Vertices that a blink moves by less than this share of its largest way are left alone."""
-MEET = 0.12
-"""Where the lids meet, from the lower (0) to the upper edge (1): the lower lid hardly rises in a blink."""
-AHEAD = 0.025
-"""The shut upper lid lies further out by this share of the eye's width: its way is straight, the eyeball is round."""
-REACH = 0.4
-"""How far from the edges the skin follows, as a share of the eye's width."""
-
-
-@dataclass(frozen=True, eq=False)
-class Eyes:
-    """The eyes of a face.
-
-    Attributes:
-        closing: (V, 3) way from open to shut lids, in the face's unit; zero wherever a blink moves nothing. None if it
-            is not known.
-        eyeballs: vertices of each eyeball.
-        source: who says so, for messages.
-
-    Raises:
-        FaceDiffError: if the closing moves nothing or is not finite, or an eyeball is no set of four vertices or more.
-    """
-
-    closing: npt.NDArray[np.float32] | None
-    eyeballs: tuple[Indices, ...]
-    source: str
-
-    def __post_init__(self) -> None:
-        if self.closing is not None and not (np.isfinite(self.closing).all() and self.closing.any()):
-            raise FaceDiffError(f"{self.source}: its blink moves nothing, or holds NaN; give the shape of shut eyes")
-        if any(len(ball) < 4 for ball in self.eyeballs):
-            raise FaceDiffError(f"{self.source}: an eyeball of less than four vertices has no centre; name all of them")
-
-    def lids(self) -> tuple[Indices, npt.NDArray[np.float32]]:
-        """The vertices (L,) that a blink moves, and their ways (L, 3).
-
-        Raises:
-            FaceDiffError: if the way is not known.
-        """
-        if self.closing is None:
-            raise FaceDiffError(f"{self.source}: does not say how the lids shut; {GIVE}")
-        way = np.linalg.norm(self.closing, axis=-1)
-        chosen = np.flatnonzero(way > STILL * way.max())
-        return chosen, self.closing[chosen]
-
-
-def sphere_centre(points: npt.NDArray[np.floating]) -> Array:
-    """Centre (3,) of the sphere nearest to points (N, 3), which may be a part of it only, by linear least squares.
-
-    |x − c|² = r² is linear in c and r² − |c|²: 2 x·c + (r² − |c|²) = |x|².
-    """
-    middle = np.asarray(points, np.float64).mean(axis=0)
-    local = np.asarray(points, np.float64) - middle
-    solution = np.linalg.lstsq(
-        np.concatenate([2.0 * local, np.ones((len(local), 1))], axis=1), (local**2).sum(axis=1), rcond=None
-    )[0]
-    return np.asarray(middle + solution[:3])
-
-
-def closing_of_lids(
-    template: npt.NDArray[np.floating], lids: list[tuple[Indices, Indices]], rigid: Indices | None = None
-) -> npt.NDArray[np.float32]:
-    """How lids shut (V, 3), from the vertices of their edges alone.
-
-    Both edges run from one corner of the eye to the other. Each edge vertex goes to the line between them at its own
-    share of the way along; the skin around follows its nearest edge vertices, less and less up to 0.4 of the eye's
-    width away.
-
-    Args:
-        template: (V, 3) the neutral face with open eyes, y up and z to the viewer.
-        lids: for each eye the vertices of the upper and of the lower edge.
-        rigid: vertices that do not follow (eyeballs).
-    """
-    places = np.asarray(template, np.float64)
-    closing = np.zeros_like(places)
-    for upper, lower in lids:
-        top, bottom = places[upper], places[lower]
-        if np.linalg.norm(top[0] - bottom[0]) > np.linalg.norm(top[0] - bottom[-1]):
-            bottom = bottom[::-1]
-            lower = lower[::-1]
-        width = max(float(np.linalg.norm(np.ptp(edge, axis=0))) for edge in (top, bottom))
-        edge = np.concatenate([upper, lower])
-        way = np.concatenate([_ways(top, bottom, width), _ways(bottom, top, width)])
-        way[len(upper) :] *= MEET
-        way[: len(upper)] *= 1.0 - MEET
-        way[: len(upper), 2] += AHEAD * width * _arch(top)
-        way[len(upper) :, 2] += 0.5 * AHEAD * width * _arch(bottom)
-        distance = np.linalg.norm(places[:, None] - places[edge], axis=-1)
-        near = np.flatnonzero(distance.min(axis=1) < REACH * width)
-        share = 1.0 - smooth_step(distance[near].min(axis=1) / (REACH * width))
-        # Inverse distances to the fourth power: at an edge vertex its own way alone, in between a blend.
-        pull = 1.0 / np.maximum(distance[near], 1e-6 * width) ** 4
-        blended = share[:, None] * (pull @ way) / pull.sum(axis=1, keepdims=True)
-        larger = np.linalg.norm(blended, axis=1) > np.linalg.norm(closing[near], axis=1)
-        closing[near[larger]] = blended[larger]
-    if rigid is not None:
-        closing[rigid] = 0.0
-    return closing.astype(np.float32)
-
-
-def _along(edge: Array) -> Array:
-    """Share of the way along an edge (N, 3) at each of its vertices (N,), 0 to 1."""
-    steps = np.linalg.norm(np.diff(edge, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)]) / max(float(steps.sum()), 1e-12)
-
-
-def _ways(edge: Array, other: Array, width: float) -> Array:
-    """From each vertex of an edge (N, 3) to the other edge, at the same share of the way along."""
-    if len(edge) < 2 or len(other) < 2 or width <= 0:
-        raise FaceDiffError("lids: an edge needs two vertices at least, from one corner of the eye to the other")
-    at, knots = _along(edge), _along(other)
-    target = np.stack([np.interp(at, knots, other[:, axis]) for axis in range(3)], axis=1)
-    return np.asarray(target - edge)
-
-
-def _arch(edge: Array) -> Array:
-    """1 in the middle of an edge, 0 at the corners (N,)."""
-    return np.asarray(np.sin(np.pi * _along(edge)))
-
-
-# Procedural blinks.
-#
-# How often people blink is from Bentivoglio et al., "Analysis of blink rate patterns in normal subjects", Movement
-# Disorders 12(6), 1997: 17 times a minute at rest, 26 in conversation, 4.5 when reading.
+# Blinks. How often people blink is from Bentivoglio et al., "Analysis of blink rate patterns in normal subjects",
+# Movement Disorders 12(6), 1997: 17 times a minute at rest, 26 in conversation, 4.5 when reading.
 
 RATE = 17.0
 """Blinks a minute of somebody at rest."""
@@ -230,20 +47,20 @@ SPREAD = (0.85, 1.2)
 GAP = 0.15
 """Seconds from one blink's end to the next one's start at least."""
 DOUBLE = 0.12
-"""Share of blinks that another one follows at once."""
+"""Share of blinks that another one follows immediately."""
 WIDENED = -0.5
 """How far an eye may be open beyond the neutral face, in closings, that a blink still makes up for."""
 
 
 def add_blinks(animation: Animation, eyes: Eyes, *, rate: float = RATE, seed: int = 0) -> Animation:
-    """Let the eyes blink, beside whatever blinks the take has.
+    """Let the eyes blink, in addition to any blinks of the animation.
 
-    The lids' own closing a and the blink's b make a + b (1 − a): at b = 0 the take's own, at b = 1 shut, never more. An
-    eye that is shut already stays just so.
+    The lids' own closing a and the blink's b make a + b (1 − a): at b = 0 the animation's own, at b = 1 shut, never
+    more. An eye that is shut already stays as it is.
 
     Args:
         animation: its head must not sway yet.
-        eyes: of the take's topology.
+        eyes: of the animation's topology.
         rate: blinks a minute, 1 to 40.
         seed: equal seeds give equal blinks.
 
@@ -269,6 +86,10 @@ def blink_curve(frames: int, frame_rate: float, *, rate: float = RATE, seed: int
 
     Raises:
         FaceDiffError: if the rate is not in 1 … 40.
+
+    Example:
+        >>> bool((blink_curve(250, 25.0, seed=1) == 1.0).any())
+        True
     """
     if not RATES[0] <= rate <= RATES[1]:
         raise FaceDiffError(
@@ -298,12 +119,11 @@ def blink_curve(frames: int, frame_rate: float, *, rate: float = RATE, seed: int
     return curve
 
 
-# Procedural gaze: fixations, and quick turns of both eyes between them.
-#
-# A saccade of A degrees takes 21 ms + 2.2 ms · A (Carpenter, "Movements of the Eyes", 1988).
+# Gaze: fixations, and quick turns of both eyes (saccades) between them. A saccade of A degrees takes 21 ms + 2.2 ms · A
+# (Carpenter, "Movements of the Eyes", 1988).
 
 DEGREES_GAZE = 4.0
-"""Farthest from straight ahead if nothing is said: the eyes wander over a listener's face."""
+"""Default of the farthest angle from straight ahead: the eyes wander over a listener's face."""
 WIDEST_GAZE = 20.0
 AHEAD_SECONDS, ASIDE_SECONDS = 1.6, 0.6
 """Mean duration of a fixation straight ahead, and elsewhere."""
@@ -320,7 +140,7 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: float = DEGREES_GAZE,
 
     Args:
         animation: its head must not sway yet.
-        eyes: of the take's topology; where the lids' closing is not known, they stay.
+        eyes: of the animation's topology; where the lids' closing is not known, they stay.
         degrees: how far from straight ahead the eyes turn at most.
         seed: equal seeds give equal gaze.
 
@@ -336,7 +156,7 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: float = DEGREES_GAZE,
         rest = animation.template[ball].astype(np.float64)
         centre = sphere_centre(rest)
         for part in parts(len(vertices)):
-            # An eyeball that the take moves is turned where it is.
+            # An eyeball that the animation moves is turned where it is.
             moved = (vertices[part, ball] - rest).mean(axis=1)[:, None]
             arms = vertices[part, ball] - moved - centre
             vertices[part, ball] = arms @ turns[part].swapaxes(1, 2) + centre + moved
@@ -351,7 +171,8 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: float = DEGREES_GAZE,
 def gaze_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_GAZE, seed: int = 0) -> Array:
     """Where the eyes look in every frame, (T, 2): degrees to the face's left and upwards.
 
-    Fixations straight ahead and elsewhere take turns, now and then two elsewhere; it begins and ends straight ahead.
+    Fixations straight ahead and elsewhere alternate, now and then with two elsewhere; the first and the last are
+    straight ahead.
 
     Raises:
         FaceDiffError: if the angle is not above 0 and at most 20.
@@ -359,14 +180,24 @@ def gaze_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_GAZE,
     if not 0 < degrees <= WIDEST_GAZE:
         raise FaceDiffError(f"--gaze {degrees:g}: expected degrees above 0 and up to {WIDEST_GAZE:g}")
     random = random_of("gaze", seed)
+
+    def fixation(mean: float) -> float:
+        return SHORTEST + float(random.gamma(2.0, (mean - SHORTEST) / 2.0))
+
+    def somewhere() -> Array:
+        # Small turns are commoner than large ones; none is farther than `degrees`.
+        size = degrees * min(1.0, 0.25 + float(random.exponential(0.35)))
+        direction = random.uniform(0.0, 2.0 * np.pi)
+        return np.array([size * np.cos(direction), UPWARDS * size * np.sin(direction)])
+
     times = np.arange(frames) / frame_rate
     last = float(times[-1]) if frames else 0.0
     curve = np.zeros((frames, 2))
-    here, now = np.zeros(2), _fixation(random, AHEAD_SECONDS)
+    here, now = np.zeros(2), fixation(AHEAD_SECONDS)
     while now < last:
         elsewhere = not here.any() or random.random() < 0.25
-        there = _target(random, degrees) if elsewhere else np.zeros(2)
-        stay = _fixation(random, ASIDE_SECONDS if elsewhere else AHEAD_SECONDS)
+        there = somewhere() if elsewhere else np.zeros(2)
+        stay = fixation(ASIDE_SECONDS if elsewhere else AHEAD_SECONDS)
         if now + stay >= last - SHORTEST:  # no time to come back
             there = np.zeros(2)
         seconds = 0.021 + 0.0022 * float(np.linalg.norm(there - here))
@@ -374,17 +205,6 @@ def gaze_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_GAZE,
         curve[first:] = here + smooth_step((times[first:] - now) / seconds)[:, None] * (there - here)
         here, now = there, now + seconds + stay
     return curve
-
-
-def _fixation(random: np.random.Generator, mean: float) -> float:
-    return SHORTEST + float(random.gamma(2.0, (mean - SHORTEST) / 2.0))
-
-
-def _target(random: np.random.Generator, degrees: float) -> Array:
-    """Small turns are commoner than large ones; none is farther than ``degrees``."""
-    size = degrees * min(1.0, 0.25 + float(random.exponential(0.35)))
-    direction = random.uniform(0.0, 2.0 * np.pi)
-    return np.array([size * np.cos(direction), UPWARDS * size * np.sin(direction)])
 
 
 def gaze_rotations(angles: npt.NDArray[np.floating]) -> Array:
@@ -396,26 +216,39 @@ def gaze_rotations(angles: npt.NDArray[np.floating]) -> Array:
     return np.asarray(np.moveaxis(sideways, 2, 0) @ np.moveaxis(upwards, 2, 0))
 
 
+def sphere_centre(points: npt.NDArray[np.floating]) -> Array:
+    """Centre (3,) of the sphere nearest to points (N, 3), which may be a part of it only, by linear least squares."""
+    # |x − c|² = r² is linear in c and r² − |c|²: 2 x·c + (r² − |c|²) = |x|².
+    middle = np.asarray(points, np.float64).mean(axis=0)
+    local = np.asarray(points, np.float64) - middle
+    solution = np.linalg.lstsq(
+        np.concatenate([2.0 * local, np.ones((len(local), 1))], axis=1), (local**2).sum(axis=1), rcond=None
+    )[0]
+    return np.asarray(middle + solution[:3])
+
+
+# Head sway: slow, small rotations and shifts of the whole head.
+
 DEGREES_SWAY = 2.0
-"""Largest turn if nothing is said."""
+"""Default of the largest rotation."""
 WIDEST_SWAY = 15.0
 BAND = (0.08, 0.6)
 """Hertz: slower cannot be seen, quicker is a tremble."""
 WAVES = 6
 AXES = np.array([0.7, 1.0, 0.5])
-"""How much of the turning is nodding, shaking and tilting."""
+"""How much of the rotation is nodding, shaking and tilting."""
 SHIFT = 0.004
-"""Largest shift for each degree of turning, as a share of the head's height: about a millimetre."""
+"""Largest shift for each degree of rotation, as a share of the head's height: about a millimetre."""
 AT_REST = 1.0
 """Seconds over which the sway swells and dies away."""
 
 
 def add_sway(animation: Animation, *, degrees: float = DEGREES_SWAY, seed: int = 0) -> Animation:
-    """Let the head sway; all vertices move as one. It is the last change to a take: nothing can be laid on it after.
+    """Let the head sway; all vertices move as one. This must be the last change: nothing can be added after it.
 
     Args:
-        animation: any take.
-        degrees: largest turn.
+        animation: any animation.
+        degrees: largest rotation.
         seed: equal seeds give equal sway.
 
     Raises:
@@ -440,9 +273,9 @@ def neck(template: npt.NDArray[np.floating]) -> Array:
 
 
 def sway_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_SWAY, seed: int = 0) -> tuple[Array, Array]:
-    """Turns (T, 3), axis-angle in radians, and shifts (T, 3), in head heights; zero in the first and the last frame.
+    """Rotations (T, 3), axis-angle in radians, and shifts (T, 3), in head heights; zero in the first and last frame.
 
-    Sums of six sines between 0.08 and 0.6 Hz, so that nothing is quick; the largest turn is ``degrees``.
+    Sums of six sines between 0.08 and 0.6 Hz, so that nothing is quick; the largest rotation is ``degrees``.
 
     Raises:
         FaceDiffError: if the angle is not above 0 and at most 15.
@@ -465,3 +298,51 @@ def _largest(vectors: Array, size: float) -> Array:
     """Vectors (T, 3) scaled so that the longest has a size."""
     longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
     return vectors * (size / longest) if longest > 0 else vectors
+
+
+# What all changes to an animation have in common: arrays that may be too large for memory, and a note in the metadata.
+
+CHUNK = 256
+"""Frames that are worked on at a time where not one by one."""
+
+
+def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """An array of the same shape to write to: in memory, or on disk where the vertices are a memory map themselves.
+
+    A file on disk lies next to the map's, or where temporary files go if that folder cannot be written, and vanishes
+    with the array.
+    """
+    if not isinstance(vertices, np.memmap):
+        return np.empty(vertices.shape, np.float32)
+    temporary = Path(tempfile.gettempdir())
+    folder = temporary if vertices.filename is None else Path(vertices.filename).parent
+    name = f".facediff-{secrets.token_hex(8)}.partial"
+    try:
+        path = folder / name
+        made = np.memmap(path, np.float32, "w+", shape=vertices.shape)
+    except OSError:
+        path = temporary / name
+        made = np.memmap(path, np.float32, "w+", shape=vertices.shape)
+    with suppress(OSError):  # Windows keeps a file that is in use
+        path.unlink()
+    return made
+
+
+def parts(frames: int) -> Iterator[slice]:
+    """Consecutive frames, some at a time."""
+    return (slice(first, first + CHUNK) for first in range(0, frames, CHUNK))
+
+
+def copied(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """A copy to work on, see :func:`room_for`."""
+    made = room_for(vertices)
+    for part in parts(len(vertices)):
+        made[part] = vertices[part]
+    return made
+
+
+def noted(animation: Animation, vertices: npt.NDArray[np.float32], key: str, words: str) -> Animation:
+    """The animation with other vertices (T, V, 3), and words added to an entry of its metadata."""
+    before = animation.metadata.get(key)
+    entry = words if before is None else f"{before}; {words}"
+    return replace(animation, vertices=vertices, metadata={**animation.metadata, key: entry})

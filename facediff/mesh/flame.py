@@ -1,9 +1,8 @@
 """FLAME, the head model of Li et al., "Learning a model of facial shape and expression from 4D scans", 2017.
 
 A layer of our own in NumPy: the published Python packages are under non-commercial licences and unpickle the model file
-without restriction. The model itself is the user's own file, see :mod:`facediff.mesh.flame`.
-
-Equation numbers are those of SMPL (Loper et al. 2015), whose skinning FLAME uses.
+without restriction. The model and its masks are the user's own files. Equation numbers are those of SMPL (Loper et al.
+2015), whose skinning FLAME uses.
 """
 
 from __future__ import annotations
@@ -17,16 +16,158 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, choices
 from facediff.utils.pickles import StandIn, load_pickle
-
-# Reading a FLAME model file without running anything that it asks for.
-#
-# The files of FLAME 2019 and 2020 are pickles of Python 2 that hold objects of chumpy and SciPy. Neither package is
-# needed here: stand-ins keep the objects' state, and the arrays are taken out of it.
 
 SHAPES, EXPRESSIONS, JOINTS = 300, 100, 5
 POSE_FEATURES = 9 * (JOINTS - 1)
+JAW = 2
+"""Joints are in this order: root, neck, jaw, left eye, right eye."""
+CHUNK = 32
+"""Frames that are computed at a time: their vertices stay in a processor's cache."""
+
+Array = npt.NDArray[np.float64]
+Values = npt.NDArray[np.generic]
+
+
+class Flame:
+    """The model with its head, neck and eyes at rest; only the jaw moves.
+
+    Args:
+        arrays: content of the model file.
+
+    Attributes:
+        template: (V, 3) the mean face, in metres.
+        faces: (F, 3) vertex indices of the triangles.
+    """
+
+    def __init__(self, arrays: FlameArrays) -> None:
+        self.template: Array = arrays.template
+        self.faces = arrays.faces
+        directions = arrays.directions.reshape(-1, SHAPES + EXPRESSIONS)
+        self._shape_basis = directions[:, :SHAPES]
+        nine = slice(9 * (JAW - 1), 9 * JAW)
+        correctives = arrays.pose_directions.reshape(len(directions), -1)[:, nine]
+        # Rows: expressions, then the nine pose correctives of the jaw; all frames are a combination of these rows.
+        self._basis = np.ascontiguousarray(np.concatenate([directions[:, SHAPES:], correctives], axis=1).T)
+        self._jaw_regressor = arrays.joint_regressor[JAW]
+        expressions = self._basis[:EXPRESSIONS].reshape(EXPRESSIONS, -1, 3)
+        self._jaw_basis: Array = np.einsum("v,evc->ec", self._jaw_regressor, expressions)
+        # Joints below the jaw turn with it and all others stay. The weights of a vertex add up to one, so that a single
+        # weight for each vertex says how much it follows the jaw.
+        moved = [joint for joint in range(JOINTS) if JAW in _ancestors(arrays.parents, joint)]
+        weights = arrays.weights[:, moved].sum(axis=1)
+        self._turning = np.flatnonzero(weights)
+        self._weights = weights[self._turning, None]
+
+    @classmethod
+    def read(cls, path: Path) -> Flame:
+        """Read a model file: FLAME 2019, 2020 or 2023 as distributed (``.pkl``), or ``.npz`` with the same keys.
+
+        Raises:
+            FaceDiffError: if the file is missing, is no FLAME model, or asks for code to be run; it is not run.
+        """
+        return cls(read_flame_arrays(path))
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of the mesh."""
+        return len(self.template)
+
+    def shaped(self, shape: npt.NDArray[np.floating]) -> Array:
+        """The face (V, 3) of shape coefficients (S,) at rest, eq. 8; S may be less than the model has.
+
+        Raises:
+            FaceDiffError: if there are too many coefficients.
+        """
+        given = _coefficients("shape", shape, SHAPES, 1)
+        face: Array = self.template + (self._shape_basis[:, : len(given)] @ given).reshape(-1, 3)
+        return face
+
+    def vertices(
+        self,
+        shape: npt.NDArray[np.floating],
+        expression: npt.NDArray[np.floating],
+        jaw: npt.NDArray[np.floating],
+    ) -> Array:
+        """Vertices (T, V, 3) in metres, without rotation of head, neck and eyes, eqs. 2 to 10.
+
+        Joints are regressed from shape and expression together, as in the published implementations.
+
+        Args:
+            shape: (S,) shape coefficients, the same for all frames; omitted ones are zero.
+            expression: (T, E) expression coefficients; omitted ones are zero.
+            jaw: (T, 3) rotation of the jaw, axis-angle in radians.
+
+        Raises:
+            FaceDiffError: if there are too many coefficients, or the numbers of frames differ.
+        """
+        expression = _coefficients("expression", expression, EXPRESSIONS, 2)
+        jaw = _coefficients("jaw", jaw, 3, 2)
+        if len(jaw) != len(expression) or jaw.shape[1] != 3:
+            raise FaceDiffError(
+                f"jaw has shape {jaw.shape} and expression {expression.shape}; expected (frames, 3) and (frames, E)"
+            )
+        face = self.shaped(shape)
+        result = np.empty((len(jaw), *face.shape))
+        for first in range(0, len(jaw), CHUNK):
+            part = slice(first, first + CHUNK)
+            self._pose(face, expression[part], jaw[part], result[part])
+        return result
+
+    def _pose(self, face: Array, expression: Array, jaw: Array, result: Array) -> None:
+        turns = rotations(jaw) - np.eye(3)
+        count = expression.shape[1]
+        flat = result.reshape(len(result), -1)
+        np.matmul(expression, self._basis[:count], out=flat)
+        flat += turns.reshape(-1, 9) @ self._basis[EXPRESSIONS:]
+        result += face
+        joint = (self._jaw_regressor @ face + expression @ self._jaw_basis[:count])[:, None]
+        # Eq. 2, (1 − w) x + w (R (x − j) + j), with the identity for every joint that stays.
+        arms = result[:, self._turning] - joint
+        result[:, self._turning] += self._weights * (arms @ turns.transpose(0, 2, 1))
+
+
+def rotations(axis_angles: npt.NDArray[np.floating]) -> Array:
+    """Rotation matrices (T, 3, 3) of axis-angle vectors (T, 3) in radians, by Rodrigues' formula, eq. 1.
+
+    Example:
+        >>> rotations(np.array([[0, 0, np.pi / 2]])).round(6)[0] @ [1, 0, 0]
+        array([0., 1., 0.])
+    """
+    vectors = np.asarray(axis_angles, np.float64)
+    angles = np.linalg.norm(vectors, axis=-1)[:, None, None]
+    cross = np.zeros((len(vectors), 3, 3))
+    for row, column, axis in ((2, 1, 0), (0, 2, 1), (1, 0, 2)):
+        cross[:, row, column] = vectors[:, axis]
+        cross[:, column, row] = -vectors[:, axis]
+    # sin(a)/a and (1 − cos(a))/a², both without a division by zero.
+    first, second = np.sinc(angles / np.pi), 0.5 * np.sinc(angles / (2 * np.pi)) ** 2
+    result: Array = np.eye(3) + first * cross + second * (cross @ cross)
+    return result
+
+
+def _ancestors(parents: npt.NDArray[np.int64], joint: int) -> list[int]:
+    """A joint, its parent, the parent of that … up to the root, whose parent is −1."""
+    chain = []
+    while joint >= 0:
+        chain.append(joint)
+        joint = int(parents[joint])
+    return chain
+
+
+def _coefficients(name: str, values: npt.NDArray[np.floating], most: int, dimensions: int) -> Array:
+    array = np.asarray(values, np.float64)
+    if array.ndim != dimensions or array.shape[-1] > most:
+        expected = f"(up to {most},)" if dimensions == 1 else f"(frames, up to {most})"
+        raise FaceDiffError(f"{name} coefficients have shape {array.shape}; expected {expected}, as FLAME has {most}")
+    return array
+
+
+# Reading a FLAME model file without running anything that it asks for. The files of FLAME 2019 and 2020 are pickles of
+# Python 2 that hold objects of chumpy and SciPy. Stand-ins keep the state of these objects, and the arrays are taken
+# out of that state, so that neither class is ever created.
+
 PACKAGES = ("chumpy", "scipy.sparse")
 SPARSE = {f"{kind}_{name}" for kind in ("csc", "csr", "coo") for name in ("matrix", "array")}
 DEEPEST = 16
@@ -35,12 +176,10 @@ MOST_VERTICES = 1_000_000
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
 HELP = "expected generic_model.pkl of FLAME 2020, from flame.is.tue.mpg.de, as it is distributed"
 
-Values = npt.NDArray[np.generic]
-
 
 @dataclass(frozen=True)
 class FlameArrays:
-    """What a model file holds, as plain arrays; V vertices, F triangles.
+    """Content of a model file as plain arrays; V vertices, F triangles.
 
     Attributes:
         template: (V, 3) mean face, in metres.
@@ -82,13 +221,17 @@ def read_flame_arrays(path: Path) -> FlameArrays:
         raise FaceDiffError(f"{path}: the weights of a vertex do not add up to 1; {HELP}")
     faces = _numbers(content, "f", path, (None, 3))
     if faces.min() < 0 or faces.max() >= count:
-        raise FaceDiffError(f"{path}: f names vertices that are not there; {HELP}")
+        raise FaceDiffError(f"{path}: f names vertices that do not exist; {HELP}")
+    parents = _numbers(content, "kintree_table", path, (2, JOINTS))[0].astype(np.int64)
+    parents[0] = -1  # the files have 2³² − 1 there
+    if (parents[1:] < 0).any() or (parents >= np.arange(JOINTS)).any():
+        raise FaceDiffError(f"{path}: kintree_table has the parents {parents.tolist()}; {HELP}")
     return FlameArrays(
         template=template,
         directions=_numbers(content, "shapedirs", path, (count, 3, SHAPES + EXPRESSIONS)),
         pose_directions=_numbers(content, "posedirs", path, (count, 3, POSE_FEATURES)),
         joint_regressor=_numbers(content, "J_regressor", path, (JOINTS, count)),
-        parents=_parents(content, path),
+        parents=parents,
         weights=weights,
         faces=faces.astype(np.int32),
     )
@@ -108,24 +251,15 @@ def _numbers(
     """An array of the file as float64, with its shape checked; None stands for any length but zero."""
     values = plain_array(content[key], f"{path}: {key}")
     fits = len(values.shape) == len(shape) and all(
-        got == wanted if wanted is not None else got for got, wanted in zip(values.shape, shape, strict=True)
+        length == wanted if wanted is not None else length for length, wanted in zip(values.shape, shape, strict=True)
     )
     if not fits:
         words = ", ".join("any" if length is None else str(length) for length in shape)
         raise FaceDiffError(f"{path}: {key} has shape {values.shape}, expected ({words}); {HELP}")
     numbers = values.astype(np.float64)
     if not np.isfinite(numbers).all():
-        raise FaceDiffError(f"{path}: {key} holds NaN or infinity; get the file anew")
+        raise FaceDiffError(f"{path}: {key} holds NaN or infinity; download the file again")
     return numbers
-
-
-def _parents(content: Mapping[Any, Any], path: Path) -> npt.NDArray[np.int64]:
-    table = _numbers(content, "kintree_table", path, (2, JOINTS))
-    parents = table[0].astype(np.int64)
-    parents[0] = -1  # the files have 2³² − 1 there
-    if (parents[1:] < 0).any() or (parents >= np.arange(JOINTS)).any():
-        raise FaceDiffError(f"{path}: kintree_table has the parents {parents.tolist()}; {HELP}")
-    return parents
 
 
 def plain_array(value: object, where: str, depth: int = 0) -> Values:
@@ -157,7 +291,7 @@ def plain_array(value: object, where: str, depth: int = 0) -> Values:
         if package == "chumpy.reordering" and depth < DEEPEST:
             return _reordered(name, state, plain_array(state["a"], where, depth + 1))
     except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise FaceDiffError(f"{where} is a damaged {value.origin} ({error!r}); get the file anew") from error
+        raise FaceDiffError(f"{where} is a damaged {value.origin} ({error!r}); download the file again") from error
     raise FaceDiffError(
         f"{where} is a {value.origin}, which is not understood; convert the model to .npz with plain arrays, "
         f"under the same keys"
@@ -181,6 +315,7 @@ def _reordered(name: str, state: Mapping[Any, Any], array: Values) -> Values:
 
 def _dense(state: Mapping[Any, Any], kind: str, where: str) -> Values:
     """A compressed-column, compressed-row or coordinate matrix as (5, V) array."""
+    # Not through scipy: it trusts the index arrays of a matrix, and these come from a file.
     rows, columns = (int(size) for size in np.asarray(state["_shape"]).ravel())
     if rows != JOINTS or not 0 < columns <= MOST_VERTICES:
         raise FaceDiffError(f"{where} has shape ({rows}, {columns}), expected {JOINTS} rows; {HELP}")
@@ -200,137 +335,26 @@ def _dense(state: Mapping[Any, Any], kind: str, where: str) -> Values:
     return dense
 
 
-JAW = 2
-"""Joints are in this order: root, neck, jaw, left eye, right eye."""
-CHUNK = 32
-"""Frames that are computed at a time: their vertices stay in a processor's cache."""
-
-Array = npt.NDArray[np.float64]
-
-
-def rotations(axis_angles: npt.NDArray[np.floating]) -> Array:
-    """Rotation matrices (T, 3, 3) of axis-angle vectors (T, 3) in radians, by Rodrigues' formula, eq. 1."""
-    vectors = np.asarray(axis_angles, np.float64)
-    angles = np.linalg.norm(vectors, axis=-1)[:, None, None]
-    cross = np.zeros((len(vectors), 3, 3))
-    for row, column, axis in ((2, 1, 0), (0, 2, 1), (1, 0, 2)):
-        cross[:, row, column] = vectors[:, axis]
-        cross[:, column, row] = -vectors[:, axis]
-    # sin(a)/a and (1 − cos(a))/a², both without a division by zero.
-    first, second = np.sinc(angles / np.pi), 0.5 * np.sinc(angles / (2 * np.pi)) ** 2
-    result: Array = np.eye(3) + first * cross + second * (cross @ cross)
-    return result
-
-
-class Flame:
-    """The model with its head, neck and eyes at rest; only the jaw moves.
+def read_masks(path: Path, names: str) -> list[int]:
+    """Vertex indices of one or several masks of a pickle such as ``FLAME_masks.pkl``.
 
     Args:
-        arrays: what the model file holds.
+        path: a pickle that holds a dict from mask to indices, or a single list of indices.
+        names: masks, several joined by "+" ("lips", "forehead+eye_region"); the whole list if empty.
 
-    Attributes:
-        template: (V, 3) the mean face, in metres.
-        faces: (F, 3) vertex indices of the triangles.
+    Raises:
+        FaceDiffError: if the file holds something else, or has no mask of that name.
     """
-
-    def __init__(self, arrays: FlameArrays) -> None:
-        self.template: Array = arrays.template
-        self.faces = arrays.faces
-        directions = arrays.directions.reshape(-1, SHAPES + EXPRESSIONS)
-        self._shape_basis = directions[:, :SHAPES]
-        nine = slice(9 * (JAW - 1), 9 * JAW)
-        correctives = arrays.pose_directions.reshape(len(directions), -1)[:, nine]
-        # Rows: expressions, then the nine pose correctives of the jaw; what all frames are a combination of.
-        self._basis = np.ascontiguousarray(np.concatenate([directions[:, SHAPES:], correctives], axis=1).T)
-        self._jaw_regressor = arrays.joint_regressor[JAW]
-        expressions = self._basis[:EXPRESSIONS].reshape(EXPRESSIONS, -1, 3)
-        self._jaw_basis: Array = np.einsum("v,evc->ec", self._jaw_regressor, expressions)
-        # What hangs on the jaw turns with it; all other joints stay, and the weights of a vertex add up to one.
-        moved = [joint for joint in range(JOINTS) if JAW in _ancestors(arrays.parents, joint)]
-        weights = arrays.weights[:, moved].sum(axis=1)
-        self._turning = np.flatnonzero(weights)
-        self._weights = weights[self._turning, None]
-
-    @classmethod
-    def read(cls, path: Path) -> Flame:
-        """Read a model file: FLAME 2019, 2020 or 2023 as distributed (``.pkl``), or ``.npz`` with the same keys.
-
-        Raises:
-            FaceDiffError: if the file is missing, is no FLAME model, or asks for code to be run; it is not run.
-        """
-        return cls(read_flame_arrays(path))
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of the mesh."""
-        return len(self.template)
-
-    def shaped(self, shape: npt.NDArray[np.floating]) -> Array:
-        """The face (V, 3) of shape coefficients (S,) at rest, eq. 8; S may be less than the model has.
-
-        Raises:
-            FaceDiffError: if there are too many coefficients.
-        """
-        given = _coefficients("shape", shape, SHAPES, 1)
-        face: Array = self.template + (self._shape_basis[:, : len(given)] @ given).reshape(-1, 3)
-        return face
-
-    def vertices(
-        self,
-        shape: npt.NDArray[np.floating],
-        expression: npt.NDArray[np.floating],
-        jaw: npt.NDArray[np.floating],
-    ) -> Array:
-        """Vertices (T, V, 3) in metres, without rotation of head, neck and eyes, eqs. 2 to 10.
-
-        Joints are regressed from shape and expression together, as the published implementations do it.
-
-        Args:
-            shape: (S,) shape coefficients, the same for all frames; those left out are zero.
-            expression: (T, E) expression coefficients; those left out are zero.
-            jaw: (T, 3) rotation of the jaw, axis-angle in radians.
-
-        Raises:
-            FaceDiffError: if there are too many coefficients, or the frames do not agree.
-        """
-        expression = _coefficients("expression", expression, EXPRESSIONS, 2)
-        jaw = _coefficients("jaw", jaw, 3, 2)
-        if len(jaw) != len(expression) or jaw.shape[1] != 3:
-            raise FaceDiffError(
-                f"jaw has shape {jaw.shape} and expression {expression.shape}; expected (frames, 3) and (frames, E)"
-            )
-        face = self.shaped(shape)
-        result = np.empty((len(jaw), *face.shape))
-        for first in range(0, len(jaw), CHUNK):
-            part = slice(first, first + CHUNK)
-            self._pose(face, expression[part], jaw[part], result[part])
-        return result
-
-    def _pose(self, face: Array, expression: Array, jaw: Array, result: Array) -> None:
-        turns = rotations(jaw) - np.eye(3)
-        count = expression.shape[1]
-        flat = result.reshape(len(result), -1)
-        np.matmul(expression, self._basis[:count], out=flat)
-        flat += turns.reshape(-1, 9) @ self._basis[EXPRESSIONS:]
-        result += face
-        joint = (self._jaw_regressor @ face + expression @ self._jaw_basis[:count])[:, None]
-        # Eq. 2, (1 − w) x + w (R (x − j) + j), with the identity for every joint that stays.
-        arms = result[:, self._turning] - joint
-        result[:, self._turning] += self._weights * (arms @ turns.transpose(0, 2, 1))
-
-
-def _ancestors(parents: npt.NDArray[np.int64], joint: int) -> list[int]:
-    """A joint, its parent, the parent of that … up to the root, whose parent is −1."""
-    chain = []
-    while joint >= 0:
-        chain.append(joint)
-        joint = int(parents[joint])
-    return chain
-
-
-def _coefficients(name: str, values: npt.NDArray[np.floating], most: int, dimensions: int) -> Array:
-    array = np.asarray(values, np.float64)
-    if array.ndim != dimensions or array.shape[-1] > most:
-        expected = f"(up to {most},)" if dimensions == 1 else f"(frames, up to {most})"
-        raise FaceDiffError(f"{name} coefficients have shape {array.shape}; expected {expected}, as FLAME has {most}")
-    return array
+    loaded = load_pickle(path)
+    if names and not isinstance(loaded, dict):
+        raise FaceDiffError(f"{path}: expected a dict from mask to vertex indices, got {type(loaded).__name__}")
+    for name in names.split("+") if names else ():
+        if name not in loaded:
+            raise FaceDiffError(f'{path}: has no mask "{name}": {choices(name, list(map(str, loaded)))}')
+    try:
+        arrays = [np.asarray(mask) for mask in ([loaded[name] for name in names.split("+")] if names else [loaded])]
+    except ValueError as error:
+        raise FaceDiffError(f"{path}: expected lists of vertex indices ({error})") from error
+    if any(array.ndim != 1 or not np.issubdtype(array.dtype, np.integer) for array in arrays):
+        raise FaceDiffError(f"{path}: expected lists of whole numbers, the vertex indices")
+    return [int(index) for array in arrays for index in array]

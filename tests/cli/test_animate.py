@@ -211,7 +211,7 @@ def test_a_take_says_how_it_was_made(speech: Path, checkpoint: Path, tmp_path: P
     assert animation.metadata["corpus"] == "tiny (synthetic)"
     assert animation.metadata["style"] == "0.25 A_e02 + 0.75 B_e02"
     assert "head sway" in animation.metadata["procedural"]
-    assert "1.5" in animation.metadata["directed"]
+    assert "1.5" in animation.metadata["edited"]
     assert animation.frame_rate == 25
     assert animation.unit == "m"
     assert animation.inner_lip_pairs is not None

@@ -322,7 +322,7 @@ REGRESSOR = "scipy.sparse.csc", "csc_matrix"
         ({"kintree_table": np.array([[-1, 0, 3, 1, 1], [0, 1, 2, 3, 4]])}, r"has the parents \[-1, 0, 3, 1, 1\]"),
         ({"weights": np.ones((COUNT, 5))}, "weights of a vertex do not add up to 1"),
         ({"weights": np.full((COUNT, 5), np.nan)}, "weights holds NaN or infinity"),
-        ({"f": np.array([[0, 1, COUNT]])}, "f names vertices that are not there"),
+        ({"f": np.array([[0, 1, COUNT]])}, "f names vertices"),
         ({"f": np.zeros((0, 3))}, r"f has shape \(0, 3\)"),
         ({"shapedirs": "none"}, "shapedirs holds str, expected an array of numbers"),
         ({"v_template": chumpy_array("text")}, "v_template holds str"),  # type: ignore[arg-type]

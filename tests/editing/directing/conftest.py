@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.procedural import Eyes
+from facediff.editing.eyes import Eyes
 from facediff.synthetic.corpus import regions, rig_of
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import CONTROLS, LINEAR_FIELDS

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.procedural import Eyes, add_blinks, blink_curve
+from facediff.editing.eyes import Eyes
+from facediff.editing.procedural import add_blinks, blink_curve
 from facediff.errors import FaceDiffError
 from facediff.synthetic.face import build_face
 

@@ -15,8 +15,8 @@ import pytest
 from facediff.animation import Animation
 from facediff.cli.options import add_directing_options, check_directing, directed
 from facediff.editing.expressiveness import scale_regions
-from facediff.editing.eyes_files import puppet_eyes, read_eyes
-from facediff.editing.procedural import Eyes, add_blinks, add_gaze, add_sway
+from facediff.editing.eyes import Eyes, puppet_eyes, read_eyes
+from facediff.editing.procedural import add_blinks, add_gaze, add_sway
 from facediff.errors import FaceDiffError
 from facediff.synthetic.face import build_face
 
@@ -47,7 +47,7 @@ def test_all_options_in_their_order(make_animation: Callable[..., Animation], ey
         == by_hand.metadata
         == {
             "identity": "F1",
-            "directed": "expressiveness (upper_face 1.5)",
+            "edited": "expressiveness (upper_face 1.5)",
             "procedural": "gaze (4 degrees, seed 7); blinks (20 a minute, seed 7); head sway (3 degrees, seed 7)",
         }
     )

@@ -10,7 +10,7 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.editing.expressiveness import FALL_OFF, read_factors, region_factors, scale_regions
-from facediff.editing.procedural import Eyes
+from facediff.editing.eyes import Eyes
 from facediff.errors import FaceDiffError
 
 
@@ -20,7 +20,7 @@ def test_one_factor_scales_every_offset(make_animation: Callable[..., Animation]
     np.testing.assert_allclose(
         scaled.vertices - animation.template, 1.7 * (animation.vertices - animation.template), atol=1e-7
     )
-    assert scaled.metadata == {"identity": "F1", "directed": "expressiveness (all 1.7)"}
+    assert scaled.metadata == {"identity": "F1", "edited": "expressiveness (all 1.7)"}
     assert animation.metadata == {"identity": "F1"}
     same = scale_regions(animation, {"all": 1.0, "lips": 1.0})
     np.testing.assert_allclose(same.vertices, animation.vertices, atol=1e-7)

@@ -11,8 +11,8 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.editing.expressiveness import scale_regions
+from facediff.editing.eyes import Eyes
 from facediff.editing.procedural import (
-    Eyes,
     add_blinks,
     add_gaze,
     add_sway,

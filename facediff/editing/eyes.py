@@ -1,0 +1,321 @@
+"""Where a face's eyelids and eyeballs are, and how the lids shut.
+
+They are known for the built-in puppet, and are read from the user's file for any other topology.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Vertices = npt.NDArray[np.floating]
+
+GIVE = (
+    "give --eyes FILE, which says where lids and eyeballs are (docs/directing.md shows one for FLAME and for any mesh)"
+)
+STILL = 0.01
+"""Vertices that a blink moves by less than this share of its largest way are left alone."""
+MEET = 0.12
+"""Where the lids meet, from the lower (0) to the upper edge (1): the lower lid hardly rises in a blink."""
+AHEAD = 0.025
+"""The shut upper lid lies further out by this share of the eye's width: its way is straight, the eyeball is round."""
+REACH = 0.4
+"""How far from the edges the skin follows, as a share of the eye's width."""
+KEYS = ("neutral", "blinks", "lids", "eyeballs")
+PLAUSIBLE = (0.002, 0.2)
+"""The largest way of a lid, as a share of the face's size (the diagonal of its box)."""
+SAME_FACE = 1e-3
+"""Metres that a face may differ from a puppet's to count as that puppet's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Eyes:
+    """The eyes of a face.
+
+    Attributes:
+        closing: (V, 3) way from open to shut lids, in the face's unit; zero wherever a blink moves nothing. None if it
+            is not known.
+        eyeballs: vertices of each eyeball.
+        source: who says so, for messages.
+
+    Raises:
+        FaceDiffError: if the closing moves nothing or is not finite, or an eyeball is no set of four vertices or more.
+    """
+
+    closing: npt.NDArray[np.float32] | None
+    eyeballs: tuple[Indices, ...]
+    source: str
+
+    def __post_init__(self) -> None:
+        if self.closing is not None and not (np.isfinite(self.closing).all() and self.closing.any()):
+            raise FaceDiffError(f"{self.source}: its blink moves nothing, or holds NaN; give the shape of shut eyes")
+        if any(len(ball) < 4 for ball in self.eyeballs):
+            raise FaceDiffError(f"{self.source}: an eyeball of less than four vertices has no centre; name all of them")
+
+    def lids(self) -> tuple[Indices, npt.NDArray[np.float32]]:
+        """The vertices (L,) that a blink moves, and their ways (L, 3).
+
+        Raises:
+            FaceDiffError: if the way is not known.
+        """
+        if self.closing is None:
+            raise FaceDiffError(f"{self.source}: does not say how the lids shut; {GIVE}")
+        way = np.linalg.norm(self.closing, axis=-1)
+        chosen = np.flatnonzero(way > STILL * way.max())
+        return chosen, self.closing[chosen]
+
+
+def eyes_for(template: Vertices, faces: npt.NDArray[np.integer] | None, file: Path | None) -> Eyes | None:
+    """The eyes of a face (V, 3): from the file if there is one, else the puppet's if it is a puppet, else None.
+
+    Raises:
+        FaceDiffError: if the file is not what it should be, or belongs to another topology.
+    """
+    return read_eyes(file, template) if file is not None else puppet_eyes(template, faces)
+
+
+def puppet_eyes(template: Vertices, faces: npt.NDArray[np.integer] | None) -> Eyes | None:
+    """The eyes of a face (V, 3) of the built-in corpus, by the rig that its blinks are made with; None for others."""
+    from facediff.synthetic import N_VERTICES
+    from facediff.synthetic.corpus import rig_of
+    from facediff.synthetic.face import build_face
+    from facediff.synthetic.rig import LINEAR_FIELDS
+    from facediff.synthetic.speakers import SPEAKERS
+
+    if len(template) != N_VERTICES or faces is None:
+        return None
+    mesh = build_face()  # takes a second or two
+    if not np.array_equal(np.asarray(faces), mesh.faces):
+        return None
+    distances = {
+        name: float(np.abs(speaker.shape(mesh.vertices) - template).max()) for name, speaker in SPEAKERS.items()
+    }
+    speaker = min(distances, key=lambda name: distances[name])
+    left = np.concatenate([mesh.groups[name] for name in mesh.groups if name.startswith("eyeball") or name == "pupil"])
+    balls = (np.sort(left), np.sort(mesh.mirror[left]))
+    if distances[speaker] <= SAME_FACE:
+        closing = rig_of(speaker).fields[LINEAR_FIELDS.index("lids_close")].astype(np.float32)
+    else:  # another speaker's face on the puppet's mesh has no rig: the edges of its own lids say how they shut
+        ring = mesh.groups["eye_0"]  # from the inner corner over the upper lid to the outer one, and back below
+        upper, lower = ring[:9], np.concatenate([ring[:1], ring[:7:-1]])
+        lids = [(upper, lower), (mesh.mirror[upper], mesh.mirror[lower])]
+        closing = closing_of_lids(template, lids, np.concatenate(balls))
+    return Eyes(closing, balls, "the built-in puppet")
+
+
+def read_eyes(path: Path, template: Vertices) -> Eyes:
+    """The eyes of a face (V, 3) from a file.
+
+    ``.json`` names shapes of shut eyes or lists the lids' edges, and lists the eyeballs::
+
+        {"neutral": "neutral.obj", "blinks": ["eyeBlinkLeft.obj", "eyeBlinkRight.obj"],
+         "eyeballs": ["FLAME_masks.pkl:left_eyeball", "FLAME_masks.pkl:right_eyeball"]}
+
+    ``.npz`` holds the same as arrays: ``closing`` (V, 3), ``neutral`` (V, 3) and any ``eyeball…`` with indices.
+
+    Raises:
+        FaceDiffError: naming the file and what is wrong with it.
+    """
+    if not path.is_file():
+        raise FaceDiffError(
+            f"--eyes {path}: no such file; expected .json or .npz that says where lids and eyeballs are"
+        )
+    count = len(template)
+    if path.suffix.lower() == ".npz":
+        found = _read_npz(path)
+        balls = tuple(_checked(path, found[name], count) for name in sorted(found) if name.startswith("eyeball"))
+        closing, neutral = found.get("closing"), found.get("neutral")
+    elif path.suffix.lower() == ".json":
+        content = _read_json(path)
+        balls = tuple(_indices(path, listed, count) for listed in content.get("eyeballs", []))
+        neutral = _read_shape(path, content["neutral"]) if "neutral" in content else None
+        closing = _closing(path, content, template, neutral, balls)
+    else:
+        raise FaceDiffError(f"--eyes {path}: expected .json or .npz")
+    if closing is None and not balls:
+        raise FaceDiffError(f"--eyes {path}: says nothing of lids or eyeballs; known are {', '.join(KEYS)}")
+    if closing is not None:
+        closing = _fitted(path, np.asarray(closing), template, neutral)
+    return Eyes(closing, balls, f"--eyes {path}")
+
+
+def _read_npz(path: Path) -> dict[str, npt.NDArray[Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        raise FaceDiffError(f"--eyes {path}: not a readable .npz file ({error})") from error
+
+
+def _read_json(path: Path) -> Mapping[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as error:
+        raise FaceDiffError(f"--eyes {path}: not a readable JSON file ({error})") from error
+    fit = isinstance(content, dict) and all(isinstance(content.get(key, []), list) for key in KEYS[1:])
+    unknown = [key for key in content if key not in KEYS] if fit else []
+    if not fit or unknown or not isinstance(content.get("neutral", ""), str):
+        raise FaceDiffError(
+            f"--eyes {path}: expected an object with {', '.join(KEYS)}, the last three of them lists"
+            + (f', not "{unknown[0]}"' if unknown else "")
+        )
+    return content
+
+
+def _closing(
+    path: Path,
+    content: Mapping[str, Any],
+    template: Vertices,
+    neutral: Vertices | None,
+    balls: tuple[Indices, ...],
+) -> Vertices | None:
+    """How the lids shut, by shapes or by edges; None if the file does not say."""
+    count = len(template)
+    if content.get("blinks"):
+        total: Vertices = np.zeros((count, 3))
+        for name in content["blinks"]:
+            shape = _read_shape(path, name)
+            absolute = Path(str(name)).suffix.lower() != ".npy"
+            if absolute and neutral is None:
+                raise FaceDiffError(f'--eyes {path}: "{name}" is a whole face; give the open one as "neutral" as well')
+            if len(shape) != count or (neutral is not None and len(neutral) != count):
+                raise FaceDiffError(f'--eyes {path}: "{name}" has {len(shape)} vertices, the face {count}')
+            total = total + (shape - neutral if absolute and neutral is not None else shape)
+        return total
+    if content.get("lids"):
+        try:
+            sides = [(lid["upper"], lid["lower"]) for lid in content["lids"]]
+        except (TypeError, KeyError) as error:
+            raise FaceDiffError(f'--eyes {path}: expected "lids" as a list of {{"upper": …, "lower": …}}') from error
+        edges = [(_indices(path, upper, count), _indices(path, lower, count)) for upper, lower in sides]
+        return closing_of_lids(template, edges, np.concatenate(balls) if balls else None)
+    return None
+
+
+def _fitted(path: Path, closing: Vertices, template: Vertices, neutral: Vertices | None) -> npt.NDArray[np.float32]:
+    """The closing in the face's unit."""
+    size = float(np.linalg.norm(np.ptp(template, axis=0)))
+    if closing.shape != template.shape or (neutral is not None and neutral.shape != template.shape):
+        raise FaceDiffError(f"--eyes {path}: its blink has shape {closing.shape}; the face has {template.shape}")
+    scale = 1.0 if neutral is None else size / max(float(np.linalg.norm(np.ptp(neutral, axis=0))), 1e-12)
+    way = scale * float(np.linalg.norm(closing, axis=-1).max())
+    if not PLAUSIBLE[0] * size < way < PLAUSIBLE[1] * size:
+        raise FaceDiffError(
+            f"--eyes {path}: its blink moves a lid by {way:.3g} on a face of size {size:.3g}; give the shape of shut "
+            f'eyes, and as "neutral" the open face in the same unit'
+        )
+    return np.asarray(scale * closing, np.float32)
+
+
+def _read_shape(path: Path, name: object) -> Vertices:
+    """Vertices of a mesh, or displacements (V, 3) of a .npy file, that the eyes' file names."""
+    from facediff.mesh import read_mesh
+
+    file = path.parent / str(name)
+    if file.suffix.lower() != ".npy":
+        return read_mesh(file).vertices
+    try:
+        array = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise FaceDiffError(f"--eyes {path}: {file} is not a readable NumPy array ({error})") from error
+    if array.size % 3 or not np.issubdtype(array.dtype, np.floating):
+        raise FaceDiffError(f"--eyes {path}: {file} has shape {array.shape}; expected displacements (V, 3)")
+    return np.asarray(array.reshape(-1, 3), np.float64)
+
+
+def _indices(path: Path, listed: object, n_vertices: int) -> Indices:
+    """Indices in their order: a list of them, a text file, or a mask of a pickle (``FLAME_masks.pkl:left_eyeball``)."""
+    from facediff.mesh.flame import read_masks
+    from facediff.metrics.regions import read_indices
+
+    if not isinstance(listed, str):
+        return _checked(path, np.asarray(listed), n_vertices)
+    file, _, mask = listed.partition(":") if ".pkl:" in listed else (listed, "", "")
+    try:
+        read = read_masks(path.parent / file, mask) if file.endswith(".pkl") else read_indices(path.parent / file)
+    except ValueError as error:
+        raise FaceDiffError(f"--eyes {path}: {error}") from error
+    return _checked(path, np.asarray(read), n_vertices)
+
+
+def _checked(path: Path, indices: npt.NDArray[Any], n_vertices: int) -> Indices:
+    fit = indices.ndim == 1 and len(indices) and np.issubdtype(indices.dtype, np.integer)
+    if not fit or not 0 <= indices.min() <= indices.max() < n_vertices:
+        raise FaceDiffError(f"--eyes {path}: expected lists of vertex indices from 0 to {n_vertices - 1}")
+    return indices.astype(np.int64)
+
+
+def closing_of_lids(
+    template: Vertices, lids: list[tuple[Indices, Indices]], rigid: Indices | None = None
+) -> npt.NDArray[np.float32]:
+    """How lids shut (V, 3), from the vertices of their edges alone.
+
+    Both edges run from one corner of the eye to the other. Each edge vertex goes to the line between them at its own
+    share of the way along; the skin around follows its nearest edge vertices, less and less up to 0.4 of the eye's
+    width away.
+
+    Args:
+        template: (V, 3) the neutral face with open eyes, y up and z to the viewer.
+        lids: for each eye the vertices of the upper and of the lower edge.
+        rigid: vertices that do not follow (eyeballs).
+
+    Raises:
+        FaceDiffError: if an edge has less than two vertices.
+    """
+    places = np.asarray(template, np.float64)
+    closing = np.zeros_like(places)
+    for upper, lower in lids:
+        top, bottom = places[upper], places[lower]
+        if np.linalg.norm(top[0] - bottom[0]) > np.linalg.norm(top[0] - bottom[-1]):
+            lower, bottom = lower[::-1], bottom[::-1]
+        width = max(float(np.linalg.norm(np.ptp(edge, axis=0))) for edge in (top, bottom))
+        if min(len(top), len(bottom)) < 2 or width <= 0:
+            raise FaceDiffError("lids: an edge needs two vertices at least, from one corner of the eye to the other")
+        edge = np.concatenate([upper, lower])
+        way = np.concatenate([(1.0 - MEET) * _ways(top, bottom), MEET * _ways(bottom, top)])
+        way[:, 2] += AHEAD * width * np.concatenate([_arch(top), 0.5 * _arch(bottom)])
+        distance = np.linalg.norm(places[:, None] - places[edge], axis=-1)
+        near = np.flatnonzero(distance.min(axis=1) < REACH * width)
+        share = 1.0 - smooth_step(distance[near].min(axis=1) / (REACH * width))
+        # Inverse distances to the fourth power: at an edge vertex its own way alone, in between a blend.
+        pull = 1.0 / np.maximum(distance[near], 1e-6 * width) ** 4
+        blended = share[:, None] * (pull @ way) / pull.sum(axis=1, keepdims=True)
+        larger = np.linalg.norm(blended, axis=1) > np.linalg.norm(closing[near], axis=1)
+        closing[near[larger]] = blended[larger]
+    if rigid is not None:
+        closing[rigid] = 0.0
+    return closing.astype(np.float32)
+
+
+def _along(edge: Array) -> Array:
+    """Share of the way along an edge (N, 3) at each of its vertices (N,), 0 to 1."""
+    steps = np.linalg.norm(np.diff(edge, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)]) / max(float(steps.sum()), 1e-12)
+
+
+def _ways(edge: Array, other: Array) -> Array:
+    """From each vertex of an edge (N, 3) to the other edge, at the same share of the way along."""
+    at, knots = _along(edge), _along(other)
+    return np.stack([np.interp(at, knots, other[:, axis]) for axis in range(3)], axis=1) - edge
+
+
+def _arch(edge: Array) -> Array:
+    """1 in the middle of an edge, 0 at the corners (N,)."""
+    return np.asarray(np.sin(np.pi * _along(edge)))
+
+
+def smooth_step(values: npt.ArrayLike) -> Array:
+    """3t² − 2t³ of values limited to 0 … 1: from 0 to 1 with flat ends."""
+    t = np.clip(np.asarray(values, np.float64), 0.0, 1.0)
+    return np.asarray(t * t * (3.0 - 2.0 * t))
