@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.utils import SAMPLE_RATE
 
 # How long a corpus's unit of length is.
 
@@ -73,7 +74,7 @@ class Animation:
     faces: npt.NDArray[np.int32] | None = None
     unit: str = "m"
     speech: npt.NDArray[np.float32] | None = None
-    sample_rate: int = 16_000
+    sample_rate: int = SAMPLE_RATE
     colours: npt.NDArray[np.uint8] | None = None
     regions: Mapping[str, npt.NDArray[np.int64]] = field(default_factory=dict)
     inner_lip_pairs: npt.NDArray[np.int64] | None = None

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import tokenize
-import zipfile
-import zlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +12,8 @@ import numpy.typing as npt
 
 from facediff.animation.animation import Animation
 from facediff.errors import FaceDiffError
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.arrays import open_vertices, read_arrays
 from facediff.utils.files import atomic
 
 # Motion that is written to a .npy file while it is made, so that memory does not hold it.
@@ -57,8 +56,6 @@ class MotionWriter:
 FORMAT = "facediff take 1"
 ARRAYS = ("vertices", "template", "faces", "speech", "colours", "inner_lip_pairs")
 NEEDED = ("vertices", "template", "about")
-BROKEN = (OSError, ValueError, EOFError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile)
-"""What NumPy raises for a damaged file; its headers are Python literals."""
 SHAPES: dict[str, tuple[str, str, tuple[int | None, ...]]] = {
     "vertices": ("f", "floating point (frames, vertices, 3)", (None, None, 3)),
     "template": ("f", "floating point (vertices, 3)", (None, 3)),
@@ -103,7 +100,7 @@ def read_archive(path: Path) -> Animation:
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected a take that `facediff animate … -o take.npz` wrote")
-    held: dict[str, Any] = {**read_entries(path)}
+    held: dict[str, Any] = {**read_arrays(path)}
     missing = [name for name in NEEDED if name not in held]
     if missing:
         raise FaceDiffError(
@@ -129,28 +126,6 @@ def read_archive(path: Path) -> Animation:
     for name, indices in {**regions, "inner_lip_pairs": held.get("inner_lip_pairs", np.zeros(0, int))}.items():
         _refuse_outside(path, name, indices, len(held["template"]))
     return Animation(**{name: held[name] for name in ARRAYS if name in held}, regions=regions, **facts)
-
-
-def read_entries(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """All arrays of an .npz file, by name.
-
-    Raises:
-        FaceDiffError: if it is no such file, damaged, or holds something else than arrays.
-    """
-    try:
-        # Opened here, since NumPy leaves a file that it opened itself open where the archive is cut off.
-        with path.open("rb") as stream:
-            if not zipfile.is_zipfile(stream):
-                raise ValueError("it is no archive, or was cut off")
-            stream.seek(0)
-            with np.load(stream, allow_pickle=False) as archive:
-                held = {name: archive[name] for name in archive.files}
-        strange = [name for name, value in held.items() if not isinstance(value, np.ndarray)]
-        if strange:
-            raise ValueError(f"{strange[0]} is no array")
-    except (*BROKEN, LookupError, RuntimeError, MemoryError, zlib.error) as error:
-        raise FaceDiffError(f"{path}: not a readable .npz file ({error}); write it anew") from error
-    return held
 
 
 def _refuse_other(
@@ -201,7 +176,7 @@ class Surroundings:
     regions: dict[str, npt.NDArray[np.int64]] = field(default_factory=dict)
     inner_lip_pairs: npt.NDArray[np.int64] | None = None
     speech: npt.NDArray[np.float32] | None = None
-    sample_rate: int = 16_000
+    sample_rate: int = SAMPLE_RATE
 
     @classmethod
     def of(cls, animation: Animation) -> Surroundings:
@@ -242,7 +217,7 @@ def read_animation(path: Path, given: Surroundings | None = None, lent: Surround
         return replace(animation, **told, regions=said.regions)
     if path.suffix != ".npy":
         raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a motion in {" or ".join(SUFFIXES)}')
-    vertices = read_vertices(path)
+    vertices = open_vertices(path).astype(np.float32, copy=False)
     given = given.completed(lent)
     if given.frame_rate is None:
         raise FaceDiffError(f"{path}: an array does not say its frame rate; give --frame-rate or --checkpoint")
@@ -259,29 +234,3 @@ def read_animation(path: Path, given: Surroundings | None = None, lent: Surround
         regions=given.regions,
         inner_lip_pairs=given.inner_lip_pairs,
     )
-
-
-def read_vertices(path: Path) -> npt.NDArray[np.float32]:
-    """Absolute vertices (T, V, 3), memory-mapped where the file holds float32.
-
-    Raises:
-        FaceDiffError: if the file is missing, broken or of another shape.
-    """
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; expected a motion (frames, vertices, 3)")
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except BROKEN as error:
-        raise FaceDiffError(f"{path}: not a readable NumPy array ({error})") from error
-    if not isinstance(array, np.ndarray):
-        array.close()
-        raise FaceDiffError(f"{path}: not a NumPy array but an archive of several; name it .npz")
-    flat = array.ndim == 2 and array.shape[1] % 3 == 0
-    if not np.issubdtype(array.dtype, np.floating) or not (flat or (array.ndim == 3 and array.shape[2] == 3)):
-        raise FaceDiffError(
-            f"{path}: holds {array.dtype} of shape {array.shape}; expected absolute vertices as floating point, "
-            f"(frames, vertices, 3) or (frames, 3 * vertices)"
-        )
-    if not array.size:
-        raise FaceDiffError(f"{path}: holds no {'vertices' if len(array) else 'frames'}; give a motion of at least one")
-    return array.reshape(len(array), -1, 3).astype(np.float32, copy=False)

@@ -10,10 +10,10 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import nn
 
 from facediff.data import SpeechMotionDataModule
-from facediff.data.audio import ArrayStore
 from facediff.data.dataset import CachedFeatures
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
+from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
 from facediff.utils.progress import track
 

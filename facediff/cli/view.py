@@ -96,9 +96,10 @@ def lent_to(path: Path, lent: Surroundings | None, lender: Animation | None) -> 
     """What completes an array: the checkpoint's facts before those of the lender."""
     if lender is None or path.suffix != ".npy":
         return lent
-    from facediff.animation.files import Surroundings, read_vertices
+    from facediff.animation.files import Surroundings
+    from facediff.utils.arrays import open_vertices
 
-    if read_vertices(path).shape[1] != len(lender.template):
+    if open_vertices(path).shape[1] != len(lender.template):
         return lent
     return (lent or Surroundings()).completed(Surroundings.of(lender))
 

@@ -1,4 +1,4 @@
-"""A corpus on disk in the layout that circulates in the field.
+"""A corpus on disk in the layout that circulates in the field, and the readers of its files.
 
 ``wav/<clip>.wav``, ``vertices_npy/<clip>.npy`` with (T, 3V) absolute vertices, ``templates.pkl``, ``regions/*.txt``,
 a mesh file with the faces, and optionally ``clips.csv`` with further columns per clip and ``manifest.json``.
@@ -12,25 +12,30 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from facediff.data.audio import ArrayStore, read_stretch, samples_for
+from facediff.data.audio import read_stretch, samples_for
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh, read_mesh
 from facediff.metrics import Region
+from facediff.utils.arrays import ArrayStore, open_vertices
 from facediff.utils.files import cache_dir
 from facediff.utils.pickles import load_pickle
 
-# Finding which vertices are the lips and the upper face, in any of the files that circulate.
+MOTION_FOLDERS = ("vertices_npy", "vertex")
+"""Where projects keep absolute vertices; the second is ProbTalk3D's."""
+
+CHUNK = 8
+"""Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
 
 ALL = "all"
-"""The source that stands for every vertex."""
+"""The region source that stands for every vertex."""
 
 FLAME_SOURCES: dict[str, tuple[str, ...]] = {
     "lips": ("regions/lve.txt", "FLAME_masks.pkl:lips", "regions/FLAME_masks.pkl:lips", "regions/lip.txt"),
@@ -40,45 +45,7 @@ FLAME_SOURCES: dict[str, tuple[str, ...]] = {
         "regions/FLAME_masks.pkl:forehead+eye_region",
     ),
 }
-"""Files that say which of FLAME's vertices are the lips and the upper face, in the order of preference."""
-
-
-def find_region(root: Path, sources: Sequence[str], name: str, n_vertices: int, help_text: str = "") -> Region:
-    """The region of the first source whose file is there.
-
-    A source is a file below ``root``: a text file of indices separated by "," or ", "; a pickle with a list of indices;
-    or ``FLAME_masks.pkl:lips``, one or several (joined by "+") masks of a pickle with named masks. ``all`` is every
-    vertex.
-
-    Raises:
-        FaceDiffError: if no file is there (naming all that were looked for), or it is not what it should be.
-    """
-    for source in sources:
-        if source == ALL:
-            return Region.from_indices("all vertices", range(n_vertices), n_vertices=n_vertices)
-        file, _, masks = source.partition(":")
-        path = root / file
-        if not path.is_file():
-            continue
-        try:
-            if path.suffix == ".pkl":
-                return Region.from_indices(name, read_masks(path, masks), n_vertices=n_vertices)
-            return Region.from_file(path, name=name, n_vertices=n_vertices)
-        except ValueError as error:
-            message = str(error)
-            raise FaceDiffError(message if str(path) in message else f"{path}: {message}") from error
-    looked = ", ".join(str(root / source) for source in sources)
-    raise FaceDiffError(
-        f"{root}: nothing says which vertices are the {name.replace('_', ' ')}; looked for {looked}. {help_text} "
-        f"To train and score on all vertices instead, set data.{name}={ALL}"
-    )
-
-
-MOTION_FOLDERS = ("vertices_npy", "vertex")
-"""Where projects keep absolute vertices; the second is ProbTalk3D's."""
-
-CHUNK = 8
-"""Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
+"""Files that list which of FLAME's vertices are the lips and the upper face, in order of preference."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +55,7 @@ class Clip:
     Attributes:
         name: the name of its files.
         identity: who speaks.
-        sentence: what is said; clips of equal sentence say the same words.
+        sentence: what is spoken; clips of equal sentence have the same words.
         attributes: further columns of ``clips.csv``, or of the name, e.g. the mood.
         root: the corpus folder that holds its files.
     """
@@ -101,12 +68,12 @@ class Clip:
 
     @property
     def number(self) -> int:
-        """The sentence's number: the last two characters, as every project of the field has it; −1 if it has none."""
+        """The sentence's number: the last two characters, as in every project of the field; −1 if it has none."""
         return int(self.sentence[-2:]) if self.sentence[-2:].isdecimal() else -1
 
 
 NameParser = Callable[[str], Clip | None]
-"""Tells identity and sentence from a clip's name; None for a file that is no clip of the corpus."""
+"""Finds identity and sentence in a clip's name; None for a file that is no clip of the corpus."""
 
 
 def parse_name(name: str) -> Clip:
@@ -116,16 +83,16 @@ def parse_name(name: str) -> Clip:
 
 
 class Corpus:
-    """Read access to a corpus folder. Motion is memory-mapped; nothing is kept in memory but the templates.
+    """Read access to a corpus folder. Motion is memory-mapped; only the templates are kept in memory.
 
     Args:
         root: the folder.
         n_vertices: vertices of its meshes.
-        frame_rate: motion frames a second that are given out.
-        stored_frame_rate: motion frames a second on disk, a whole multiple of ``frame_rate``, of which every second
-            (third …) is taken; what ``manifest.json`` says goes before it.
-        parse: tells identity and sentence from a clip's name.
-        people: folders of further people with the same topology, as ``facediff data import-person`` writes them.
+        frame_rate: frames per second of the motion that is returned.
+        stored_frame_rate: frames per second of the motion on disk, a whole multiple of ``frame_rate``, of which every
+            second (third …) frame is read; ``manifest.json`` overrides it.
+        parse: finds identity and sentence in a clip's name.
+        people: folders of further speakers with the same topology, as ``facediff data import-person`` writes them.
     """
 
     def __init__(
@@ -155,73 +122,57 @@ class Corpus:
     def _stride(self, root: Path, default: float) -> int:
         if (root / "prepare.json").is_file() and not (root / "manifest.json").is_file():
             raise FaceDiffError(
-                f"{root}: was not prepared to its end (prepare.json is there, manifest.json is not); run the same "
-                f"`facediff data prepare` again, which goes on where it was stopped"
+                f"{root}: its preparation was interrupted (prepare.json is there, manifest.json is not); run the same "
+                f"`facediff data prepare` again to continue it"
             )
-        said = read_manifest(root).get("frame_rate") or default
-        if not isinstance(said, int | float) or not 0 < said < float("inf"):
-            raise FaceDiffError(f"{root / 'manifest.json'}: frame_rate is {said!r}, expected frames a second, e.g. 25")
-        stored = float(said)
+        stored = read_manifest(root).get("frame_rate") or default
+        if not isinstance(stored, int | float) or not 0 < stored < float("inf"):
+            raise FaceDiffError(
+                f"{root / 'manifest.json'}: frame_rate is {stored!r}, expected frames per second, e.g. 25"
+            )
         stride = round(stored / self.frame_rate)
         if stride < 1 or abs(stride * self.frame_rate - stored) > 1e-6:
             raise FaceDiffError(
-                f"{root / 'manifest.json'}: frame_rate is {stored:g}, which is no whole multiple of the corpus's "
-                f"{self.frame_rate:g} frames a second; prepare the folder anew with that frame rate"
+                f"{root / 'manifest.json'}: frame_rate is {stored:g}, expected a whole multiple of the corpus's "
+                f"{self.frame_rate:g} frames per second; prepare the folder again with that frame rate"
             )
         return stride
 
     @cached_property
     def clips(self) -> dict[str, Clip]:
-        """Every clip that has both speech and motion, by name, sorted; people's own clips after the corpus's."""
+        """Every clip that has both speech and motion, by name, sorted; imported speakers' clips come last."""
         clips = self._clips_of(self.root, self.parse)
         if not clips:
-            raise FaceDiffError(f"{self.root}: no clip found; expected wav/<clip>.wav beside vertices_npy/<clip>.npy")
+            raise FaceDiffError(f"{self.root}: no clip found; expected wav/<clip>.wav with vertices_npy/<clip>.npy")
         for person in self.people:
             more = self._clips_of(person, parse_name)
             for name in more.keys() & clips.keys():
                 raise FaceDiffError(
-                    f"{person}: its clip {name} is also in {clips[name].root}; give the person a new name"
+                    f"{person}: its clip {name} is also in {clips[name].root}; import the speaker under a new name"
                 )
             clips |= more
         return clips
 
-    def _clips_of(self, root: Path, parse: NameParser) -> dict[str, Clip]:
-        rows = self._attributes(root)
-        clips = {}
-        for name in sorted(
-            path.stem for path in (root / "wav").glob("*.wav") if motion_path(root, path.stem).is_file()
-        ):
-            clip = parse(name)
-            if clip is not None:
-                clips[name] = Clip(name, clip.identity, clip.sentence, {**rows.get(name, {}), **clip.attributes}, root)
-        return clips
-
     @staticmethod
-    def _attributes(root: Path) -> dict[str, dict[str, str]]:
-        path = root / "clips.csv"
-        if not path.is_file():
-            return {}
-        try:
-            with path.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets put a mark at the beginning
-                rows = [{key: value for key, value in row.items() if key} for row in csv.DictReader(stream)]
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise FaceDiffError(f"{path}: not readable as a UTF-8 table ({error}); save it as CSV UTF-8") from error
-        if rows and "clip" not in rows[0]:
-            raise FaceDiffError(f"{path}: has no column clip; expected clip and further columns, one row a clip")
-        return {str(row.pop("clip")): {key: (value or "").strip() for key, value in row.items()} for row in rows}
+    def _clips_of(root: Path, parse: NameParser) -> dict[str, Clip]:
+        rows = read_clip_table(root)
+        clips = {}
+        for name in sorted(path.stem for path in (root / "wav").glob("*.wav")):
+            clip = parse(name) if motion_path(root, name).is_file() else None
+            if clip is not None:
+                attributes = {**rows.get(name, {}), **clip.attributes}
+                clips[name] = Clip(name, clip.identity, clip.sentence, attributes, root)
+        return clips
 
     @cached_property
     def templates(self) -> dict[str, Tensor]:
         """Neutral face (V, 3) of every identity, float32."""
-        templates: dict[str, Tensor] = {}
-        templates |= read_templates(self.root / "templates.pkl", self.n_vertices)
+        templates = read_templates(self.root / "templates.pkl", self.n_vertices)
         for root in self.people:
             name = str(read_manifest(root).get("person"))
             own = read_templates(root / "templates.pkl", self.n_vertices)
             if name in templates:
-                raise FaceDiffError(
-                    f"{root}: there is a {name} in {self.root} already; import the person by a new name"
-                )
+                raise FaceDiffError(f"{root}: {self.root} has a {name} already; import the speaker under a new name")
             templates |= {name: own[name]} if name in own else {}
         return templates
 
@@ -247,10 +198,12 @@ class Corpus:
         return len(self.open_vertices(clip))
 
     def read_motion(self, clip: Clip, start: int = 0, stop: int | None = None) -> Tensor:
-        """Offsets from the template (T, V, 3), float32; only the frames asked for are read."""
+        """Offsets from the template (T, V, 3), float32; only frames ``start`` to ``stop`` are read."""
         template = self.template(clip).numpy()
         stored = self.open_vertices(clip)[start:stop]
         motion = np.empty(stored.shape, np.float32)
+        # Conversion, check and subtraction go over each chunk while it is in the processor's cache: done one after the
+        # other over the whole clip, each would wait for main memory.
         for first in range(0, len(stored), CHUNK):
             chunk = motion[first : first + CHUNK]
             np.copyto(chunk, stored[first : first + CHUNK], casting="same_kind")
@@ -274,7 +227,7 @@ class Corpus:
         return clip.root / "wav" / f"{clip.name}.wav"
 
     def read_mesh(self, files: Sequence[str]) -> Mesh | None:
-        """The first mesh file that is there, in the folder itself or in ``templates/``; None if there is none."""
+        """The first mesh file that exists, in the folder itself or in ``templates/``; None if there is none."""
         places = [folder / file for file in files for folder in (self.root, self.root / "templates")]
         path = next((place for place in places if place.is_file()), None)
         if path is None:
@@ -285,11 +238,11 @@ class Corpus:
         return mesh
 
     def read_region(self, sources: Sequence[str], name: str, help_text: str = "") -> Region:
-        """The first of several region sources that is there; see :func:`facediff.data.corpus.find_region`."""
+        """The first of several region sources that exists; see :func:`facediff.data.corpus.find_region`."""
         return find_region(self.root, sources, name, self.n_vertices, help_text)
 
     def read_pairs(self, file: str) -> Tensor | None:
-        """Vertex pairs (P, 2), one ``upper, lower`` a line; None if there is no such file."""
+        """Vertex pairs (P, 2) of a file in ``regions/``, one ``upper, lower`` a line; None if there is no such file."""
         path = self.root / "regions" / file
         if not path.is_file():
             return None
@@ -303,57 +256,60 @@ class Corpus:
         return pairs
 
 
+# The readers, one for each kind of file; motion is read by facediff.utils.arrays.open_vertices.
+
+
 def motion_path(root: Path, name: str) -> Path:
     """Where a clip's vertices lie; the usual place if they are nowhere."""
     paths = [root / folder / f"{name}.npy" for folder in MOTION_FOLDERS]
     return next((path for path in paths if path.is_file()), paths[0])
 
 
-def open_vertices(path: Path, n_vertices: int, mode: Literal["r", "c"] = "r") -> npt.NDArray[np.floating]:
-    """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3), memory-mapped.
+def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tensor]:
+    """``templates.pkl``: the neutral face (V, 3) of each identity, float32.
 
     Args:
         path: the file.
-        n_vertices: vertices of the mesh.
-        mode: "r", or "c" for an array that may be written to without touching the file.
+        n_vertices: vertices of the mesh; those of the first face if None.
 
     Raises:
-        FaceDiffError: if the file is unreadable or of another shape.
-    """
-    try:
-        array = np.load(path, mmap_mode=mode, allow_pickle=False)
-    except Exception as error:  # a damaged header makes NumPy raise anything
-        raise FaceDiffError(f"{path}: not a readable NumPy array ({error}); expected (T, 3V) floats") from error
-    if array.ndim not in (2, 3) or array.shape[1:] not in ((3 * n_vertices,), (n_vertices, 3)) or not len(array):
-        raise FaceDiffError(
-            f"{path}: has shape {array.shape}, expected (frames, {3 * n_vertices}) with at least one frame"
-        )
-    if not np.issubdtype(array.dtype, np.floating):
-        raise FaceDiffError(f"{path}: holds {array.dtype}, expected floating-point vertices")
-    return array.reshape(len(array), n_vertices, 3)
-
-
-def read_templates(path: Path, n_vertices: int) -> dict[str, Tensor]:
-    """``templates.pkl``: identity to neutral face (V, 3), float32.
-
-    Raises:
-        FaceDiffError: if the file is not that.
+        FaceDiffError: if the file holds anything else.
     """
     loaded = load_pickle(path)
     if not isinstance(loaded, dict):
         raise FaceDiffError(f"{path}: expected a dict from identity to (V, 3) array, got {type(loaded).__name__}")
+    if n_vertices is None:
+        size = np.size(next(iter(loaded.values()), ()))
+        if not size or size % 3:
+            raise FaceDiffError(f"{path}: expected a dict from identity to (V, 3) array, as every corpus has it")
+        n_vertices = size // 3
     templates = {}
     for name, value in loaded.items():
         try:
-            array = np.asarray(value, np.float32)
-        except (TypeError, ValueError) as error:
-            raise FaceDiffError(f"{path}: the template of {name} is no array of numbers; expected (V, 3)") from error
-        if array.shape not in ((3 * n_vertices,), (n_vertices, 3)):
-            raise FaceDiffError(f"{path}: the template of {name} has shape {array.shape}, expected ({n_vertices}, 3)")
-        if not np.isfinite(array).all():
-            raise FaceDiffError(f"{path}: the template of {name} holds NaN or infinity")
-        templates[str(name)] = torch.from_numpy(np.array(array).reshape(-1, 3))
+            templates[str(name)] = torch.from_numpy(as_template(value, n_vertices))
+        except ValueError as error:
+            raise FaceDiffError(f"{path}: the template of {name} {error}") from error
     return templates
+
+
+def as_template(value: object, n_vertices: int) -> npt.NDArray[np.float32]:
+    """One entry of ``templates.pkl`` as a neutral face (V, 3).
+
+    Raises:
+        ValueError: saying what is wrong with it.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            array = np.array(value, np.float32)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"is no array of numbers; expected ({n_vertices}, 3)") from error
+    if array.shape not in ((3 * n_vertices,), (n_vertices, 3)):
+        raise ValueError(f"has shape {array.shape}, expected ({n_vertices}, 3)")
+    array = array.reshape(n_vertices, 3)
+    bad = np.count_nonzero(~np.isfinite(array).all(axis=1))
+    if bad:
+        raise ValueError(f"holds NaN or infinity in {bad} {'vertex' if bad == 1 else 'vertices'}")
+    return array
 
 
 def read_manifest(root: Path) -> dict[str, Any]:
@@ -369,6 +325,56 @@ def read_manifest(root: Path) -> dict[str, Any]:
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise FaceDiffError(
-            f"{path}: not readable as JSON ({error}); prepare the folder anew, or remove the file"
+            f"{path}: not readable as JSON ({error}); prepare the folder again, or remove the file"
         ) from error
     return manifest if isinstance(manifest, dict) else {}
+
+
+def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
+    """``clips.csv`` of a folder: the further columns of each clip; empty if there is none.
+
+    Raises:
+        FaceDiffError: if it is not a UTF-8 table, or has no column ``clip``.
+    """
+    path = root / "clips.csv"
+    if not path.is_file():
+        return {}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets put a mark at the beginning
+            rows = [{key: value for key, value in row.items() if key} for row in csv.DictReader(stream)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FaceDiffError(f"{path}: not readable as a UTF-8 table ({error}); save it as CSV UTF-8") from error
+    if rows and "clip" not in rows[0]:
+        raise FaceDiffError(f"{path}: has no column clip; expected clip and further columns, one row a clip")
+    return {str(row.pop("clip")): {key: (value or "").strip() for key, value in row.items()} for row in rows}
+
+
+def find_region(root: Path, sources: Sequence[str], name: str, n_vertices: int, help_text: str = "") -> Region:
+    """The region of the first source whose file exists.
+
+    A source is a file below ``root``: a text file of indices separated by "," or ", "; a pickle with a list of indices;
+    or ``FLAME_masks.pkl:lips``, one or several (joined by "+") masks of a pickle with named masks. ``all`` is every
+    vertex.
+
+    Raises:
+        FaceDiffError: if no file exists (naming all that were looked for), or it is not what it should be.
+    """
+    for source in sources:
+        if source == ALL:
+            return Region.from_indices("all vertices", range(n_vertices), n_vertices=n_vertices)
+        file, _, masks = source.partition(":")
+        path = root / file
+        if not path.is_file():
+            continue
+        try:
+            if path.suffix == ".pkl":
+                return Region.from_indices(name, read_masks(path, masks), n_vertices=n_vertices)
+            return Region.from_file(path, name=name, n_vertices=n_vertices)
+        except ValueError as error:
+            message = str(error)
+            raise FaceDiffError(message if str(path) in message else f"{path}: {message}") from error
+    looked = ", ".join(str(root / source) for source in sources)
+    raise FaceDiffError(
+        f"{root}: no file lists the vertices of the {name.replace('_', ' ')}; looked for {looked}. {help_text} "
+        f"To train and score on all vertices instead, set data.{name}={ALL}"
+    )

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, DistributedSampler
 
-from facediff.data.audio import ArrayStore, samples_for
+from facediff.data.audio import samples_for
 from facediff.data.batch import UNKNOWN_IDENTITY, Sample
 from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
+from facediff.utils.arrays import ArrayStore
 
 # Features of an audio encoder's frozen part, kept on disk, one array a clip.
 

@@ -6,7 +6,6 @@ They are known for the built-in puppet, and are read from the user's file for an
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.utils.arrays import open_array, read_arrays
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -133,7 +133,7 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
         )
     count = len(template)
     if path.suffix.lower() == ".npz":
-        found = _read_npz(path)
+        found = read_arrays(path, name=f"--eyes {path}")
         balls = tuple(_checked(path, found[name], count) for name in sorted(found) if name.startswith("eyeball"))
         closing, neutral = found.get("closing"), found.get("neutral")
     elif path.suffix.lower() == ".json":
@@ -148,14 +148,6 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
     if closing is not None:
         closing = _fitted(path, np.asarray(closing), template, neutral)
     return Eyes(closing, balls, f"--eyes {path}")
-
-
-def _read_npz(path: Path) -> dict[str, npt.NDArray[Any]]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise FaceDiffError(f"--eyes {path}: not a readable .npz file ({error})") from error
 
 
 def _read_json(path: Path) -> Mapping[str, Any]:
@@ -225,11 +217,8 @@ def _read_shape(path: Path, name: object) -> Vertices:
     file = path.parent / str(name)
     if file.suffix.lower() != ".npy":
         return read_mesh(file).vertices
-    try:
-        array = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise FaceDiffError(f"--eyes {path}: {file} is not a readable NumPy array ({error})") from error
-    if array.size % 3 or not np.issubdtype(array.dtype, np.floating):
+    array = open_array(file, kinds="f", name=f"--eyes {path}: {file}")
+    if array.size % 3:
         raise FaceDiffError(f"--eyes {path}: {file} has shape {array.shape}; expected displacements (V, 3)")
     return np.asarray(array.reshape(-1, 3), np.float64)
 

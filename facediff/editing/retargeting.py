@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.animation import METRES
-from facediff.animation.files import read_entries
 from facediff.editing.correspondence import Correspondence, Surface, averaging, refuse_other_mesh
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity
+from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic
 
 # Correspondences and landmarks on disk.
@@ -62,7 +62,7 @@ def load_correspondence(path: Path) -> Correspondence:
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected a correspondence that `facediff retarget` wrote")
-    held = read_entries(path)
+    held = read_arrays(path)
     if "format" not in held or str(held["format"]) != FORMAT:
         raise FaceDiffError(f"{path}: is no correspondence; expected one that `facediff retarget` wrote")
     for name, (kind, axes) in {**ARRAYS, **SIMILARITY}.items():

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
-from facediff.data.corpus import ALL, MOTION_FOLDERS, find_region
+from facediff.data.corpus import ALL, MOTION_FOLDERS, find_region, read_templates
 from facediff.errors import FaceDiffError
 from facediff.metrics import TOPOLOGIES, Region
-from facediff.utils.pickles import load_pickle
+from facediff.utils.arrays import open_vertices
 
 # What a file's name says: who speaks, what is said, and whose style the prediction was given.
 
@@ -266,18 +265,10 @@ def count_vertices(topology: str | None, templates: Path | None, truth: Path) ->
     if topology in TOPOLOGIES:
         return TOPOLOGIES[topology].n_vertices
     if templates is not None:
-        loaded = load_pickle(templates)
-        sizes = [np.size(value) for value in loaded.values()] if isinstance(loaded, dict) else []
-        if sizes and sizes[0] and sizes[0] % 3 == 0:
-            return int(sizes[0]) // 3
-        raise FaceDiffError(f"{templates}: expected a dict from subject to (V, 3) array")
+        return len(next(iter(read_templates(templates).values())))
     for path in sorted(truth.glob("**/*.npy")):
-        try:
-            shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
-        except (ValueError, OSError, EOFError):
-            continue
-        if len(shape) in (2, 3) and np.prod(shape[1:]) % 3 == 0 and np.prod(shape[1:]):
-            return int(np.prod(shape[1:])) // 3
+        with suppress(FaceDiffError):
+            return open_vertices(path).shape[1]
     raise FaceDiffError(f"{truth}: no file says how many vertices the mesh has; say it with --n-vertices")
 
 

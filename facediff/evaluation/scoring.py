@@ -7,27 +7,22 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 from typing import cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from facediff.data.corpus import open_vertices
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import Pair
 from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMetric, VertexError
 from facediff.metrics.base import Clips, LengthRule, Pooling, align
 from facediff.metrics.one_pass import one_pass
+from facediff.utils.arrays import open_vertices
 from facediff.utils.jobs import run_tasks
 
 NATIVE = (np.float16, np.float32, np.float64)
 """Types that torch reads as they are."""
-
-OPENING = Lock()
-"""Held while a file is opened: NumPy reads a file's header with ast, which two threads at once may break in
-Python 3.11 (SystemError, "AST constructor recursion depth mismatch")."""
 
 
 @dataclass(frozen=True)
@@ -235,9 +230,8 @@ def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
     Raises:
         FaceDiffError: if the file is unreadable or of another shape.
     """
-    with OPENING:
-        # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
-        array = open_vertices(path, n_vertices, "c")[::stride]
+    # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
+    array = open_vertices(path, n_vertices, mode="c")[::stride]
     if array.dtype not in NATIVE or not array.dtype.isnative:
         array = array.astype(array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64)
     return torch.from_numpy(array)

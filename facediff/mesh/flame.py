@@ -7,7 +7,6 @@ without restriction. The model and its masks are the user's own files. Equation 
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, choices
+from facediff.utils.arrays import read_arrays
 from facediff.utils.pickles import StandIn, load_pickle
 
 SHAPES, EXPRESSIONS, JOINTS = 300, 100, 5
@@ -208,7 +208,7 @@ def read_flame_arrays(path: Path) -> FlameArrays:
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; {HELP}")
-    content = _read_npz(path) if path.suffix.lower() == ".npz" else load_pickle(path, stand_ins=PACKAGES)
+    content = read_arrays(path, KEYS, remedy=HELP) if path.suffix.lower() == ".npz" else load_pickle(path, stand_ins=PACKAGES)
     if not isinstance(content, Mapping):
         raise FaceDiffError(f"{path}: holds a {type(content).__name__}, no FLAME model; {HELP}")
     absent = [key for key in KEYS if key not in content]
@@ -235,14 +235,6 @@ def read_flame_arrays(path: Path) -> FlameArrays:
         weights=weights,
         faces=faces.astype(np.int32),
     )
-
-
-def _read_npz(path: Path) -> dict[str, Values]:
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {key: archive[key] for key in KEYS if key in archive}
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
-        raise FaceDiffError(f"{path}: not a readable .npz of plain arrays ({error}); {HELP}") from error
 
 
 def _numbers(

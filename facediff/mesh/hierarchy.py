@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,6 +16,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.spirals import Indices, Points, checked_faces, spirals
+from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, cache_dir
 
 # Points of a surface as weighted means of the corners of a coarser surface's faces.
@@ -518,10 +517,8 @@ def _key(template: Points, faces: Indices, vertices: Indices | None, options: li
 def _read(path: Path) -> MeshHierarchy | None:
     """The hierarchy in a file; None if there is none or the file is damaged."""
     try:
-        # Opened here, since NumPy leaves a file open that turns out to be no archive.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            return MeshHierarchy.from_arrays(dict(stored))
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, FaceDiffError):
+        return MeshHierarchy.from_arrays(read_arrays(path))
+    except (ValueError, KeyError, FaceDiffError):
         return None
 
 

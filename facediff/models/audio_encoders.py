@@ -19,14 +19,13 @@ from torch import Tensor, nn
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.models.layers import frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
+from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:
     from transformers import HubertModel
 
 
 # What every audio encoder is.
-
-SAMPLE_RATE = 16_000
 
 
 class AudioEncoder(nn.Module, ABC):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,7 +98,7 @@ def corpus_clip(name: str, source: Mapping[str, str]) -> Path:
 
 def open_style(path: Path) -> StyleFile:
     """A style's file, memory-mapped where it is an array."""
-    import numpy as np
+    from facediff.utils.arrays import open_array
 
     if not path.is_file():
         raise FaceDiffError(f"--style {path}: no such file")
@@ -108,11 +107,8 @@ def open_style(path: Path) -> StyleFile:
 
         animation = read_archive(path)
         return StyleFile(path, animation.vertices, animation.template, animation.frame_rate, animation.unit)
-    try:
-        array: npt.NDArray[np.generic] = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise FaceDiffError(f"--style {path}: not a readable NumPy array ({error})") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+    array = open_array(path, name=f"--style {path}")
+    if array.dtype.kind not in "fiu":
         raise FaceDiffError(f"--style {path}: holds no array of numbers; expected a motion or a style vector")
     return StyleFile(path, array)
 

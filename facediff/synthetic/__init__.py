@@ -18,7 +18,7 @@ from facediff.synthetic.corpus import (
 )
 from facediff.synthetic.face import N_VERTICES
 from facediff.synthetic.motion import FRAME_RATE
-from facediff.synthetic.speech import SAMPLE_RATE
+from facediff.utils import SAMPLE_RATE
 
 #: Unit of length of every position in the corpus.
 UNIT = "m"

@@ -24,7 +24,8 @@ from facediff.synthetic.face import Array, build_face
 from facediff.synthetic.motion import FRAME_RATE, analyse, generate_clips, segments_of, visemes_of
 from facediff.synthetic.rig import Rig, build_rig, lip_pairs
 from facediff.synthetic.speakers import SPEAKERS
-from facediff.synthetic.speech import SAMPLE_RATE, SENTENCES, Phoneme, speak
+from facediff.synthetic.speech import SENTENCES, Phoneme, speak
+from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import sha256
 from facediff.utils.jobs import WorkerDied, run_tasks
 

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils import SAMPLE_RATE
 
 # What the puppets say: 32 sentences written for this corpus, rich in p, b, m, rounded and open vowels.
 
@@ -61,8 +62,6 @@ SENTENCES: tuple[str, ...] = (
     "Beth above all hoped for a warm room.",
 )
 
-
-SAMPLE_RATE = 16_000
 
 _SYNCHRONOUS = 2
 _PHONEME_EVENTS_AS_IPA = 0x0001 | 0x0002

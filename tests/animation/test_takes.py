@@ -219,9 +219,9 @@ def test_a_motion_larger_than_memory_is_read_without_holding_it(tmp_path: Path) 
     del made
     program = f"""
 import resource, numpy as np
-from facediff.takes import Animation
-from facediff.takes.reading import read_vertices
-vertices = read_vertices(__import__("pathlib").Path({str(tmp_path / "large.npy")!r}))
+from facediff.animation import Animation
+from facediff.utils.arrays import open_vertices
+vertices = open_vertices(__import__("pathlib").Path({str(tmp_path / "large.npy")!r}))
 take = Animation("large", vertices, np.zeros((20_000, 3), np.float32), 25.0)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 take.refuse_not_finite()

@@ -108,7 +108,7 @@ def test_a_damaged_cache_file_is_made_anew(losses: Callable[..., tuple[list[floa
     files = sorted(tmp_path.rglob("*.npy"))
     assert len(files) == 10
     files[3].write_bytes(files[3].read_bytes()[:90])
-    with pytest.warns(UserWarning, match="a damaged or half-written cache file; it is made anew"):
+    with pytest.warns(UserWarning, match="a damaged or half-written cache file"):
         again, encoded = losses(SpeechFeatureCache(str(tmp_path)))
     assert again == first
     assert encoded == 1

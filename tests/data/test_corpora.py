@@ -184,7 +184,7 @@ def test_sixty_stored_frames_a_second_become_thirty_by_every_second(tmp_path: Pa
     assert prepared.corpus.frames(prepared.corpus.clips[clip.name]) == 7
     assert prepared.assets().unit == "mm"
     (root / "manifest.json").write_text('{"frame_rate": 50}')
-    with pytest.raises(FaceDiffError, match=r"frame_rate is 50, which is no whole multiple of the corpus's 30"):
+    with pytest.raises(FaceDiffError, match=r"frame_rate is 50.*30 frames"):
         _ = MiniVocaset(root=str(root)).corpus
     (root / "manifest.json").write_text("{")
     with pytest.raises(FaceDiffError, match=r"manifest\.json: not readable as JSON"):
@@ -259,7 +259,7 @@ def test_regions_come_from_any_circulating_file(
         ("m.pkl", r"m\.pkl: expected lists"),
         ("list.pkl:lips", r"list\.pkl: expected a dict from mask"),
         ("list.pkl", r"list\.pkl: .*the index 10, a mesh of 10 vertices ends at 9"),
-        ("none.txt", r"which vertices are the upper face; looked for .*none\.txt\. Ask X\. .*data\.upper_face=all"),
+        ("none.txt", r"upper face; looked for .*none\.txt\. Ask X\. .*data\.upper_face=all"),
     ],
 )
 def test_a_wrong_region_is_one_sentence(tmp_path: Path, source: str, sentence: str) -> None:
@@ -323,7 +323,7 @@ def test_a_persons_folder_must_be_one(tmp_path: Path) -> None:
     root = write(tmp_path / "biwi", ["F2_e01", "F2_e02"], {"F2"})
     with pytest.raises(FaceDiffError, match=r"data\.people: .*biwi is no person's folder"):
         MiniBiwi(root=str(root), people=[str(root)])
-    for name, sentence in (("F2", "data.people: F2 is there more than once"), ("M6", "there is a M6 in")):
+    for name, sentence in (("F2", "data.people: F2 is there more than once"), ("M6", "M6 already")):
         own = write(tmp_path / f"with {name}", ["F2_e01", "F2_e02"], {"F2", "M6"})
         clash = write_person(tmp_path / f"clash {name}", name)
         with pytest.raises(FaceDiffError, match=sentence):

@@ -353,7 +353,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match=r"m\.npz: not a readable \.npz"):
         Flame.read(tmp_path / "m.npz")
     np.savez(tmp_path / "m.npz", **{**flame_arrays(), "weights": np.array([{}], object)})
-    with pytest.raises(FaceDiffError, match=r"m\.npz: not a readable \.npz of plain arrays"):
+    with pytest.raises(FaceDiffError, match=r"m\.npz: not a readable \.npz"):
         Flame.read(tmp_path / "m.npz")
     (tmp_path / "list.pkl").write_bytes(pickle.dumps([1]))
     with pytest.raises(FaceDiffError, match=r"list\.pkl: holds a list, no FLAME model"):

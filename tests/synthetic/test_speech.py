@@ -11,6 +11,7 @@ from facediff.synthetic.motion import SPEECH_CONTROLS, VISEMES, visemes_of
 from facediff.synthetic.rig import CONTROLS
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.synthetic.speech import SENTENCES
+from facediff.utils import SAMPLE_RATE
 
 pytest.importorskip("espeakng_loader")
 VOICE = SPEAKERS["F1"].voice
@@ -41,7 +42,7 @@ def test_a_library_that_is_loaded_already_is_left_alone(monkeypatch: pytest.Monk
 
 def test_phonemes_follow_one_another_and_the_sound() -> None:
     said = speech.speak(SENTENCES[0], VOICE)
-    length = said.samples.size / speech.SAMPLE_RATE
+    length = said.samples.size / SAMPLE_RATE
     for before, after in zip(said.phonemes[:-1], said.phonemes[1:], strict=True):
         assert before.end == after.start
         assert before.end > before.start

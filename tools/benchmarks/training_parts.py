@@ -19,7 +19,6 @@ from loading import resident
 from torch import Tensor
 
 from facediff.data import Batch, Biwi
-from facediff.data.audio import ArrayStore
 from facediff.data.dataset import CachedFeatures
 from facediff.models import DualPathDiffusion
 from facediff.models.audio_encoders import HubertEncoder
@@ -28,6 +27,7 @@ from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.losses import training_losses
 from facediff.models.samplers import unit_noise
 from facediff.models.style_encoders import TcnGruTransformer
+from facediff.utils.arrays import ArrayStore
 
 SUBJECTS = ["F2", "F3"]
 RATE = 25

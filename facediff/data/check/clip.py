@@ -6,16 +6,16 @@ Worker processes import this, so it imports nothing heavy.
 from __future__ import annotations
 
 import struct
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.data.check.findings import Finding, Severity, relative
+from facediff.errors import FaceDiffError
+from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.files import sha256
 
 # Looking at one file of motion.
@@ -71,10 +71,10 @@ def look_at_motion(
     facts = MotionFacts()
     try:
         array = open_array(path)
-    except Exception as error:  # NumPy's header parser raises all sorts of things on damaged files
-        facts.add("error", "motion_unreadable", where, unreadable(path, error))
+    except FaceDiffError as error:
+        facts.add("error", "motion_unreadable", where, str(error).removeprefix(f"{path}: "))
         return facts
-    facts.n_vertices = vertices_of(array)
+    facts.n_vertices = vertices_of(array.shape)
     if not np.issubdtype(array.dtype, np.floating):
         facts.add(
             "error", "motion_dtype", where, f"holds {array.dtype}, expected floating-point vertices; write it anew"
@@ -99,39 +99,6 @@ def look_at_motion(
     if not quick:
         _look_inside(facts, array.reshape(len(array), n_vertices, 3), where, subject, templates)
     return facts
-
-
-def open_array(path: Path) -> npt.NDArray[Any]:
-    """A ``.npy`` file, memory-mapped.
-
-    Raises:
-        ValueError: if it is something else; NumPy raises further kinds of errors on damaged files.
-    """
-    if not path.is_file():
-        raise ValueError("it is no regular file")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # NumPy's advice on headers by Python 2
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    if not isinstance(array, np.ndarray):
-        array.close()
-        raise ValueError("it is an archive")
-    return array
-
-
-def unreadable(path: Path, error: Exception) -> str:
-    """The sentence for a file that NumPy cannot open."""
-    if "mmap length" in str(error):
-        return f"is cut short: its {path.stat().st_size} bytes are fewer than its header says; copy it anew"
-    return f"not a readable NumPy array ({error}); expected .npy with (frames, 3 x vertices) floats, copy it anew"
-
-
-def vertices_of(array: npt.NDArray[Any]) -> int | None:
-    """Vertices of the frames of (T, 3V) or (T, V, 3); None for any other shape."""
-    if array.ndim == 3 and array.shape[2] == 3:
-        return int(array.shape[1]) or None
-    if array.ndim == 2 and array.shape[1] and array.shape[1] % 3 == 0:
-        return int(array.shape[1]) // 3
-    return None
 
 
 def _look_inside(facts: MotionFacts, array: Array, where: str, subject: str, templates: Mapping[str, Array]) -> None:

@@ -14,9 +14,9 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args, get_origin, get_type_hints
 
-from facediff.data.check.clip import open_array, vertices_of
 from facediff.data.check.findings import Finding, Report, counted, few, guarded, number
 from facediff.errors import FaceDiffError, choices
+from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.files import sha256
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ class Folder:
         counts: Counter[int] = Counter()
         for path in islice(self.motions.values(), PROBED):
             try:
-                found = vertices_of(open_array(path))
+                found = vertices_of(open_array(path).shape)
             except Exception:  # told when the clips are looked at
                 found = None
             if found is not None:

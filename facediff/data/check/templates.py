@@ -121,6 +121,8 @@ def check_templates(root: Path, view: View, findings: list[Finding]) -> tuple[di
     Returns:
         the usable templates (V, 3) by subject, float32, and the report's section.
     """
+    from facediff.data.corpus import as_template
+
     path = root / "templates.pkl"
     section: dict[str, Any] = {"file": None, "subjects": [], "broken": [], "blob": None}
     section |= {"origin": None, "areas": None}
@@ -131,32 +133,16 @@ def check_templates(root: Path, view: View, findings: list[Finding]) -> tuple[di
             raise FaceDiffError(f"expected a dict from subject to (V, 3) array, got {type(loaded).__name__}")
         section["file"] = "templates.pkl"
         for subject, value in loaded.items():
-            problem, template = read_template(value, view.n_vertices)
-            if template is None:
+            try:
+                templates[str(subject)] = as_template(value, view.n_vertices)
+            except ValueError as error:
                 where = f"templates.pkl:{subject}"
                 section["broken"].append(str(subject))
-                findings.append(Finding("error", "template_broken", where, f"{problem}; get templates.pkl anew"))
-            else:
-                templates[str(subject)] = template
+                findings.append(Finding("error", "template_broken", where, f"{error}; get templates.pkl again"))
         section["subjects"] = sorted(templates)
         section["blob"] = blob_id(path)
         section["origin"] = _origin(view, str(section["blob"]), findings)
     return templates, section
-
-
-def read_template(value: object, n_vertices: int) -> tuple[str, Array | None]:
-    """One entry as a neutral face (V, 3), float32; or what is wrong with it, and None."""
-    try:
-        with np.errstate(all="ignore"):
-            array = np.asarray(value, np.float32)
-    except (TypeError, ValueError, OverflowError):
-        return f"is no array of numbers; expected ({n_vertices}, 3)", None
-    if array.size != 3 * n_vertices:
-        return f"has shape {array.shape}, expected ({n_vertices}, 3)", None
-    if not np.isfinite(array).all():
-        bad = int((~np.isfinite(array.reshape(-1, 3)).all(axis=1)).sum())
-        return f"holds NaN or infinity in {counted(bad, 'vertex', 'vertices')}", None
-    return "", array.reshape(n_vertices, 3)
 
 
 def blob_id(path: Path) -> str:

@@ -13,7 +13,6 @@ import numpy.typing as npt
 from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity, face_size, read_mesh, robust_align
-from facediff.utils.pickles import load_pickle
 from facediff.utils.progress import track
 
 # Arrays on disk that are needed while importing only.
@@ -89,7 +88,7 @@ def read_auxiliary(root: Path, *, name: str, frame_rate: float | None) -> Auxili
     """
     if not root.is_dir():
         raise FaceDiffError(f"--corpus {root}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl")
-    templates = _templates(root / "templates.pkl")
+    templates = read_templates(root / "templates.pkl")
     stems = {path.stem for folder in MOTION_FOLDERS for path in (root / folder).glob("*.npy")}
     subjects = {*templates, *(stem.rpartition("_")[0] for stem in stems)}
     if name.casefold() in {subject.casefold() for subject in subjects}:
@@ -98,7 +97,7 @@ def read_auxiliary(root: Path, *, name: str, frame_rate: float | None) -> Auxili
         )
     manifest = read_manifest(root)
     unit = manifest.get("unit")
-    mean = np.mean(list(templates.values()), axis=0)
+    mean: Array = np.stack([template.numpy() for template in templates.values()]).astype(np.float64).mean(axis=0)
     return Auxiliary(
         root,
         mean,
@@ -117,15 +116,6 @@ def _frame_rate(root: Path, told: object, given: float | None) -> float:
             f"--corpus-frame-rate {given:g}: {root / 'manifest.json'} says {known:g}; leave the option away"
         )
     return known if known is not None else float(given or 0)
-
-
-def _templates(path: Path) -> dict[str, Array]:
-    loaded = load_pickle(path)
-    first = next(iter(loaded.values()), None) if isinstance(loaded, dict) else None
-    size = np.size(first) if isinstance(first, np.ndarray) else 0
-    if not size or size % 3:
-        raise FaceDiffError(f"{path}: expected a dict from subject to (V, 3) array, as every corpus has it")
-    return {name: template.numpy().astype(np.float64) for name, template in read_templates(path, size // 3).items()}
 
 
 def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:

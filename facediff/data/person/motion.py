@@ -27,6 +27,7 @@ from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
 from facediff.mesh.alignment import Indices, chunks
 from facediff.mesh.flame import Flame
+from facediff.utils.arrays import open_array
 
 # What is done by the loudness of speech: finding frames of a neutral face, and cutting into clips.
 
@@ -165,22 +166,6 @@ def read_motion(
     if flame is None:
         raise FaceDiffError(f"{path}: holds FLAME parameters; add --flame MODEL, your own FLAME model file")
     return _read_flame(path, flame, n_vertices, scratch)
-
-
-def open_array(path: Path) -> npt.NDArray[np.floating]:
-    """A .npy file of numbers, memory-mapped.
-
-    Raises:
-        FaceDiffError: if it is missing, damaged, empty, or holds anything but floating-point numbers.
-    """
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise FaceDiffError(f"{path}: not a readable NumPy array ({error}); expected .npy with numbers") from error
-    if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, np.floating) or not array.size:
-        kind = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else "an archive"
-        raise FaceDiffError(f"{path}: holds {kind}; expected floating-point numbers")
-    return array
 
 
 def _as_vertices(array: npt.NDArray[np.floating], n_vertices: int) -> npt.NDArray[np.floating] | None:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.flame import EXPRESSIONS, SHAPES
+from facediff.utils.arrays import open_array
 
 if TYPE_CHECKING:
     import h5py
@@ -189,13 +190,11 @@ def read_parameters(path: Path) -> Parameters:
 
 
 def _read_array(path: Path) -> dict[str, Array]:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise FaceDiffError(f"{path}: not a readable NumPy array, perhaps truncated ({error}); get it again") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind != "f" or array.shape[-1:] != (ALL,):
-        kind = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else "an archive"
-        raise FaceDiffError(f"{path}: holds {kind}; expected floats of shape (1, frames, {ALL}), FLAME parameters")
+    array = open_array(path)
+    if array.dtype.kind != "f" or array.shape[-1:] != (ALL,):
+        raise FaceDiffError(
+            f"{path}: holds {array.dtype} {array.shape}; expected floats of shape (1, frames, {ALL}), FLAME parameters"
+        )
     joined = _as_frames(array, ALL, f"{path}: the array")
     ends = np.cumsum(list(WIDTHS.values()))
     return dict(zip(WIDTHS, np.split(joined, ends[:-1], axis=1), strict=True))

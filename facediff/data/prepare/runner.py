@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.arrays import open_array
 from facediff.utils.batch import run_batch
 from facediff.utils.files import (
     atomic,
@@ -251,8 +252,8 @@ def finished_frames(plan: Plan, job: Job, out: Path) -> int | None:
     try:
         if speech.stat().st_size <= WAV_HEADER:
             return None
-        array = np.load(motion, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError):
+        array = open_array(motion)
+    except (OSError, FaceDiffError):
         return None
     whole = array.ndim == 2 and array.shape[1] == 3 * plan.n_vertices and array.dtype == plan.dtype
     return len(array) if whole else None

@@ -28,6 +28,7 @@ from facediff.data.prepare.runner import (
     write_templates,
 )
 from facediff.errors import FaceDiffError
+from facediff.utils.arrays import open_vertices
 from facediff.utils.pickles import load_pickle
 
 RAW_RATE = 60
@@ -208,23 +209,6 @@ def read_samples(entry: object, where: str) -> tuple[npt.NDArray[np.float32], fl
         raise FaceDiffError(f"{where}: a sample of its sound in {AUDIO} is {peak:g}; expected 16-bit samples")
     full = 1.0 if samples.dtype.kind == "f" and not peak > 1.0 else FULL_SCALE
     return (samples / full).astype(np.float32), rate
-
-
-def open_vertices(path: Path) -> npt.NDArray[np.floating]:
-    """All frames (N, V, 3), memory-mapped.
-
-    Raises:
-        FaceDiffError: if the file is truncated or holds something else.
-    """
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise FaceDiffError(f"{path}: not a readable NumPy array, perhaps truncated ({error}); get it again") from error
-    if array.ndim == 2 and array.shape[1] % 3 == 0:
-        array = array.reshape(len(array), -1, 3)
-    if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind != "f" or not array.size:
-        raise FaceDiffError(f"{path}: has shape {array.shape} and type {array.dtype}; expected (rows, 5023, 3) floats")
-    return array
 
 
 def _need(raw: Path, name: str) -> Path:

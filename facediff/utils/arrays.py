@@ -1,0 +1,164 @@
+"""NumPy's files: reading them safely, as motion or as they are, and keeping arrays on disk between runs."""
+
+from __future__ import annotations
+
+import hashlib
+import tokenize
+import warnings
+import zipfile
+import zlib
+from collections.abc import Container
+from pathlib import Path
+from threading import Lock
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.utils.files import atomic
+
+# NumPy parses a file's header with Python's own parser, which two threads that read at the same time can break in
+# Python 3.11 (SystemError, "AST constructor recursion depth mismatch").
+_PARSING = Lock()
+
+
+def open_array(path: Path, *, mode: Literal["r", "c"] = "r", name: str = "") -> npt.NDArray[Any]:
+    """The array of a ``.npy`` file, memory-mapped.
+
+    Args:
+        path: the file.
+        mode: ``r``, or ``c`` for an array that may be written to without changing the file.
+        name: what messages call the file, e.g. the option that names it; its path if empty.
+
+    Raises:
+        FaceDiffError: if the file is missing, damaged, an archive, or holds Python objects.
+    """
+    name = name or str(path)
+    if not path.is_file():
+        raise FaceDiffError(f"{name}: no such file; expected a NumPy array (.npy)")
+    try:
+        with _PARSING, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
+            array = np.load(path, mmap_mode=mode, allow_pickle=False)
+    except Exception as error:  # a damaged header makes NumPy raise anything
+        if "mmap length" in str(error):
+            size = path.stat().st_size
+            raise FaceDiffError(
+                f"{name}: is cut short: its {size} bytes are fewer than its header says; copy it again"
+            ) from error
+        raise FaceDiffError(f"{name}: not a readable NumPy array ({error}); expected a .npy file of numbers") from error
+    if not isinstance(array, np.ndarray):
+        array.close()
+        raise FaceDiffError(f"{name}: is an archive of several arrays; name it .npz")
+    return array
+
+
+def open_vertices(
+    path: Path, n_vertices: int | None = None, *, mode: Literal["r", "c"] = "r", name: str = ""
+) -> npt.NDArray[np.floating]:
+    """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3), memory-mapped.
+
+    Args:
+        path: the file.
+        n_vertices: vertices of the mesh; any number if None.
+        mode: as :func:`open_array` takes it.
+        name: as :func:`open_array` takes it.
+
+    Raises:
+        FaceDiffError: if the file is unreadable, of another shape, empty, or not of floating-point numbers.
+    """
+    array, name = open_array(path, mode=mode, name=name), name or str(path)
+    found = vertices_of(array.shape)
+    if found is None or not len(array) or n_vertices not in (None, found):
+        wanted = "(frames, 3 * vertices)" if n_vertices is None else f"(frames, {3 * n_vertices})"
+        raise FaceDiffError(
+            f"{name}: has shape {array.shape}, expected {wanted} or (frames, vertices, 3) with at least one frame"
+        )
+    if not np.issubdtype(array.dtype, np.floating):
+        raise FaceDiffError(f"{name}: holds {array.dtype}, expected floating-point vertices")
+    return array.reshape(len(array), found, 3)
+
+
+def vertices_of(shape: tuple[int, ...]) -> int | None:
+    """Vertices of an array of motion, by its shape (T, 3V) or (T, V, 3); None for any other shape."""
+    if len(shape) == 3 and shape[2] == 3:
+        return shape[1] or None
+    return shape[1] // 3 or None if len(shape) == 2 and shape[1] % 3 == 0 else None
+
+
+def read_arrays(
+    path: Path, keys: Container[str] | None = None, *, name: str = "", remedy: str = "write it again"
+) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of a ``.npz`` file, by name.
+
+    Args:
+        path: the file.
+        keys: the arrays to read; all if None.
+        name: what messages call the file; its path if empty.
+        remedy: what messages advise.
+
+    Raises:
+        FaceDiffError: if it is no such file, damaged, or holds anything but arrays of plain types.
+    """
+    try:
+        # Opened here, since NumPy leaves a file that it opened itself open where the archive is cut off.
+        with path.open("rb") as stream:
+            if not zipfile.is_zipfile(stream):
+                raise ValueError("it is no archive, or was cut off")
+            stream.seek(0)
+            with _PARSING, np.load(stream, allow_pickle=False) as archive:
+                held = {entry: archive[entry] for entry in archive.files if keys is None or entry in keys}
+        strange = [entry for entry, value in held.items() if not isinstance(value, np.ndarray)]
+        if strange:
+            raise ValueError(f"{strange[0]} is no array")
+    except (
+        *(OSError, ValueError, EOFError, SyntaxError, LookupError, RuntimeError, MemoryError),
+        *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+    ) as error:
+        raise FaceDiffError(f"{name or path}: not a readable .npz file ({error}); {remedy}") from error
+    return held
+
+
+class ArrayStore:
+    """A folder of arrays by key, kept between runs. Anything in it may be removed at any time: it is made again.
+
+    Args:
+        folder: where the arrays lie; made when the first one is put in.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._writable = True
+
+    @staticmethod
+    def key(*parts: object) -> str:
+        """A key from anything that decides the array; equal parts give equal keys on every machine."""
+        return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()[:40]
+
+    def path(self, key: str) -> Path:
+        """Where an array lies, or would lie."""
+        return self.folder / key[:2] / f"{key}.npy"
+
+    def get(self, key: str) -> npt.NDArray[Any] | None:
+        """The array, memory-mapped; None if there is none, or if its file is damaged, which is reported as a warning."""
+        path = self.path(key)
+        if not path.is_file():
+            return None
+        try:
+            return open_array(path)
+        except FaceDiffError:
+            warnings.warn(f"{path}: a damaged or half-written cache file; it is made again", stacklevel=2)
+            return None
+
+    def put(self, key: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Keep an array and return it; a folder that cannot be written to is reported once and not tried again."""
+        if not self._writable:
+            return array
+        try:
+            with atomic(self.path(key)) as temporary:
+                np.save(temporary, array)
+        except FaceDiffError as error:
+            self._writable = False
+            warnings.warn(f"{error}; going on without the cache, slower", stacklevel=2)
+        return array
