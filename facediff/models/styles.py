@@ -107,10 +107,7 @@ def open_style(path: Path) -> StyleFile:
 
         animation = read_archive(path)
         return StyleFile(path, animation.vertices, animation.template, animation.frame_rate, animation.unit)
-    array = open_array(path, name=f"--style {path}")
-    if array.dtype.kind not in "fiu":
-        raise FaceDiffError(f"--style {path}: holds no array of numbers; expected a motion or a style vector")
-    return StyleFile(path, array)
+    return StyleFile(path, open_array(path, kinds="fiu", name=f"--style {path}"))
 
 
 def read_reference(

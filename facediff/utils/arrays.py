@@ -23,20 +23,22 @@ from facediff.utils.files import atomic
 _PARSING = Lock()
 
 
-def open_array(path: Path, *, mode: Literal["r", "c"] = "r", name: str = "") -> npt.NDArray[Any]:
+def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", name: str = "") -> npt.NDArray[Any]:
     """The array of a ``.npy`` file, memory-mapped.
 
     Args:
         path: the file.
+        kinds: NumPy's letters for the kinds of numbers that are accepted, of which there must be at least one: ``f``
+            for floating point, ``fiu`` for whole numbers as well; anything if empty.
         mode: ``r``, or ``c`` for an array that may be written to without changing the file.
         name: what messages call the file, e.g. the option that names it; its path if empty.
 
     Raises:
-        FaceDiffError: if the file is missing, damaged, an archive, or holds Python objects.
+        FaceDiffError: if the file is missing, damaged, an archive, or holds Python objects or numbers of another kind.
     """
     name = name or str(path)
     if not path.is_file():
-        raise FaceDiffError(f"{name}: no such file; expected a NumPy array (.npy)")
+        raise FaceDiffError(f"{name}: no such file, or no regular file; expected a NumPy array (.npy)")
     try:
         with _PARSING, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
@@ -51,6 +53,9 @@ def open_array(path: Path, *, mode: Literal["r", "c"] = "r", name: str = "") -> 
     if not isinstance(array, np.ndarray):
         array.close()
         raise FaceDiffError(f"{name}: is an archive of several arrays; name it .npz")
+    if kinds and (array.dtype.kind not in kinds or not array.size):
+        wanted = "floating-point numbers" if kinds == "f" else "numbers"
+        raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {wanted}")
     return array
 
 
@@ -68,15 +73,11 @@ def open_vertices(
     Raises:
         FaceDiffError: if the file is unreadable, of another shape, empty, or not of floating-point numbers.
     """
-    array, name = open_array(path, mode=mode, name=name), name or str(path)
+    array, name = open_array(path, kinds="f", mode=mode, name=name), name or str(path)
     found = vertices_of(array.shape)
-    if found is None or not len(array) or n_vertices not in (None, found):
+    if found is None or n_vertices not in (None, found):
         wanted = "(frames, 3 * vertices)" if n_vertices is None else f"(frames, {3 * n_vertices})"
-        raise FaceDiffError(
-            f"{name}: has shape {array.shape}, expected {wanted} or (frames, vertices, 3) with at least one frame"
-        )
-    if not np.issubdtype(array.dtype, np.floating):
-        raise FaceDiffError(f"{name}: holds {array.dtype}, expected floating-point vertices")
+        raise FaceDiffError(f"{name}: has shape {array.shape}, expected {wanted} or (frames, vertices, 3)")
     return array.reshape(len(array), found, 3)
 
 

@@ -140,7 +140,7 @@ def read_motion(
     """
     parameters = path.suffix.lower() in (".hdf5", ".h5")
     if path.suffix.lower() == ".npy" and path.is_file():
-        array = open_array(path)
+        array = open_array(path, kinds="f")
         vertices = _as_vertices(array, n_vertices)
         if vertices is not None and flame is None:
             return Motion(vertices)
@@ -399,7 +399,7 @@ def read_template(path: Path, corpus: Auxiliary) -> Template:
     suffix, faces, count = path.suffix.lower(), None, corpus.n_vertices
     vertices: Array
     if suffix == ".npy":
-        array = open_array(path)
+        array = open_array(path, kinds="f")
         if array.size != 3 * count:
             raise FaceDiffError(f"{path}: has shape {array.shape}; expected ({count}, 3) like the corpus")
         vertices = np.array(array, np.float64).reshape(count, 3)

@@ -190,8 +190,8 @@ def read_parameters(path: Path) -> Parameters:
 
 
 def _read_array(path: Path) -> dict[str, Array]:
-    array = open_array(path)
-    if array.dtype.kind != "f" or array.shape[-1:] != (ALL,):
+    array = open_array(path, kinds="f")
+    if array.shape[-1:] != (ALL,):
         raise FaceDiffError(
             f"{path}: holds {array.dtype} {array.shape}; expected floats of shape (1, frames, {ALL}), FLAME parameters"
         )

@@ -373,7 +373,7 @@ def break_folder(folder: Path, flaw: str) -> None:
         ("two videos", r"differ in more than one number"),
         ("gap", r"20 frames are missing between frame_39\.obj and frame_60\.obj"),
         ("empty", r"motion: holds no mesh files"),
-        ("face beyond", r"frame_1\.obj: a face names a vertex that is not there"),
+        ("face beyond", r"frame_1\.obj: .*a face names a vertex"),
     ],
 )
 def test_a_flawed_folder_gets_one_sentence(
@@ -404,7 +404,7 @@ def test_a_flawed_folder_gets_one_sentence(
         (["--corpus", "{tmp}/bare"], r"bare/templates\.pkl: no such file"),
         (["--audio", "{tmp}/none.wav"], r"none\.wav: no such sound file"),
         (["--audio", "{tmp}/silent.wav"], r"silent\.wav: holds only silence"),
-        (["--template", "{tmp}/none.npy"], r"none\.npy: not a readable NumPy array"),
+        (["--template", "{tmp}/none.npy"], r"none\.npy: no such file"),
         (["--template", "{tmp}/small.npy"], r"small\.npy: has shape \(4, 3\)"),
         (["--template", "{tmp}/metres.npy"], r"metres\.npy: is 0\.001 times as large as the faces of the motion"),
         (["--template", "{tmp}/other.npy"], r"other\.npy: (is|does not lie)"),

@@ -240,7 +240,7 @@ def test_a_pickle_that_would_run_code_does_not(raw: Path, monkeypatch: pytest.Mo
 def test_a_file_that_is_missing_or_truncated_is_named(raw: Path, file: str) -> None:
     whole = (raw / file).read_bytes()
     (raw / file).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(FaceDiffError, match=f"{file}: not a "):
+    with pytest.raises(FaceDiffError, match=f"{file}: (not a |is cut short)"):
         prepared(raw)
     (raw / file).unlink()
     with pytest.raises(FaceDiffError, match=rf"{file}: no such file; expected data_verts\.npy"):
