@@ -61,7 +61,12 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
     ("motion cut short", lambda r: cut_bytes(motion(r), 100), {"motion_unreadable"}, "cut short"),
     ("motion of text", lambda r: motion(r).write_text("no motion\n" * 20), {"motion_unreadable"}, "not a readable"),
     ("motion of no bytes", lambda r: motion(r).write_bytes(b""), {"motion_unreadable"}, "not a readable"),
-    ("motion header only", lambda r: motion(r).write_bytes(motion(r).read_bytes()[:60]), {"motion_unreadable"}, "not a readable"),
+    (
+        "motion header only",
+        lambda r: motion(r).write_bytes(motion(r).read_bytes()[:60]),
+        {"motion_unreadable"},
+        "not a readable",
+    ),
     ("motion is a folder", lambda r: swap_for_folder(motion(r)), {"motion_unreadable"}, "no regular file"),
     ("motion is a pipe", lambda r: swap_for_pipe(motion(r)), {"motion_unreadable"}, "no regular file"),
     ("motion links nowhere", lambda r: swap_for_broken_link(motion(r)), {"motion_unreadable"}, "no regular file"),
