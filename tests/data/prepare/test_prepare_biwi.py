@@ -14,8 +14,7 @@ import pytest
 import soundfile
 
 from facediff.data.prepare import biwi
-from facediff.data.prepare.biwi import check_sizes, gaps, read_vl
-from facediff.data.prepare.biwi import codetalker
+from facediff.data.prepare.biwi import check_sizes, codetalker, gaps, read_vl
 from facediff.data.prepare.runner import Report, prepare
 from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
