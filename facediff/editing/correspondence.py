@@ -18,7 +18,7 @@ from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, align, face_size, robust_align
 from facediff.mesh.alignment import TUKEY
 from facediff.mesh.flame import rotations
-from facediff.mesh.hierarchy import closest_on_triangles
+from facediff.mesh.mesh import closest_on_triangles
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -1,4 +1,4 @@
-"""A mesh, the same mesh with fewer and fewer vertices, and the maps between them: made once per topology and kept."""
+"""A mesh, the same mesh with fewer and fewer vertices, and the maps between them: made once per topology and cached."""
 
 from __future__ import annotations
 
@@ -15,118 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.mesh.mesh import Array, closest_on_triangles
 from facediff.mesh.spirals import Indices, Points, checked_faces, spirals
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, cache_dir
 
-# Points of a surface as weighted means of the corners of a coarser surface's faces.
-
-Array = npt.NDArray[np.float64]
-
-
-def project(points: Array, coarse: Array, faces: Indices, clusters: Indices) -> tuple[Indices, Array]:
-    """The nearest point on a coarse mesh, by the corners of its face.
-
-    Looked for among the faces at the coarse vertex that a point belongs to and at that one's neighbours. Where there
-    are no such faces, the coarse vertex itself is taken.
-
-    Args:
-        points: (V, 3).
-        coarse: (M, 3) vertices of the coarse mesh.
-        faces: (G, 3) its faces.
-        clusters: (V,) the coarse vertex that each point belongs to.
-
-    Returns:
-        corners (V, 3) and their weights (V, 3), none negative, which sum to one; equal points choose the first face.
-    """
-    corners = np.repeat(clusters[:, None], 3, axis=1)
-    weights = np.tile([1.0, 0.0, 0.0], (len(points), 1))
-    if not len(faces):
-        return corners, weights
-    starts, around = _faces_around(faces, len(coarse))
-    count = np.diff(starts)[clusters]
-    point = np.repeat(np.arange(len(points)), count)
-    first = np.repeat(np.cumsum(count) - count, count)
-    face = around[np.repeat(starts[clusters], count) + np.arange(len(point)) - first]
-    share, square = closest_on_triangles(points[point], coarse[faces[face]])
-    order = np.lexsort((face, square, point))
-    found, best = np.unique(point[order], return_index=True)
-    best = order[best]
-    corners[found], weights[found] = faces[face[best]], share[best]
-    return corners, weights
-
-
-def _faces_around(faces: Indices, n_vertices: int) -> tuple[Indices, Indices]:
-    """Faces that touch each vertex or one of its neighbours: where each vertex's list starts, and the lists."""
-    ring = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    ring = np.unique(np.concatenate([ring, ring[:, ::-1], np.repeat(np.arange(n_vertices)[:, None], 2, 1)]), axis=0)
-    corner, face = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
-    order = np.argsort(corner, kind="stable")
-    starts = np.searchsorted(corner[order], np.arange(n_vertices + 1))
-    count = np.diff(starts)[ring[:, 1]]
-    vertex = np.repeat(ring[:, 0], count)
-    offset = np.arange(len(vertex)) - np.repeat(np.cumsum(count) - count, count)
-    touching = face[order][np.repeat(starts[ring[:, 1]], count) + offset]
-    pairs = np.unique(vertex * len(faces) + touching)
-    return np.searchsorted(pairs // len(faces), np.arange(n_vertices + 1)), pairs % len(faces)
-
-
-def closest_on_triangles(points: Array, triangles: Array) -> tuple[Array, Array]:
-    """The point of each triangle (N, 3, 3) nearest to each point (N, 3): weights (N, 3) and squared distances (N,).
-
-    The nearest point lies inside or on an edge: of the foot of the perpendicular, where it is inside, and the nearest
-    points of the three edges, the nearest counts.
-    """
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    best, square = _on_edges(points, triangles)
-    ab, ac, ap = b - a, c - a, points - a
-    d00, d01, d11 = (_dot(x, y) for x, y in ((ab, ab), (ab, ac), (ac, ac)))
-    d20, d21 = _dot(ap, ab), _dot(ap, ac)
-    area = d00 * d11 - d01 * d01
-    flat = area <= 1e-12 * d00 * d11  # no normal to speak of: an edge does
-    area = np.where(flat, 1.0, area)
-    v, w = (d11 * d20 - d01 * d21) / area, (d00 * d21 - d01 * d20) / area
-    inside = ~flat & (v >= 0) & (w >= 0) & (v + w <= 1)
-    foot = np.stack([1 - v - w, v, w], axis=1)
-    away = np.square(ap - v[:, None] * ab - w[:, None] * ac).sum(axis=1)
-    better = inside & (away < square)
-    return np.where(better[:, None], foot, best), np.where(better, away, square)
-
-
-def _on_edges(points: Array, triangles: Array) -> tuple[Array, Array]:
-    best, square = np.zeros((len(points), 3)), np.full(len(points), np.inf)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        start, along = triangles[:, i], triangles[:, j] - triangles[:, i]
-        length = np.maximum(_dot(along, along), np.finfo(float).tiny)
-        part = np.clip(_dot(points - start, along) / length, 0.0, 1.0)
-        away = np.square(points - start - part[:, None] * along).sum(axis=1)
-        better = away < square
-        square[better] = away[better]
-        best[better] = 0.0
-        best[better, i], best[better, j] = 1.0 - part[better], part[better]
-    return best, square
-
-
-def _dot(x: Array, y: Array) -> Array:
-    product: Array = np.einsum("ij,ij->i", x, y)
-    return product
-
-
-# Fewer vertices on the same surface: quadric edge collapse, and the sparse maps down to the few and up again.
-
 Pooling = Literal["select", "mean"]
 
-EDGE = 25.0
-"""Mean edge length that a mesh is scaled to before it is simplified.
-
-The simplifier compares errors with thresholds in absolute units that grow from pass to pass. At this scale the last
-edges of a reduction by four fall some fifteen to thirty passes in, where a threshold is little above the one before
-it; in metres all edges would be below the first threshold, and would be collapsed in the order of the file.
-"""
-AGGRESSION = 7.0
-"""Power of the passes' thresholds; the simplifier's own default."""
-BLOCK = 64
-"""Points at a time in comparisons of all with all."""
+VERSION = 1
+"""Part of every key in the cache; to be raised whenever equal input gives another result."""
 
 
 @dataclass(frozen=True)
@@ -151,199 +48,6 @@ class Operator:
         scaled = values[self.columns] * self.weights.reshape(-1, *[1] * (values.ndim - 1)).astype(np.float64)
         mapped: Array = np.add.reduceat(scaled, np.searchsorted(self.rows, np.arange(self.shape[0])), axis=0)
         return mapped
-
-
-@dataclass(frozen=True)
-class Coarse:
-    """A mesh with fewer vertices, and what links it to the one that it was made from.
-
-    Attributes:
-        template: (M, 3) positions: those of the chosen vertices, or the clusters' means.
-        faces: (G, 3) vertex indices; no face names a vertex twice and no two faces have the same vertices.
-        clusters: (V,) which coarse vertex each vertex became part of.
-        down: from the V vertices to the M coarse ones.
-        up: from the M coarse vertices to the V ones.
-    """
-
-    template: Array
-    faces: Indices
-    clusters: Indices
-    down: Operator
-    up: Operator
-
-
-def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, pooling: Pooling = "select") -> Coarse:
-    """Reduce a mesh to exactly ``n_vertices`` vertices.
-
-    Edges are collapsed by Garland and Heckbert's quadric error ("Surface simplification using quadric error metrics",
-    SIGGRAPH 1997), as Ranjan et al. do for faces ("Generating 3D faces using convolutional mesh autoencoders", ECCV
-    2018). The compiled simplifier moves vertices; of its work only the collapses are used. They group the vertices
-    into clusters, of which each gives one coarse vertex: the vertex nearest to the cluster's mean (``select``: a row
-    of ``down`` has one entry, 1) or the mean (``mean``). A vertex without faces joins the vertex with faces nearest to
-    it. Where the simplifier stops too early (it takes no edge that would fold the surface), the shortest edges follow.
-
-    ``up`` writes each vertex as a point of the coarse face nearest to it, among those around its cluster.
-
-    Args:
-        template: (V, 3) positions in any unit.
-        faces: (F, 3) vertex indices.
-        n_vertices: vertices to keep, 1 to V.
-        pooling: what a coarse vertex takes from its cluster.
-
-    Raises:
-        FaceDiffError: if the template is not (V, 3) or not finite, if faces do not fit it, or if ``n_vertices`` is not
-            between 1 and V.
-        MissingExtraError: if the simplifier is not installed.
-    """
-    points = checked_template(template)
-    faces = checked_faces(faces, len(points))
-    if not 1 <= n_vertices <= len(points):
-        raise FaceDiffError(f"coarsen: {n_vertices} vertices asked for; expected 1 to {len(points)}")
-    labels = _clusters(points, faces, n_vertices)
-    chosen = _nearest_to_mean(points, labels)
-    # Coarse vertices are numbered as the chosen ones are.
-    order = np.argsort(chosen)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(n_vertices)
-    clusters, chosen = rank[labels], chosen[order]
-    down = _selection(chosen, len(points)) if pooling == "select" else _means(clusters, n_vertices)
-    coarse = down.apply(points)
-    coarse_faces = _coarse_faces(clusters[faces])
-    corners, weights = project(points, coarse, coarse_faces, clusters)
-    return Coarse(coarse, coarse_faces, clusters, down, _from_corners(corners, weights, n_vertices))
-
-
-def checked_template(template: Points) -> Array:
-    """Positions as float64.
-
-    Raises:
-        FaceDiffError: if they are not (V, 3) with at least one vertex, or not finite.
-    """
-    points = np.asarray(template, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise FaceDiffError(f"template: shape {points.shape}; expected (V, 3) with at least one vertex")
-    if not np.isfinite(points).all():
-        raise FaceDiffError("template: holds values that are not finite; expected a position for every vertex")
-    return points
-
-
-def _clusters(points: Array, faces: Indices, n_vertices: int) -> Indices:
-    """(V,) numbers 0 … n_vertices - 1 of the cluster of every vertex."""
-    roots = np.arange(len(points))
-    spare = len(points) - n_vertices
-    used = np.unique(faces)
-    if len(used) and spare:
-        loose = np.setdiff1d(roots, used)
-        near, distance = _nearest(points[loose], points[used])
-        loose, near = (part[np.argsort(distance, kind="stable")][:spare] for part in (loose, near))
-        pairs = _collapses(points[used], np.searchsorted(used, faces), max(len(used) - spare + len(loose), 1))
-        kept, gone = used[pairs[: spare - len(loose)].T]
-        # The last collapse first: by then it is known where the vertex that stays ends up.
-        for stays, goes in zip(kept[::-1].tolist(), gone[::-1].tolist(), strict=True):
-            roots[goes] = roots[stays]
-        roots[loose] = roots[used[near]]
-    labels = np.unique(roots, return_inverse=True)[1]
-    while labels.max() >= n_vertices:
-        labels = _merged(points, faces, labels, n_vertices)
-    return labels
-
-
-def _collapses(points: Array, faces: Indices, n_vertices: int) -> Indices:
-    """Collapses (N, 2) in their order: the vertex that stays and the one that goes; enough of them, if all goes well.
-
-    Raises:
-        MissingExtraError: if the simplifier is not installed.
-    """
-    try:
-        import fast_simplification
-    except ImportError as error:
-        raise MissingExtraError("fast-simplification", "mesh", "down-sampling a mesh") from error
-    corners = points[faces]
-    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).mean()
-    scaled = (points - points.mean(axis=0)) * (EDGE / edge if edge > 0 else 1.0)
-    # Two faces go with a vertex inside, one with a vertex at a border, so this is at least as far as needed.
-    target = max(len(faces) - 2 * (len(points) - n_vertices) - 2, 0)
-    pairs = fast_simplification.simplify(
-        scaled, faces.astype(np.int32), target_count=target, agg=AGGRESSION, return_collapses=True
-    )[2]
-    return np.asarray(pairs, np.int64).reshape(-1, 2)
-
-
-def _nearest(points: Array, targets: Array) -> tuple[Indices, Array]:
-    """Index of and distance to the target (M, 3) nearest to each point (N, 3); of equal ones the first."""
-    index, square = np.zeros(len(points), np.int64), np.zeros(len(points))
-    for start in range(0, len(points), BLOCK):
-        part = slice(start, start + BLOCK)
-        away = np.square(points[part, None, :] - targets[None]).sum(axis=-1)
-        index[part] = away.argmin(axis=1)
-        square[part] = away.min(axis=1)
-    return index, np.sqrt(square)
-
-
-def _merged(points: Array, faces: Indices, labels: Indices, n_vertices: int) -> Indices:
-    """Clusters joined in pairs, the nearest first, along edges where there are any; each is joined once at most."""
-    count = int(labels.max()) + 1
-    centres = _means(labels, count).apply(points)
-    joined = labels[faces]
-    pairs = np.concatenate([joined[:, :2], joined[:, 1:], joined[:, ::2]])
-    pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
-    if not len(pairs):
-        pairs = _neighbours(centres)
-    lengths = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
-    roots, taken, left = np.arange(count), np.zeros(count, bool), count - n_vertices
-    for first, second in pairs[np.argsort(lengths, kind="stable")].tolist():
-        if left and not (taken[first] or taken[second]):
-            roots[second], left = first, left - 1
-            taken[[first, second]] = True
-    return np.unique(roots[labels], return_inverse=True)[1]
-
-
-def _neighbours(centres: Array) -> Indices:
-    """Pairs (N, 2) of each point and the one nearest to it."""
-    pairs = []
-    for start in range(0, len(centres), BLOCK):
-        rows = np.arange(start, min(start + BLOCK, len(centres)))
-        away = np.square(centres[rows, None, :] - centres[None]).sum(axis=-1)
-        away[np.arange(len(rows)), rows] = np.inf
-        pairs.append(np.stack([rows, away.argmin(axis=1)], axis=1))
-    return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
-
-
-def _nearest_to_mean(points: Array, labels: Indices) -> Indices:
-    """The vertex of each cluster that is nearest to the cluster's mean; of equal ones the first."""
-    centres = _means(labels, int(labels.max()) + 1).apply(points)
-    square = np.square(points - centres[labels]).sum(axis=1)
-    order = np.lexsort((np.arange(len(points)), square, labels))
-    chosen: Indices = order[np.searchsorted(labels[order], np.arange(len(centres)))]
-    return chosen
-
-
-def _selection(chosen: Indices, n_vertices: int) -> Operator:
-    rows = np.arange(len(chosen))
-    return Operator(rows, chosen, np.ones(len(chosen), np.float32), (len(chosen), n_vertices))
-
-
-def _means(clusters: Indices, count: int) -> Operator:
-    order = np.argsort(clusters, kind="stable")
-    weights = (1.0 / np.bincount(clusters, minlength=count))[clusters[order]]
-    return Operator(clusters[order], order, weights.astype(np.float32), (count, len(clusters)))
-
-
-def _from_corners(corners: Indices, weights: Array, count: int) -> Operator:
-    """Rows of three corners (V, 3) and their weights, without the entries that are zero."""
-    rows, places = np.nonzero(weights > 0)
-    return Operator(rows, corners[rows, places], weights[rows, places].astype(np.float32), (len(corners), count))
-
-
-def _coarse_faces(faces: Indices) -> Indices:
-    """Faces without those that lost a corner, and of those with the same corners the first."""
-    faces = checked_faces(faces, int(faces.max(initial=-1)) + 1)
-    first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]
-    return faces[np.sort(first)]
-
-
-VERSION = 1
-"""Part of every key in the cache; to be raised whenever equal input gives another result."""
 
 
 @dataclass(frozen=True)
@@ -413,10 +117,33 @@ class MeshHierarchy:
                 raise ValueError("levels")
         except (KeyError, ValueError, IndexError, TypeError) as error:
             raise FaceDiffError(
-                f"mesh hierarchy: its arrays are not complete or do not fit one another ({error}); make it anew from "
-                f"the template"
+                f"mesh hierarchy: its arrays are not complete or do not fit one another ({error}); compute it again "
+                f"from the template"
             ) from error
         return cls(n_vertices, vertices, levels)
+
+
+def _level(arrays: Mapping[str, npt.NDArray[Any]], number: int, sizes: list[int]) -> MeshLevel:
+    """Raises KeyError or ValueError if an array is missing or an index is out of its range."""
+
+    def within(name: str, size: int, dimensions: int) -> Indices:
+        index = arrays[f"{number}.{name}"]
+        if index.ndim != dimensions or (index.size and not (index.min() >= 0 and index.max() < size)):
+            raise ValueError("an index out of range")
+        return index.astype(np.int64)
+
+    def operator(name: str, rows: int, columns: int) -> Operator:
+        row, column = within(f"{name}.rows", rows, 1), within(f"{name}.columns", columns, 1)
+        weights = arrays[f"{number}.{name}.weights"].astype(np.float32)
+        if not row.shape == column.shape == weights.shape:
+            raise ValueError(name)
+        return Operator(row, column, weights, (rows, columns))
+
+    size, coarse = sizes[number], (*sizes, 0)[number + 1]
+    table, faces = within("spirals", size, 2), within("faces", size, 2)
+    if not coarse:
+        return MeshLevel(size, faces, table, None, None)
+    return MeshLevel(size, faces, table, operator("down", coarse, size), operator("up", size, coarse))
 
 
 def mesh_hierarchy(
@@ -432,8 +159,8 @@ def mesh_hierarchy(
 ) -> MeshHierarchy:
     """A mesh and ``levels`` coarser ones, each with a ``factor``-th of the vertices (rounded up) of the one before.
 
-    Numbers of vertices depend on V, ``factor`` and ``levels`` alone. The result is kept in a file under the hash of
-    everything it depends on; a damaged file is written anew, and without a folder to write to nothing is kept.
+    Numbers of vertices depend on V, ``factor`` and ``levels`` alone. The result is cached in a file under the hash of
+    everything it depends on; a damaged file is written again, and without a writable folder nothing is cached.
 
     Args:
         template: (V, 3) positions in any unit; used in float32, as the hash is.
@@ -444,7 +171,7 @@ def mesh_hierarchy(
         dilation: distance along the spiral between two of them.
         pooling: whether a coarse vertex is one vertex of its cluster or the cluster's mean.
         vertices: the vertices to use (e.g. a face without its eyeballs), an index set; all if None. Faces with a
-            corner elsewhere are left out.
+            corner elsewhere are dropped.
         cache: folder of the files; ``topology`` in facediff's cache if None.
 
     Raises:
@@ -461,9 +188,9 @@ def mesh_hierarchy(
     chosen = None if vertices is None else _checked_vertices(vertices, len(template))
     key = _key(template, faces, chosen, [levels, factor, spiral_length, dilation, pooling])
     path = (cache or cache_dir() / "topology") / f"{key}.npz"
-    kept = _read(path)
-    if kept is not None:
-        return kept
+    cached = _read(path)
+    if cached is not None:
+        return cached
     points, inner = (template, faces) if chosen is None else submesh(template, faces, chosen)
     made = []
     for _ in range(levels):
@@ -474,17 +201,31 @@ def mesh_hierarchy(
     table = spirals(inner, len(points), spiral_length, dilation, points)
     made.append(MeshLevel(len(points), inner, table, None, None))
     hierarchy = MeshHierarchy(len(template), chosen, tuple(made))
-    with suppress(FaceDiffError), atomic(path) as temporary:  # what cannot be kept is made again next time
+    with suppress(FaceDiffError), atomic(path) as temporary:  # a hierarchy that cannot be cached is computed again
         np.savez(temporary, allow_pickle=False, **hierarchy.arrays())
     return hierarchy
 
 
-def submesh(template: Points, faces: Indices, vertices: Indices) -> tuple[npt.NDArray[np.float64], Indices]:
+def submesh(template: Points, faces: Indices, vertices: Indices) -> tuple[Array, Indices]:
     """Some vertices of a mesh (ascending indices), and the faces all of whose corners are among them."""
     place = np.full(len(template), -1)
     place[vertices] = np.arange(len(vertices))
     kept = place[faces]
     return np.asarray(template, np.float64)[vertices], kept[(kept >= 0).all(axis=1)]
+
+
+def checked_template(template: Points) -> Array:
+    """Positions as float64.
+
+    Raises:
+        FaceDiffError: if they are not (V, 3) with at least one vertex, or not finite.
+    """
+    points = np.asarray(template, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise FaceDiffError(f"template: shape {points.shape}; expected (V, 3) with at least one vertex")
+    if not np.isfinite(points).all():
+        raise FaceDiffError("template: holds values that are not finite; expected a position for every vertex")
+    return points
 
 
 def _checked_vertices(vertices: npt.NDArray[np.integer], n_vertices: int) -> Indices:
@@ -522,28 +263,199 @@ def _read(path: Path) -> MeshHierarchy | None:
         return None
 
 
-def _level(arrays: Mapping[str, npt.NDArray[Any]], number: int, sizes: list[int]) -> MeshLevel:
-    """Raises KeyError or ValueError if an array is missing or an index is out of its range."""
-    size = sizes[number]
-    table, faces = (_within(arrays[f"{number}.{name}"], size, 2) for name in ("spirals", "faces"))
-    if number + 1 == len(sizes):
-        return MeshLevel(size, faces, table, None, None)
-    coarse = sizes[number + 1]
-    down = _operator(arrays, f"{number}.down", (coarse, size))
-    return MeshLevel(size, faces, table, down, _operator(arrays, f"{number}.up", (size, coarse)))
+# One step down: fewer vertices on the same surface by quadric edge collapse, and the sparse maps down and up again.
+
+EDGE = 25.0
+"""Mean edge length that a mesh is scaled to before it is simplified.
+
+The simplifier compares errors with thresholds in absolute units that grow from pass to pass. At this scale the last
+edges of a reduction by four fall some fifteen to thirty passes in, where a threshold is little above the one before
+it; in metres all edges would be below the first threshold, and would be collapsed in the order of the file.
+"""
+AGGRESSION = 7.0
+"""Power of the passes' thresholds; the simplifier's own default."""
 
 
-def _operator(arrays: Mapping[str, npt.NDArray[Any]], name: str, shape: tuple[int, int]) -> Operator:
-    rows, columns = (
-        _within(arrays[f"{name}.{part}"], n, 1) for part, n in zip(("rows", "columns"), shape, strict=True)
-    )
-    weights = arrays[f"{name}.weights"].astype(np.float32)
-    if not rows.shape == columns.shape == weights.shape:
-        raise ValueError(name)
-    return Operator(rows, columns, weights, shape)
+@dataclass(frozen=True)
+class Coarse:
+    """A mesh with fewer vertices, and its relation to the one that it was made from.
+
+    Attributes:
+        template: (M, 3) positions: those of the chosen vertices, or the clusters' means.
+        faces: (G, 3) vertex indices; no face names a vertex twice and no two faces have the same vertices.
+        clusters: (V,) which coarse vertex each vertex became part of.
+        down: from the V vertices to the M coarse ones.
+        up: from the M coarse vertices to the V ones.
+    """
+
+    template: Array
+    faces: Indices
+    clusters: Indices
+    down: Operator
+    up: Operator
 
 
-def _within(index: npt.NDArray[Any], size: int, dimensions: int) -> Indices:
-    if index.ndim != dimensions or (index.size and not (index.min() >= 0 and index.max() < size)):
-        raise ValueError("an index out of range")
-    return index.astype(np.int64)
+def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, pooling: Pooling = "select") -> Coarse:
+    """Reduce a mesh to exactly ``n_vertices`` vertices.
+
+    Edges are collapsed by Garland and Heckbert's quadric error ("Surface simplification using quadric error metrics",
+    SIGGRAPH 1997), as Ranjan et al. do for faces ("Generating 3D faces using convolutional mesh autoencoders", ECCV
+    2018). The compiled simplifier moves vertices; of its work only the collapses are used. They group the vertices
+    into clusters, of which each gives one coarse vertex: the vertex nearest to the cluster's mean (``select``: a row
+    of ``down`` has one entry, 1) or the mean (``mean``). A vertex without faces joins the vertex with faces nearest to
+    it. Where the simplifier stops too early (it takes no edge that would fold the surface), the shortest edges follow.
+
+    ``up`` writes each vertex as a point of the coarse face nearest to it, among those around its cluster.
+
+    Args:
+        template: (V, 3) positions in any unit.
+        faces: (F, 3) vertex indices.
+        n_vertices: vertices to keep, 1 to V.
+        pooling: what a coarse vertex takes from its cluster.
+
+    Raises:
+        FaceDiffError: if the template is not (V, 3) or not finite, if faces do not fit it, or if ``n_vertices`` is not
+            between 1 and V.
+        MissingExtraError: if the simplifier is not installed.
+    """
+    points = checked_template(template)
+    faces = checked_faces(faces, len(points))
+    if not 1 <= n_vertices <= len(points):
+        raise FaceDiffError(f"coarsen: {n_vertices} vertices asked for; expected 1 to {len(points)}")
+    labels = _clusters(points, faces, n_vertices)
+    # The vertex of each cluster that is nearest to the cluster's mean; of equal ones the first.
+    square = np.square(points - _means(labels, n_vertices).apply(points)[labels]).sum(axis=1)
+    order = np.lexsort((np.arange(len(points)), square, labels))
+    chosen = order[np.searchsorted(labels[order], np.arange(n_vertices))]
+    # Coarse vertices are numbered as the chosen ones are.
+    clusters, chosen = np.argsort(np.argsort(chosen))[labels], np.sort(chosen)
+    if pooling == "select":
+        down = Operator(np.arange(n_vertices), chosen, np.ones(n_vertices, np.float32), (n_vertices, len(points)))
+    else:
+        down = _means(clusters, n_vertices)
+    coarse = down.apply(points)
+    # Faces without those that lost a corner, and of those with the same corners the first.
+    coarse_faces = checked_faces(clusters[faces], n_vertices)
+    coarse_faces = coarse_faces[np.sort(np.unique(np.sort(coarse_faces, axis=1), axis=0, return_index=True)[1])]
+    corners, weights = project(points, coarse, coarse_faces, clusters)
+    rows, places = np.nonzero(weights > 0)
+    up = Operator(rows, corners[rows, places], weights[rows, places].astype(np.float32), (len(points), n_vertices))
+    return Coarse(coarse, coarse_faces, clusters, down, up)
+
+
+def _means(clusters: Indices, count: int) -> Operator:
+    order = np.argsort(clusters, kind="stable")
+    weights = (1.0 / np.bincount(clusters, minlength=count))[clusters[order]]
+    return Operator(clusters[order], order, weights.astype(np.float32), (count, len(clusters)))
+
+
+def _clusters(points: Array, faces: Indices, n_vertices: int) -> Indices:
+    """(V,) numbers 0 … n_vertices - 1 of the cluster of every vertex."""
+    roots = np.arange(len(points))
+    spare = len(points) - n_vertices
+    used = np.unique(faces)
+    if len(used) and spare:
+        loose = np.setdiff1d(roots, used)
+        near, distance = _nearest(points[loose], points[used])
+        loose, near = (part[np.argsort(distance, kind="stable")][:spare] for part in (loose, near))
+        pairs = _collapses(points[used], np.searchsorted(used, faces), max(len(used) - spare + len(loose), 1))
+        kept, gone = used[pairs[: spare - len(loose)].T]
+        # The last collapse first: by then it is known where the vertex that stays ends up.
+        for stays, goes in zip(kept[::-1].tolist(), gone[::-1].tolist(), strict=True):
+            roots[goes] = roots[stays]
+        roots[loose] = roots[used[near]]
+    labels = np.unique(roots, return_inverse=True)[1]
+    while labels.max() >= n_vertices:
+        labels = _merged(points, faces, labels, n_vertices)
+    return labels
+
+
+def _nearest(points: Array, targets: Array) -> tuple[Indices, Array]:
+    """Index of and distance to the target (M, 3) nearest to each point (N, 3); of equal ones the first."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(targets)
+    distance = tree.query(points)[0]
+    # A tree returns any of several equally near targets, as where texture seams double a vertex.
+    alike = tree.query_ball_point(points, distance * (1 + 1e-12))
+    return np.array([min(indices) for indices in alike], np.int64), distance
+
+
+def _collapses(points: Array, faces: Indices, n_vertices: int) -> Indices:
+    """Collapses (N, 2) in their order: the vertex that stays and the one that goes; usually enough of them.
+
+    Raises:
+        MissingExtraError: if the simplifier is not installed.
+    """
+    try:
+        import fast_simplification
+    except ImportError as error:
+        raise MissingExtraError("fast-simplification", "mesh", "down-sampling a mesh") from error
+    corners = points[faces]
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).mean()
+    scaled = (points - points.mean(axis=0)) * (EDGE / edge if edge > 0 else 1.0)
+    # Two faces go with a vertex inside, one with a vertex at a border, so this is at least as far as needed.
+    target = max(len(faces) - 2 * (len(points) - n_vertices) - 2, 0)
+    pairs = fast_simplification.simplify(
+        scaled, faces.astype(np.int32), target_count=target, agg=AGGRESSION, return_collapses=True
+    )[2]
+    return np.asarray(pairs, np.int64).reshape(-1, 2)
+
+
+def _merged(points: Array, faces: Indices, labels: Indices, n_vertices: int) -> Indices:
+    """Clusters joined in pairs, the nearest first, along edges where there are any; each is joined once at most."""
+    from scipy.spatial import cKDTree
+
+    count = int(labels.max()) + 1
+    centres = _means(labels, count).apply(points)
+    joined = labels[faces]
+    pairs = np.concatenate([joined[:, :2], joined[:, 1:], joined[:, ::2]])
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    if not len(pairs):  # no edges are left: each cluster and the one nearest to it
+        every, near = np.arange(count), cKDTree(centres).query(centres, k=2)[1]
+        # In one place with others, a cluster need not be the first that is nearest to itself.
+        pairs = np.stack([every, np.where(near[:, 0] == every, near[:, 1], near[:, 0])], axis=1)
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    lengths = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
+    roots, taken, left = np.arange(count), np.zeros(count, bool), count - n_vertices
+    for first, second in pairs[np.argsort(lengths, kind="stable")].tolist():
+        if left and not (taken[first] or taken[second]):
+            roots[second], left = first, left - 1
+            taken[[first, second]] = True
+    return np.unique(roots[labels], return_inverse=True)[1]
+
+
+def project(points: Array, coarse: Array, faces: Indices, clusters: Indices) -> tuple[Indices, Array]:
+    """The nearest point on a coarse mesh, by the corners of its face.
+
+    Searched for among the faces at the coarse vertex that a point belongs to and at that one's neighbours. Where there
+    are no such faces, the coarse vertex itself is taken.
+
+    Args:
+        points: (V, 3).
+        coarse: (M, 3) vertices of the coarse mesh.
+        faces: (G, 3) its faces.
+        clusters: (V,) the coarse vertex that each point belongs to.
+
+    Returns:
+        corners (V, 3) and their weights (V, 3), none negative, which sum to one; equal points choose the first face.
+    """
+    from scipy.sparse import csr_array
+
+    corners = np.repeat(clusters[:, None], 3, axis=1)
+    weights = np.tile([1.0, 0.0, 0.0], (len(points), 1))
+    if not len(faces):
+        return corners, weights
+    # Vertices and their faces as a sparse matrix: its product with its transpose has an entry for every pair of
+    # neighbours, and the product with the matrix again one for every face around a vertex or one of its neighbours.
+    index = np.arange(0, faces.size + 1, 3)
+    touching = csr_array((np.ones(faces.size), faces.ravel(), index), shape=(len(faces), len(coarse))).T
+    around = (touching @ touching.T @ touching).tocsr()
+    pairs = around[clusters].tocoo()
+    point, face = pairs.row, pairs.col
+    share, square = closest_on_triangles(points[point], coarse[faces[face]])
+    order = np.lexsort((face, square, point))
+    found, best = np.unique(point[order], return_index=True)
+    best = order[best]
+    corners[found], weights[found] = faces[face[best]], share[best]
+    return corners, weights

@@ -205,5 +205,5 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         {},
     ]
     for named in wrong:
-        with pytest.raises(FaceDiffError, match="make it anew"):
+        with pytest.raises(FaceDiffError, match="mesh hierarchy: its arrays"):
             MeshHierarchy.from_arrays(named)
