@@ -4,6 +4,7 @@ What a figure shows is computed by functions of its own (`motion_maps`, `error_m
 which need no matplotlib; drawing needs the extra ``figures``.
 """
 
+from facediff.data.phonemes import Phoneme, read_phonemes
 from facediff.evaluation.figures.curves import (
     Curve,
     Curves,
@@ -20,12 +21,10 @@ from facediff.evaluation.figures.curves import (
 )
 from facediff.evaluation.figures.frames import (
     Moment,
-    Phoneme,
     draw_frames,
     find_phoneme,
     frame_at,
     pick_frames,
-    read_phonemes,
 )
 from facediff.evaluation.figures.heatmaps import VertexMap, draw_error, draw_heatmap, error_maps, motion_maps
 from facediff.evaluation.figures.material import Material, find_clips

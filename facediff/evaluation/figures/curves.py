@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from facediff.data.phonemes import BILABIALS, Phoneme
 from facediff.errors import FaceDiffError, choices
-from facediff.evaluation.figures.frames import BILABIALS, Phoneme
 from facediff.evaluation.figures.material import TRUTH, Array, Material, chunks, shortest
 from facediff.evaluation.figures.page import (
     BLACK,

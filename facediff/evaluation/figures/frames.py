@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import math
 import re
 import unicodedata
 from collections.abc import Sequence
@@ -12,76 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from facediff.data.phonemes import LENGTH, STRESS, Phoneme
+from facediff.data.phonemes import phonemes_file as phonemes_file
 from facediff.errors import FaceDiffError, choices
 from facediff.evaluation.figures.material import Array, Material, Painter
 from facediff.evaluation.figures.page import Grid, Heading, Paper, check_output, save, style
-
-# When which phoneme is spoken in a clip.
-
-STRESS, LENGTH = "ˈˌ", "ː"
-BILABIALS = ("p", "b", "m")
-"""Phonemes for which the lips close."""
-
-
-@dataclass(frozen=True)
-class Phoneme:
-    """A phoneme in time.
-
-    Attributes:
-        start: where it begins, in seconds.
-        end: where it ends.
-        ipa: the phoneme, with stress and length marks; empty for a pause.
-        viseme: names of its visemes, joined by "+"; may be empty.
-        word: the word it belongs to; empty if that is not known.
-    """
-
-    start: float
-    end: float
-    ipa: str
-    viseme: str = ""
-    word: str = ""
-
-    @property
-    def middle(self) -> float:
-        """The middle of its time, in seconds."""
-        return (self.start + self.end) / 2
-
-    @property
-    def plain(self) -> str:
-        """The phoneme without stress marks."""
-        return self.ipa.strip(STRESS)
-
-
-def phonemes_file(corpus: Path | None, clip: str) -> Path | None:
-    """Where a corpus has a clip's phonemes; None if it has none."""
-    path = None if corpus is None else corpus / "phonemes" / f"{clip}.csv"
-    return path if path is not None and path.is_file() else None
-
-
-def read_phonemes(path: Path) -> list[Phoneme]:
-    """Phonemes of a table with the columns ``start``, ``end`` (seconds) and ``ipa``, and maybe ``viseme``, ``word``.
-
-    Raises:
-        FaceDiffError: if the file is not that.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = list(csv.DictReader(stream))
-        found = [
-            Phoneme(float(row["start"]), float(row["end"]), row["ipa"] or "", row.get("viseme") or "", _word(row))
-            for row in rows
-        ]
-    except (OSError, UnicodeDecodeError, csv.Error, KeyError, ValueError, TypeError) as error:
-        raise FaceDiffError(
-            f"{path}: not readable as phonemes ({error}); expected a table with the columns start, end (seconds), ipa"
-        ) from error
-    if not found or any(not (math.isfinite(p.end) and 0 <= p.start <= p.end) for p in found):
-        raise FaceDiffError(f"{path}: expected phonemes whose start is not below 0 and not after their end")
-    return found
-
-
-def _word(row: dict[str, str]) -> str:
-    return (row.get("word") or "").strip()
 
 
 def find_phoneme(wanted: str, phonemes: Sequence[Phoneme], clip: str) -> Phoneme:
