@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import torch
 from torch import Tensor
+from torchmetrics import Metric
 
+from facediff.data.audio import SAMPLE_RATE, read_speech
+from facediff.data.corpus import ALL, read_manifest
+from facediff.data.phonemes import closures, phonemes_file, read_phonemes
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import (
     DEFAULT_PATTERNS,
     OWN,
     TRUTH_PATTERN,
     NamePattern,
+    Pair,
     Pairing,
     index_truths,
     list_names,
     pair_up,
 )
 from facediff.evaluation.report import Bootstrap, MethodTable, Report
-from facediff.evaluation.scoring import Scorer, score_all
-from facediff.metrics import Protocol, Region, protocol
+from facediff.evaluation.scoring import METRICS, Scorer, score_all
+from facediff.metrics import Context, LipPairs, Protocol, Region, protocol
+from facediff.metrics.by_name import parse_all
 
 
 def evaluate(
@@ -33,6 +42,10 @@ def evaluate(
     templates: Mapping[str, Tensor] | None = None,
     n_vertices: int,
     protocols: Sequence[str | Protocol] = ("paper",),
+    metrics: Sequence[str] = (),
+    lip_pairs: LipPairs | None = None,
+    corpus: Path | None = None,
+    frame_rate: float | None = None,
     topology: str | None = None,
     patterns: Sequence[str] = DEFAULT_PATTERNS,
     truth_pattern: str = TRUTH_PATTERN,
@@ -54,14 +67,20 @@ def evaluate(
         truth: folder of truths.
         lips: lip vertices.
         upper_face: upper-face vertices; needed if a protocol has FDD.
-        templates: neutral face (V, 3) by subject; needed if a protocol has FDD.
+        templates: neutral face (V, 3) by identity; needed if a protocol has FDD.
         n_vertices: vertices V of the mesh.
         protocols: names of protocols, or protocols of one's own.
+        metrics: further metrics, each the name of a registered one, which may be followed by options:
+            ``temporal_misalignment:at=path,smoothing=1.5``. What they need in addition is found in ``corpus``.
+        lip_pairs: pairs of inner-lip vertices; those of the corpus if None.
+        corpus: corpus folder of the truth, whose ``wav``, ``phonemes``, ``regions/inner_lip_pairs.txt`` and
+            ``manifest.json`` are used where a metric needs them.
+        frame_rate: frames per second of the predictions; that of the corpus's ``manifest.json`` if None.
         topology: name of the mesh (``biwi``, ``vocaset`` …), to have unusual regions pointed out.
         patterns: how predictions may be named; see :class:`facediff.evaluation.files.NamePattern`.
         truth_pattern: how truths are named.
         identity: which predictions of a clip are scored where several were conditioned on different identities:
-            ``own`` takes the one conditioned on the clip's own subject (or whose name has no condition), ``all`` the
+            ``own`` takes the one conditioned on the clip's own speaker (or whose name has no condition), ``all`` the
             mean over conditions, as DiffSpeaker does; anything else is the identity's name.
         truth_stride: 2 takes every second frame of the truth, for VOCASET's truth at 60 frames a second.
         bootstrap: resamples of the sequences for confidence intervals; 0 for none.
@@ -78,6 +97,18 @@ def evaluate(
         raise FaceDiffError("expected at least one method, at least one protocol and a truth_stride of at least 1")
     settings = find_protocols(protocols, topology)
     sampling = Bootstrap(bootstrap, level, seed)
+    requests = parse_all(metrics)
+    names, unnamed_truths = list_names(Path(truth), [NamePattern(truth_pattern, templates or ())])
+    truths = index_truths(names)
+    if frame_rate is None and corpus is not None and "frame_rate" in (manifest := read_manifest(corpus)):
+        frame_rate = float(manifest["frame_rate"]) / truth_stride
+    material = Material(
+        corpus if requests else None,
+        frame_rate,
+        sorted({name.subject for name in names.values()}),
+    )
+    context = material.context(lips, upper_face, lip_pairs, templated=bool(templates), every_condition=identity == ALL)
+    chosen = {request.text: request.build(context) for request in requests}
     scorer = Scorer(
         settings,
         lips=lips,
@@ -85,9 +116,9 @@ def evaluate(
         templates=templates or {},
         n_vertices=n_vertices,
         truth_stride=truth_stride,
+        metrics=chosen,
+        inputs=partial(material.inputs, needed={need for request in requests for need in request.needs}),
     )
-    names, unnamed_truths = list_names(Path(truth), [NamePattern(truth_pattern, templates or ())])
-    truths = index_truths(names)
     readers = [NamePattern(pattern, templates or ()) for pattern in patterns]
     pairings: dict[str, Pairing] = {}
     for method, folder in methods.items():
@@ -103,9 +134,9 @@ def evaluate(
     return Report(
         truth=str(truth),
         lips=lips,
-        upper_face=upper_face if any(setting.fdd for setting in settings) else None,
+        upper_face=upper_face if needs_upper_face(settings, metrics) else None,
         n_vertices=n_vertices,
-        protocols={setting.name: setting.describe() for setting in settings},
+        protocols={setting.name: setting.describe() for setting in settings} | describe_metrics(chosen),
         identity=identity,
         truth_stride=truth_stride,
         resamples=bootstrap,
@@ -116,6 +147,103 @@ def evaluate(
         unnamed_truths=unnamed_truths,
         remarks=scorer.remarks,
     )
+
+
+def needs_upper_face(protocols: Sequence[Protocol], metrics: Sequence[str]) -> bool:
+    """Whether a protocol or a metric chosen by name reads the upper-face vertices."""
+    return any(setting.fdd for setting in protocols) or any(
+        "upper_face" in (*request.needs, request.options.get("region")) for request in parse_all(metrics)
+    )
+
+
+def describe_metrics(chosen: Mapping[str, Metric]) -> dict[str, str]:
+    """The definitions of metrics chosen by name, under the name that stands in place of a protocol's."""
+    words = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in chosen.items()]
+    return {METRICS: "\n".join(["further metrics", *words])} if words else {}
+
+
+@dataclass(frozen=True)
+class Material:
+    """What metrics may read of a corpus in addition to motion.
+
+    Args:
+        corpus: the corpus folder, if there is one.
+        frame_rate: frames per second of the predictions, if known.
+        identities: names of all speakers.
+    """
+
+    corpus: Path | None
+    frame_rate: float | None
+    identities: Sequence[str]
+
+    def context(
+        self,
+        lips: Region,
+        upper_face: Region | None,
+        lip_pairs: LipPairs | None,
+        *,
+        templated: bool,
+        every_condition: bool,
+    ) -> Context:
+        """What there is for metrics, and how to get what is missing.
+
+        Raises:
+            FaceDiffError: if the corpus's file of lip pairs is damaged.
+        """
+        pairs_file = None if self.corpus is None else self.corpus / "regions" / "inner_lip_pairs.txt"
+        if lip_pairs is None and pairs_file is not None and pairs_file.is_file():
+            try:
+                lip_pairs = LipPairs.from_file(pairs_file)
+            except ValueError as error:
+                raise FaceDiffError(str(error)) from error
+        has: dict[str, dict[str, Any]] = {"lips": {"lips": lips}, "identities": {"n_identities": len(self.identities)}}
+        rates = {"sample_rate": SAMPLE_RATE, "frames_per_second": self.frame_rate}
+        for need, there, arguments in (
+            ("upper_face", upper_face is not None, {"upper": upper_face}),
+            ("lip_pairs", lip_pairs is not None, {"pairs": lip_pairs}),
+            ("template", templated, {}),
+            ("closures", self._has("phonemes"), {}),
+            ("speech", self._has("wav"), rates),
+            ("conditions", every_condition, {}),
+        ):
+            if there:
+                has[need] = arguments
+        rate = "" if self.frame_rate else " and give --frame-rate"
+        in_test = "is known to `facediff test --model.metrics=[…]` only"
+        return Context(
+            has,
+            {
+                "upper_face": "give --upper-face FILE, or --regions FOLDER with fdd.txt",
+                "lip_pairs": "give --lip-pairs FILE",
+                "template": "give --templates FILE",
+                "closures": f"score against a corpus folder with phonemes/{rate}",
+                "speech": f"score against a corpus folder with wav/{rate}",
+                "conditions": "choose --identity all",
+                "samples": f"a folder holds one sample of each clip; the number of samples {in_test}",
+                "style": f"a model's style encoder {in_test}",
+                "time": f"the time that inference takes {in_test}",
+            },
+        )
+
+    def _has(self, folder: str) -> bool:
+        return self.corpus is not None and self.frame_rate is not None and (self.corpus / folder).is_dir()
+
+    def inputs(self, pair: Pair, needed: Set[str]) -> dict[str, Any]:
+        """What the needs mean for one clip, by the name under which metrics take it.
+
+        Raises:
+            FaceDiffError: if a file of the clip is missing or damaged.
+        """
+        found: dict[str, Any] = {}
+        if "identities" in needed:
+            found["identities"] = [self.identities.index(pair.truth.name.subject)]
+        clip = pair.truth.path.stem
+        if "speech" in needed and self.corpus is not None:
+            found["waveform"] = torch.from_numpy(read_speech(self.corpus / "wav" / f"{clip}.wav"))
+        if "closures" in needed and self.frame_rate is not None:
+            file = phonemes_file(self.corpus, clip)
+            found["closures"] = [] if file is None else closures(read_phonemes(file), self.frame_rate)
+        return found
 
 
 def find_protocols(wanted: Sequence[str | Protocol], topology: str | None = None) -> list[Protocol]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -11,8 +12,9 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import Pair, Pairing
-from facediff.evaluation.scoring import ClipScores, Column
+from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
+from facediff.utils.tables import format_table
 
 
 @dataclass(frozen=True)
@@ -34,11 +36,12 @@ class Score:
 
     Attributes:
         protocol: whose definition.
-        metric: ``mve``, ``lve``, ``fdd``, ``fdd_absolute`` or ``fdd_signed``.
-        value: the number, in the vertices' unit or that squared, as the definition says.
-        interval: None with a single sequence or without resamples.
+        metric: ``mve``, ``lve``, ``fdd``, ``fdd_absolute`` or ``fdd_signed``, or a metric that was chosen by name.
+        value: the number, in the unit that the definition names.
+        interval: None with a single sequence, without resamples, or if the metric is no mean of sequences.
         frames: frames behind it.
         sequences: sequences behind it.
+        region: name, count and hash of the vertices that it was taken over, or "all vertices".
     """
 
     protocol: str
@@ -47,6 +50,12 @@ class Score:
     interval: Interval | None
     frames: int
     sequences: int
+    region: dict[str, Any] | str
+
+    @property
+    def name(self) -> str:
+        """``<protocol>/<metric>``."""
+        return f"{self.protocol}/{self.metric}"
 
 
 @dataclass(frozen=True)
@@ -62,7 +71,8 @@ class SequenceScores:
         frames: frames scored, all conditions together.
         cut_prediction: frames cut from predictions.
         cut_truth: frames cut from the truth.
-        scores: ``<protocol>/<metric>`` to value; the mean over conditions where there are several.
+        scores: ``<protocol>/<metric>`` to value; the mean over conditions where there are several; None where the
+            metric has no value on the clip.
     """
 
     method: str
@@ -73,7 +83,7 @@ class SequenceScores:
     frames: int
     cut_prediction: int
     cut_truth: int
-    scores: dict[str, float]
+    scores: dict[str, float | None]
 
     def row(self) -> dict[str, Any]:
         """The same in one flat row for a table."""
@@ -152,7 +162,7 @@ class Report:
         lips: lip vertices.
         upper_face: upper-face vertices; None if no protocol uses them.
         n_vertices: vertices of the mesh.
-        protocols: the definition of each protocol, by name.
+        protocols: the definition of each protocol, by name; under ``metrics`` those of metrics chosen by name.
         identity: which conditions were scored.
         truth_stride: 2 if every second frame of the truth was taken, and so on.
         resamples: bootstrap resamples; 0 for none.
@@ -182,30 +192,20 @@ class Report:
     def regions(self) -> dict[str, dict[str, Any]]:
         """Name, vertex count, hash and repeated indices of each region."""
         parts = {"lips": self.lips, "upper_face": self.upper_face}
-        return {
-            part: {
-                "name": region.name,
-                "count": region.count,
-                "hash": region.hash,
-                "duplicates": region.duplicates,
-            }
-            for part, region in parts.items()
-            if region is not None
-        }
+        return {part: region.as_dict() for part, region in parts.items() if region is not None}
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON; every score carries its protocol, regions, frames and sequences."""
-        regions = self.regions()
         return {
             "truth": self.truth,
             "n_vertices": self.n_vertices,
-            "regions": regions,
+            "regions": self.regions(),
             "remarks": self.remarks,
             "protocols": self.protocols,
             "identity": self.identity,
             "truth_stride": self.truth_stride,
             "bootstrap": {"resamples": self.resamples, "level": self.level, "seed": self.seed},
-            "methods": [_report_method(method, regions) for method in self.methods],
+            "methods": [asdict(method) for method in self.methods],
             "comparisons": [asdict(comparison) for comparison in self.comparisons],
             "unnamed_truths": self.unnamed_truths,
         }
@@ -213,15 +213,6 @@ class Report:
     def rows(self) -> list[dict[str, Any]]:
         """One flat row for each sequence and method."""
         return [sequence.row() for method in self.methods for sequence in method.sequences]
-
-
-def _report_method(method: MethodResult, regions: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """A method as plain data, each score with the region that it was taken over."""
-    found = asdict(method)
-    for score in found["scores"]:
-        part = {"lve": "lips", "mve": ""}.get(score["metric"], "upper_face")
-        score["region"] = regions[part] if part else "all vertices"
-    return found
 
 
 # From the values of sequences to a score, and how sure it is.
@@ -237,12 +228,13 @@ def pooled(values: Array, weights: Array) -> Array:
 
     Args:
         values: (sequences, columns).
-        weights: likewise; frames where all frames count alike, 1 where all sequences do.
+        weights: likewise; frames where all frames count alike, 1 where all sequences do, 0 where there is no value.
 
     Returns:
-        (columns,).
+        (columns,); NaN where no sequence has a value.
     """
-    return np.asarray((values * weights).sum(0) / weights.sum(0))
+    with np.errstate(invalid="ignore"):
+        return np.asarray((values * weights).sum(0) / weights.sum(0))
 
 
 def draws(sequences: int, resamples: int, seed: int) -> Iterator[Array]:
@@ -303,10 +295,11 @@ class Bootstrap:
             return None
         weighted = values * weights
         # einsum and not a matrix product: its digits do not depend on threads or on the processor's library.
-        blocks = [
-            np.einsum("rs,sc->rc", counts, weighted) / np.einsum("rs,sc->rc", counts, weights)
-            for counts in draws(len(values), self.resamples, self.seed)
-        ]
+        with np.errstate(invalid="ignore"):  # resamples without any sequence that has a value are not used
+            blocks = [
+                np.einsum("rs,sc->rc", counts, weighted) / np.einsum("rs,sc->rc", counts, weights)
+                for counts in draws(len(values), self.resamples, self.seed)
+            ]
         return np.concatenate(blocks)
 
     def intervals(self, scores: Array | None, columns: int) -> list[Interval | None]:
@@ -318,8 +311,9 @@ class Bootstrap:
         """
         if scores is None:
             return [None] * columns
-        ends = np.quantile(scores, [(1 - self.level) / 2, (1 + self.level) / 2], axis=0)
-        return [Interval(float(low), float(high)) for low, high in ends.T]
+        places = [(1 - self.level) / 2, (1 + self.level) / 2]
+        valued = [column[~np.isnan(column)] for column in scores.T]
+        return [Interval(*np.quantile(column, places).tolist()) if len(column) else None for column in valued]
 
 
 # The values of all clips of a method, and what becomes of them.
@@ -365,25 +359,60 @@ class MethodTable:
         if not self.rows:
             raise FaceDiffError(f"{folder}: {_why_nothing(self.missing)}")
         self.clips = [pair.clip for pair, _ in self.rows]
-        self.values: Array = np.array([scores.values for _, scores in self.rows])
+        values: Array = np.array([scores.values for _, scores in self.rows])
         by_frames = np.array([column.pooling == "frames" for column in columns])
-        self.weights: Array = np.where(by_frames, np.array([scores.weights for _, scores in self.rows]), 1.0)
+        weights = np.where(by_frames, np.array([scores.weights for _, scores in self.rows]), 1.0)
+        self.weights: Array = np.where(np.isnan(values), 0.0, weights)
+        self.values: Array = np.nan_to_num(values)
 
     def result(self, bootstrap: Bootstrap) -> MethodResult:
         """The scores with their intervals, and the values of each clip."""
-        totals = pooled(self.values, self.weights)
+        totals = self._totals()
         intervals = bootstrap.intervals(bootstrap.scores(self.values, self.weights), len(self.columns))
         frames = sum(scores.frames for _, scores in self.rows)
         return MethodResult(
             self.name,
             self.folder,
             [
-                Score(column.protocol, column.metric, float(total), interval, frames, len(self.rows))
-                for column, total, interval in zip(self.columns, totals, intervals, strict=True)
+                Score(
+                    column.protocol,
+                    column.metric,
+                    total,
+                    interval,
+                    frames,
+                    len(self.rows) if column.metric in self.rows[0][1].states else int(np.count_nonzero(weights)),
+                    column.region,
+                )
+                for column, total, interval, weights in zip(
+                    self.columns, totals, intervals, self.weights.T, strict=True
+                )
             ],
             [self._sequence(pair, scores) for pair, scores in self.rows],
             self.missing,
         )
+
+    def _totals(self) -> list[float]:
+        """The score of each column over all clips.
+
+        Raises:
+            FaceDiffError: if a metric has no value.
+        """
+        totals: list[float] = pooled(self.values, self.weights).tolist()
+        for place, column in enumerate(self.columns):
+            if column.metric in self.rows[0][1].states and column.protocol == METRICS:
+                # Such a metric has no values of single clips, whose mean it would be; its sums are added, clip by clip.
+                whole = self.rows[0][1].states[column.metric].clone()
+                try:
+                    for _, scores in self.rows[1:]:
+                        whole.merge_state(scores.states[column.metric])
+                    totals[place] = float(whole.compute())
+                except (ValueError, RuntimeError) as error:
+                    raise FaceDiffError(f"{self.folder}: metric {column.metric}: {error}") from error
+            elif math.isnan(totals[place]):
+                raise FaceDiffError(
+                    f"{self.folder}: metric {column.metric} has no value on any of {len(self.rows)} clips"
+                )
+        return totals
 
     def _sequence(self, pair: Pair, scores: ClipScores) -> SequenceScores:
         return SequenceScores(
@@ -395,7 +424,11 @@ class MethodTable:
             scores.frames,
             scores.cut_prediction,
             scores.cut_truth,
-            {column.name: value for column, value in zip(self.columns, scores.values, strict=True)},
+            {
+                column.name: None if math.isnan(value) else value
+                for column, value in zip(self.columns, scores.values, strict=True)
+                if column.metric not in scores.states
+            },
         )
 
     def compare(self, baseline: MethodTable, bootstrap: Bootstrap) -> list[Comparison]:
@@ -418,6 +451,7 @@ class MethodTable:
             for column, difference, interval in zip(
                 self.columns, pooled(*a) - pooled(*b), bootstrap.intervals(spread, len(self.columns)), strict=True
             )
+            if not math.isnan(difference)
         ]
 
     def places(self, clips: Sequence[str]) -> list[int]:
@@ -461,7 +495,8 @@ def text(report: Report) -> str:
         )
     lines += report.remarks
     for name in report.protocols:
-        lines += ["", f"protocol {name}", *_scores(report, name), *_comparisons(report, name)]
+        title = "further metrics" if name == METRICS else f"protocol {name}"
+        lines += ["", title, *_scores(report, name), *_comparisons(report, name)]
     if any(score.interval for method in report.methods for score in method.scores):
         lines += [
             "",
@@ -477,45 +512,39 @@ def text(report: Report) -> str:
 
 def _scores(report: Report, protocol: str) -> list[str]:
     rows = []
+    if protocol == METRICS:  # names of metrics with their options are long: one row for each
+        for score in [score for score in report.methods[0].scores if score.protocol == METRICS]:
+            same = [each for method in report.methods for each in method.scores if each.name == score.name]
+            counts = "/".join(dict.fromkeys(str(each.sequences) for each in same))
+            rows.append([score.metric, *(_cell(each.value, each.interval) for each in same), counts])
+        return format_table(["", *(method.name for method in report.methods), "sequences"], rows).splitlines()
     for method in report.methods:
         scores = [score for score in method.scores if score.protocol == protocol]
-        cells = [f"{score.value:.4e}{_interval(score.interval)}" for score in scores]
+        cells = [_cell(score.value, score.interval) for score in scores]
         rows.append([method.name, *cells, str(scores[0].frames), str(scores[0].sequences)])
     metrics = [score.metric for score in report.methods[0].scores if score.protocol == protocol]
-    return _align([["", *metrics, "frames", "sequences"], *rows])
+    return format_table(["", *metrics, "frames", "sequences"], rows).splitlines()
 
 
 def _comparisons(report: Report, protocol: str) -> list[str]:
-    """Differences from the first method; a star where the interval leaves zero out."""
-    rows: dict[str, list[str]] = {}
-    counts: dict[str, int] = {}
-    for found in report.comparisons:
-        if found.protocol == protocol:
-            sure = found.interval is not None and (found.interval.low > 0 or found.interval.high < 0)
-            cell = f"{found.difference:+.4e}{_interval(found.interval, '+')}{'*' if sure else ''}"
-            rows.setdefault(found.method, []).append(cell)
-            counts[found.method] = found.sequences
-    if not rows:
+    """Differences from the first method; a star where the interval does not contain zero."""
+    found = [each for each in report.comparisons if each.protocol == protocol]
+    if not found:
         return []
-    metrics = [score.metric for score in report.methods[0].scores if score.protocol == protocol]
-    body = [[f"{method} − {report.methods[0].name}", *cells, str(counts[method])] for method, cells in rows.items()]
-    head = "difference, over the sequences that both have (*: the interval leaves out 0)"
-    return [head, *_align([["", *metrics, "sequences"], *body])]
+    rows: dict[str, list[str]] = {}
+    for each in found:
+        row = f"{each.method} − {each.baseline}" + (f": {each.metric}" if protocol == METRICS else "")
+        sure = each.interval is not None and (each.interval.low > 0 or each.interval.high < 0)
+        rows.setdefault(row, []).append(_cell(each.difference, each.interval, "+") + ("*" if sure else ""))
+    metrics = ["difference"] if protocol == METRICS else list(dict.fromkeys(each.metric for each in found))
+    counts = {each.method: str(each.sequences) for each in found}
+    body = [[row, *cells, counts[row.partition(" − ")[0]]] for row, cells in rows.items()]
+    head = "difference, over the sequences that both have (*: the interval does not contain 0)"
+    return [head, *format_table(["", *metrics, "sequences"], body).splitlines()]
 
 
-def _interval(interval: Interval | None, sign: str = "") -> str:
-    return "" if interval is None else f" [{interval.low:{sign}.3e}, {interval.high:{sign}.3e}]"
-
-
-def _align(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
-    return [
-        "  ".join(
-            cell.rjust(width) if place else cell.ljust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+def _cell(value: float, interval: Interval | None, sign: str = "") -> str:
+    return f"{value:{sign}.4e}" + (f" [{interval.low:{sign}.3e}, {interval.high:{sign}.3e}]" if interval else "")
 
 
 def _left_out(report: Report) -> list[str]:

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
+from torchmetrics import Metric
 
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import Pair
-from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMetric, VertexError
+from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMetric, VertexError, feed
 from facediff.metrics.base import Clips, LengthRule, Pooling, align
 from facediff.metrics.one_pass import one_pass
 from facediff.utils.arrays import open_vertices
 from facediff.utils.jobs import run_tasks
+
+METRICS = "metrics"
+"""Stands in place of a protocol's name where metrics were chosen by name."""
 
 NATIVE = (np.float16, np.float32, np.float64)
 """Types that torch reads as they are."""
@@ -30,12 +34,13 @@ class Column:
     """One score of one protocol.
 
     Attributes:
-        protocol: the protocol's name.
-        metric: the score's name there: ``mve``, ``lve``, ``fdd``, ``fdd_absolute``.
+        protocol: the protocol's name; ``metrics`` for metrics that were chosen by name.
+        metric: the score's name there: ``mve``, ``lve``, ``fdd``, ``fdd_absolute``, or the metric as it was chosen.
         pooling: how sequences become one number.
         rule: what the protocol does where lengths differ.
         source: which of the scorer's metrics gives the value of a sequence.
         absolute: whether its sign is dropped.
+        region: name, count and hash of what the score was taken over.
     """
 
     protocol: str
@@ -44,6 +49,7 @@ class Column:
     rule: LengthRule
     source: str
     absolute: bool = False
+    region: dict[str, Any] | str = "all vertices"
 
     @property
     def name(self) -> str:
@@ -56,11 +62,12 @@ class ClipScores:
     """What one clip gave, the mean over its conditions where there are several.
 
     Attributes:
-        values: a value for each column.
+        values: a value for each column; NaN where the metric has none on this clip.
         weights: frames behind it, for pooling by frames.
         frames: frames scored, all conditions together.
         cut_prediction: frames cut from predictions.
         cut_truth: frames cut from the truth.
+        states: the metrics of this clip that have a value over all clips only, by name.
     """
 
     values: tuple[float, ...]
@@ -68,20 +75,23 @@ class ClipScores:
     frames: int
     cut_prediction: int
     cut_truth: int
+    states: Mapping[str, Metric] = field(default_factory=dict)
 
 
 class Scorer:
     """Scores clips by several protocols; what two protocols share is computed once.
 
-    May be used by several threads at once.
+    May be used by several threads at the same time.
 
     Args:
         protocols: what to compute.
         lips: lip vertices.
         upper_face: upper-face vertices; None if no protocol has FDD.
-        templates: neutral face (V, 3) by subject; empty if no protocol has FDD.
+        templates: neutral face (V, 3) by identity; empty if no protocol has FDD.
         n_vertices: vertices of the mesh.
         truth_stride: 2 takes every second frame of the truth, and so on.
+        metrics: further metrics by name, made for the corpus.
+        inputs: gives what these read of a clip in addition to its motion.
 
     Raises:
         FaceDiffError: if a protocol needs what is not given, or a region does not fit the mesh.
@@ -96,6 +106,8 @@ class Scorer:
         templates: Mapping[str, Tensor],
         n_vertices: int,
         truth_stride: int = 1,
+        metrics: Mapping[str, Metric] | None = None,
+        inputs: Callable[[Pair], dict[str, Any]] = lambda _: {},
     ) -> None:
         self.columns: list[Column] = []
         self.metrics: dict[str, SequenceMetric] = {}
@@ -116,7 +128,28 @@ class Scorer:
                 self._add(protocol, name, metric)
         self.needs_template = any(isinstance(metric, FaceDynamicsDeviation) for metric in self.metrics.values())
         if self.needs_template and not templates:
-            raise FaceDiffError("FDD needs each subject's neutral face: give --templates, or a protocol without FDD")
+            raise FaceDiffError("FDD needs each speaker's neutral face: give --templates, or a protocol without FDD")
+        self.chosen = dict(metrics or {})
+        self.inputs = inputs
+        for name, chosen in self.chosen.items():
+            region = getattr(chosen, "pairs", None) or getattr(chosen, "region", None)
+            if region is not None:
+                try:
+                    region.check(n_vertices)
+                except ValueError as error:
+                    raise FaceDiffError(f"metric {name}: {error}") from error
+            # The scores of single sequences are known where the metric is a mean of them.
+            self.columns.append(
+                Column(
+                    METRICS,
+                    name,
+                    getattr(chosen, "pooling", "sequences"),
+                    getattr(chosen, "length_rule", "min"),
+                    name,
+                    region="all vertices" if region is None else region.as_dict(),
+                )
+            )
+        self.needs_template |= any("template" in getattr(chosen, "needs", ()) for chosen in self.chosen.values())
 
     def _add(self, protocol: Protocol, name: str, metric: SequenceMetric) -> None:
         absolute = False
@@ -131,7 +164,8 @@ class Scorer:
             source = f"{protocol.name} {name}"
         self.metrics.setdefault(source, metric)
         pooling: Pooling = "sequences" if source.startswith("fdd") else protocol.pooling
-        self.columns.append(Column(protocol.name, name, pooling, protocol.length_rule, source, absolute))
+        region = "all vertices" if metric.region is None else metric.region.as_dict()
+        self.columns.append(Column(protocol.name, name, pooling, protocol.length_rule, source, absolute, region))
 
     def score(self, pair: Pair) -> ClipScores | str:
         """The scores of a clip; in words why it has none if a file of it cannot be used.
@@ -148,6 +182,7 @@ class Scorer:
             predictions = {
                 condition: read_vertices(path, self.n_vertices) for condition, path in pair.predictions.items()
             }
+            inputs = {"truth": truth, "template": template} | (self.inputs(pair) if self.chosen else {})
         except FaceDiffError as error:
             return str(error)
         done = [
@@ -156,27 +191,61 @@ class Scorer:
         ]
         weights = np.array([each.weights for each in done])
         values = np.array([each.values for each in done])
-        by_frames = np.array([column.pooling == "frames" for column in self.columns])
+        by_frames = np.array([column.pooling == "frames" for column in self.columns[: values.shape[1]]])
         # A condition's share of the clip is its frames where all frames count alike; they differ only if one was cut.
         shares = np.where(by_frames, weights, 1.0)
+        further, states = self._chosen(pair, predictions, inputs)
         return ClipScores(
-            tuple(((values * shares).sum(0) / shares.sum(0)).tolist()),
-            tuple(weights.mean(0).tolist()),
+            (*((values * shares).sum(0) / shares.sum(0)).tolist(), *(value for value, _ in further)),
+            (*weights.mean(0).tolist(), *(weight for _, weight in further)),
             sum(each.frames for each in done),
             sum(each.cut_prediction for each in done),
             sum(each.cut_truth for each in done),
+            states,
         )
+
+    def _chosen(
+        self, pair: Pair, predictions: Mapping[str, Tensor], inputs: dict[str, Any]
+    ) -> tuple[list[tuple[float, float]], dict[str, Metric]]:
+        """Value and weight of a clip under each metric chosen by name, and the metrics that have none of single clips.
+
+        Raises:
+            FaceDiffError: if a metric refuses the clip.
+        """
+        found: list[tuple[float, float]] = []
+        states: dict[str, Metric] = {}
+        for name, chosen in self.chosen.items():
+            one = chosen.clone()
+            try:
+                if "conditions" in getattr(chosen, "needs", ()):
+                    frames = min(map(len, predictions.values()))
+                    several = torch.stack([motion[:frames] for motion in predictions.values()])
+                    feed(one, {"predictions": several, "clip_names": [pair.clip]})
+                else:
+                    for condition, motion in predictions.items():
+                        clip_names = [pair.predictions[condition].stem]
+                        feed(one, inputs | {"prediction": motion, "clip_names": clip_names})
+                if not isinstance(one, SequenceMetric) or one.latest is None:
+                    states[name] = one
+                    found.append((math.nan, 0.0))
+                    continue
+                frames, sequences = one.counts[:2].tolist()
+                found.append((one.compute().item(), frames / sequences) if sequences else (math.nan, 0.0))
+            except (ValueError, TypeError) as error:
+                raise FaceDiffError(f"metric {name}: {error}") from error
+        return found, states
 
     def _score(self, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> ClipScores:
         """One prediction."""
         aligned: dict[str, Clips] = {}
-        for column in self.columns:
+        columns = [column for column in self.columns if column.protocol != METRICS]
+        for column in columns:
             if column.rule not in aligned:
                 # Every rule that does not refuse the lengths leaves the same frames, those that both sides have.
                 aligned[column.rule] = self._align(column, name, prediction, truth, template)
         first = next(iter(aligned.values()))
         found = self._values(first)
-        each = [(found[column.source], column.absolute) for column in self.columns]
+        each = [(found[column.source], column.absolute) for column in columns]
         frames = first.clips[0].frames
         return ClipScores(
             tuple(abs(value) if absolute else value for value, absolute in each),
