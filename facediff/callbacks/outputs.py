@@ -1,4 +1,4 @@
-"""Writing what ``facediff predict`` predicts."""
+"""What ``facediff test`` prints and writes, and the files that ``facediff predict`` writes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from facediff.callbacks.dashboard import measure_clips, wandb_media, worst_clips
 from facediff.models import AnimationModel
 from facediff.models.inference import Prediction
 from facediff.utils.files import atomic, write_rows
-
-# The table that ``facediff test`` prints.
+from facediff.utils.tables import format_table
 
 METHOD_NAMES = {"model": "model", "still": "still face", "shuffled": "model, shuffled speech"}
 
@@ -25,9 +24,9 @@ METHOD_NAMES = {"model": "model", "still": "still face", "shuffled": "model, shu
 class ScoreTable(Callback):
     """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
 
-    Beside the model stand a face that never moves, and the model given another sentence's speech. Weights & Biases gets
-    the table of sequences as ``test/sequences``, with sound and a picture of the errors for the worst clips, and the
-    protocol's definition in the run's config.
+    Next to the model are scored a face that never moves, and the model given another sentence's speech. Weights &
+    Biases gets the table of sequences as ``test/sequences``, with sound and a picture of the errors for the worst
+    clips, and the protocol's definition in the run's config.
 
     Args:
         file: name of the CSV file in the run's folder; None writes none.
@@ -57,8 +56,9 @@ class ScoreTable(Callback):
         if not trainer.is_global_zero:
             return
         assets = pl_module.assets
-        print(format_table(rows, assets.corpus, synthetic=assets.synthetic))
-        print(evaluation.protocol.describe())
+        chosen = [request.text for request in evaluation.requests]
+        print(describe_scores(rows, assets.corpus, synthetic=assets.synthetic, metrics=chosen))
+        print(evaluation.describe())
         if self.file and folder:
             path = Path(folder) / self.file
             write_csv(path, rows)
@@ -72,7 +72,7 @@ class ScoreTable(Callback):
             worst = worst_clips(sequences, self.media_clips)
             media = wandb_media(pl_module, measure_clips(trainer, pl_module, worst))
             for logger in loggers:
-                log_sequences(logger, sequences, evaluation.protocol.describe(), media)
+                log_sequences(logger, sequences, evaluation.describe(), media)
 
 
 def log_sequences(
@@ -99,21 +99,30 @@ def log_sequences(
     logger.experiment.config.update({"protocol_definition": definition}, allow_val_change=True)
 
 
-def format_table(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool) -> str:
-    """The scores as text, with what they were taken over."""
+def describe_scores(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool, metrics: Sequence[str] = ()) -> str:
+    """The scores as text, with what they were taken over.
+
+    Args:
+        rows: one row per split and method.
+        corpus: name of the corpus.
+        synthetic: whether it was made by a program.
+        metrics: metrics that were chosen by name.
+    """
     names = [name for name in ("mve", "lve", "fdd", "fdd_absolute") if name in rows[0]]
     kind = "SYNTHETIC corpus" if synthetic else "corpus"
-    lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}, unseen people: {rows[0]['unseen_identity']}"]
+    lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}, unseen speakers: {rows[0]['unseen_identity']}"]
     for region in rows[0]["regions"].values():
         lines.append(f"region {region['name']}: {region['count']} vertices, hash {region['hash']}")
-    lines.append(
-        f"{'split':<8} {'who':<24}" + "".join(f"{name.upper():>13}" for name in names) + f"{'frames':>9}{'clips':>7}"
-    )
+    head = ["split", "method", *map(str.upper, names), "frames", "clips"]
+    body = []
     for row in rows:
-        scores = "".join(f"{row[name]:>13.4e}" for name in names)
-        lines.append(
-            f"{row['split']:<8} {METHOD_NAMES[row['method']]:<24}{scores}{row['frames']:>9}{row['sequences']:>7}"
-        )
+        scores = [f"{row[name]:.4e}" for name in names]
+        body.append([row["split"], METHOD_NAMES[row["method"]], *scores, row["frames"], row["sequences"]])
+    lines.append(format_table(head, body, left=2))
+    if metrics:  # their names, with options, are long: one row for each
+        methods = [f"{row['split']}: {METHOD_NAMES[row['method']]}" for row in rows]
+        values = [[name, *(None if row[name] is None else f"{row[name]:.4e}" for row in rows)] for name in metrics]
+        lines += ["", format_table(["metric", *methods], values)]
     return "\n".join(lines)
 
 
@@ -144,7 +153,7 @@ class PredictionWriter(BasePredictionWriter):
         self.folder = Path()
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Settle the folder on every process at once: where the run's folder is, is broadcast."""
+        """Choose the folder on every process at the same time: the path of the run's folder is broadcast."""
         run = trainer.log_dir or trainer.default_root_dir
         self.folder = Path(self.output_dir or Path(run) / "predictions")
 
@@ -166,6 +175,6 @@ class PredictionWriter(BasePredictionWriter):
                 np.save(temporary, clip.vertices.flatten(1).numpy())
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say where the files are."""
+        """Print where the files are."""
         if trainer.is_global_zero:
             print(f"written: {self.folder}")

@@ -35,7 +35,7 @@ from facediff.utils.files import config_dir
 LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a model that the data module knows."""
 
-FREE = ("sampler", "sampling_space", "unseen_identity")
+FREE = ("sampler", "sampling_space", "unseen_identity", "protocol", "metrics")
 """Constructor arguments of a model that may differ from its checkpoint's; no weights depend on them."""
 
 
@@ -97,7 +97,7 @@ def from_checkpoint(name: str, arguments: list[str]) -> list[str]:
     if given:
         raise FaceDiffError(
             f"{given[0]}: the checkpoint {path} decides the model, and its weights fit no other; leave the flag away "
-            f"(only --model.sampler…, --model.sampling_space and --model.unseen_identity may change)"
+            f"(only {', '.join(f'--model.{option}' for option in FREE)} may change)"
         )
     config = {"seed_everything": 0, "model": described(checkpoint["hyper_parameters"], drop=LINKS)}
     if option(arguments, "--data") is None:

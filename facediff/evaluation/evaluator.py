@@ -1,4 +1,4 @@
-"""Scoring several methods' files against the truth, one clip at a time."""
+"""Score several methods' files against the truth, one clip at a time, with what metrics read of the corpus."""
 
 from __future__ import annotations
 

@@ -410,7 +410,7 @@ class MethodTable:
                     raise FaceDiffError(f"{self.folder}: metric {column.metric}: {error}") from error
             elif math.isnan(totals[place]):
                 raise FaceDiffError(
-                    f"{self.folder}: metric {column.metric} has no value on any of {len(self.rows)} clips"
+                    f"{self.folder}: metric {column.metric} has no value on any of its {len(self.rows)} clips; omit it"
                 )
         return totals
 

@@ -9,7 +9,7 @@ import functools
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -87,6 +87,8 @@ class AnimationModel(LightningModule, Inference, ABC):
         lr_schedule: constant, or a cosine down to zero at the end of training.
         warmup_steps: optimiser steps over which the learning rate rises from zero.
         protocol: the metrics' protocol for validation and test.
+        metrics: further metrics for validation and test, by name with their options, such as
+            ``lip_warping_distance`` or ``temporal_misalignment:at=path``; see docs/metrics.md.
         unseen_identity: which identity unseen speakers are tested with: none, with their own style (``style_only``),
             each training identity in turn with the mean of the scores (``each_seen``), or their own, once the model is
             adapted to them (``adapted``).
@@ -105,6 +107,7 @@ class AnimationModel(LightningModule, Inference, ABC):
         lr_schedule: Schedule = "constant",
         warmup_steps: int = 0,
         protocol: str = "paper",
+        metrics: Sequence[str] = (),
         unseen_identity: IdentityPolicy = "style_only",
     ) -> None:
         super().__init__()
@@ -118,7 +121,7 @@ class AnimationModel(LightningModule, Inference, ABC):
         self.lr_schedule = lr_schedule
         self.warmup_steps = warmup_steps
         self.unseen_identity: IdentityPolicy = unseen_identity
-        self.evaluation = Evaluation(protocol, unseen_identity)
+        self.evaluation = Evaluation(protocol, unseen_identity, metrics)
         self.windows = WindowPlan()
         self.data_source: dict[str, str] = {}
         self._assets: Assets | None = None
@@ -200,7 +203,7 @@ class AnimationModel(LightningModule, Inference, ABC):
         losses = self.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
-        self.evaluation.update("val", "model", self.generate(batch, seed=0), batch)
+        self.evaluation.score(self, "val", batch)
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics as ``val/mve`` …."""
@@ -211,7 +214,7 @@ class AnimationModel(LightningModule, Inference, ABC):
         """Score generated motion, a still face, and the model's motion for another sentence's speech."""
         split = self.evaluation.splits[dataloader_idx]
         for name, view in conditioned(batch, self.unseen_identity, self.identities, self.assets.references):
-            self.evaluation.update(split, "model", self.generate(view, seed=0), view, name)
+            self.evaluation.score(self, split, view, name)
         self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
         if batch.decoy_audio is not None:
             decoy = replace(batch, audio=batch.decoy_audio, features=None)
@@ -292,10 +295,11 @@ class AnimationModel(LightningModule, Inference, ABC):
         self.attach_mesh()
         if stage != "predict":
             self.evaluation.prepare(
-                self.assets,
+                self,
                 ["val"] if stage in ("fit", "validate") else data.test_splits,
                 # The model itself is moved to its device later; a process without clips must have its metrics there.
                 self.trainer.strategy.root_device,
+                data.root,
             )
 
     def attach_mesh(self) -> None:

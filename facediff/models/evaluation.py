@@ -1,42 +1,47 @@
-"""Scores of a model beside what a still face and shuffled speech score."""
+"""What a test scores: the model, a face that never moves, and the model given another sentence's speech."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, cast
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torchmetrics import Metric
 
 from facediff.data import Assets, Batch, Reference
+from facediff.data.audio import SAMPLE_RATE
 from facediff.data.batch import pad
+from facediff.data.phonemes import closures, phonemes_file, read_phonemes
 from facediff.errors import FaceDiffError
-from facediff.metrics import ProtocolMetrics, Region, SequenceMetric, protocol
-
-# As whom people are animated in a test whom the model was not trained on.
+from facediff.metrics import Context, LipPairs, ProtocolMetrics, Region, SequenceMetric, device_name, feed, protocol
+from facediff.metrics.by_name import parse_all
+from facediff.models.inference import Inference
 
 IdentityPolicy = Literal["style_only", "each_seen", "adapted"]
-"""``style_only``: as nobody known, with the style of their own reference. ``each_seen``: as each training identity in
-turn, with that identity's own style, and the mean of the scores, as the released test scripts do. ``adapted``: as
-themselves, which the model must have been adapted to."""
+"""Which identity unseen speakers are tested with. ``style_only``: none, with the style of their own reference.
+``each_seen``: each training identity in turn, with that identity's own style, and the mean of the scores, as the
+released test scripts do. ``adapted``: their own, which the model must have been adapted to."""
 
 
 def conditioned(
     batch: Batch, policy: IdentityPolicy, identities: Sequence[str], references: Mapping[str, Reference]
 ) -> list[tuple[str, Batch]]:
-    """The batches to score in place of one, each with the name of the identity for its unknown people.
+    """The batches to score in place of one, each with the name of the identity for its unseen speakers.
 
-    A clip of somebody known comes once.
+    A clip of a training identity comes once.
 
     Args:
-        batch: clips of known and of unknown people.
-        policy: what becomes of the unknown ones.
+        batch: clips of training identities and of unseen speakers.
+        policy: which identity the unseen speakers get.
         identities: training identities in the order of the identity index.
         references: their style references.
 
     Raises:
-        FaceDiffError: if the policy is ``adapted`` and somebody is unknown, or an identity has no style to lend.
+        FaceDiffError: if the policy is ``adapted`` and a speaker is unseen, or an identity has no style reference.
     """
     known = [clip for clip, index in enumerate(batch.identity.tolist()) if index >= 0]
     unknown = [clip for clip in range(len(batch)) if clip not in known]
@@ -45,49 +50,76 @@ def conditioned(
     if policy == "adapted":
         raise FaceDiffError(
             f"unseen_identity=adapted: clip {batch.names[unknown[0]]} is of {batch.identity_names[unknown[0]]}, whom "
-            f"the model does not know; let it get to know them with `facediff adapt`, or choose another policy"
+            f"the model was not trained on; adapt it with `facediff adapt`, or choose another policy"
         )
     found = [("", batch.select(known))] if known else []
     unseen = batch.select(unknown)
     for index, name in enumerate(identities):
         if name not in references:
             raise FaceDiffError(f"unseen_identity=each_seen: the model holds no style reference of {name}")
-        motion = references[name].motion.to(unseen.reference)
-        length = unseen.reference_lengths.new_full((len(unseen),), len(motion))
-        view = replace(
-            unseen,
-            identity=unseen.identity.new_full((len(unseen),), index),
-            reference=pad([motion] * len(unseen)),
-            reference_lengths=length,
-            reference_names=[references[name].clip] * len(unseen),
-        )
-        found.append((name, view))
+        found.append((name, with_identity(unseen, index, references[name])))
     return found
+
+
+def with_identity(batch: Batch, index: int, reference: Reference) -> Batch:
+    """The batch as if all clips were of one training identity, with that identity's style."""
+    motion = reference.motion.to(batch.reference)
+    return replace(
+        batch,
+        identity=batch.identity.new_full((len(batch),), index),
+        reference=pad([motion] * len(batch)),
+        reference_lengths=batch.reference_lengths.new_full((len(batch),), len(motion)),
+        reference_names=[reference.clip] * len(batch),
+    )
 
 
 METHODS = ("model", "still", "shuffled")
 """Who is scored: the model, a face that never moves, the model given another sentence's speech."""
 
+OF_THE_MODEL = {"samples", "conditions", "style", "time"}
+"""Needs that only the model meets: metrics that have one are not taken of a still face or of shuffled speech."""
+
 
 class Evaluation:
-    """Metrics of one protocol for every split and method.
+    """Metrics of one protocol, and metrics chosen by name, for every split and method.
 
     No part of the model's module tree: weight averaging copies that tree before the regions are known.
 
     Args:
         protocol_name: the protocol.
-        unseen_identity: as whom people are animated whom the model was not trained on; told beside the scores.
+        unseen_identity: which identity unseen speakers are tested with; reported next to the scores.
+        metrics: further metrics by name, with their options: ``temporal_misalignment:at=path``.
+
+    Raises:
+        FaceDiffError: if there is no such metric or option.
     """
 
-    def __init__(self, protocol_name: str, unseen_identity: str) -> None:
+    def __init__(self, protocol_name: str, unseen_identity: str, metrics: Sequence[str] = ()) -> None:
         self.protocol = protocol(protocol_name)
         self.unseen_identity = unseen_identity
+        self.requests = parse_all(metrics)
+        self.needs = {need for request in self.requests for need in request.needs}
         self.splits: list[str] = []
         self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}
+        self.chosen: dict[str, dict[str, dict[str, Metric]]] = {}
         self._sequences: list[dict[str, Any]] = []
+        self._corpus = Path()
+        self._frame_rate = 0.0
+        self._speakers: list[str] = []
 
-    def prepare(self, assets: Assets, splits: Sequence[str], device: torch.device) -> None:
-        """Make empty metrics for a corpus's regions, on the device where processes reduce them."""
+    def prepare(self, model: Inference, splits: Sequence[str], device: torch.device, root: Path) -> None:
+        """Make empty metrics for a model's corpus, on the device where processes reduce them.
+
+        Args:
+            model: the model with its assets.
+            splits: the splits that are scored.
+            device: the device.
+            root: the corpus folder.
+
+        Raises:
+            FaceDiffError: if the corpus or the model lacks something that a metric needs.
+        """
+        assets = model.assets
         regions = {
             name: Region.from_indices(
                 f"{assets.corpus}/{name if len(indices) < assets.n_vertices else 'all vertices'}",
@@ -98,6 +130,9 @@ class Evaluation:
         }
         self.splits = list(splits)
         self._sequences = []
+        self._corpus = root
+        self._frame_rate = assets.frame_rate
+        self._speakers = sorted(assets.templates)
         methods = METHODS if self.splits != ["val"] else METHODS[:1]
         self.metrics = {
             split: {
@@ -105,8 +140,105 @@ class Evaluation:
             }
             for split in self.splits
         }
+        context = self._context(model, regions, device) if self.requests else Context()
+        self.chosen = {
+            split: {
+                method: {
+                    request.text: request.build(context).to(device)
+                    for request in self.requests
+                    if method == "model" or not OF_THE_MODEL & set(request.needs)
+                }
+                for method in methods
+            }
+            for split in self.splits
+        }
 
-    def update(self, split: str, method: str, motion: Tensor, batch: Batch, identity: str = "") -> None:
+    def _context(self, model: Inference, regions: Mapping[str, Region], device: torch.device) -> Context:
+        """What the corpus and the model have for metrics, and why they lack the rest."""
+        assets, name = model.assets, type(model).__name__
+        has: dict[str, dict[str, Any]] = {
+            "lips": {"lips": regions["lips"]},
+            "upper_face": {"upper": regions["upper_face"]},
+            "template": {},
+            "speech": {"sample_rate": SAMPLE_RATE, "frames_per_second": assets.frame_rate},
+            "identities": {"n_identities": len(assets.templates)},
+            "time": {"hardware": device_name(device)},
+        }
+        if assets.inner_lip_pairs is not None:
+            has["lip_pairs"] = {"pairs": LipPairs.from_pairs(f"{assets.corpus}/inner lips", assets.inner_lip_pairs)}
+        if (self._corpus / "phonemes").is_dir():
+            has["closures"] = {}
+        if model.samples:
+            has["samples"] = {}
+        if len(self._styles(assets)) > 1:
+            has["conditions"] = {}
+        if "style" in self.needs:
+            still = torch.zeros(1, 1, assets.n_vertices, 3, device=model.device)
+            with torch.inference_mode():
+                if model.encode_style(still, torch.ones(1, 1, dtype=torch.bool, device=model.device)).shape[1]:
+                    has["style"] = {}
+        missing = {
+            "lip_pairs": "the corpus has no regions/inner_lip_pairs.txt",
+            "closures": f"{self._corpus / 'phonemes'}: no such folder",
+            "samples": f"{name} is deterministic",
+            "conditions": "the corpus has no style references of two training identities",
+            "style": f"{name} has no style encoder",
+        }
+        return Context(has, missing)
+
+    @staticmethod
+    def _styles(assets: Assets) -> dict[int, Reference]:
+        """Style references of the training identities that have one, by index."""
+        references = assets.references
+        return {place: references[name] for place, name in enumerate(assets.identities) if name in references}
+
+    def score(self, model: Inference, split: str, batch: Batch, identity: str = "") -> None:
+        """Generate a batch's motion, and what metrics need of the model besides, and add it to the model's scores.
+
+        Args:
+            model: the model.
+            split: the split.
+            batch: the clips with their true motion.
+            identity: the identity that all clips are generated with, if it is not their own.
+        """
+        start = self._clock(model)
+        motion = model.generate(batch, seed=0)
+        spoken = float(batch.frame_lengths.sum()) / model.assets.frame_rate
+        inputs: dict[str, Any] = {"computing": self._clock(model) - start, "speech": spoken}
+        if not batch.repeated:
+            chosen = self.chosen[split]["model"].values()
+            if "samples" in self.needs:
+                count = max(int(getattr(metric, "n_samples", 1)) for metric in chosen)
+                # A sample is the seed of its noise; the first is the motion that all other metrics score.
+                more = [model.generate(batch, seed=seed) for seed in range(1, count)]
+                inputs["samples"] = torch.stack([motion, *more], 1)
+            if "conditions" in self.needs:
+                views = [with_identity(batch, place, each) for place, each in self._styles(model.assets).items()]
+                inputs["predictions"] = torch.stack([model.generate(view, seed=0) for view in views], 1)
+            if "style" in self.needs:
+                inputs["embeddings"] = model.encode_style(motion, batch.mask)
+                inputs["labels"] = self._numbers(batch)
+        self.update(split, "model", motion, batch, identity, inputs)
+
+    def _clock(self, model: Inference) -> float:
+        """Seconds; work on a GPU is waited for where a metric asks how long inference took."""
+        if "time" in self.needs and model.device.type == "cuda":
+            torch.cuda.synchronize(model.device)
+        return time.perf_counter()
+
+    def _numbers(self, batch: Batch) -> list[int]:
+        """The number of each clip's speaker among all speakers."""
+        return [self._speakers.index(name) for name in batch.identity_names]
+
+    def update(
+        self,
+        split: str,
+        method: str,
+        motion: Tensor,
+        batch: Batch,
+        identity: str = "",
+        inputs: Mapping[str, Any] | None = None,
+    ) -> None:
         """Add a batch's motion (offsets from the template), unless another process adds the same clips.
 
         Args:
@@ -114,49 +246,116 @@ class Evaluation:
             method: who made the motion.
             motion: offsets from the template.
             batch: the clips with their true motion.
-            identity: the identity that all clips were animated as, if it is not their own.
+            identity: the identity that all clips were generated with, if it is not their own.
+            inputs: what metrics chosen by name read in addition, by the name under which they take it.
         """
         if batch.repeated:
             return
         metrics = self.metrics[split][method].to(motion.device)
         metrics.update(motion, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
+        scores: dict[str, Metric] = {**metrics.scores()}
+        inputs = self._inputs(motion, batch) | dict(inputs or {}) if self.requests else {}
+        for name, metric in self.chosen[split][method].items():
+            given = inputs
+            if "samples" in inputs and hasattr(metric, "n_samples"):
+                given = inputs | {"samples": inputs["samples"][:, : metric.n_samples]}
+            try:
+                feed(metric.to(motion.device), given)
+            except ValueError as error:
+                raise FaceDiffError(f"metric {name}: {error}") from error
+            scores[name] = metric
         if split == "val":
             return
-        scorers = cast(Sequence[tuple[str, SequenceMetric]], metrics.items(copy_state=False))
-        values = {name: cast(Tensor, metric.latest).tolist() for name, metric in scorers}
+        values = {
+            name: metric.latest.tolist()
+            for name, metric in scores.items()
+            if isinstance(metric, SequenceMetric) and metric.latest is not None
+        }
         for place, (clip, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
             own = {name: each[place] for name, each in values.items()}
-            told = {"split": split, "method": method, "clip": clip, "identity": identity, "frames": frames}
-            self._sequences.append({**told, **own})
+            facts = {"split": split, "method": method, "clip": clip, "identity": identity, "frames": frames}
+            self._sequences.append({**facts, **own})
+
+    def _inputs(self, motion: Tensor, batch: Batch) -> dict[str, Any]:
+        """What metrics chosen by name may read of a batch, by the name under which they take it; see `NEEDS`."""
+        inputs: dict[str, Any] = {
+            "prediction": motion,
+            "truth": batch.motion,
+            "lengths": batch.frame_lengths,
+            "clip_names": batch.names,
+            "offsets_from": batch.template,
+            "waveform": batch.audio,
+        }
+        if "identities" in self.needs:
+            inputs["identities"] = self._numbers(batch)
+        if "closures" in self.needs:
+            files = [phonemes_file(self._corpus, clip) for clip in batch.names]
+            rate = self._frame_rate
+            inputs["closures"] = [[] if file is None else closures(read_phonemes(file), rate) for file in files]
+        return inputs
 
     def sequences(self) -> list[dict[str, Any]]:
-        """One row per test clip and method with its own scores, of all processes; collective under several."""
+        """One row per test clip and method with its own scores, of all processes; collective under several.
+
+        All rows have the same keys; None stands where a metric has no value.
+        """
         rows = self._sequences
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             shares: list[Any] = [None] * torch.distributed.get_world_size()
             torch.distributed.all_gather_object(shares, rows)
             rows = [row for share in shares for row in share]
-        return sorted(rows, key=lambda row: (row["split"], METHODS.index(row["method"]), row["clip"], row["identity"]))
+        return evened(
+            sorted(rows, key=lambda row: (row["split"], METHODS.index(row["method"]), row["clip"], row["identity"]))
+        )
 
     def scalars(self, split: str) -> dict[str, float]:
         """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics."""
         found: dict[str, float] = {}
         for row in self.rows(split):
-            for name in map(str, self.metrics[split]["model"]):
-                prefix = split if row["method"] == "model" else f"{split}/{row['method']}"
-                found[f"{prefix}/{name}"] = row[name]
+            prefix = split if row["method"] == "model" else f"{split}/{row['method']}"
+            names = [*map(str, self.metrics[split]["model"]), *self.chosen[split]["model"]]
+            found |= {f"{prefix}/{name}": row[name] for name in names if row[name] is not None}
         for metrics in self.metrics[split].values():
             metrics.reset()
+        for chosen in self.chosen[split].values():
+            for metric in chosen.values():
+                metric.reset()
         return found
 
     def rows(self, split: str) -> list[dict[str, Any]]:
-        """One row per method: scores, and what they were taken over; collective under several processes."""
+        """One row per method: scores, and what they were taken over; collective under several processes.
+
+        A metric that has no value over the whole split has None.
+        """
         table = []
         for method, metrics in self.metrics[split].items():
             summary = metrics.summary()
             if not summary.coverage.sequences:
                 continue  # no clip of the split had speech of another sentence to shuffle with
-            scores = {name: float(value) for name, value in metrics.compute().items()}
-            told = {"split": split, "method": method, "unseen_identity": self.unseen_identity}
-            table.append({**told, **scores, **summary.as_dict()})
+            scores: dict[str, float | None] = {name: float(value) for name, value in metrics.compute().items()}
+            for name in self.chosen[split]["model"]:
+                scores[name] = value_of(self.chosen[split][method].get(name))
+            facts = {"split": split, "method": method, "unseen_identity": self.unseen_identity}
+            table.append({**facts, **scores, **summary.as_dict()})
         return table
+
+    def describe(self) -> str:
+        """The definitions of all numbers, in words."""
+        lines = [self.protocol.describe()]
+        for name, metric in next(iter(self.chosen.values()), {}).get("model", {}).items():
+            lines.append(f"metric {name}: {getattr(metric, 'definition', type(metric).__doc__)}")
+        return "\n".join(lines)
+
+
+def value_of(metric: Metric | None) -> float | None:
+    """A metric's score; None without a metric, or if it has no value on any sequence."""
+    try:
+        return None if metric is None else float(metric.compute())
+    except ValueError:
+        return None
+
+
+def evened(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows with the keys of all of them, in the order in which they first come; None where a row has no value."""
+    keys = dict.fromkeys(key for row in rows for key in row)
+    return [{key: None if row.get(key) != row.get(key) else row.get(key) for key in keys} for row in rows]

@@ -234,7 +234,7 @@ def test_everything_that_is_not_scored_is_told(files: Files) -> None:
     ("options", "message"),
     [
         ({"protocols": ["papers"]}, "unknown protocol 'papers'"),
-        ({"templates": None}, "FDD needs each subject's neutral face"),
+        ({"templates": None}, "FDD needs .*--templates"),
         ({"upper_face": None}, "protocol paper: .* give the upper-face region"),
         ({"lips": Region.from_indices("far", [99])}, "protocol paper: .* holds the index 99"),
         ({"topology": "biwi"}, "protocol paper|23370"),
