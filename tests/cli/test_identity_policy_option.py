@@ -14,7 +14,7 @@ def test_the_policy_is_chosen_at_test_time_and_told(
 ) -> None:
     words = ["--trainer.accelerator=cpu", f"--trainer.logger.save_dir={tmp_path}"]
     assert main(["test", "--ckpt_path", str(checkpoint), "--model.unseen_identity=each_seen", *words]) == 0
-    assert "unseen people: each_seen" in capsys.readouterr().out
+    assert "unseen speakers: each_seen" in capsys.readouterr().out
     (table,) = tmp_path.rglob("test_scores.csv")
     with table.open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))

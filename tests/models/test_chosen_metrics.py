@@ -1,4 +1,4 @@
-"""Metrics chosen by name in a test: every registered one is computed or refused with its reason, next to the protocol."""
+"""Metrics chosen by name in a test: every registered one is computed, next to the protocol."""
 
 from __future__ import annotations
 
