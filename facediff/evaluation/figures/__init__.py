@@ -1,24 +1,10 @@
 """The figures of a paper: faces, heat maps and curves of truth and methods, in the sizes and formats of journals.
 
-What a figure shows is computed by functions of its own (`motion_maps`, `error_maps`, `opening_curves`, `read_curves`),
-which need no matplotlib; drawing needs the extra ``figures``.
+The numbers in a figure are computed by functions of their own (`motion_maps`, `error_maps`, `opening_curves`,
+`read_curves`), which need no matplotlib; drawing needs the extra ``figures``.
 """
 
 from facediff.data.phonemes import Phoneme, read_phonemes
-from facediff.evaluation.figures.curves import (
-    Curve,
-    Curves,
-    Sound,
-    choose_scalars,
-    draw_lips,
-    draw_training,
-    find_gaps,
-    find_metrics,
-    opening_curves,
-    read_curves,
-    read_pairs,
-    smooth,
-)
 from facediff.evaluation.figures.frames import (
     Moment,
     draw_frames,
@@ -27,8 +13,18 @@ from facediff.evaluation.figures.frames import (
     pick_frames,
 )
 from facediff.evaluation.figures.heatmaps import VertexMap, draw_error, draw_heatmap, error_maps, motion_maps
+from facediff.evaluation.figures.lips import Curves, Sound, draw_lips, opening_curves, read_pairs
 from facediff.evaluation.figures.material import Material, find_clips
 from facediff.evaluation.figures.page import COLUMN, PAGE, Paper
+from facediff.evaluation.figures.training import (
+    Curve,
+    choose_scalars,
+    draw_training,
+    find_gaps,
+    find_metrics,
+    read_curves,
+    smooth,
+)
 
 __all__ = [
     "COLUMN",

@@ -1,4 +1,4 @@
-"""The figure of chosen moments: truth and methods below one another, times or phonemes side by side."""
+"""The figure of chosen moments: a row for the truth and each method, a column for each time or phoneme."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ from facediff.errors import FaceDiffError, choices
 from facediff.evaluation.figures.material import Array, Material, Painter
 from facediff.evaluation.figures.page import Grid, Heading, Paper, check_output, save, style
 
+HIGHEST = 50.0
+"""Largest height of a picture in mm."""
+
 
 def find_phoneme(wanted: str, phonemes: Sequence[Phoneme], clip: str) -> Phoneme:
     """A phoneme by name: ``m`` is the first of the clip, ``m:2`` the second.
 
-    A name that is in the clip to the letter goes first; else stress marks are passed over, then length marks and
-    diacritics; else it is the name of a viseme, ``PP``.
+    An exact match takes precedence; else stress marks are ignored, then length marks and diacritics; else the name is
+    that of a viseme, ``PP``.
 
     Raises:
         FaceDiffError: if the clip has no such phoneme, or not so many.
@@ -31,7 +34,7 @@ def find_phoneme(wanted: str, phonemes: Sequence[Phoneme], clip: str) -> Phoneme
     for same in (
         lambda p: p.ipa == name,
         lambda p: p.plain == name.strip(STRESS),
-        lambda p: _bare(p.ipa) == _bare(name),
+        lambda p: _without_marks(p.ipa) == _without_marks(name),
         lambda p: name in p.viseme.split("+"),
     ):
         found = [phoneme for phoneme in spoken if same(phoneme)]
@@ -43,14 +46,10 @@ def find_phoneme(wanted: str, phonemes: Sequence[Phoneme], clip: str) -> Phoneme
     raise FaceDiffError(f'phoneme "{wanted}": not spoken in clip {clip}: {choices(name, known)}')
 
 
-def _bare(ipa: str) -> str:
+def _without_marks(ipa: str) -> str:
     """Without stress, length and diacritics."""
     letters = unicodedata.normalize("NFD", ipa)
     return "".join(letter for letter in letters if letter not in STRESS + LENGTH and not unicodedata.combining(letter))
-
-
-HIGHEST = 50.0
-"""Largest height of a picture in mm."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class Moment:
 
     @property
     def heading(self) -> Heading:
-        """What is written above its column."""
+        """The text above its column."""
         if self.phoneme is None or not self.phoneme.ipa:
             return Heading(small=f"{self.time:.2f} s")
         word = f" {self.phoneme.word}" if self.phoneme.word else ""
@@ -97,7 +96,7 @@ def pick_frames(material: Material, clip: str, moments: Sequence[Moment]) -> dic
                 raise FaceDiffError(
                     f"{path}: has no frame at {moment.time:g} s; {name} lasts from 0 to "
                     f"{len(motion) / material.rate:g} s ({len(motion)} frames at {material.rate:g} a "
-                    f"second; --frame-rate says another rate)"
+                    f"second; give --frame-rate if that is another)"
                 )
             face = np.asarray(motion[frame], np.float64)
             if not np.isfinite(face).all():
@@ -125,10 +124,10 @@ def draw_frames(
         output: ``.png``, ``.pdf`` or ``.svg``.
         paper: width, resolution and font.
         view: a name in :data:`facediff.render.VIEWS`.
-        region: vertices to show closely, such as the lips; the whole face if None.
+        region: vertices to show in a close-up, such as the lips; the whole face if None.
 
     Raises:
-        FaceDiffError: if there is no moment, no mesh, or a file cannot be used.
+        FaceDiffError: if there is no moment or no mesh, or a file cannot be used.
     """
     check_output(output)
     if not moments:

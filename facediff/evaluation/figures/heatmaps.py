@@ -1,14 +1,14 @@
-"""Figures of numbers at vertices: how much each moves, and how far it is from the truth."""
+"""Figures of numbers at vertices: how much each vertex moves, and how far it is from the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
+from torch import Tensor
 
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import FLAT, TRUTH, Array, Material, Painter, chunks, shortest
@@ -26,39 +26,13 @@ from facediff.evaluation.figures.page import (
     wrapped,
 )
 
-# The numbers behind pictures of the face: how much each vertex moves, and how far it is from the truth.
+HIGHEST = 70.0
+"""Largest height of a picture in mm."""
 
+BAR, BAR_SPACE = 2.5, 16.0
+"""Width of a colour bar, and of the bar with its numbers and label, in mm."""
 
-class Moments:
-    """Mean, population standard deviation and maximum over frames that come a few at a time.
-
-    Chan, Golub and LeVeque's update (1983) of mean and sum of squared deviations: exact to rounding for any number of
-    frames, where a difference of sums of squares is not.
-
-    Args:
-        n_vertices: numbers a frame.
-    """
-
-    def __init__(self, n_vertices: int) -> None:
-        self.count = 0
-        self.mean: Array = np.zeros(n_vertices)
-        self.maximum: Array = np.zeros(n_vertices)
-        self._squares: Array = np.zeros(n_vertices)
-
-    def add(self, values: Array) -> None:
-        """Take in values (frames, n_vertices), none below zero."""
-        count = self.count + len(values)
-        mean = values.mean(0)
-        apart = mean - self.mean
-        self._squares += ((values - mean) ** 2).sum(0) + apart**2 * (self.count * len(values) / count)
-        self.mean = self.mean + apart * (len(values) / count)
-        self.maximum = np.maximum(self.maximum, values.max(0))
-        self.count = count
-
-    @property
-    def deviation(self) -> Array:
-        """Population standard deviation (n_vertices,)."""
-        return np.asarray(np.sqrt(self._squares / max(self.count, 1)))
+Statistic = Literal["mean", "max", "both"]
 
 
 @dataclass(frozen=True)
@@ -69,7 +43,7 @@ class VertexMap:
         mean: mean over frames (V,).
         deviation: population standard deviation over frames (V,).
         maximum: maximum over frames (V,).
-        frames: frames that they are over.
+        frames: number of frames.
     """
 
     mean: Array
@@ -79,9 +53,9 @@ class VertexMap:
 
 
 def motion_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, VertexMap], list[str]]:
-    """How far each vertex is from the subject's template, over all frames of the clips, of truth and methods.
+    """How far each vertex is from the identity's template, over all frames of the clips, of truth and methods.
 
-    Where lengths differ, the frames that all have are taken, so that the panels of a figure compare alike.
+    Where lengths differ, the frames that all have are used, so that the panels of a figure are comparable.
 
     Returns:
         a map by name, the truth's first; and notes on frames that were left out.
@@ -89,16 +63,13 @@ def motion_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, Ver
     Raises:
         FaceDiffError: if a file cannot be used or a template is missing.
     """
-    found = {name: Moments(material.n_vertices) for name in material.names}
-    notes = []
-    for clip in clips:
-        template, motions = material.template(clip), material.open(clip)
-        frames, note = shortest(motions)
-        notes += [f"{clip}: {note}"] if note else []
-        for name, motion in motions.items():
-            for _, part in chunks(motion, material.path(clip, name), frames):
-                found[name].add(np.linalg.norm(part - template, axis=2))
-    return {name: _map(moments) for name, moments in found.items()}, notes
+
+    def distances(clip: str, name: str, motions: Mapping[str, Tensor], frames: int) -> Iterator[Array]:
+        template = material.template(clip)
+        for part in chunks(motions[name], material.path(clip, name), frames):
+            yield np.linalg.norm(part - template, axis=2)
+
+    return _vertex_maps(material, clips, material.names, distances)
 
 
 def error_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, VertexMap], list[str]]:
@@ -110,31 +81,45 @@ def error_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, Vert
     Raises:
         FaceDiffError: if a file cannot be used.
     """
-    found = {name: Moments(material.n_vertices) for name in material.methods}
+
+    def distances(clip: str, name: str, motions: Mapping[str, Tensor], frames: int) -> Iterator[Array]:
+        true = chunks(motions[TRUTH], material.path(clip, TRUTH), frames)
+        for one, other in zip(chunks(motions[name], material.path(clip, name), frames), true, strict=True):
+            yield np.linalg.norm(one - other, axis=2)
+
+    return _vertex_maps(material, clips, list(material.methods), distances)
+
+
+def _vertex_maps(
+    material: Material,
+    clips: Sequence[str],
+    names: Sequence[str],
+    distances: Callable[[str, str, Mapping[str, Tensor], int], Iterator[Array]],
+) -> tuple[dict[str, VertexMap], list[str]]:
+    """Statistics by name of the distances (n, V) that a function gives for a clip, a few frames at a time."""
+    count = dict.fromkeys(names, 0)
+    mean, squares, maximum = ({name: np.zeros(material.n_vertices) for name in names} for _ in range(3))
     notes = []
     for clip in clips:
         motions = material.open(clip)
         frames, note = shortest(motions)
         notes += [f"{clip}: {note}"] if note else []
-        for name, moments in found.items():
-            true = chunks(motions[TRUTH], material.path(clip, TRUTH), frames)
-            predicted = chunks(motions[name], material.path(clip, name), frames)
-            for (_, one), (_, other) in zip(predicted, true, strict=True):
-                moments.add(np.linalg.norm(one - other, axis=2))
-    return {name: _map(moments) for name, moments in found.items()}, notes
-
-
-def _map(moments: Moments) -> VertexMap:
-    return VertexMap(moments.mean, moments.deviation, moments.maximum, moments.count)
-
-
-HIGHEST = 70.0
-"""Largest height of a picture in mm."""
-
-BAR, BAR_SPACE = 2.5, 16.0
-"""Width of a colour bar, and of the bar with its numbers and label, in mm."""
-
-Statistic = Literal["mean", "max", "both"]
+        for name in names:
+            for values in distances(clip, name, motions, frames):
+                # Chan, Golub and LeVeque's update (1983) of mean and sum of squared deviations: exact to rounding for
+                # any number of frames, where a difference of sums of squares is not.
+                before, count[name] = count[name], count[name] + len(values)
+                new_mean = values.mean(0)
+                apart = new_mean - mean[name]
+                weight = len(values) / count[name]
+                squares[name] += ((values - new_mean) ** 2).sum(0) + apart**2 * (before * weight)
+                mean[name] += apart * weight
+                maximum[name] = np.maximum(maximum[name], values.max(0))
+    maps = {
+        name: VertexMap(mean[name], np.sqrt(squares[name] / max(count[name], 1)), maximum[name], count[name])
+        for name in names
+    }
+    return maps, notes
 
 
 @dataclass(frozen=True)
@@ -142,7 +127,7 @@ class Row:
     """A row of pictures with one colour scale.
 
     Attributes:
-        label: what the colour bar says, without the unit.
+        label: text at the colour bar, without the unit.
         values: numbers (V,) by column, in the vertices' unit.
         highest: value of the last colour, in the unit shown; the largest value of the row if None.
     """
@@ -178,13 +163,13 @@ def draw_heatmap(
         FaceDiffError: if there is no mesh, or a file cannot be used.
     """
     check_output(output)
-    mesh = material.mesh(clips)
+    material.mesh(clips)  # refuses before the work
     maps, notes = motion_maps(material, clips)
     rows = [
         Row("mean of motion", {name: each.mean for name, each in maps.items()}, highest[0]),
         Row("std of motion", {name: each.deviation for name, each in maps.items()}, highest[1]),
     ]
-    _draw(material, mesh, rows, output, paper or Paper(), view)
+    _draw(material, clips, rows, output, paper or Paper(), view)
     return notes
 
 
@@ -216,30 +201,23 @@ def draw_error(
         FaceDiffError: if there is no mesh, or a file cannot be used.
     """
     check_output(output)
-    mesh = material.mesh(clips)
+    material.mesh(clips)  # refuses before the work
     maps, notes = error_maps(material, clips)
     rows = {
         "mean": Row("mean error", {name: each.mean for name, each in maps.items()}, highest[0]),
         "max": Row("maximum error", {name: each.maximum for name, each in maps.items()}, highest[1]),
     }
     chosen = list(rows.values()) if statistic == "both" else [rows[statistic]]
-    _draw(material, mesh, chosen, output, paper or Paper(), view)
+    _draw(material, clips, chosen, output, paper or Paper(), view)
     return notes
 
 
-def _draw(
-    material: Material,
-    mesh: tuple[npt.NDArray[np.int32], Array],
-    rows: Sequence[Row],
-    output: Path,
-    paper: Paper,
-    view: str,
-) -> None:
+def _draw(material: Material, clips: Sequence[str], rows: Sequence[Row], output: Path, paper: Paper, view: str) -> None:
     from facediff.render.panels import heat_colours
 
     factor, unit = material.scale
     ends = [scale_end(row.values, factor, row.highest) for row in rows]
-    faces, shape = mesh
+    faces, shape = material.mesh(clips)
     painter = Painter(faces, shape, view=view, look=FLAT)
     names = list(rows[0].values)
     with style(paper):
@@ -259,7 +237,7 @@ def _draw(
                 colours = heat_colours(row.values[name] * factor, end)
                 page.picture(painter.paint(shape, colours), *grid.place(number, column))
             beyond = max(float(values.max()) for values in row.values.values()) * factor > end * (1 + 1e-9)
-            _bar(page, grid, number, end, f"{row.label} [{unit}]", beyond=beyond)
+            _draw_bar(page, grid, number, end, f"{row.label} [{unit}]", beyond=beyond)
         save(page.figure, output)
 
 
@@ -277,8 +255,8 @@ def scale_end(values: Mapping[str, Array], factor: float, highest: float | None)
     return largest if largest > 0 else 1.0  # nothing moves: any scale is right
 
 
-def _bar(page: Page, grid: Grid, row: int, end: float, label: str, *, beyond: bool) -> None:
-    """A colour bar at the right of a row, of the very colours that the meshes have."""
+def _draw_bar(page: Page, grid: Grid, row: int, end: float, label: str, *, beyond: bool) -> None:
+    """A colour bar at the right of a row, with exactly the colours that the meshes have."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
     from matplotlib.ticker import MaxNLocator
@@ -288,9 +266,9 @@ def _bar(page: Page, grid: Grid, row: int, end: float, label: str, *, beyond: bo
     _, top = grid.place(row, 0)
     height = min(grid.height * 0.9, 45.0)
     axes = page.axes(grid.end + 2 * GAP, top + (grid.height - height) / 2, BAR, height)
-    shown = ScalarMappable(Normalize(0, end), ListedColormap(heat_ramp() / 255))
-    bar = page.figure.colorbar(shown, cax=axes, extend="max" if beyond else "neither")
-    lines = wrapped(label, grid.height, SMALLEST_TEXT, page.paper.font)  # it must not run into the next row's
+    mappable = ScalarMappable(Normalize(0, end), ListedColormap(heat_ramp() / 255))
+    bar = page.figure.colorbar(mappable, cax=axes, extend="max" if beyond else "neither")
+    lines = wrapped(label, grid.height, SMALLEST_TEXT, page.paper.font)  # must not overlap the next row's
     bar.set_label(plain("\n".join(lines)), size=SMALLEST_TEXT)
     bar.outline.set_linewidth(0.4)
     bar.locator = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])

@@ -1,4 +1,4 @@
-"""What figures are drawn from: the clips that truth and all methods have, and what is known about their mesh."""
+"""What figures are drawn from: the clips of truth and methods and their mesh; and the painter of that mesh."""
 
 from __future__ import annotations
 
@@ -28,34 +28,53 @@ from facediff.render import EVEN, Camera, Light, Look, Renderer
 from facediff.render.rasteriser import FIELD_OF_VIEW
 
 TRUTH = "truth"
-"""What the truth is called in a figure."""
+"""Name of the truth in a figure."""
 
 CHUNK = 2**20
-"""Coordinates that are widened to float64 at a time: 8 MB, however long a clip is."""
+"""Coordinates that are converted to float64 together: 8 MB, however long a clip is."""
 
 LISTED = 12
-"""Clips that a message names at most."""
+"""The most clips that a message names."""
+
+SMALLEST_PICTURE = 40
+"""Fewest pixels of a picture that shows anything."""
+
+WHITE = (1.0, 1.0, 1.0)
+
+SHADED = Look(lights=EVEN, background_top=WHITE, background_bottom=WHITE)
+"""For faces: light from straight ahead, the same on both halves."""
+
+FLAT = Look(
+    lights=(Light((0.0, 0.25, 0.97), (0.45, 0.45, 0.45), wrap=1.0),),
+    sky=(0.55, 0.55, 0.55),
+    ground=(0.55, 0.55, 0.55),
+    background_top=WHITE,
+    background_bottom=WHITE,
+)
+"""For colours that stand for numbers: what faces the viewer has exactly its colour, without highlights."""
+
+HALF = math.tan(FIELD_OF_VIEW / 2)
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Material:
-    """The files of truth and methods, and what lies beside them.
+    """The files of truth and methods, and what is known about them.
 
     Attributes:
         truths: truths by clip, ``<subject>_<sentence>``.
         methods: each method's predictions by clip; methods in the order in which they are drawn.
         n_vertices: vertices V of the mesh.
         frame_rate: frames a second of the predictions, and of the truth after ``truth_stride``; None if not known.
-        truth_stride: every how many-th frame of a truth is taken.
+        truth_stride: every n-th frame of a truth is used.
         unit: unit of length of the vertices.
-        templates: neutral face (V, 3) by subject.
+        templates: neutral face (V, 3) by identity.
         faces: triangles (F, 3); None if no mesh is known.
         rest: positions (V, 3) of the mesh file; None if no mesh is known.
         colours: sRGB (V, 3) of the mesh file; None if it has none.
         corpus: the corpus folder that the truth belongs to, if it does.
-        remark: what is written below every figure, such as that the corpus is synthetic.
+        remark: text below every figure, such as that the corpus is synthetic.
     """
 
     truths: dict[str, Truth]
@@ -78,7 +97,7 @@ class Material:
 
     @property
     def scale(self) -> tuple[float, str]:
-        """What lengths are multiplied with to be shown, and the unit that they are shown in."""
+        """The factor by which lengths are multiplied for a figure, and the resulting unit."""
         return (1000.0, "mm") if self.unit == "m" else (1.0, self.unit.partition(" (")[0] or "unit of the vertices")
 
     @property
@@ -86,24 +105,24 @@ class Material:
         """Frames a second.
 
         Raises:
-            FaceDiffError: if nothing says it.
+            FaceDiffError: if it is not known.
         """
         if self.frame_rate is None:
-            raise FaceDiffError("nothing says how many frames a second the predictions have; give --frame-rate")
+            raise FaceDiffError("the frame rate of the predictions is not known; give --frame-rate")
         return self.frame_rate
 
     def choose(self, clips: Sequence[str] | None = None) -> list[str]:
         """Clips to draw: those asked for, else all that the truth and every method have.
 
         Raises:
-            FaceDiffError: if a clip is not there, or there is none that all have.
+            FaceDiffError: if a clip does not exist, or there is none that all have.
         """
         common = [clip for clip in self.truths if all(clip in files for files in self.methods.values())]
         if clips is None:
             if not common:
                 raise FaceDiffError(
                     f"{' and '.join(self.names)} have no clip in common; the truth has {few(self.truths)}; "
-                    f"say how files are named with --pattern and --truth-pattern"
+                    f"give --pattern and --truth-pattern, which say how files are named"
                 )
             return common
         for clip in clips:
@@ -131,11 +150,11 @@ class Material:
         return opened
 
     def path(self, clip: str, name: str) -> Path:
-        """Where a clip's vertices lie, of the truth or of a method."""
+        """The file of a clip's vertices, of the truth or of a method."""
         return self.truths[clip].path if name == TRUTH else self.methods[name][clip]
 
     def template(self, clip: str) -> Array:
-        """Neutral face (V, 3) of a clip's subject.
+        """Neutral face (V, 3) of a clip's speaker.
 
         Raises:
             FaceDiffError: if there is none.
@@ -154,7 +173,7 @@ class Material:
         """
         if self.faces is None or self.rest is None:
             raise FaceDiffError(
-                "nothing says how the vertices are joined to faces; give --mesh FILE, a .ply or .obj of this topology"
+                "the triangles of the mesh are not known; give --mesh FILE, a .ply or .obj of this topology"
             )
         subjects = dict.fromkeys(self.truths[clip].name.subject for clip in clips)
         found = [np.asarray(self.templates[name], np.float64) for name in subjects if name in self.templates]
@@ -170,12 +189,12 @@ def find_clips(
     truth_pattern: str = TRUTH_PATTERN,
     identity: str = OWN,
 ) -> tuple[dict[str, Truth], dict[str, dict[str, Path]]]:
-    """Which file is which clip's, as ``facediff evaluate`` tells it.
+    """The files of truth and methods by clip, matched by their names as ``facediff evaluate`` does.
 
     Args:
         methods: folder of predictions by method.
         truth: folder of truths.
-        subjects: known subjects.
+        subjects: known speakers.
         patterns: how predictions may be named.
         truth_pattern: how truths are named.
         identity: ``own``, or the identity whose predictions are drawn.
@@ -184,7 +203,7 @@ def find_clips(
         truths by clip, and each method's predictions by clip.
 
     Raises:
-        FaceDiffError: if a folder is missing or has no file that can be told, or a method none of a truth's clip.
+        FaceDiffError: if a folder is missing or has no file whose name matches, or a method has none of a truth's clip.
     """
     if identity == ALL:
         raise FaceDiffError("--identity all: a figure shows one condition; expected own or an identity's name")
@@ -193,7 +212,7 @@ def find_clips(
     names, _ = list_names(truth, [NamePattern(truth_pattern, subjects)])
     truths = dict(sorted(index_truths(names).items()))
     if not truths:
-        raise FaceDiffError(f"{truth}: no file is named like {truth_pattern}.npy; say how with --truth-pattern")
+        raise FaceDiffError(f"{truth}: no file is named like {truth_pattern}.npy; give --truth-pattern")
     readers = [NamePattern(pattern, subjects) for pattern in patterns]
     found: dict[str, dict[str, Path]] = {}
     for method, folder in methods.items():
@@ -202,14 +221,14 @@ def find_clips(
         if not pairs:
             raise FaceDiffError(
                 f"{folder}: no file is a prediction of a truth's clip under the condition {identity}; the truth has "
-                f"{few(truths)}; say how files are named with --pattern, or choose another --identity"
+                f"{few(truths)}; give --pattern, or choose another --identity"
             )
         found[method] = {pair.clip: next(iter(pair.predictions.values())) for pair in pairs}
     return truths, found
 
 
 def few(clips: Mapping[str, object], like: str = "") -> str:
-    """The names of clips for a message, not more than a few, the nearest first."""
+    """The names of clips for a message: all, or a few of many, those most like a name first."""
     import difflib
 
     if len(clips) <= LISTED:
@@ -221,68 +240,38 @@ def few(clips: Mapping[str, object], like: str = "") -> str:
 
 
 def shortest(motions: Mapping[str, Tensor]) -> tuple[int, str | None]:
-    """Frames that all motions have, and a note on what that cuts; None if they are of one length."""
+    """Number of frames that all motions have, and a note on what that cuts; None if they are of one length."""
     lengths = {name: len(motion) for name, motion in motions.items()}
     frames = min(lengths.values())
     if len(set(lengths.values())) == 1:
         return frames, None
-    told = ", ".join(f"{name} {length}" for name, length in lengths.items())
-    return frames, f"lengths differ ({told} frames): cut to the first {frames}"
+    listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+    return frames, f"lengths differ ({listed} frames): cut to the first {frames}"
 
 
-def chunks(motion: Tensor, path: Path, frames: int | None = None) -> Iterator[tuple[int, Array]]:
-    """A motion (T, V, 3) in float64, a few frames at a time, each with the number of its first frame.
+def chunks(motion: Tensor, path: Path, frames: int) -> Iterator[Array]:
+    """The first frames of a motion (T, V, 3) in float64, a few at a time.
 
     Args:
         motion: the motion.
         path: its file, for messages.
-        frames: frames to read; all if None.
+        frames: number of frames to read.
 
     Raises:
         FaceDiffError: at NaN or infinity.
     """
-    frames = len(motion) if frames is None else frames
     step = max(1, CHUNK // max(1, motion[0].numel()))
     for first in range(0, frames, step):
         part = np.asarray(motion[first : min(first + step, frames)], np.float64)
         finite = np.isfinite(part).all((1, 2))
         if not finite.all():
             bad = first + int(np.argmin(finite))
-            raise FaceDiffError(f"{path}: frame {bad} holds NaN or infinity (counted from 0); repair or leave it out")
-        yield first, part
-
-
-# Pictures of meshes for figures: on white, cut to the face, all with one camera.
-
-WHITE = (1.0, 1.0, 1.0)
-
-SHADED = Look(lights=EVEN, background_top=WHITE, background_bottom=WHITE)
-"""For faces: light from straight ahead, the same on both halves."""
-
-FLAT = Look(
-    lights=(Light((0.0, 0.25, 0.97), (0.45, 0.45, 0.45), wrap=1.0),),
-    sky=(0.55, 0.55, 0.55),
-    ground=(0.55, 0.55, 0.55),
-    background_top=WHITE,
-    background_bottom=WHITE,
-)
-"""For colours that stand for numbers: what faces the viewer has exactly its colour, without highlights."""
-
-MARGIN = 0.015
-"""Share of the face's size that stays free on every side, for motion that leaves the template."""
-
-HALF = math.tan(FIELD_OF_VIEW / 2)
-"""Half the extent of a camera's picture at distance 1."""
-
-SMALLEST = 40
-"""Fewest pixels of a picture that shows anything."""
-
-AROUND_LIPS = 0.9
-"""How much more than the lips a close-up shows on every side, as a share of their width."""
+            raise FaceDiffError(f"{path}: frame {bad} holds NaN or infinity (counted from 0); repair or omit the file")
+        yield part
 
 
 class Painter:
-    """Draws one topology, white around, with a camera framed once on a face at rest.
+    """Draws one topology on white, with a camera framed once on a face at rest.
 
     Args:
         faces: triangles (F, 3).
@@ -290,7 +279,7 @@ class Painter:
         view: a name in ``VIEWS``.
         look: material and lights.
         colours: sRGB (V, 3) of the surface; the look's material if None.
-        region: vertices to show closely; the whole mesh if None.
+        region: vertices to show in a close-up; the whole mesh if None.
     """
 
     def __init__(
@@ -310,8 +299,9 @@ class Painter:
         self._camera = replace(camera, radius=max(camera.radius, whole.radius))
         points = self._camera.to_camera(framed)
         seen = points[:, :2] / -points[:, 2:]
-        margin = MARGIN * np.ptp(seen, axis=0).max()
-        # The camera leaves free what perspective takes from the far parts: pictures are cut to what is seen.
+        margin = 0.015 * np.ptp(seen, axis=0).max()  # for motion that leaves the template
+        # The camera's picture is wider than the face, since perspective makes far parts small: it is cut to what is
+        # seen. HALF is half the extent of the camera's picture at distance 1.
         self._seen = np.clip(seen.min(0) - margin, -HALF, HALF), np.clip(seen.max(0) + margin, -HALF, HALF)
         self._cut = slice(0), slice(0)
         self._renderer: Renderer | None = None
@@ -323,12 +313,12 @@ class Painter:
         return float((high[0] - low[0]) / (high[1] - low[1]))
 
     def set_size(self, width: int, height: int) -> None:
-        """Say how many pixels a picture has.
+        """Choose how many pixels a picture has.
 
         Raises:
             FaceDiffError: if they are too few to see anything.
         """
-        if min(width, height) < SMALLEST:
+        if min(width, height) < SMALLEST_PICTURE:
             raise FaceDiffError(
                 f"a picture of {width} × {height} pixels shows nothing; draw fewer columns, or raise --width or --dpi"
             )
@@ -350,18 +340,16 @@ class Painter:
     def paint(self, vertices: Array, colours: npt.NDArray[np.uint8] | None = None) -> npt.NDArray[np.uint8]:
         """A picture (height, width, 3) of a face (V, 3) on pure white."""
         if self._renderer is None:
-            raise ValueError("say the size first, with set_size")
-        picture, backdrop = (
-            each[self._cut] for each in (self._renderer.render(vertices, colours=colours), self._renderer.backdrop)
-        )
-        picture[(picture == backdrop).all(-1)] = 255  # the backdrop darkens towards its corners
+            raise ValueError("choose the size first, with set_size")
+        picture = self._renderer.render(vertices, colours=colours)[self._cut]
+        picture[(picture == self._renderer.backdrop[self._cut]).all(-1)] = 255  # the backdrop darkens in its corners
         return picture
 
 
 def _box_around(points: Array) -> Array:
-    """The points with the corners of a larger box."""
+    """Points (N, 3) of the lips, and the corners of a box that is wider by 0.45 of their width on every side."""
     low, high = points.min(0), points.max(0)
-    more = AROUND_LIPS / 2 * (high[0] - low[0])
+    more = 0.45 * (high[0] - low[0])
     low, high = low - (more, more, 0), high + (more, more, 0)
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
     return np.concatenate([points, corners])

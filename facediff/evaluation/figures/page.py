@@ -1,7 +1,8 @@
-"""A figure of exact size in millimetres: fonts, colours and files as journals want them."""
+"""Figures of exact size in millimetres: fonts, colours, files, and pictures in rows and columns."""
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -31,7 +32,7 @@ SMALLEST_TEXT, TEXT = 7.0, 8.0
 
 POINTS_PER_MM = 72 / 25.4
 FONT = "DejaVu Sans"
-"""The font that matplotlib brings: it has the letters of the IPA, and is the same on every machine."""
+"""The font that comes with matplotlib: it has the letters of the IPA, and is the same on every machine."""
 
 BLACK, GREY, FAINT = "#000000", "#595959", "#BFBFBF"
 
@@ -44,12 +45,21 @@ LINES: tuple[tuple[str, Any], ...] = (
     ("#E69F00", (0, (3, 1))),
     ("#56B4E9", (0, (8, 1.5, 1.2, 1.5, 1.2, 1.5))),
 )
-"""Colour and dashes of each line, so that lines are told apart without colours too."""
+"""Colour and dashes of each line, so that lines differ without colours too."""
+
+PANEL_HEIGHT = 42.0
+"""Height in mm of axes with curves."""
+
+GAP = 1.0
+"""Millimetres between pictures, and between pictures and labels."""
+
+NAME_LINES = 2
+"""The most lines of a row's name."""
 
 
 @dataclass(frozen=True)
 class Paper:
-    """What a figure is drawn on.
+    """Size, resolution and font of a figure.
 
     Attributes:
         width: of the figure in mm.
@@ -62,7 +72,6 @@ class Paper:
     font: str = FONT
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if not 30 <= self.width <= 1000:
             raise FaceDiffError(f"--width {self.width:g}: expected millimetres from 30 to 1000, e.g. 85 or 175")
         if not 50 <= self.dpi <= 1200:
@@ -74,7 +83,7 @@ class Paper:
 
 
 def matplotlib() -> ModuleType:
-    """The package, or a sentence that says how to get it.
+    """The package matplotlib.
 
     Raises:
         MissingExtraError: if it is not installed.
@@ -89,10 +98,10 @@ def matplotlib() -> ModuleType:
 
 
 def check_output(path: Path) -> None:
-    """Refuse, before any work is done, a suffix that is no format, or a place that cannot be written.
+    """Check, before any work is done, that a figure can be written to a file.
 
     Raises:
-        FaceDiffError: if either is so.
+        FaceDiffError: if the suffix is no format, or the place cannot be written.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise FaceDiffError(f'--output {path}: unknown suffix "{path.suffix}"; expected one of {", ".join(SUFFIXES)}')
@@ -101,13 +110,17 @@ def check_output(path: Path) -> None:
 
 @contextmanager
 def style(paper: Paper) -> Iterator[None]:
-    """Settings under which a figure is made and saved; the caller's own come back afterwards.
+    """Settings of matplotlib for drawing and saving a figure; the caller's own are restored afterwards.
 
     Raises:
         FaceDiffError: if the font is not installed, or lacks a letter.
     """
     package = matplotlib()
-    _check_font(paper.font)
+    from matplotlib import font_manager
+
+    fonts = sorted(set(font_manager.get_font_names()))
+    if paper.font not in fonts:
+        raise FaceDiffError(f'--font: there is no "{paper.font}": {choices(paper.font, fonts)}')
     settings = {
         "font.family": [paper.font],
         "font.size": TEXT,
@@ -141,19 +154,11 @@ def style(paper: Paper) -> Iterator[None]:
             raise FaceDiffError(f"the font {paper.font} lacks a letter ({letter}); choose one with --font") from warning
 
 
-def _check_font(name: str) -> None:
-    from matplotlib import font_manager
-
-    known = sorted(set(font_manager.get_font_names()))
-    if name not in known:
-        raise FaceDiffError(f'--font: there is no "{name}": {choices(name, known)}')
-
-
 class Page:
     """A figure whose parts are placed in millimetres from its upper left corner.
 
     Args:
-        paper: what it is drawn on.
+        paper: width, resolution and font.
         height: in mm.
     """
 
@@ -189,7 +194,7 @@ def new_figure(paper: Paper, height: float, **options: object) -> Figure:
     from matplotlib.figure import Figure
 
     settings: dict[str, Any] = dict(options)
-    # A hair more than whole pixels, which matplotlib rounds down to.
+    # matplotlib rounds down to whole pixels, hence a little more.
     size = [(paper.pixels(mm) + 1e-3) / paper.dpi for mm in (paper.width, height)]
     figure = Figure(figsize=(size[0], size[1]), dpi=paper.dpi, facecolor="white", **settings)
     FigureCanvasAgg(figure)
@@ -215,8 +220,23 @@ def save(figure: Figure, path: Path) -> None:
         figure.savefig(temporary, format=suffix[1:], dpi="figure", metadata=dates[suffix])
 
 
+def line_style(number: int) -> dict[str, object]:
+    """Colour, dashes and width of a method's or run's line, as matplotlib's options."""
+    colour, dashes = LINES[number % len(LINES)]
+    return {"color": colour, "linestyle": dashes, "linewidth": 1.1 if number < len(LINES) else 0.7}
+
+
+def legend_columns(axes: Axes, paper: Paper) -> int:
+    """The number of legend entries that surely fit on one line."""
+    labels = axes.get_legend_handles_labels()[1]
+    font_size = axes.xaxis.label.get_fontproperties().get_size_in_points()
+    widest = max(text_width(label, font_size, paper.font) for label in labels)
+    entry = widest + (2.6 + 0.8 + 2.0) * font_size / POINTS_PER_MM
+    return max(1, min(len(labels), int((paper.width - 2) / entry)))
+
+
 def plain(text: str) -> str:
-    """Text that matplotlib does not take for a formula."""
+    """Text in which matplotlib sees no formula."""
     return text.replace("$", r"\$")
 
 
@@ -230,14 +250,9 @@ def text_width(text: str, size: float, font: str = FONT) -> float:
 
 
 def wrapped(text: str, width: float, size: float, font: str = FONT) -> list[str]:
-    """Text in lines no wider than so many mm: broken behind blanks, "-" and "_" where that is enough, else anywhere."""
-    words: list[str] = [""]
-    for letter in text:
-        words[-1] += letter
-        if letter in " -_":
-            words.append("")
+    """Text in lines of at most a width in mm: broken behind blanks, "-" and "_" where that is enough, else anywhere."""
     lines = [""]
-    for word in filter(None, words):
+    for word in re.findall(r"[^ \-_]*[ \-_]|[^ \-_]+", text):
         if lines[-1] and text_width(lines[-1] + word.rstrip(), size, font) > width:
             lines.append("")
         lines[-1] += word
@@ -252,18 +267,9 @@ def line_height(size: float) -> float:
     return 1.25 * size / POINTS_PER_MM
 
 
-# Pictures in rows and columns with their labels, laid out in millimetres.
-
-GAP = 1.0
-"""Millimetres between pictures, and between pictures and labels."""
-
-NAME_LINES = 2
-"""Lines that a row's name may have."""
-
-
 @dataclass(frozen=True)
 class Heading:
-    """What is written above a column: a line in large letters and one in small ones; either may be empty."""
+    """The text above a column: a line in large letters and one in small ones; either may be empty."""
 
     large: str = ""
     small: str = ""
@@ -273,7 +279,7 @@ class Grid:
     """Places of pictures of one size; row names stand upright at the left, headings above the columns.
 
     Args:
-        paper: what the figure is drawn on.
+        paper: width, resolution and font.
         rows: name of each row.
         columns: heading of each column.
         aspect: width of a picture by its height.
@@ -296,7 +302,9 @@ class Grid:
         self.paper, self.rows, self.columns, self.remark = paper, rows, columns, remark
         line = line_height(TEXT)
         lines = 1 if any(rows) else 0
-        for _ in range(NAME_LINES):  # how many lines a name takes depends on the height, which depends on them
+        # The height of pictures follows from the width that names leave, and the lines of a name from the height:
+        # this is repeated until the lines cannot grow any more.
+        for _ in range(NAME_LINES):
             names = lines * line + (GAP if lines else 0)
             width = (paper.width - names - right - GAP * (len(columns) - 1)) / len(columns)
             height = min(width / aspect, highest)

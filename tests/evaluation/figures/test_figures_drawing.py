@@ -29,7 +29,7 @@ from facediff.evaluation.figures import (
     draw_lips,
     draw_training,
 )
-from facediff.evaluation.figures import curves as curves_module
+from facediff.evaluation.figures import lips as lips_module
 from facediff.evaluation.figures import page as page_module
 from facediff.evaluation.figures.heatmaps import scale_end
 from facediff.evaluation.figures.material import FLAT, Painter
@@ -253,7 +253,7 @@ def test_options_of_curves_that_cannot_be(tmp_path: Path) -> None:
 
 def test_lips_are_drawn_at_their_times_and_in_their_unit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     saved: list[Figure] = []
-    monkeypatch.setattr(curves_module, "save", lambda figure, path: saved.append(figure))
+    monkeypatch.setattr(lips_module, "save", lambda figure, path: saved.append(figure))
     click = np.zeros(32_000, "f4")
     click[16_000] = 1
     sound = Sound(click, phonemes=PHONEMES)

@@ -30,7 +30,7 @@ from facediff.evaluation.figures import (
     smooth,
 )
 from facediff.evaluation.figures import material as material_module
-from facediff.evaluation.figures.curves import envelope
+from facediff.evaluation.figures.lips import envelope
 from facediff.metrics import mouth_opening_difference
 from facediff.utils.pickles import load_pickle
 from tests.fakes.tiny import RATE, VERTICES
