@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from facediff.cli.adapt import run as adapt
+from facediff.cli.adapt import adapt
 from facediff.cli.lightning import run_cli
 from facediff.data import Puppet, collate
 from facediff.data.audio import SAMPLE_RATE
@@ -75,8 +75,14 @@ def measure(name: str, config: str, epochs: int, args: argparse.Namespace) -> Ro
     for person in UNSEEN_IDENTITIES:
         adapted = path.with_name(f"{path.stem}_{person}.ckpt")
         if not adapted.is_file():
-            options = ["--epochs", str(args.adapt_epochs), "--accelerator", "cpu", "--quiet"]
-            adapt("adapt", ["--checkpoint", str(path), "--person", person, "-o", str(adapted), *options])
+            adapt(
+                checkpoint=path,
+                person=person,
+                output=adapted,
+                epochs=args.adapt_epochs,
+                accelerator="cpu",
+                quiet=True,
+            )
         before, after = (person_lve(load_model(each), data, person) for each in (path, adapted))
         row[f"{person} LVE before adapting"], row[f"{person} LVE after"] = before, after
         row[f"{person} LVE, after to before"] = after / before

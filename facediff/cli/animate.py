@@ -2,52 +2,175 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
+from facediff.cli.options import Checkpoint, ControlOptions, File, Identity, Output, OutputOptions, Seed, Workers
+from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError, choices
-from facediff.pipelines.animate import check, parser
+
+if TYPE_CHECKING:
+    from facediff.pipelines.animate import AnimationOptions
 
 
-def run(name: str, arguments: Sequence[str]) -> int:
-    """Animate; every input is checked before the model is loaded, and every output appears whole or not at all."""
-    args = parser().parse_args(list(arguments))
-    # What can be told at once is told before anything heavy is imported.
-    if not args.checkpoint.is_file():
+@dataclass(frozen=True)
+class WindowOptions:
+    """Long speech (animated by sliding windows).
+
+    Attributes:
+        window: seconds of a window (default: 4)
+        overlap: seconds that neighbouring windows share (default: 1)
+        max_seconds: refuse speech that lasts longer
+        stream: read PCM (16 bit, mono, little endian) from standard input as it comes
+        rate: sample rate of that PCM
+    """
+
+    window: Annotated[float | None, Option(metavar="S")] = None
+    overlap: Annotated[float | None, Option(metavar="S")] = None
+    max_seconds: Annotated[float | None, Option(metavar="S")] = None
+    stream: bool = False
+    rate: Annotated[int, Option(metavar="HZ", least=1000, most=384_000)] = 16_000
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """Batch (several recordings or a folder; can be resumed).
+
+    Attributes:
+        suffix: format of the batch's outputs
+        workers: processes (default: one for each processor)
+        retry_failed: try recordings again that failed before
+    """
+
+    suffix: Annotated[str, Option(metavar="SUFFIX")] = ".mp4"
+    workers: Workers = None
+    retry_failed: bool = False
+
+
+def animate(
+    speech: Annotated[list[Path], Option(metavar="SPEECH")],
+    *,
+    checkpoint: Checkpoint,
+    output: Output,
+    identity: Identity = None,
+    style: Annotated[str | None, Option(metavar="STYLE")] = None,
+    style_template: Annotated[str | None, Option(metavar="FACE")] = None,
+    samples: Annotated[int, Option(metavar="N", least=1)] = 1,
+    sampler: Annotated[str | None, Option(metavar="NAME")] = None,
+    steps: Annotated[int | None, Option(metavar="N")] = None,
+    seed: Seed = 0,
+    device: str = "cpu",
+    precision: Literal["32", "bf16"] = "32",
+    target_mesh: File = None,
+    correspondence: Annotated[Path | None, Option(metavar="MAP")] = None,
+    quiet: bool = False,
+    files: OutputOptions,
+    windows: WindowOptions,
+    batch: BatchOptions,
+    controls: ControlOptions,
+) -> int:
+    """Animate a face with a recording of speech, with many, or with speech as it comes.
+
+    For example:
+      facediff animate speech.wav --checkpoint demo/puppet.ckpt -o speech.mp4
+      facediff animate speech.wav --checkpoint demo/puppet.ckpt --samples 3 --blinks -o speech.html
+      facediff animate recordings/ --checkpoint demo/puppet.ckpt --suffix .glb -o animations/
+      arecord -f S16_LE -r 16000 -t raw | facediff animate - --stream --checkpoint demo/puppet.ckpt -o live.npy
+
+    Args:
+        speech: recording: wav, flac, ogg, mp3 or a video; several or a folder for a batch; - with --stream
+        checkpoint: trained model (.ckpt)
+        output: file to write; its suffix chooses the format (see `facediff export --help`); a folder for a batch
+        identity: whose face and identity; by default the first one trained on
+        style: the speaking style: a motion (.npy of absolute vertices, .npz animation), a vector of `facediff style
+            extract`, a clip's name (F1_e03), or a mixture of them (a.npy:0.3,b.npy:0.7); by default the identity's
+            stored reference
+        style_template: neutral face (mesh or .npy) of the speaker whose motion --style holds, where the checkpoint does
+            not know them; or the word median
+        samples: how many animations, with seeds one after another
+        sampler: sampler by name; see `facediff components sampler`
+        steps: denoising steps of the sampler
+        seed: seed of the noise
+        device: cpu, cuda …
+        precision: bf16 multiplies in 16 bits, where the processor is faster at it; the motion differs a little
+        target_mesh: transfer the motion to this mesh
+        correspondence: with --target-mesh: .npz to use if it exists, else to write
+        quiet: no progress bars
+        files: how the files are written.
+        windows: how long speech is cut.
+        batch: how several recordings are animated.
+        controls: what is changed after inference.
+
+    Returns:
+        the exit status: 1 if a recording of a batch failed.
+    """
+    streamed = [str(path) for path in speech] == ["-"]
+    if windows.stream and not streamed:
         raise FaceDiffError(
-            f"{args.checkpoint}: no such checkpoint; expected a .ckpt file that `facediff fit` has written, or "
+            f"--stream: reads standard input; give - in place of {speech[0]} (a file needs no --stream)"
+        )
+    if streamed and not windows.stream:
+        raise FaceDiffError("speech: - is standard input; add --stream, and send samples rather than a file")
+    if not streamed and len(speech) == 1 and not speech[0].exists():
+        raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
+    if not checkpoint.is_file():
+        raise FaceDiffError(
+            f"{checkpoint}: no such checkpoint; expected a .ckpt file that `facediff fit` has written, or "
             f"demo/puppet.ckpt of `facediff demo`"
         )
-    if args.stream or [str(path) for path in args.speech] == ["-"]:
-        from facediff.pipelines.stream import run_stream
+    from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, read_recording, refuse_replacing
 
-        if not args.stream:
-            raise FaceDiffError("speech: - is standard input; add --stream, and send samples rather than a file")
-        return run_stream(args)
-    if len(args.speech) == 1 and not args.speech[0].exists():
-        raise FaceDiffError(f"{args.speech[0]}: no such sound file, nor a folder of recordings")
-    if len(args.speech) > 1 or args.speech[0].is_dir():
-        return run_batch(args, list(arguments))
-    check(args, args.output)
-
-    from facediff.pipelines.animate import AnimationPipeline, read_checked, refuse_replacing
-
-    refuse_replacing(args.speech, [args.output])
-    speech = read_checked(args.speech[0], args.max_seconds)  # before the model, which takes longer to load
-    written, animation = AnimationPipeline(args).write(speech, args.speech[0].stem, args.output, seed=args.seed)
-    told = f"{len(animation.vertices)} frames, identity {animation.metadata['identity']}, style of {animation.metadata['style']}"
-    procedural = "".join(
-        f", {name}: {animation.metadata[name]}" for name in ("edited", "procedural") if name in animation.metadata
+    options = AnimationOptions(
+        checkpoint=checkpoint,
+        identity=identity,
+        style=style,
+        style_template=style_template,
+        samples=samples,
+        sampler=sampler,
+        steps=steps,
+        device=device,
+        precision=precision,
+        window=windows.window,
+        overlap=windows.overlap,
+        controls=controls.controls(),
+        target_mesh=target_mesh,
+        correspondence=correspondence,
+        export=files.export(quiet=quiet),
+        quiet=quiet,
     )
+    if windows.stream:
+        from facediff.pipelines.stream import animate_stream
+
+        animate_stream(options, output, rate=windows.rate, seed=seed)
+        return 0
+    if len(speech) > 1 or speech[0].is_dir():
+        return animate_batch(options, speech, output, batch, seed=seed, max_seconds=windows.max_seconds)
+    options.check(output)
+    refuse_replacing(speech, [output])
+    samples_of_speech = read_recording(speech[0], windows.max_seconds)  # before the model, which takes longer to load
+    written, animation = AnimationPipeline(options).write(samples_of_speech, speech[0].stem, output, seed=seed)
+    metadata = animation.metadata
+    notes = "".join(f", {name}: {metadata[name]}" for name in ("edited", "procedural") if name in metadata)
+    line = f"{len(animation.vertices)} frames, identity {metadata['identity']}, style of {metadata['style']}{notes}"
     for path in written:
-        print(f"{path}: {told}{procedural}")
-        told, procedural = "beside it", ""
+        print(f"{path}: {line}")
+        line = "next to it"
     return 0
 
 
-def run_batch(args: argparse.Namespace, words: list[str]) -> int:
-    """Many recordings into a folder.
+def animate_batch(
+    options: AnimationOptions,
+    speech: list[Path],
+    output: Path,
+    batch: BatchOptions,
+    *,
+    seed: int,
+    max_seconds: float | None,
+) -> int:
+    """Animate many recordings into a folder.
 
     Raises:
         FaceDiffError: if nothing can be made at all.
@@ -56,44 +179,65 @@ def run_batch(args: argparse.Namespace, words: list[str]) -> int:
     from facediff.models.styles import style_paths
     from facediff.pipelines.folder import recordings, run_folder
 
-    if args.suffix not in FORMATS:
-        raise FaceDiffError(f"--suffix {args.suffix}: there is no such format: {choices(args.suffix, FORMATS)}")
-    if args.output.suffix in FORMATS and not args.output.is_dir():
+    suffix = batch.suffix
+    if suffix not in FORMATS:
+        raise FaceDiffError(f"--suffix {suffix}: there is no such format: {choices(suffix, FORMATS)}")
+    if output.suffix in FORMATS and not output.is_dir():
         raise FaceDiffError(
-            f"--output {args.output}: several recordings go into a folder; give its name, and --suffix "
-            f"{args.output.suffix}"
+            f"--output {output}: several recordings go into a folder; give its name, and --suffix {output.suffix}"
         )
-    check(args, args.output / f"recording{args.suffix}")
-    kind = FORMATS[args.suffix]
-    if kind.is_folder or (args.takes > 1 and not kind.holds_several):
-        fit = ".html or .mp4, which hold several takes" if args.takes > 1 else "a format of one file, such as .glb"
-        raise FaceDiffError(f"--suffix {args.suffix}: a batch writes one file for each recording; choose {fit}")
-    speeches = recordings(args.speech)
-    if args.correspondence is not None and not args.correspondence.exists():
-        write_correspondence(args)
-    style_template = None if args.style_template is None else Path(args.style_template)
-    files = [args.checkpoint, *style_paths(args.style)]
-    files += [
-        path
-        for path in (args.target_mesh, args.eyes, args.correspondence, style_template)
-        if path is not None and path.is_file()
-    ]
-    if args.shapes is not None:
-        inside = sorted(args.shapes.iterdir()) if args.shapes.is_dir() else [args.shapes]
+    options.check(output / f"recording{suffix}")
+    if FORMATS[suffix].is_folder or (options.samples > 1 and not FORMATS[suffix].holds_several):
+        fit = ".html or .mp4, which show several" if options.samples > 1 else "a format of one file, such as .glb"
+        raise FaceDiffError(f"--suffix {suffix}: a batch writes one file for each recording; choose {fit}")
+    found = recordings(speech)
+    if options.correspondence is not None and not options.correspondence.exists():
+        write_correspondence(options)
+    template = None if options.style_template is None else Path(options.style_template)
+    files = [options.checkpoint, *style_paths(options.style)]
+    optional = (options.target_mesh, options.controls.eyes, options.correspondence, template)
+    files += [path for path in optional if path is not None and path.is_file()]
+    shapes = options.export.shapes
+    if shapes is not None:
+        inside = sorted(shapes.iterdir()) if shapes.is_dir() else [shapes]
         files += [path for path in inside if path.is_file()]
+    quiet = replace(options, quiet=True, export=replace(options.export, quiet=True))
+    decides = {**asdict(quiet), "seed": seed, "max_seconds": max_seconds}
     return run_folder(
-        speeches,
-        args.output,
-        args.suffix,
-        deciding(words),
-        make_worker=make_worker,
+        found,
+        output,
+        suffix,
+        [f"{name}={json.dumps(value, default=str)}" for name, value in decides.items()],
+        make_worker=BatchWorker(quiet, seed, max_seconds),
         files=files,
-        workers=args.workers or (None if args.device == "cpu" else 1),  # one accelerator holds one model
-        retry_failed=args.retry_failed,
+        workers=batch.workers or (None if options.device == "cpu" else 1),  # one accelerator holds one model
+        retry_failed=batch.retry_failed,
     )
 
 
-def write_correspondence(args: argparse.Namespace) -> None:
+@dataclass(frozen=True)
+class BatchWorker:
+    """Makes the function by which a process of a batch animates a recording; the model is loaded once."""
+
+    options: AnimationOptions
+    seed: int
+    max_seconds: float | None
+
+    def __call__(self, command: list[str]) -> Callable[[Path, Path], None]:
+        """The function of a recording and an output."""
+        from facediff.pipelines.animate import AnimationPipeline, read_recording
+        from facediff.pipelines.folder import seed_of_recording
+
+        pipeline = AnimationPipeline(self.options)
+
+        def animate(recording: Path, output: Path) -> None:
+            speech = read_recording(recording, self.max_seconds)
+            pipeline.write(speech, recording.stem, output, seed=seed_of_recording(recording, self.seed))
+
+        return animate
+
+
+def write_correspondence(options: AnimationOptions) -> None:
     """Fit the target mesh, once and before a batch.
 
     Otherwise every process would fit it, and a second run would find a file that decides the outputs and that the
@@ -103,37 +247,11 @@ def write_correspondence(args: argparse.Namespace) -> None:
         FaceDiffError: if a file is unreadable, or the meshes do not fit.
     """
     from facediff.animation import Animation
-    from facediff.cli.options import assets_of, carried, facts_of
+    from facediff.editing.retargeting import retarget
+    from facediff.models.checkpoint import read_assets
+    from facediff.pipelines.animate import facts_of
 
-    facts = facts_of(assets_of(args.checkpoint), args.identity)
-    neutral = Animation(name=str(args.checkpoint), vertices=facts["template"][None], **facts)
-    carried(neutral, args.target_mesh, args.correspondence)
-
-
-def deciding(words: Sequence[str]) -> list[str]:
-    """The command without what decides nothing of a single output."""
-    options = parser()
-    args = options.parse_args(list(words))
-    aside = ("speech", "output", "workers", "retry_failed", "quiet", "help", "stream", "suffix")
-    kept = []
-    for action in options._actions:
-        value = getattr(args, action.dest, None)
-        if action.dest in aside or value is None or value is False or not action.option_strings:
-            continue
-        kept += [action.option_strings[-1]] if value is True else [f"{action.option_strings[-1]}={value}"]
-    return kept
-
-
-def make_worker(command: list[str]) -> Callable[[Path, Path], None]:
-    """What a process of a batch does with each recording; the model is loaded once."""
-    from facediff.pipelines.animate import AnimationPipeline, read_checked
-    from facediff.pipelines.folder import seed_of_recording
-
-    args = parser().parse_args(["-", "-o", "-", *command, "--quiet"])
-    pipeline = AnimationPipeline(args)
-
-    def animate(recording: Path, output: Path) -> None:
-        speech = read_checked(recording, args.max_seconds)
-        pipeline.write(speech, recording.stem, output, seed=seed_of_recording(recording, args.seed))
-
-    return animate
+    facts = facts_of(read_assets(options.checkpoint), options.identity)
+    neutral = Animation(name=str(options.checkpoint), vertices=facts["template"][None], **facts)
+    if options.target_mesh is not None:
+        retarget(neutral, options.target_mesh, options.correspondence)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import facediff
@@ -17,49 +17,98 @@ class Command:
     """A subcommand.
 
     Attributes:
-        module: where its ``run(name, arguments)`` lives; imported only when the command is used.
+        target: ``module:function``, imported only when the command is used. The function is typed and documented; its
+            parser is made from that (:mod:`facediff.cli.parsing`). A function called ``run`` gets the command's name
+            and the words as they are.
         help: one line.
     """
 
-    module: str
+    target: str
     help: str
 
 
 COMMANDS = {
-    "demo": Command("facediff.cli.demo", "make a corpus, train, test and render a talking face, in ten minutes"),
-    "animate": Command("facediff.cli.animate", "animate a face with a recording of speech"),
-    "adapt": Command("facediff.cli.adapt", "let a trained model get to know one person more"),
-    "style": Command("facediff.cli.style", "write how a person moves as a style vector"),
-    "view": Command("facediff.cli.view", "one HTML file that plays animations with their speech in any browser"),
-    "export": Command("facediff.cli.export", "animations for other programs: glb, USD, OBJ, point caches …"),
-    "blendshapes": Command("facediff.cli.blendshapes", "animations as weights of blendshapes (ARKit)"),
-    "retarget": Command("facediff.cli.retarget", "carry animations over to another mesh"),
-    "fit": Command("facediff.cli.lightning", "train a model"),
-    "validate": Command("facediff.cli.lightning", "score a model on the validation split"),
-    "test": Command("facediff.cli.lightning", "score a model on the test splits"),
-    "predict": Command("facediff.cli.lightning", "write a model's motion for a split"),
-    "evaluate": Command("facediff.cli.evaluate", "score anybody's predicted motion files by named protocols"),
-    "figure": Command("facediff.cli.figure", "draw the figures of a paper: faces, heat maps, lip and training curves"),
-    "data": Command("facediff.cli.data", "prepare and check corpora, import a person's video"),
-    "components": Command("facediff.cli.components", "list what can be chosen by name"),
+    "demo": Command("facediff.cli.demo:demo", "make a corpus, train, test and render a talking face, in ten minutes"),
+    "animate": Command("facediff.cli.animate:animate", "animate a face with a recording of speech"),
+    "adapt": Command("facediff.cli.adapt:adapt", "fine-tune a trained model on a new speaker"),
+    "style extract": Command("facediff.cli.style:extract", "write a speaking style as a style vector"),
+    "view": Command("facediff.cli.view:view", "one HTML file that plays animations with their speech in any browser"),
+    "export": Command("facediff.cli.export:export", "animations for other programs: glb, USD, OBJ, point caches …"),
+    "blendshapes": Command("facediff.cli.blendshapes:blendshapes", "animations as weights of blendshapes (ARKit)"),
+    "retarget": Command("facediff.cli.retarget:retarget", "transfer animations to another mesh"),
+    "fit": Command("facediff.cli.lightning:run", "train a model"),
+    "validate": Command("facediff.cli.lightning:run", "score a model on the validation split"),
+    "test": Command("facediff.cli.lightning:run", "score a model on the test splits"),
+    "predict": Command("facediff.cli.lightning:run", "write a model's motion for a split"),
+    "evaluate": Command("facediff.cli.evaluate:evaluate", "score anybody's predicted motion files by named protocols"),
+    "figure frames": Command("facediff.cli.figure:frames", "faces of truth and methods at chosen moments"),
+    "figure heatmap": Command("facediff.cli.figure:heatmap", "mean and deviation of motion at every vertex"),
+    "figure error": Command("facediff.cli.figure:error", "error at every vertex"),
+    "figure lips": Command("facediff.cli.figure:lips", "lip opening over time"),
+    "figure training": Command("facediff.cli.figure:training", "training curves of runs"),
+    "data prepare": Command("facediff.cli.data:run", "make a corpus folder from a raw distribution"),
+    "data check": Command(
+        "facediff.cli.data:check", "report what a folder is, what is missing and what is wrong in it"
+    ),
+    "data regions": Command("facediff.cli.data:regions", "draw a corpus's lips and upper face on its mesh"),
+    "data import-person": Command("facediff.cli.data:import_person", "make a reconstructed video a corpus entry"),
+    "components": Command("facediff.cli.components:components", "list what can be chosen by name"),
+}
+HELP = ("-h", "--help")
+GROUPS = {
+    "style": "speaking styles of trained models",
+    "figure": "draw the figures of a paper: faces, heat maps, lip and training curves",
+    "data": "prepare and check corpora, import a reconstructed video",
 }
 
 
-def usage() -> str:
-    """The top-level help."""
-    lines = [
-        "usage: facediff <command> [options]",
-        "",
-        "Personalised speech-driven 3D facial animation.",
-        "",
-        "commands:",
-        *(f"  {name:<12}{command.help}" for name, command in COMMANDS.items()),
-        "",
-        "options:",
-        "  -h, --help  this text; `facediff <command> --help` tells a command's options",
-        "  --version   the version",
-    ]
-    return "\n".join(lines)
+def usage(group: str = "") -> str:
+    """The help text of the program or of a group of commands."""
+    if group:
+        rows = {name.partition(" ")[2]: command.help for name, command in COMMANDS.items() if in_group(name, group)}
+    else:
+        rows = {}
+        for name, command in COMMANDS.items():
+            first = name.partition(" ")[0]
+            rows[first] = GROUPS.get(first, command.help)
+    program = f"facediff {group}".strip()
+    return "\n".join(
+        [
+            f"usage: {program} <command> [options]",
+            "",
+            f"{GROUPS[group]}" if group else "Personalised speech-driven 3D facial animation.",
+            "",
+            "commands:",
+            *(f"  {name:<14}{text}" for name, text in rows.items()),
+            "",
+            "options:",
+            f"  -h, --help  show this text; `{program} <command> --help` lists the options of a command",
+            *([] if group else ["  --version   show the version"]),
+        ]
+    )
+
+
+def in_group(name: str, group: str) -> bool:
+    """Whether a command is one of a group's."""
+    return name.startswith(f"{group} ")
+
+
+def find(words: Sequence[str]) -> tuple[str, list[str]]:
+    """The command's name, which may have two words, and the rest.
+
+    Raises:
+        FaceDiffError: naming the nearest command.
+    """
+    first, rest = words[0], list(words[1:])
+    if first in COMMANDS:
+        return first, rest
+    if first not in GROUPS:
+        raise FaceDiffError(f'there is no command "{first}": {choices(first, [*GROUPS, *COMMANDS])}')
+    name = f"{first} {rest[0]}"
+    if name not in COMMANDS:
+        known = [each.partition(" ")[2] for each in COMMANDS if in_group(each, first)]
+        raise FaceDiffError(f'there is no command "{name}": {choices(rest[0], known)}')
+    return name, rest[1:]
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -72,17 +121,17 @@ def main(args: Sequence[str] | None = None) -> int:
         the exit status: 0 for success, 2 for something the user can put right.
     """
     words = list(sys.argv[1:] if args is None else args)
-    if not words or words[0] in ("-h", "--help"):
-        print(usage())
-        return 0 if words else 2
-    if words[0] == "--version":
-        print(facediff.__version__)
-        return 0
-    name, rest = words[0], words[1:]
-    if name not in COMMANDS:
-        return fail(f'there is no command "{name}": {choices(name, COMMANDS)}')
+    name = words[0] if words else ""
     try:
-        status: int = importlib.import_module(COMMANDS[name].module).run(name, rest)
+        if help_wanted(words):
+            print(usage(name if name in GROUPS else ""))
+            status = 0 if words[-1:] and words[-1] in HELP else 2
+        elif name == "--version":
+            print(facediff.__version__)
+            status = 0
+        else:
+            name, rest = find(words)
+            status = run(name, rest)
         sys.stdout.flush()
     except FaceDiffError as error:
         return fail(str(error))
@@ -100,6 +149,29 @@ def main(args: Sequence[str] | None = None) -> int:
             f'run  pip install "facediff[all]"'
         )
     return status
+
+
+def help_wanted(words: Sequence[str]) -> bool:
+    """Whether the words ask for the commands: none, a group alone, or a flag for help where a command is expected."""
+    rest = words[1:] if words and words[0] in GROUPS else words
+    return not rest or rest[0] in HELP
+
+
+def run(name: str, arguments: Sequence[str]) -> int:
+    """Import a command and run it with its arguments."""
+    function = load(name)
+    if function.__name__ == "run":  # reads its words by a parser of its own
+        return int(function(name, arguments))
+    from facediff.cli.parsing import arguments_of
+
+    return int(function(**arguments_of(function, f"facediff {name}", arguments)) or 0)
+
+
+def load(name: str) -> Callable[..., int | None]:
+    """Import a command's function."""
+    module, _, function = COMMANDS[name].target.partition(":")
+    found: Callable[..., int | None] = getattr(importlib.import_module(module), function)
+    return found
 
 
 def fail(message: str, status: int = 2) -> int:

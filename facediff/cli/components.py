@@ -2,42 +2,59 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-from collections.abc import Sequence
+import inspect
+import json as json_format
+from typing import TYPE_CHECKING, Annotated
+
+from facediff.cli.parsing import Option, plain_text
+from facediff.errors import FaceDiffError, choices
+
+if TYPE_CHECKING:
+    from facediff.registry import Entry
 
 
-def parser() -> argparse.ArgumentParser:
-    """Options of the command."""
+def components(kind: Annotated[str | None, Option(metavar="KIND")] = None, *, json: bool = False) -> None:
+    """List everything that can be chosen by name: components of models, models, corpora, metrics and export formats.
+
+    Args:
+        kind: only this kind, with the options of each entry
+        json: machine-readable: a list of objects
+    """
     from facediff.registry import KINDS
 
-    made = argparse.ArgumentParser(
-        "facediff components", description="List what can be chosen by name; `--model.<kind>=<name>` chooses it."
-    )
-    made.add_argument("kind", nargs="?", choices=list(KINDS), help="only this kind")
-    made.add_argument("--json", action="store_true", help="machine-readable: a list of objects")
-    return made
-
-
-def run(name: str, arguments: Sequence[str]) -> int:
-    """Print the components, by kind."""
-    from facediff.registry import KINDS
-
-    args = parser().parse_args(list(arguments))
-    kinds = [kind for kind in KINDS.values() if args.kind in (None, kind.kind)]
-    if args.json:
+    if kind is not None and kind not in KINDS:
+        raise FaceDiffError(f'there is no kind "{kind}": {choices(kind, KINDS)}')
+    chosen = [each for each in KINDS.values() if kind in (None, each.kind)]
+    if json:
         rows = [
-            {"kind": kind.kind, "name": entry.name, "summary": entry.summary, "class": entry.owner}
-            for kind in kinds
-            for entry in kind
+            {"kind": each.kind, "name": entry.name, "summary": entry.summary, "class": entry.owner}
+            for each in chosen
+            for entry in each
         ]
-        json.dump(rows, sys.stdout, indent=2)
-        print()
-        return 0
-    width = max(len(entry.name) for kind in kinds for entry in kind) + 2
-    for kind in kinds:
-        print(f"{kind.kind}: {kind.title}")
-        for entry in kind:
-            print(f"  {entry.name:<{width}}{entry.summary}")
-    return 0
+        print(json_format.dumps(rows, indent=2))
+        return
+    width = max((len(entry.name) for each in chosen for entry in each), default=0) + 2
+    for each in chosen:
+        print(f"{each.kind}: {each.title}")
+        for entry in each:
+            print(f"  {entry.name:<{width}}{plain_text(entry.summary)}")
+            if kind is not None:
+                for line in options_of(entry):
+                    print(f"      {line}")
+
+
+def options_of(entry: Entry) -> list[str]:
+    """The options of an entry, a line each: name, default, meaning."""
+    import docstring_parser
+
+    if not inspect.isclass(entry.implementation):
+        return []
+    parsed = docstring_parser.parse(inspect.getdoc(entry.implementation) or "", docstring_parser.DocstringStyle.GOOGLE)
+    meanings = {each.arg_name: plain_text(each.description or "") for each in parsed.params}
+    lines = []
+    for name, parameter in inspect.signature(entry.implementation).parameters.items():
+        if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+            continue
+        default = "" if parameter.default is parameter.empty else f" = {parameter.default!r}"
+        lines.append(f"{name}{default}: {meanings.get(name, '')}".rstrip(": "))
+    return lines

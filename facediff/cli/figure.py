@@ -2,438 +2,330 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from facediff.errors import FaceDiffError, choices
+from facediff.cli.options import File, Folder, FrameRate, Output, View, named_folders
+from facediff.cli.parsing import Option
+from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
+    from collections.abc import Sequence
 
-    from facediff.data import SpeechMotionDataModule
-    from facediff.evaluation.figures import Material
-    from facediff.mesh.mesh import Mesh
+    from facediff.evaluation.figures import Material, Paper
 
-    Module = type[SpeechMotionDataModule]
-    from facediff.evaluation.figures import Paper, Phoneme
-
-
-# What lies beside the files that ``facediff figure`` draws: templates, mesh, frame rate, sound.
-
-PUPPET = Path("puppet")
-"""Stands for the built-in corpus where it lies in the user's cache folder."""
-
-
-def named_folders(words: Sequence[str], name_of: Callable[[Path], str]) -> dict[str, Path]:
-    """Folders by name, from words NAME=FOLDER or FOLDER.
-
-    Args:
-        words: what the user gave.
-        name_of: names a folder that was given without a name.
-
-    Raises:
-        FaceDiffError: if a word is neither, or two folders have one name.
-    """
-    found: dict[str, Path] = {}
-    for word in words:
-        name, equals, folder = word.partition("=")
-        if not equals or Path(word).exists():
-            name, folder = name_of(Path(word)), word
-        if not name or not folder:
-            raise FaceDiffError(f"{word}: expected NAME=FOLDER")
-        if name in found:
-            raise FaceDiffError(f'{word}: there is already one called "{name}"; name it with NAME=FOLDER')
-        found[name] = Path(folder)
-    return found
-
-
-def gather(args: argparse.Namespace) -> Material:
-    """Find truth, methods and what is known about their mesh.
-
-    Raises:
-        FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others.
-    """
-    from facediff.data.corpus import read_manifest, read_templates
-    from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN
-    from facediff.evaluation.figures import Material, find_clips
-    from facediff.evaluation.files import find_truths
-
-    methods = named_folders([args.predictions, *args.method], lambda path: path.resolve().name)
-    truth, corpus = find_truths(_truth_folder(args.truth))
-    if not truth.is_dir():
-        raise FaceDiffError(f"{args.truth}: no such folder; expected a corpus, a folder of .npy files, or puppet")
-    manifest = read_manifest(corpus) if corpus else {}
-    module = _recognise(args.topology, corpus or truth, manifest)
-    templates_file = args.templates or (corpus / "templates.pkl" if corpus else None)
-    if templates_file is not None and args.templates is None and not templates_file.is_file():
-        templates_file = None
-    n_vertices = module.n_vertices if module else _count_vertices(templates_file, truth)
-    templates = {} if templates_file is None else read_templates(templates_file, n_vertices)
-    mesh = _find_mesh(args.mesh, corpus or truth, module, n_vertices)
-    rate, stride = _rates(args, manifest, module)
-    truths, found = find_clips(
-        methods,
-        truth,
-        subjects=list(templates),
-        patterns=args.pattern or DEFAULT_PATTERNS,
-        truth_pattern=args.truth_pattern or TRUTH_PATTERN,
-        identity=args.identity,
-    )
-    return Material(
-        truths,
-        found,
-        n_vertices,
-        rate,
-        stride,
-        args.unit or str(manifest.get("unit") or getattr(module, "unit", "")),
-        templates,
-        None if mesh is None else mesh.faces,
-        None if mesh is None else mesh.vertices,
-        None if mesh is None else mesh.colours,
-        corpus,
-        f"{module.corpus_name}: synthetic corpus" if module and module.synthetic else "",
-    )
-
-
-def read_sound(given: Path | None, material: Material, clip: str) -> npt.NDArray[np.float32] | None:
-    """Speech (S,) of a clip at 16 kHz: the file given, else the corpus's; None if there is none.
-
-    Raises:
-        FaceDiffError: if the file given is missing or unreadable.
-    """
-    from facediff.data.audio import read_speech
-
-    path = given
-    if path is None and material.corpus is not None:
-        path = material.corpus / "wav" / f"{material.truths[clip].path.stem}.wav"
-        path = path if path.is_file() else None
-    return None if path is None else read_speech(path)
-
-
-def _truth_folder(truth: Path) -> Path:
-    if truth != PUPPET or truth.is_dir():
-        return truth
-    from facediff.data.puppet import cache_root
-
-    root = cache_root(0)
-    if not root.is_dir():
-        raise FaceDiffError(f"{root}: the built-in corpus is not there yet; `facediff demo` makes it")
-    return root
-
-
-def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module | None:
-    """The data module whose topology this is; None if that cannot be told."""
-    import os
-    import sys
-
-    import facediff.data  # noqa: F401 - the data modules are known once they are imported
-    from facediff.data.check.layouts import by_name, list_folder, recognise
-    from facediff.data.corpus import MOTION_FOLDERS
-
-    folder = list_folder(root, MOTION_FOLDERS)
-    if name is not None:
-        if "." in name:
-            sys.path.append(os.getcwd())  # a data module of one's own may lie in the working folder
-        return by_name(name, folder.n_vertices())
-    if not folder.motions or isinstance(manifest.get("person"), str):
-        return None
-    module = recognise(folder, manifest.get("corpus"), folder.n_vertices())
-    return module if module is not None and module.n_vertices == folder.n_vertices() else None
-
-
-def _count_vertices(templates_file: Path | None, truth: Path) -> int:
-    """Vertices of the mesh where no data module tells: as the templates have it, else the first readable truth."""
-    from facediff.evaluation.files import count_vertices
-
-    if templates_file is None and not any(truth.glob("**/*.npy")):
-        raise FaceDiffError(f"{truth}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
-    return count_vertices(None, templates_file, truth)
-
-
-def _find_mesh(given: Path | None, root: Path, module: Module | None, n_vertices: int) -> Mesh | None:
-    """The mesh given, else the one that lies in the corpus folder, else the built-in corpus's own; None without one."""
-    from facediff.mesh.mesh import SUFFIXES, read_mesh
-
-    if given is not None:
-        mesh = read_mesh(given)
-        if len(mesh.vertices) != n_vertices:
-            raise FaceDiffError(f"{given}: has {len(mesh.vertices)} vertices, the motion {n_vertices}; give its mesh")
-        return mesh
-    places = [root, root / "templates"]
-    files = [place / file for file in (module.mesh_files if module else ()) for place in places]
-    files += [file for place in places for file in sorted(place.glob("*")) if file.suffix.lower() in SUFFIXES]
-    for file in files:
-        if file.is_file() and len((mesh := read_mesh(file)).vertices) == n_vertices:
-            return mesh
-    if module is not None and module.corpus_name == "puppet":
-        from facediff.mesh.mesh import Mesh
-        from facediff.synthetic.face import build_face
-
-        face = build_face()
-        return Mesh(face.vertices, face.faces.astype("int32"), face.colours)
-    return None
-
-
-def _rates(args: argparse.Namespace, manifest: dict[str, Any], module: Module | None) -> tuple[float | None, int]:
-    """Frames a second of the predictions, and every how many-th frame of the truth belongs to them."""
-    said = manifest.get("frame_rate") or (module and (module.stored_frame_rate or module.frame_rate))
-    stored = float(said) if isinstance(said, int | float) else None
-    rate = args.frame_rate if args.frame_rate is not None else module.frame_rate if module else stored
-    if rate is not None and not 0 < rate < 10_000:
-        raise FaceDiffError(f"--frame-rate {rate:g}: expected frames a second, e.g. 25")
-    if args.truth_stride is not None:
-        if args.truth_stride < 1:
-            raise FaceDiffError(f"--truth-stride {args.truth_stride}: expected a number from 1")
-        return rate, args.truth_stride
-    if rate is None or stored is None:
-        return rate, 1
-    stride = round(stored / rate)
-    if stride < 1 or abs(stride * rate - stored) > 1e-6:
-        raise FaceDiffError(
-            f"the truth has {stored:g} frames a second, no whole multiple of the predictions' {rate:g}; say what is "
-            f"so with --frame-rate and --truth-stride"
-        )
-    return rate, stride
-
-
-EPILOG = """\
-PREDICTIONS are folders of .npy files of absolute vertices, (frames, V, 3) or (frames, 3V). TRUTH is a corpus folder
-(its vertices_npy, wav, templates.pkl, regions, phonemes and mesh are used), any folder of .npy files, or `puppet`, the
-built-in corpus. Exit status: 0 drawn, 2 something to put right."""
 NOTES = 3
 """Notes that are printed at most."""
 
+Predictions = Annotated[str, Option(metavar="PREDICTIONS")]
+Truth = Annotated[Path, Option(metavar="TRUTH")]
+Clip = Annotated[str | None, Option(metavar="CLIP")]
+Clips = Annotated[list[str] | None, Option(metavar="CLIP", many=True)]
+Highest = Annotated[float | None, Option(metavar="VALUE")]
 
-def run(name: str, arguments: Sequence[str]) -> int:
-    """Find the figure and draw it.
 
-    Raises:
-        FaceDiffError: if there is no such figure, or for anything that the user can put right.
+@dataclass(frozen=True)
+class FileOptions:
+    """Files.
+
+    PREDICTIONS are folders of .npy files of absolute vertices, (frames, V, 3) or (frames, 3V). TRUTH is a corpus
+    folder (its vertices_npy, wav, templates.pkl, regions, phonemes and mesh are used), any folder of .npy files, or
+    `puppet`, the built-in corpus.
+
+    Attributes:
+        method: a further method, repeatable
+        pattern: how predictions are named, repeatable (see `facediff evaluate`)
+        truth_pattern: how truths are named (default: {subject}_{sentence})
+        identity: whose style predictions were given: own, or an identity's name
+        topology: biwi, vocaset, mead3d, puppet, or package.module.Class
+        templates: templates.pkl, each speaker's neutral face
+        mesh: .ply or .obj with the faces
+        frame_rate: frames a second of the predictions
+        truth_stride: use every N-th frame of the truth (default: by the frame rates)
+        unit: unit of the vertices, such as m (default: the corpus's)
     """
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage())
-        return 0 if arguments else 2
-    figure, *rest = arguments
-    if figure not in FIGURES:
-        raise FaceDiffError(f'there is no command "figure {figure}": {choices(figure, FIGURES)}')
-    args = parser(figure).parse_args(rest)
-    from facediff.evaluation.figures.page import check_output, matplotlib
 
-    matplotlib()
-    check_output(args.output)
-    notes = FIGURES[figure][2](args)
+    method: Annotated[list[str] | None, Option(metavar="NAME=FOLDER")] = None
+    pattern: Annotated[list[str] | None, Option(metavar="PATTERN")] = None
+    truth_pattern: Annotated[str | None, Option(metavar="PATTERN")] = None
+    identity: Annotated[str, Option(metavar="NAME")] = "own"
+    topology: Annotated[str | None, Option(also="--corpus", metavar="NAME")] = None
+    templates: File = None
+    mesh: File = None
+    frame_rate: FrameRate = None
+    truth_stride: Annotated[int | None, Option(metavar="N", least=1)] = None
+    unit: Annotated[str | None, Option(metavar="U")] = None
+
+    def gather(self, predictions: str, truth: Path) -> Material:
+        """What is drawn.
+
+        Raises:
+            FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others.
+        """
+        from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN
+        from facediff.evaluation.figures.gather import gather
+
+        return gather(
+            named_folders([predictions, *(self.method or [])]),
+            truth,
+            patterns=self.pattern or DEFAULT_PATTERNS,
+            truth_pattern=self.truth_pattern or TRUTH_PATTERN,
+            identity=self.identity,
+            topology=self.topology,
+            templates=self.templates,
+            mesh=self.mesh,
+            frame_rate=self.frame_rate,
+            truth_stride=self.truth_stride,
+            unit=self.unit,
+        )
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """Page.
+
+    Attributes:
+        width: mm; 175 fills a page, 85 a column
+        dpi: pixels an inch
+        font: an installed font; DejaVu Sans has the IPA
+    """
+
+    width: Annotated[float, Option(metavar="MM")] = 175.0
+    dpi: Annotated[int, Option(metavar="N")] = 300
+    font: Annotated[str, Option(metavar="NAME")] = "DejaVu Sans"
+
+    def paper(self, output: Path) -> Paper:
+        """The page, after a check that the figure can be written.
+
+        Raises:
+            FaceDiffError: if it cannot, or the page is impossible.
+        """
+        from facediff.evaluation.figures import Paper
+        from facediff.evaluation.figures.page import check_output, matplotlib
+
+        matplotlib()
+        check_output(output)
+        return Paper(self.width, self.dpi, self.font)
+
+
+def frames(
+    predictions: Predictions,
+    truth: Truth,
+    *,
+    output: Output,
+    clip: Clip = None,
+    times: Annotated[list[float] | None, Option(metavar="SECONDS", many=True)] = None,
+    phonemes: Annotated[list[str] | None, Option(metavar="IPA", many=True)] = None,
+    phoneme_file: Annotated[Path | None, Option(metavar="CSV")] = None,
+    close_up: bool = False,
+    regions: Folder = None,
+    lips: Annotated[str | None, Option(metavar="FILE")] = None,
+    view: View = "front",
+    files: FileOptions,
+    page: PageOptions,
+) -> None:
+    """Faces at chosen times or phonemes, the truth and the methods below one another.
+
+    Args:
+        predictions: folder of predictions, or NAME=FOLDER
+        truth: corpus folder, folder of truths, or puppet
+        output: .png, .pdf or .svg
+        clip: <subject>_<sentence> (default: the first that all have)
+        times: columns by time
+        phonemes: columns by phoneme or viseme; m:2 is the clip's second /m/
+        phoneme_file: table of start, end, ipa (default: the corpus's)
+        close_up: show the mouth only
+        regions: for --close-up: folder with lve.txt or FLAME_masks.pkl
+        lips: for --close-up: the lips, as `facediff evaluate` takes them
+        view: camera
+        files: what is drawn.
+        page: how it is printed.
+    """
+    if bool(times) == bool(phonemes):
+        raise FaceDiffError("choose what the columns show, with either --times or --phonemes")
+    paper = page.paper(output)
+    from facediff.evaluation.figures import Moment, draw_frames, find_phoneme
+    from facediff.evaluation.figures.gather import phonemes_of
+
+    material = files.gather(predictions, truth)
+    chosen = material.choose([clip] if clip else None)[0]
+    spoken = phonemes_of(material, chosen, phoneme_file)
+    if times:
+        moments = [Moment(time, next((p for p in spoken if p.start <= time < p.end), None)) for time in times]
+    elif not spoken:
+        raise FaceDiffError(
+            f"nothing says when which phoneme of {chosen} is spoken; give --phoneme-file, a table with the columns "
+            f"start, end (seconds) and ipa, or choose --times"
+        )
+    else:
+        found = [find_phoneme(name, spoken, chosen) for name in phonemes or []]
+        moments = [Moment(phoneme.middle, phoneme) for phoneme in found]
+    region = None
+    if close_up:
+        from facediff.evaluation import read_region
+
+        folder = regions or (material.corpus / "regions" if material.corpus else None)
+        region = read_region("lips", material.n_vertices, folder=folder, source=lips).indices
+    draw_frames(material, chosen, moments, output, paper=paper, view=view, region=region)
+    report(output)
+
+
+def heatmap(
+    predictions: Predictions,
+    truth: Truth,
+    *,
+    output: Output,
+    clips: Clips = None,
+    highest_mean: Highest = None,
+    highest_std: Highest = None,
+    view: View = "front",
+    files: FileOptions,
+    page: PageOptions,
+) -> None:
+    """Mean and standard deviation over time of each vertex's motion.
+
+    Args:
+        predictions: folder of predictions, or NAME=FOLDER
+        truth: corpus folder, folder of truths, or puppet
+        output: .png, .pdf or .svg
+        clips: clips to count (default: all that truth and methods have)
+        highest_mean: end of the mean's scale in the unit shown
+        highest_std: end of the standard deviation's scale
+        view: camera
+        files: what is drawn.
+        page: how it is printed.
+    """
+    paper = page.paper(output)
+    from facediff.evaluation.figures import draw_heatmap
+
+    material = files.gather(predictions, truth)
+    chosen, highest = material.choose(clips), (highest_mean, highest_std)
+    report(output, draw_heatmap(material, chosen, output, paper=paper, view=view, highest=highest))
+
+
+def error(
+    predictions: Predictions,
+    truth: Truth,
+    *,
+    output: Output,
+    clips: Clips = None,
+    statistic: Literal["mean", "max", "both"] = "mean",
+    highest_mean: Highest = None,
+    highest_max: Highest = None,
+    view: View = "front",
+    files: FileOptions,
+    page: PageOptions,
+) -> None:
+    """Each vertex's error against the truth.
+
+    Args:
+        predictions: folder of predictions, or NAME=FOLDER
+        truth: corpus folder, folder of truths, or puppet
+        output: .png, .pdf or .svg
+        clips: clips to count (default: all that truth and methods have)
+        statistic: over frames
+        highest_mean: end of the mean's scale in the unit shown
+        highest_max: end of the maximum's scale
+        view: camera
+        files: what is drawn.
+        page: how it is printed.
+    """
+    paper = page.paper(output)
+    from facediff.evaluation.figures import draw_error
+
+    material = files.gather(predictions, truth)
+    notes = draw_error(
+        material,
+        material.choose(clips),
+        output,
+        paper=paper,
+        view=view,
+        statistic=statistic,
+        highest=(highest_mean, highest_max),
+    )
+    report(output, notes)
+
+
+def lips(
+    predictions: Predictions,
+    truth: Truth,
+    *,
+    output: Output,
+    clip: Clip = None,
+    lip_pairs: Annotated[str | None, Option(metavar="FILE")] = None,
+    audio: File = None,
+    phoneme_file: Annotated[Path | None, Option(metavar="CSV")] = None,
+    span: Annotated[tuple[float, float] | None, Option(metavar=("FROM", "TO"))] = None,
+    files: FileOptions,
+    page: PageOptions,
+) -> None:
+    """Lip opening over time, with phonemes and waveform beneath.
+
+    Args:
+        predictions: folder of predictions, or NAME=FOLDER
+        truth: corpus folder, folder of truths, or puppet
+        output: .png, .pdf or .svg
+        clip: <subject>_<sentence> (default: the first that all have)
+        lip_pairs: pairs of upper and lower lip vertices (default: the corpus's)
+        audio: the clip's speech (default: the corpus's)
+        phoneme_file: table of start, end, ipa (default: the corpus's)
+        span: seconds to show (default: all)
+        files: what is drawn.
+        page: how it is printed.
+    """
+    paper = page.paper(output)
+    from facediff.evaluation.figures import Sound, draw_lips, opening_curves, read_pairs
+    from facediff.evaluation.figures.gather import phonemes_of, sound_of
+
+    material = files.gather(predictions, truth)
+    chosen = material.choose([clip] if clip else None)[0]
+    curves, note = opening_curves(material, chosen, read_pairs(lip_pairs, material.corpus, material.n_vertices))
+    samples = sound_of(material, chosen, audio)
+    notes = [f"{chosen}: {note}"] if note else []
+    if samples is None:
+        notes.append(f"there is no sound of {chosen}; give --audio to have its waveform")
+    phonemes = phonemes_of(material, chosen, phoneme_file)
+    sound = Sound(phonemes=phonemes) if samples is None else Sound(samples, phonemes=phonemes)
+    draw_lips(curves, sound, output, paper=paper, scale=material.scale, span=span, remark=material.remark)
+    report(output, notes)
+
+
+def training(
+    runs: Annotated[list[str], Option(metavar="RUN")],
+    *,
+    output: Output,
+    scalar: Annotated[list[str] | None, Option(metavar="NAME")] = None,
+    smooth: Annotated[float, Option(metavar="W")] = 0.0,
+    log: bool = False,
+    x: Literal["step", "epoch"] = "step",
+    page: PageOptions,
+) -> None:
+    """Curves of one or several training runs from their metrics.csv.
+
+    Args:
+        runs: run folder with metrics.csv, or NAME=FOLDER
+        output: .png, .pdf or .svg
+        scalar: such as val/lve, repeatable (default: train/loss, val/lve)
+        smooth: weight of the past, 0 to below 1
+        log: logarithmic values
+        x: what the curves are over
+        page: how it is printed.
+    """
+    paper = page.paper(output)
+    from facediff.evaluation.figures import choose_scalars, draw_training, find_gaps, find_metrics, read_curves
+
+    folders = named_folders(runs, lambda path: "/".join(path.resolve().parts[-2:]).removeprefix("/"))
+    curves = {name: read_curves(find_metrics(folder), x) for name, folder in folders.items()}
+    scalars = choose_scalars(curves, scalar)
+    draw_training(curves, scalars, output, paper=paper, axis=x, smoothing=smooth, log=log)
+    report(output, find_gaps(curves, scalars, log=log))
+
+
+def report(output: Path, notes: Sequence[str] = ()) -> None:
+    """Print where the figure is, and the first of the notes about it."""
     for note in notes[:NOTES]:
         print(f"note: {note}")
     if len(notes) > NOTES:
         print(f"note: likewise {len(notes) - NOTES} more")
-    print(f"written: {args.output}")
-    return 0
-
-
-def parser(figure: str) -> argparse.ArgumentParser:
-    """Options of one of the figures."""
-    description, options, _ = FIGURES[figure]
-    made = argparse.ArgumentParser(
-        f"facediff figure {figure}",
-        description=description[:1].upper() + description[1:] + ".",
-        epilog=None if figure == "training" else EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    options(made.add_argument)
-    _page_options(made.add_argument)
-    return made
-
-
-def usage() -> str:
-    """The help text."""
-    lines = ["usage: facediff figure <figure> [options]", "", "figures:"]
-    lines += [f"  {name:<10}{description}" for name, (description, _, _) in FIGURES.items()]
-    return "\n".join([*lines, "", "`facediff figure <figure> --help` tells a figure's options"])
-
-
-Add = Callable[..., argparse.Action]
-
-
-def _page_options(add: Add) -> None:
-    add("-o", "--output", type=Path, required=True, metavar="FILE", help=".png, .pdf or .svg")
-    add("--width", type=float, default=175.0, metavar="MM", help="175 (default) fills a page, 85 a column")
-    add("--dpi", type=int, default=300, help="pixels an inch (default: 300)")
-    add("--font", default="DejaVu Sans", help="an installed font (default: DejaVu Sans, which has the IPA)")
-
-
-def _file_options(add: Add) -> None:
-    add("predictions", metavar="PREDICTIONS", help="folder of predictions, or NAME=FOLDER")
-    add("truth", metavar="TRUTH", type=Path, help="corpus folder, folder of truths, or puppet")
-    add("--method", metavar="NAME=FOLDER", action="append", default=[], help="a further method, repeatable")
-    add("--pattern", metavar="PATTERN", action="append", help="how predictions are named (see `facediff evaluate`)")
-    add("--truth-pattern", metavar="PATTERN", help="how truths are named (default: {subject}_{sentence})")
-    add("--identity", default="own", help="whose style predictions were given: own (default), or a name")
-    add("--topology", "--corpus", metavar="NAME", help="biwi, vocaset, mead3d, puppet, or package.module.Class")
-    add("--templates", type=Path, metavar="FILE", help="templates.pkl, each subject's neutral face")
-    add("--mesh", type=Path, metavar="FILE", help=".ply or .obj with the faces")
-    add("--frame-rate", type=float, metavar="FPS", help="frames a second of the predictions")
-    add("--truth-stride", type=int, metavar="N", help="take every N-th frame of the truth (default: by the rates)")
-    add("--unit", help="unit of the vertices, such as m (default: the corpus's)")
-
-
-def _view_options(add: Add) -> None:
-    _file_options(add)
-    add("--view", choices=["front", "three_quarter", "side"], default="front", help="default: %(default)s")
-
-
-def _frames_options(add: Add) -> None:
-    _view_options(add)
-    add("--clip", metavar="CLIP", help="<subject>_<sentence> (default: the first that all have)")
-    add("--times", type=float, nargs="+", metavar="SECONDS", help="columns by time")
-    add("--phonemes", nargs="+", metavar="IPA", help="columns by phoneme or viseme; m:2 is the clip's second /m/")
-    add("--phoneme-file", type=Path, metavar="CSV", help="table of start, end, ipa (default: the corpus's)")
-    add("--close-up", action="store_true", help="show the mouth only")
-    add("--regions", type=Path, metavar="FOLDER", help="for --close-up: folder with lve.txt or FLAME_masks.pkl")
-    add("--lips", metavar="FILE", help="for --close-up: the lips, as `facediff evaluate` takes them")
-
-
-def _clips_options(add: Add) -> None:
-    _view_options(add)
-    add("--clips", nargs="+", metavar="CLIP", help="clips to count (default: all that truth and methods have)")
-
-
-def _heatmap_options(add: Add) -> None:
-    _clips_options(add)
-    add("--highest-mean", type=float, metavar="VALUE", help="end of the mean's scale in the unit shown")
-    add("--highest-std", type=float, metavar="VALUE", help="end of the standard deviation's scale")
-
-
-def _error_options(add: Add) -> None:
-    _clips_options(add)
-    add("--statistic", choices=["mean", "max", "both"], default="mean", help="over frames (default: %(default)s)")
-    add("--highest-mean", type=float, metavar="VALUE", help="end of the mean's scale in the unit shown")
-    add("--highest-max", type=float, metavar="VALUE", help="end of the maximum's scale")
-
-
-def _lips_options(add: Add) -> None:
-    _file_options(add)
-    add("--clip", metavar="CLIP", help="<subject>_<sentence> (default: the first that all have)")
-    add("--lip-pairs", metavar="FILE", help="pairs of upper and lower lip vertices (default: the corpus's)")
-    add("--audio", type=Path, metavar="FILE", help="the clip's speech (default: the corpus's)")
-    add("--phoneme-file", type=Path, metavar="CSV", help="table of start, end, ipa (default: the corpus's)")
-    add("--span", type=float, nargs=2, metavar=("FROM", "TO"), help="seconds to show (default: all)")
-
-
-def _training_options(add: Add) -> None:
-    add("runs", nargs="+", metavar="RUN", help="run folder with metrics.csv, or NAME=FOLDER")
-    add("--scalar", action="append", metavar="NAME", help="such as val/lve, repeatable (default: train/loss, val/lve)")
-    add("--smooth", type=float, default=0.0, metavar="W", help="weight of the past, 0 (default) to below 1")
-    add("--log", action="store_true", help="logarithmic values")
-    add("--x", choices=["step", "epoch"], default="step", help="what the curves are over (default: %(default)s)")
-
-
-def _paper(args: argparse.Namespace) -> Paper:
-    from facediff.evaluation.figures import Paper
-
-    return Paper(args.width, args.dpi, args.font)
-
-
-def _frames(args: argparse.Namespace) -> list[str]:
-    from facediff.evaluation.figures import Moment, draw_frames, find_phoneme
-
-    if bool(args.times) == bool(args.phonemes):
-        raise FaceDiffError("choose what the columns show, with either --times or --phonemes")
-    paper, material = _paper(args), gather(args)
-    clip = material.choose([args.clip] if args.clip else None)[0]
-    if args.times:
-        moments = [Moment(time, _spoken_at(time, args, material, clip)) for time in args.times]
-    else:
-        phonemes = _phonemes(args, material, clip)
-        if not phonemes:
-            raise FaceDiffError(
-                f"nothing says when which phoneme of {clip} is spoken; give --phoneme-file, a table with the columns "
-                f"start, end (seconds) and ipa, or choose --times"
-            )
-        found = [find_phoneme(name, phonemes, clip) for name in args.phonemes]
-        moments = [Moment(phoneme.middle, phoneme) for phoneme in found]
-    region = None
-    if args.close_up:
-        from facediff.evaluation import read_region
-
-        folder = args.regions or (material.corpus / "regions" if material.corpus else None)
-        region = read_region("lips", material.n_vertices, folder=folder, source=args.lips).indices
-    draw_frames(material, clip, moments, args.output, paper=paper, view=args.view, region=region)
-    return []
-
-
-def _phonemes(args: argparse.Namespace, material: Material, clip: str) -> list[Phoneme]:
-    """Phonemes of a clip; none if nothing says them."""
-    from facediff.evaluation.figures import read_phonemes
-    from facediff.evaluation.figures.frames import phonemes_file
-
-    path = args.phoneme_file or phonemes_file(material.corpus, material.truths[clip].path.stem)
-    return read_phonemes(path) if path else []
-
-
-def _spoken_at(time: float, args: argparse.Namespace, material: Material, clip: str) -> Phoneme | None:
-    return next((p for p in _phonemes(args, material, clip) if p.start <= time < p.end), None)
-
-
-def _heatmap(args: argparse.Namespace) -> list[str]:
-    from facediff.evaluation.figures import draw_heatmap
-
-    paper, material = _paper(args), gather(args)
-    highest = (args.highest_mean, args.highest_std)
-    clips = material.choose(args.clips)
-    return draw_heatmap(material, clips, args.output, paper=paper, view=args.view, highest=highest)
-
-
-def _error(args: argparse.Namespace) -> list[str]:
-    from facediff.evaluation.figures import draw_error
-
-    paper, material = _paper(args), gather(args)
-    clips = material.choose(args.clips)
-    highest = (args.highest_mean, args.highest_max)
-    return draw_error(
-        material, clips, args.output, paper=paper, view=args.view, statistic=args.statistic, highest=highest
-    )
-
-
-def _lips(args: argparse.Namespace) -> list[str]:
-    from facediff.evaluation.figures import Sound, draw_lips, opening_curves, read_pairs
-
-    paper, material = _paper(args), gather(args)
-    clip = material.choose([args.clip] if args.clip else None)[0]
-    pairs = read_pairs(args.lip_pairs, material.corpus, material.n_vertices)
-    curves, note = opening_curves(material, clip, pairs)
-    samples = read_sound(args.audio, material, clip)
-    notes = [f"{clip}: {note}"] if note else []
-    if samples is None:
-        notes.append(f"there is no sound of {clip}; give --audio to have its waveform")
-    phonemes = _phonemes(args, material, clip)
-    sound = Sound(phonemes=phonemes) if samples is None else Sound(samples, phonemes=phonemes)
-    span = tuple(args.span) if args.span else None
-    draw_lips(curves, sound, args.output, paper=paper, scale=material.scale, span=span, remark=material.remark)
-    return notes
-
-
-def _training(args: argparse.Namespace) -> list[str]:
-    from facediff.evaluation.figures import choose_scalars, draw_training, find_gaps, find_metrics, read_curves
-
-    paper = _paper(args)
-    folders = named_folders(args.runs, lambda path: "/".join(path.resolve().parts[-2:]).removeprefix("/"))
-    runs = {name: read_curves(find_metrics(folder), args.x) for name, folder in folders.items()}
-    scalars = choose_scalars(runs, args.scalar)
-    draw_training(runs, scalars, args.output, paper=paper, axis=args.x, smoothing=args.smooth, log=args.log)
-    return find_gaps(runs, scalars, log=args.log)
-
-
-FIGURES: dict[str, tuple[str, Callable[[Add], None], Callable[[argparse.Namespace], list[str]]]] = {
-    "frames": (
-        "faces at chosen times or phonemes, the truth and the methods below one another",
-        _frames_options,
-        _frames,
-    ),
-    "heatmap": ("mean and standard deviation over time of each vertex's motion", _heatmap_options, _heatmap),
-    "error": ("each vertex's error against the truth", _error_options, _error),
-    "lips": ("lip opening over time, with phonemes and waveform beneath", _lips_options, _lips),
-    "training": ("curves of one or several runs from their metrics.csv", _training_options, _training),
-}
+    print(f"written: {output}")

@@ -1,24 +1,25 @@
 """Parsers made from the signatures and docstrings of the command functions.
 
 A command is a typed function. Its parameters are its options: the name, the type hint, the default and the docstring's
-``Args:`` entry become flag, type, default and help text. Parameters without a default that may be given by position
-are positional arguments. A parameter whose type is a dataclass is a group of options that several commands share; its
-fields are options as well, and the function gets an instance.
+``Args:`` entry become flag, type, default and help text. A parameter that may be given by position in Python is a
+positional argument of the command, too. A parameter whose type is a dataclass is a group of options that several
+commands share: the dataclass's fields are the options, and the function receives an instance.
 
 Type conversion is jsonargparse's; this module adds what that library leaves open: flags with dashes, options that may
-stand without a value, ranges of numbers, and one-sentence errors.
+stand without a value, ranges of numbers, and errors of one or two sentences.
 """
 
 from __future__ import annotations
 
 import argparse
+import collections.abc
 import dataclasses
 import inspect
 import math
 import re
 import types
 import typing
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
@@ -26,28 +27,33 @@ from facediff.errors import FaceDiffError, choices
 
 MISSING = inspect.Parameter.empty
 
+RENAMED = {"--takes": "--samples", "--directing-seed": "--controls-seed"}
+"""Options of version 0.1 that have another name now; the error names it."""
+
 
 @dataclass(frozen=True)
 class Option:
     """What a type hint cannot say about an option; used as ``Annotated[float, Option(...)]``.
 
     Attributes:
-        short: a short flag such as ``-o``.
-        metavar: the value's name in the help text.
+        also: another flag, such as ``-o``.
+        metavar: the name or, for a pair, the names of the value in the help text.
         many: for lists, whether one flag takes several values; else the flag is repeated.
         bare: the value if the option is given without one; None if a value is needed.
         least: smallest number allowed; infinity and NaN are never allowed.
         most: largest number allowed.
         above: number that the value must exceed.
+        below: number that the value must not reach.
     """
 
-    short: str = ""
-    metavar: str = ""
+    also: str = ""
+    metavar: str | tuple[str, ...] = ""
     many: bool = False
     bare: Any = None
     least: float | None = None
     most: float | None = None
     above: float | None = None
+    below: float | None = None
 
 
 @dataclass(frozen=True)
@@ -63,11 +69,10 @@ class Parameter:
 
     @property
     def flag(self) -> str:
-        """The name as it is typed."""
+        """The name as it is typed; the opposite's for a switch that is on by default."""
         if self.positional:
             return self.name
-        negative = self.default is True and self.is_switch
-        return f"--{'no-' if negative else ''}{self.name.replace('_', '-')}"
+        return f"--{'no-' if self.is_switch and self.default is True else ''}{self.name.replace('_', '-')}"
 
     @property
     def is_switch(self) -> bool:
@@ -75,9 +80,26 @@ class Parameter:
         return self.hint is bool
 
     @property
+    def length(self) -> int | None:
+        """How many values a tuple has; None for other types."""
+        hint = without_none(self.hint)
+        return len(get_args(hint)) if get_origin(hint) is tuple else None
+
+    @property
     def is_list(self) -> bool:
-        """Whether several values may be given."""
-        return get_origin(without_none(self.hint)) in (list, tuple, Sequence)
+        """Whether any number of values may be given."""
+        return get_origin(without_none(self.hint)) in (list, collections.abc.Sequence)
+
+    @property
+    def has_commas(self) -> bool:
+        """Whether one word holds all values of a list, separated by commas: so for a ``Sequence``."""
+        return get_origin(without_none(self.hint)) is collections.abc.Sequence
+
+    @property
+    def value_type(self) -> Any:  # noqa: ANN401 - a type or a type hint
+        """The type of a single value."""
+        hint = without_none(self.hint)
+        return get_args(hint)[0] if self.is_list or self.length else hint
 
     def check(self, value: Any) -> None:  # noqa: ANN401
         """Refuse numbers outside the range.
@@ -85,31 +107,44 @@ class Parameter:
         Raises:
             FaceDiffError: naming the option and the range.
         """
-        for number in value if isinstance(value, list) else [value]:
+        o = self.option
+        for number in value if isinstance(value, list | tuple) else [value]:
             if isinstance(number, bool) or not isinstance(number, int | float):
                 continue
-            o = self.option
             inside = (
                 math.isfinite(number)
                 and (o.least is None or number >= o.least)
                 and (o.most is None or number <= o.most)
                 and (o.above is None or number > o.above)
+                and (o.below is None or number < o.below)
             )
             if not inside:
                 raise FaceDiffError(f"{self.flag} {number}: out of range; expected {self.expected()}")
 
     def expected(self) -> str:
         """What values the parameter takes, in words."""
-        hint, o = without_none(self.hint), self.option
-        if self.is_list:
-            hint = get_args(hint)[0]
-        if get_origin(hint) is Literal:
-            return f"one of {', '.join(str(value) for value in get_args(hint))}"
-        noun = {int: "a whole number", float: "a finite number", str: "text"}.get(hint, "a path")
-        limits = [f"above {o.above:g}"] if o.above is not None else []
-        limits += [f"of at least {o.least:g}"] if o.least is not None else []
-        limits += [f"at most {o.most:g}"] if o.most is not None else []
-        return " ".join([noun, " and ".join(limits)]).strip()
+        o = self.option
+        if get_origin(self.value_type) is Literal:
+            return f"one of {', '.join(str(value) for value in get_args(self.value_type))}"
+        noun = {int: "a whole number", float: "a finite number", str: "text"}.get(self.value_type, "a path")
+        words = {"above": o.above, "of at least": o.least, "below": o.below, "of at most": o.most}
+        limits = " and ".join(f"{word} {limit}" for word, limit in words.items() if limit is not None)
+        several = f"{self.length} times {noun}" if self.length else noun
+        return f"{several} {limits}".strip()
+
+
+Parameters = Mapping[str, "Parameter | Group"]
+"""A command's parameters by name."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """A dataclass parameter: options that several commands share."""
+
+    made: type
+    title: str
+    details: str
+    parameters: list[Parameter]
 
 
 def without_none(hint: Any) -> Any:  # noqa: ANN401
@@ -120,35 +155,36 @@ def without_none(hint: Any) -> Any:  # noqa: ANN401
     return hint
 
 
-def parameters_of(function: Callable[..., Any]) -> dict[str, list[Parameter] | Parameter]:
-    """The parameters of a command function; those of a dataclass parameter as a list."""
-    helps = help_texts(function)
+def parameters_of(function: Callable[..., Any]) -> dict[str, Parameter | Group]:
+    """The parameters of a command function, or the fields of a dataclass."""
+    import docstring_parser
+
+    parsed = docstring_parser.parse(inspect.getdoc(function) or "", docstring_parser.DocstringStyle.GOOGLE)
+    helps = {entry.arg_name: plain_text(entry.description or "") for entry in parsed.params}
     hints = typing.get_type_hints(function, include_extras=True)
-    found: dict[str, list[Parameter] | Parameter] = {}
+    found: dict[str, Parameter | Group] = {}
     for name, parameter in inspect.signature(function).parameters.items():
-        if name == "return" or parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+        if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
             continue
-        hint = hints[name]
+        hint, option = hints[name], Option()
         if dataclasses.is_dataclass(hint):
-            group = parameters_of(typing.cast(type, hint))
-            found[name] = [each for each in group.values() if isinstance(each, Parameter)]
+            made = typing.cast(type, hint)
+            fields = [field for field in parameters_of(made).values() if isinstance(field, Parameter)]
+            found[name] = Group(made, *summary_of(made), fields)
             continue
-        option = Option()
         if get_origin(hint) is Annotated:
             hint, *extras = get_args(hint)
             option = next((extra for extra in extras if isinstance(extra, Option)), option)
-        # A required parameter that may be given by position is a positional argument of the command, too.
-        positional = parameter.default is MISSING and parameter.kind is not parameter.KEYWORD_ONLY
+        # The fields of a dataclass may be given by position in Python, but are options of the command line.
+        positional = parameter.kind is not parameter.KEYWORD_ONLY and not inspect.isclass(function)
         found[name] = Parameter(name, hint, parameter.default, helps.get(name, ""), option, positional)
     return found
 
 
-def help_texts(function: Callable[..., Any]) -> dict[str, str]:
-    """What a docstring's ``Args:`` or ``Attributes:`` section says of each parameter, without reST marks."""
-    import docstring_parser
-
-    parsed = docstring_parser.parse(inspect.getdoc(function) or "", docstring_parser.DocstringStyle.GOOGLE)
-    return {p.arg_name: plain_text(p.description or "") for p in parsed.params}
+def flat(parameters: Parameters) -> list[Parameter]:
+    """All parameters, those of groups included."""
+    entries = ([entry] if isinstance(entry, Parameter) else entry.parameters for entry in parameters.values())
+    return [parameter for entry in entries for parameter in entry]
 
 
 def plain_text(text: str) -> str:
@@ -157,13 +193,13 @@ def plain_text(text: str) -> str:
     return " ".join(text.replace("``", "").split())
 
 
-def summary_of(function: Callable[..., Any]) -> tuple[str, str]:
-    """A docstring's first line, and what stands between it and its sections."""
+def summary_of(documented: object) -> tuple[str, str]:
+    """A docstring's first line, and the text between it and its sections."""
     import docstring_parser
 
-    parsed = docstring_parser.parse(inspect.getdoc(function) or "", docstring_parser.DocstringStyle.GOOGLE)
-    long = inspect.cleandoc(parsed.long_description or "").replace("``", "")
-    return plain_text(parsed.short_description or ""), long
+    parsed = docstring_parser.parse(inspect.getdoc(documented) or "", docstring_parser.DocstringStyle.GOOGLE)
+    details = inspect.cleandoc(parsed.long_description or "").replace("``", "")
+    return plain_text(parsed.short_description or ""), details
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -182,122 +218,160 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         return super()._format_action_invocation(shown if action.option_strings else action)
 
 
-def make_parser(function: Callable[..., Any], program: str) -> Any:  # noqa: ANN401 - jsonargparse is imported late
-    """The parser of a command function.
+def make_parser(
+    parameters: Parameters, program: str, summary: str, details: str | Callable[[], str] = ""
+) -> argparse.ArgumentParser:
+    """The parser of a command.
 
     Args:
-        function: the command.
+        parameters: its options.
         program: what is typed for it, such as ``facediff export``.
+        summary: what it does, in a sentence.
+        details: text at the end of the help; a function is called when the help is printed.
     """
     import jsonargparse
 
     class Parser(jsonargparse.ArgumentParser):
         def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-            raise FaceDiffError(readable(message, parameters, program)) from ex
+            raise FaceDiffError(readable(message, flat(parameters), program)) from ex
 
-    summary, details = summary_of(function)
-    parser = Parser(
-        prog=program,
-        description=summary,
-        epilog=details or None,
-        formatter_class=HelpFormatter,
-        allow_abbrev=False,
-    )
-    grouped = parameters_of(function)
-    parameters = [p for entry in grouped.values() for p in (entry if isinstance(entry, list) else [entry])]
-    hints = typing.get_type_hints(function)
-    for name, entry in grouped.items():
+        def format_help(self, *arguments: Any) -> str:  # noqa: ANN401 - passed on
+            self.epilog = details() if callable(details) else details
+            return super().format_help(*arguments)
+
+    parser = Parser(prog=program, description=summary, formatter_class=HelpFormatter, allow_abbrev=False)
+    for entry in parameters.values():
         if isinstance(entry, Parameter):
             add(parser, entry)
         else:
-            title, details = summary_of(hints[name])
-            group = parser.add_argument_group(title.rstrip("."), details or None)
-            for parameter in entry:
+            group = parser.add_argument_group(entry.title.rstrip("."), entry.details or None)
+            for parameter in entry.parameters:
                 add(group, parameter)
     return parser
 
 
-def add(parser: Any, parameter: Parameter) -> None:  # noqa: ANN401
+def add(parser: Any, parameter: Parameter) -> None:  # noqa: ANN401 - argparse's groups have no public type
     """Add one parameter to a parser or to a group of it."""
-    option, optional = parameter.option, parameter.default is not MISSING
+    option = parameter.option
     words: dict[str, Any] = {"help": parameter.help.replace("%", "%%")}
+    dashed = parameter.flag
+    flags = list(dict.fromkeys([*([option.also] if option.also else []), dashed, f"--{dashed[2:].replace('-', '_')}"]))
     if parameter.is_switch:
-        action = "store_false" if parameter.default else "store_true"
-        flags = dict.fromkeys([parameter.flag, parameter.flag.replace("-", "_").replace("__", "--", 1)])
-        parser.add_argument(*flags, dest=parameter.name, action=action, **words)
+        parser.add_argument(
+            *flags, dest=parameter.name, action="store_false" if parameter.default else "store_true", **words
+        )
         return
-    hint = parameter.hint
-    if parameter.is_list:
-        inner = get_args(without_none(hint))[0]
-        if parameter.positional:
-            parser.add_argument(parameter.name, type=inner, nargs="+", metavar=option.metavar or None, **words)
-            return
-        words |= {"type": inner, "nargs": "+"} if option.many else {"type": inner, "action": "append"}
-    else:
-        words |= {"type": hint}
-    if option.bare is not None:
-        words |= {"nargs": "?", "const": option.bare}
+    words["type"] = str if parameter.has_commas else parameter.value_type
     if option.metavar:
         words["metavar"] = option.metavar
+    if parameter.length:
+        words["nargs"] = parameter.length
+    elif parameter.is_list and not parameter.has_commas:
+        words |= {"nargs": "+"} if option.many or parameter.positional else {"action": "append"}
+    if option.bare is not None:
+        words |= {"nargs": "?", "const": option.bare}
     if parameter.positional:
+        words |= {} if parameter.default is MISSING else {"nargs": "?", "default": parameter.default}
         parser.add_argument(parameter.name, **words)
         return
-    words |= {"default": parameter.default} if optional else {"required": True}
-    if parameter.is_list and optional and not isinstance(parameter.default, type(None)):
-        words["default"] = list(parameter.default)
-    flags = dict.fromkeys([*([option.short] if option.short else []), parameter.flag, f"--{parameter.name}"])
+    if parameter.default is MISSING:
+        words["required"] = True
+    else:
+        words["default"] = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
     parser.add_argument(*flags, dest=parameter.name, **words)
 
 
-def run_function(function: Callable[..., Any], program: str, arguments: Sequence[str]) -> int:
-    """Parse the arguments of a command and call its function.
+def parse(
+    parameters: Parameters,
+    arguments: Sequence[str],
+    program: str,
+    summary: str = "",
+    details: str | Callable[[], str] = "",
+) -> dict[str, Any]:
+    """The values of a command's parameters; those of a group as an instance of its dataclass.
 
     Args:
-        function: the command; what it returns is the exit status, None means 0.
-        program: what is typed for it.
-        arguments: the words after it.
+        parameters: the command's options.
+        arguments: the words after its name.
+        program: as :func:`make_parser` takes it, like what follows.
+        summary: likewise.
+        details: likewise.
 
     Raises:
-        FaceDiffError: if the arguments are wrong; the message names the option.
+        FaceDiffError: if the words are wrong; the message names the option.
     """
-    parser = make_parser(function, program)
-    values = vars(parser.parse_args(list(arguments)))
-    status = function(**arguments_from(function, values))
-    return int(status or 0)
-
-
-def arguments_from(function: Callable[..., Any], values: typing.Mapping[str, Any]) -> dict[str, Any]:
-    """A command function's arguments from parsed values: dataclass parameters made, numbers checked.
-
-    Raises:
-        FaceDiffError: if a number is out of range.
-    """
-    hints = typing.get_type_hints(function)
-    made: dict[str, Any] = {}
-    for name, entry in parameters_of(function).items():
-        for parameter in entry if isinstance(entry, list) else [entry]:
-            parameter.check(values[parameter.name])
-        if isinstance(entry, list):
-            made[name] = hints[name](**{parameter.name: values[parameter.name] for parameter in entry})
-        else:
+    values = vars(make_parser(parameters, program, summary, details).parse_args(list(arguments)))
+    for parameter in flat(parameters):
+        value = values[parameter.name]
+        if parameter.has_commas and isinstance(value, str):
+            values[parameter.name] = [word for word in value.replace(",", " ").split() if word]
+        elif parameter.length and value is not None:
+            values[parameter.name] = tuple(value)
+        parameter.check(value)
+    made = {}
+    for name, entry in parameters.items():
+        if isinstance(entry, Parameter):
             made[name] = values[name]
+        else:
+            made[name] = entry.made(**{parameter.name: values[parameter.name] for parameter in entry.parameters})
     return made
 
 
+def arguments_of(function: Callable[..., Any], program: str, words: Sequence[str]) -> dict[str, Any]:
+    """The arguments of a command function, read from a command line.
+
+    Args:
+        function: the command.
+        program: what is typed for it.
+        words: what follows.
+
+    Raises:
+        FaceDiffError: if the words are wrong; the message names the option.
+    """
+    summary, details = summary_of(function)
+    late: Callable[[], str] | None = getattr(function, "more_help", None)
+    whole = details if late is None else lambda: f"{details}\n\n{late()}".strip()
+    return parse(parameters_of(function), words, program, summary, whole)
+
+
+Function = typing.TypeVar("Function", bound=Callable[..., Any])
+
+
+def with_more_help(text: Callable[[], str]) -> Callable[[Function], Function]:
+    """Decorator of a command whose help ends with text that is costly to make, and made when the help is printed."""
+
+    def decorate(function: Function) -> Function:
+        vars(function)["more_help"] = text
+        return function
+
+    return decorate
+
+
 def readable(message: str, parameters: Collection[Parameter], program: str) -> str:
-    """One sentence for what argparse and jsonargparse say in several lines."""
+    """At most two sentences for what argparse and jsonargparse say in several lines."""
     see = f"see `{program} --help`"
+    flags = {parameter.name: parameter.flag for parameter in parameters}
     key = re.search(r'Parser key "(\w+)"', message)
     parameter = next((p for p in parameters if key is not None and p.name == key.group(1)), None)
     if parameter is not None:
         given = re.search(r"(?:Got|Given) value: (.*)", message)
         value = given.group(1).strip("'\"") if given is not None else ""
-        return f"{parameter.flag} {value}: not valid; expected {parameter.expected()} ({see})"
+        bare = f"; {parameter.flag} without a value goes to the end" if parameter.option.bare is not None else ""
+        return f"{parameter.flag} {value}: not valid; expected {parameter.expected()}{bare} ({see})"
     unknown = re.search(r"[Uu]nrecognized arguments?: (\S+)", message)
-    if unknown is not None and unknown.group(1).startswith("-"):
+    if unknown is not None:
         word = unknown.group(1).partition("=")[0]
-        known = [p.flag for p in parameters if not p.positional]
+        if not word.startswith("-"):
+            return f"{word}: one argument too many; {see}"
+        known = [parameter.flag for parameter in parameters if not parameter.positional]
+        if RENAMED.get(word) in known:
+            return f"{word}: there is no such option; it is called {RENAMED[word]} now"
         hint = choices(word, known).partition("known are")[0].strip()
-        return f"{word}: there is no such option; {hint + ' ' if hint else ''}{see}".replace("? see", "? See")
+        return f"{word}: there is no such option; {hint} S{see[1:]}" if hint else f"{word}: no such option; {see}"
+    needed = re.search(r"arguments are required: (.*)", message)
+    if needed is not None:
+        names = [name.split("/")[-1].strip() for name in needed.group(1).split(",")]
+        shown = ", ".join(flags.get(name.lstrip("-").replace("-", "_"), name) for name in names)
+        return f"{shown}: missing; {see}"
     first = " ".join(message.split())
     return f"{first[:1].lower()}{first[1:]}; {see}"

@@ -1,66 +1,46 @@
-"""``facediff style extract``: how a person moves, as one vector."""
+"""``facediff style extract``: a speaking style as one vector."""
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
-from pathlib import Path
+from typing import Annotated
 
+from facediff.cli.options import Checkpoint, Identity, Output
+from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 
 
-def parser() -> argparse.ArgumentParser:
-    """Options of the command."""
-    made = argparse.ArgumentParser("facediff style", description="Style vectors of people's motion.")
-    made.add_argument(
-        "action", choices=["extract"], help="write the style vector of clips, their mean if there are several"
-    )
-    made.add_argument(
-        "clips",
-        nargs="+",
-        metavar="CLIP",
-        help="motion of one person: .npy files of absolute vertices, or names of the corpus's clips (F1_e03)",
-    )
-    made.add_argument("--checkpoint", type=Path, required=True, metavar="C", help="trained model (.ckpt)")
-    made.add_argument(
-        "--identity",
-        metavar="NAME",
-        help="whose motion it is, where the files' names do not tell; the first trained on",
-    )
-    made.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="vector to write (.npy)")
-    return made
+def extract(
+    clips: Annotated[list[str], Option(metavar="CLIP")],
+    *,
+    checkpoint: Checkpoint,
+    output: Output,
+    identity: Identity = None,
+) -> None:
+    """Write the style vector of clips, their mean if there are several.
 
+    Args:
+        clips: motion of one speaker: .npy files of absolute vertices, or names of the corpus's clips (F1_e03)
+        checkpoint: trained model (.ckpt)
+        output: vector to write (.npy)
+        identity: whose motion it is, where the files' names do not say it; by default the first one trained on
+    """
+    if output.suffix != ".npy":
+        raise FaceDiffError(f"--output {output}: expected a name that ends in .npy")
+    if not checkpoint.is_file():
+        raise FaceDiffError(f"--checkpoint {checkpoint}: no such file")
 
-def run(name: str, arguments: Sequence[str]) -> int:
-    """Extract a style vector."""
-    args = parser().parse_args(list(arguments))
-    import numpy as np
-    import torch
-
-    from facediff.models import Style, load_model
-    from facediff.models.styles import read_style
+    from facediff.models import load_model
+    from facediff.models.styles import extract_style
     from facediff.utils.files import atomic, check_writable
 
-    if args.output.suffix != ".npy":
-        raise FaceDiffError(f"--output {args.output}: expected a name that ends in .npy")
-    check_writable(args.output)
-    model = load_model(args.checkpoint)
-    identity = args.identity or model.identities[0]
-    vectors = []
-    for clip in args.clips:
-        style = read_style(clip, identity, model)
-        if isinstance(style, Style):
-            raise FaceDiffError(f"{clip}: is a style vector already; give a motion (frames, vertices, 3)")
-        motion = style.motion.float()[None]
-        with torch.inference_mode():
-            vectors.append(model.encode_style(motion, torch.ones(motion.shape[:2], dtype=torch.bool))[0])
-    vector = torch.stack(vectors).mean(0)
+    check_writable(output)
+    model = load_model(checkpoint)
+    vector = extract_style(clips, identity or model.identities[0], model)
     if not len(vector):
-        raise FaceDiffError(f"{args.checkpoint}: was trained without a dynamic style, so it has no style vectors")
-    with atomic(args.output) as temporary, temporary.open("wb") as stream:
+        raise FaceDiffError(f"{checkpoint}: was trained without a dynamic style, so it has no style vectors")
+    import numpy as np
+
+    with atomic(output) as temporary, temporary.open("wb") as stream:
         np.save(stream, vector.numpy(), allow_pickle=False)
-    print(
-        f"{args.output}: style vector of {len(vector)} numbers from {', '.join(args.clips)}, for this checkpoint only"
-    )
-    print(f"next: facediff animate speech.wav --checkpoint {args.checkpoint} --style {args.output} -o speech.mp4")
-    return 0
+    print(f"{output}: style vector of {len(vector)} numbers from {', '.join(clips)}, for this checkpoint only")
+    print(f"next: facediff animate speech.wav --checkpoint {checkpoint} --style {output} -o speech.mp4")

@@ -10,12 +10,20 @@ from facediff import synthetic as puppet
 from facediff.data.corpus import Clip
 from facediff.data.datamodule import SpeechMotionDataModule, Split
 from facediff.data.dataset import ReferenceChoice
+from facediff.mesh import Mesh
+from facediff.synthetic.face import build_face
 from facediff.utils.files import cache_dir
 
 
 def cache_root(seed: int) -> Path:
     """Where the corpus of a seed is kept: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
     return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}"
+
+
+def built_in_mesh() -> Mesh:
+    """The mesh of the built-in corpus, with its colours."""
+    face = build_face()
+    return Mesh(face.vertices, face.faces.astype("int32"), face.colours)
 
 
 @registry.corpus.register("Puppet")

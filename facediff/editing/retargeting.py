@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,12 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.animation import METRES
-from facediff.editing.correspondence import Correspondence, Surface, averaging, refuse_other_mesh
+from facediff.editing.correspondence import Correspondence, Surface, averaging, correspond, refuse_other_mesh
+from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
 from facediff.errors import FaceDiffError
-from facediff.mesh import Mesh, Similarity
+from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.utils.arrays import read_arrays
-from facediff.utils.files import atomic
+from facediff.utils.files import atomic, check_writable
 
 # Correspondences and landmarks on disk.
 
@@ -202,6 +204,79 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh) ->
             "carried": f"from a mesh of {len(neutral)} vertices to one of {len(rest)} by nearest points of its surface",
         },
     )
+
+
+def retarget(
+    animation: Animation, mesh_path: Path, correspondence_path: Path | None = None, landmarks_path: Path | None = None
+) -> tuple[Animation, Correspondence]:
+    """An animation on the mesh in a file, and the correspondence between both meshes.
+
+    Args:
+        animation: with triangles.
+        mesh_path: the other face at rest.
+        correspondence_path: used if it exists, else written; None for neither.
+        landmarks_path: CSV of vertex pairs, for a correspondence that does not exist yet.
+
+    Raises:
+        FaceDiffError: if a file is unreadable, or a mesh is not the correspondence's or has its vertices in another
+            order.
+    """
+    triangles = animation.triangles  # refuses an animation without triangles before the other mesh is read
+    mesh = read_mesh(mesh_path)
+    if correspondence_path is not None and correspondence_path.exists():
+        if landmarks_path is not None:
+            raise FaceDiffError(
+                f"--landmarks {landmarks_path}: {correspondence_path} exists and would be used without them; remove "
+                f"it, or omit the landmarks"
+            )
+        found = load_correspondence(correspondence_path)
+        refuse_other_mesh(str(mesh_path), mesh.vertices, mesh.faces, found.target_vertices, found.target_faces)
+        return carry(animation, found, mesh), found
+    if correspondence_path is not None:
+        if correspondence_path.suffix != ".npz":
+            raise FaceDiffError(f"--correspondence {correspondence_path}: expected a name that ends in .npz")
+        check_writable(correspondence_path)
+    landmarks = None if landmarks_path is None else read_landmarks(landmarks_path)
+    try:
+        found = correspond(animation.template, triangles, mesh.vertices, mesh.faces, landmarks=landmarks)
+    except FaceDiffError as error:
+        raise FaceDiffError(f"{mesh_path}: {error}") from error
+    made = carry(animation, found, mesh)
+    if correspondence_path is not None:
+        save_correspondence(correspondence_path, found)
+    return made, found
+
+
+def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
+    """Blendshapes of another topology, transferred to an animation's mesh.
+
+    Args:
+        path: a set of shapes, as :func:`facediff.editing.shapes.read_shape_files` takes it.
+        animation: with triangles.
+
+    Raises:
+        FaceDiffError: if the shapes cannot be read, come without a neutral face with triangles, or do not fit.
+    """
+    files = read_shape_files(path)
+    if files.neutral is None or files.faces is None:
+        raise FaceDiffError(
+            f"{path}: transferring shapes to another mesh needs their neutral face with triangles; add it as "
+            f"neutral{files.first.suffix}"
+        )
+    found = correspond(files.neutral, files.faces, animation.template, animation.triangles)
+    note = f"the shapes are transferred from a mesh of {len(files.neutral)} vertices"
+    if found.fits_badly:
+        note += ", which fits badly: look at the result with --show"
+    template = animation.template.astype(np.float64)
+    moved = replace(
+        files,
+        shapes=template + carry_displacements(found, files.shapes - files.neutral),
+        neutral=template,
+        faces=animation.faces,
+        metric=False,
+        notes=(*files.notes, note),
+    )
+    return fitted(moved, animation.template, animation.unit)
 
 
 def unit_of(unit: str, scale: float) -> str:

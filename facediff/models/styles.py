@@ -356,6 +356,28 @@ def vector_of(style: Reference | Style, model: AnimationModel) -> Tensor:
     return encoded[0].cpu().clone()
 
 
+def extract_style(clips: Sequence[str], identity: str, model: AnimationModel) -> Tensor:
+    """The style vector (S,) of clips; their mean if there are several.
+
+    Args:
+        clips: motions, as :func:`read_style` takes them.
+        identity: whose motion it is, where a file's name does not say it.
+        model: gives the style vectors; S is 0 if it was trained without styles.
+
+    Raises:
+        FaceDiffError: if a clip cannot be read, or is a style vector already.
+    """
+    import torch
+
+    from facediff.models import Style
+
+    styles = [read_style(clip, identity, model) for clip in clips]
+    for clip, style in zip(clips, styles, strict=True):
+        if isinstance(style, Style):
+            raise FaceDiffError(f"{clip}: is a style vector already; give a motion (frames, vertices, 3)")
+    return torch.stack([vector_of(style, model) for style in styles]).mean(0)
+
+
 def style_paths(words: str | None) -> list[Path]:
     """The files among the words of ``--style``, by which to tell whether a style has changed."""
     return [Path(part.name) for part in split_styles(words) if Path(part.name).is_file()] if words else []

@@ -1,8 +1,7 @@
-"""``facediff animate --stream``: PCM from standard input, frames as soon as they are certain."""
+"""Samples of speech from standard input to frames of animation, as soon as these are certain."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import sys
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from facediff.errors import FaceDiffError
-from facediff.pipelines.animate import check_seed
+from facediff.pipelines.animate import AnimationOptions, AnimationPipeline
 from facediff.utils.files import atomic, check_writable
 
 if TYPE_CHECKING:
@@ -26,62 +25,35 @@ CHUNK = 0.02
 """Seconds of speech that are read at a time, at most."""
 
 
-def check_stream(args: argparse.Namespace) -> None:
-    """Refuse what streaming cannot do.
+def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_000, seed: int = 0) -> None:
+    """Animate samples of standard input as they come, until they end or Ctrl-C ends them.
+
+    Args:
+        options: of inference; what needs the whole animation is refused.
+        output: a .npy file, or ``-`` for raw float32 vertices to standard output.
+        rate: sample rate of the 16-bit mono samples.
+        seed: seed of the noise.
 
     Raises:
-        FaceDiffError: naming the option.
+        FaceDiffError: if an option is impossible, or the speech ends before a frame.
     """
-    if [str(path) for path in args.speech] != ["-"]:
-        raise FaceDiffError(
-            f"--stream: reads standard input; give - in place of {args.speech[0]} (a file needs no --stream)"
-        )
-    if str(args.output) != "-" and args.output.suffix != ".npy":
-        raise FaceDiffError(
-            f"--output {args.output}: a stream is written as .npy, or as raw float32 to standard output with -o -; "
-            f"`facediff export` turns the .npy into other formats"
-        )
-    whole = ("expressiveness", "blinks", "gaze", "sway", "target_mesh", "output_unit", "up")
-    given = next((name for name in whole if getattr(args, name) is not None), None)
-    if given is not None or args.takes != 1:
-        raise FaceDiffError(
-            f"--{'takes' if given is None else given.replace('_', '-')}: needs the whole performance; stream to .npy, "
-            f"then use `facediff export`"
-        )
-    check_seed(args.seed)
-    if sys.stdin is None:
-        raise FaceDiffError("--stream: standard input is closed; send samples to it")
-    if not 1000 <= args.rate <= 384_000:
-        raise FaceDiffError(f"--rate {args.rate}: expected samples a second, such as 16000 or 48000")
-    if str(args.output) != "-":
-        check_writable(args.output)
-
-
-def run_stream(args: argparse.Namespace) -> int:
-    """Animate speech as it comes, until it ends or Ctrl-C ends it.
-
-    Raises:
-        FaceDiffError: if an option is no good, or the speech ends before a frame.
-    """
-    check_stream(args)
+    check_stream(options, output)
 
     import torch
 
-    from facediff.pipelines.animate import AnimationPipeline
-
-    pipeline = AnimationPipeline(args)
+    pipeline = AnimationPipeline(options)
     model = pipeline.model
     plan = model.windows
     template = model.assets.template(pipeline.identity)
-    tell(
+    report(
         f"look-ahead {plan.look_ahead:.2f} s and the time that a window takes; {plan.in_frames(model.frame_rate).hop} "
-        f"frames at a time, {model.frame_rate:g} a second, {len(template)} vertices; reading {args.rate} Hz, 16 bit"
+        f"frames at a time, {model.frame_rate:g} a second, {len(template)} vertices; reading {rate} Hz, 16 bit"
     )
     busy, heard = 0.0, 0
-    with sink(args.output, tuple(template.shape)) as write, pipeline.precision(), ended_by_interrupt() as read:
-        # In the precision asked for from the style on, as a file is animated.
-        stream = model.stream(identity=pipeline.identity, style=pipeline.style, seeds=[args.seed])
-        for samples in pcm(sys.stdin.buffer, args.rate, read):
+    with sink(output, tuple(template.shape)) as write, pipeline.precision(), ended_by_interrupt() as read:
+        # The style is encoded within the precision as well, as it is for a file.
+        stream = model.stream(identity=pipeline.identity, style=pipeline.style, seeds=[seed])
+        for samples in pcm(sys.stdin.buffer, rate, read):
             started = time.perf_counter()
             part = stream.feed(torch.from_numpy(samples))
             busy += time.perf_counter() - started
@@ -93,12 +65,42 @@ def run_stream(args: argparse.Namespace) -> int:
         part = stream.finish()
         busy += time.perf_counter() - started
         write((part[0].cpu() + template).numpy())
-    tell(f"{heard / 16_000:.2f} s of speech; real-time factor {busy / max(heard / 16_000, 1e-9):.2f}")
-    return 0
+    report(f"{heard / 16_000:.2f} s of speech; real-time factor {busy / max(heard / 16_000, 1e-9):.2f}")
 
 
-def tell(sentence: str) -> None:
-    """To standard error, since standard output may be the stream."""
+def check_stream(options: AnimationOptions, output: Path) -> None:
+    """Refuse what streaming cannot do.
+
+    Raises:
+        FaceDiffError: naming the option.
+    """
+    if str(output) != "-" and output.suffix != ".npy":
+        raise FaceDiffError(
+            f"--output {output}: a stream is written as .npy, or as raw float32 to standard output with -o -; "
+            f"`facediff export` turns the .npy into other formats"
+        )
+    controls, export = options.controls, options.export
+    whole = {
+        "expressiveness": controls.expressiveness,
+        "blinks": controls.blinks,
+        "gaze": controls.gaze,
+        "sway": controls.sway,
+        "target-mesh": options.target_mesh,
+        "output-unit": export.unit,
+        "up": export.up,
+        "samples": None if options.samples == 1 else options.samples,
+    }
+    for option, value in whole.items():
+        if value is not None:
+            raise FaceDiffError(f"--{option}: needs the whole animation; stream to .npy, then use `facediff export`")
+    if sys.stdin is None:
+        raise FaceDiffError("--stream: standard input is closed; send samples to it")
+    if str(output) != "-":
+        check_writable(output)
+
+
+def report(sentence: str) -> None:
+    """Print to standard error, since standard output may be the stream."""
     print(f"facediff animate: {sentence}", file=sys.stderr, flush=True)
 
 
@@ -108,9 +110,9 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
-    """An ``os.read`` that is at its end after Ctrl-C, which ends most microphones; a second Ctrl-C stops at once.
+    """An ``os.read`` that returns nothing more after Ctrl-C, by which most recordings end; a second Ctrl-C stops.
 
-    Where Ctrl-C is ignored or somebody else's, it stays so.
+    A handler of Ctrl-C that somebody else has installed stays in place.
     """
     stopped = reading = False
 
@@ -147,7 +149,7 @@ def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.rea
     """Pieces (n,) of speech at 16 kHz as they come.
 
     Args:
-        source: 16-bit mono samples, little endian; half a sample at the end is left away.
+        source: 16-bit mono samples, little endian; half a sample at the end is dropped.
         rate: their sample rate.
         read: as ``os.read``.
 
@@ -179,7 +181,7 @@ def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.rea
 
 @contextmanager
 def sink(output: Path, frame: tuple[int, ...]) -> Iterator[Callable[[npt.NDArray[np.float32]], None]]:
-    """Where frames (n, V, 3) go: a .npy file that appears when it is whole, or standard output at once.
+    """Where frames (n, V, 3) go: a .npy file that appears when it is complete, or standard output.
 
     Raises:
         FaceDiffError: if the file cannot be written.
@@ -200,4 +202,4 @@ def sink(output: Path, frame: tuple[int, ...]) -> Iterator[Callable[[npt.NDArray
             yield writer.write
         finally:
             writer.close()
-    tell(f"{output}: {writer.frames} frames")
+    report(f"{output}: {writer.frames} frames")

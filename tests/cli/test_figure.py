@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import pickle
 import re
@@ -17,10 +16,11 @@ import pytest
 import trimesh
 from PIL import Image
 
-from facediff.cli.app import main
-from facediff.cli.figure import FIGURES as KNOWN
-from facediff.cli.figure import gather, named_folders, parser
+from facediff.cli.app import COMMANDS, load, main
+from facediff.cli.options import named_folders
+from facediff.cli.parsing import arguments_of
 from facediff.errors import FaceDiffError
+from facediff.evaluation.figures import Material
 from tests.fakes.tiny import VERTICES
 
 ROOT = Path(__file__).parents[2]
@@ -84,13 +84,16 @@ def test_in_a_process_of_its_own(corpus: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "figure.pdf").read_bytes().startswith(b"%PDF")
 
 
-def options(corpus: Path, *more: str) -> argparse.Namespace:
-    """The options as the command has them, for `gather`."""
-    return parser("frames").parse_args([str(corpus.parent / "ours"), str(corpus), "-o", "a.png", *more])
+def gather(corpus: Path, *more: str) -> Material:
+    """What the command finds by its options."""
+    words = [str(corpus.parent / "ours"), str(corpus), "-o", "a.png", *more]
+    given = arguments_of(load("figure heatmap"), "facediff figure heatmap", words)
+    material: Material = given["files"].gather(given["predictions"], given["truth"])
+    return material
 
 
 def test_what_lies_beside_the_files_is_found(corpus: Path) -> None:
-    material = gather(options(corpus, *TINY))
+    material = gather(corpus, *TINY)
     assert (material.n_vertices, material.rate, material.truth_stride) == (VERTICES, 25.0, 1)
     assert (material.unit, material.remark, material.corpus) == ("m", "tiny: synthetic corpus", corpus)
     assert material.names == ["truth", "ours"]
@@ -101,12 +104,12 @@ def test_what_lies_beside_the_files_is_found(corpus: Path) -> None:
 
 def test_a_truth_of_twice_the_frame_rate(corpus: Path) -> None:
     (corpus / "manifest.json").write_text('{"frame_rate": 50, "unit": "cm"}')
-    material = gather(options(corpus, *TINY))
+    material = gather(corpus, *TINY)
     assert (material.rate, material.truth_stride, material.unit) == (25.0, 2, "cm")
-    assert gather(options(corpus, *TINY, "--frame-rate", "50")).truth_stride == 1
-    assert gather(options(corpus, *TINY, "--truth-stride", "3")).truth_stride == 3
+    assert gather(corpus, *TINY, "--frame-rate", "50").truth_stride == 1
+    assert gather(corpus, *TINY, "--truth-stride", "3").truth_stride == 3
     with pytest.raises(FaceDiffError, match="no whole multiple"):
-        gather(options(corpus, *TINY, "--frame-rate", "30"))
+        gather(corpus, *TINY, "--frame-rate", "30")
 
 
 def test_folders_that_are_no_corpus(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -266,6 +269,8 @@ def test_documented_commands_parse(page: str) -> None:
     assert len(lines) >= 3
     for line in lines:
         figure, *rest = shlex.split(line)
-        assert parser(figure).parse_args(rest).output
+        assert arguments_of(load(f"figure {figure}"), "", rest)["output"]
     if page != "README.md":
-        assert {shlex.split(line)[0] for line in lines} == set(KNOWN)
+        assert {shlex.split(line)[0] for line in lines} == {
+            name.split()[1] for name in COMMANDS if name.startswith("figure ")
+        }

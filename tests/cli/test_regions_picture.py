@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from facediff.cli.data import regions_run
+from facediff.cli.app import run
 from facediff.errors import FaceDiffError
 from facediff.metrics import Region
 
@@ -32,7 +32,7 @@ def tinted(path: Path, channel: int) -> NDArray[np.intp]:
 
 def test_regions_are_coloured_where_they_are(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "regions.png"
-    assert regions_run("data regions", [str(root), "-o", str(path), *TINY]) == 0
+    assert run("data regions", [str(root), "-o", str(path), *TINY]) == 0
     lips, upper = tinted(path, 0), tinted(path, 2)
     # The lips are the lower two rows of vertices, the upper face the upper two; both are seen from two sides.
     assert len(lips) > 100
@@ -51,7 +51,7 @@ def test_other_sources_and_repeated_indices(root: Path, tmp_path: Path, capsys: 
     (root / "mine.txt").write_text("18, 19,18,20,18")
     path = tmp_path / "regions.png"
     words = [str(root), "-o", str(path), "--lips", "mine.txt", "--upper-face", "regions/lve.txt", *TINY]
-    assert regions_run("data regions", words) == 0
+    assert run("data regions", words) == 0
     assert tinted(path, 0).mean() < tinted(path, 2).mean()
     told = capsys.readouterr().out
     assert "lips (3 vertices, " in told
@@ -65,7 +65,7 @@ def test_other_sources_and_repeated_indices(root: Path, tmp_path: Path, capsys: 
         (lambda root: (root / "regions" / "fdd.txt").unlink(), [], "which vertices are the upper face"),
         (lambda root: None, ["--lips", "none.txt"], "none.txt"),
         (lambda root: (root / "regions" / "lve.txt").write_text("1, 24"), [], "24 vertices ends at 23"),
-        (lambda root: None, ["-o", "regions.jpg"], "must end in .png"),
+        (lambda root: None, ["-o", "regions.jpg"], "regions.jpg"),
         (lambda root: None, ["--corpus", "biwy"], 'there is no "biwy": did you mean "biwi"'),
         (shutil.rmtree, [], "no such folder"),
     ],
@@ -75,11 +75,11 @@ def test_what_is_missing_is_told_and_nothing_written(
 ) -> None:
     spoil(root)
     with pytest.raises(FaceDiffError) as error:
-        regions_run("data regions", [str(root), "-o", str(tmp_path / "regions.png"), *TINY, *words])
+        run("data regions", [str(root), "-o", str(tmp_path / "regions.png"), *TINY, *words])
     assert told in str(error.value)
     assert not list(tmp_path.glob("*.*"))
 
 
 def test_a_folder_that_is_no_corpus(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="not recognised.*--corpus"):
-        regions_run("data regions", [str(tmp_path), "-o", str(tmp_path / "regions.png")])
+        run("data regions", [str(tmp_path), "-o", str(tmp_path / "regions.png")])

@@ -59,7 +59,7 @@ def test_takes_of_one_recording_are_told_apart_by_their_files(animation: Animati
         (["a.npz", "-o", "a.fbx"], 'there is no format ".fbx"'),
         (["a.npz", "-o", "a.csv"], "give --shapes"),
         (["a.npz", "-o", "a.glb", "--shapes", "."], "--shapes"),
-        (["a.npz", "-o", "a.npy"], "a.npz: no such file"),
+        (["missing.npz", "-o", "a.npy"], "missing.npz: no such file"),
         (["a.npz", "-o", "a.mp4", "--up", "z"], ".mp4 holds no axes"),
     ],
 )
@@ -67,12 +67,13 @@ def test_refusals_are_one_sentence(
     words: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.npz").touch()
     assert main(["export", *words]) == 2
     said = capsys.readouterr()
     assert said.out == ""
     assert sentence in said.err
     assert len(said.err.splitlines()) == 1
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
 
 
 def test_the_help_lists_the_formats(capsys: pytest.CaptureFixture[str]) -> None:

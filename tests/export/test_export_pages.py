@@ -12,7 +12,8 @@ import cv2
 import pytest
 
 from facediff.animation import Animation
-from facediff.cli.export import parser
+from facediff.cli.export import export
+from facediff.cli.parsing import arguments_of
 from facediff.export import FORMATS, write_animations
 
 ROOT = Path(__file__).parents[2]
@@ -39,8 +40,8 @@ def test_the_table_of_formats_is_complete() -> None:
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_commands_are_understood(command: str) -> None:
     words = shlex.split(command.partition("#")[0])[2:]
-    args = parser().parse_args(words)
-    assert args.output.suffix in FORMATS or "$" in command
+    output = arguments_of(export, "facediff export", words)["output"]
+    assert output.suffix in FORMATS or "$" in command
 
 
 def test_links_lead_somewhere() -> None:

@@ -217,7 +217,10 @@ FACEXHUBERT = re.compile(r"[FM]\d_(\d\d)(_cut)?")
 
 def known() -> list[Module]:
     """Every data module that can be made, facediff's own first."""
+    from facediff import registry
     from facediff.data import SpeechMotionDataModule
+
+    registry.corpus.load()  # a data module is a subclass only once it is imported
 
     def below(module: Any) -> Iterator[Module]:  # noqa: ANN401 - an abstract class is no Module to mypy
         for child in module.__subclasses__():

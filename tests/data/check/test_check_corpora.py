@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli.data import check_run
+from facediff.cli.app import run
 from facediff.data.check import check
 from facediff.data.check import findings as facts
 from facediff.errors import FaceDiffError
@@ -37,7 +37,7 @@ def test_totals_of_a_corpus_without_a_list(fakes: Path) -> None:
 def test_the_json_object_is_complete(copies: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = copies / "tiny"
     (root / "wav" / "A_e01.wav").unlink()
-    assert check_run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--json"]) == 0
+    assert run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert set(report) == {
         *("format", "root", "quick", "corpus", "data_module", "raw", "sound", "frame_rate", "stored_frame_rate"),

@@ -14,7 +14,7 @@ import pytest
 import soundfile
 import trimesh
 
-from facediff.cli.data import check_run
+from facediff.cli.app import run
 from tests.data.check.planting import (
     CLIP,
     FRAMES,
@@ -52,7 +52,7 @@ def root(sound_corpus: Path, tmp_path: Path) -> Path:
 
 def examined(root: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict]:
     """Exit status and report of the command."""
-    status = check_run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--json", *options])
+    status = run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--json", *options])
     return status, json.loads(capsys.readouterr().out)
 
 
@@ -339,5 +339,5 @@ def test_damaged_headers_of_all_sorts_are_told(root: Path, capsys: pytest.Captur
 def test_no_manifest_ends_the_check(root: Path, capsys: pytest.CaptureFixture[str], fields: dict[str, object]) -> None:
     write_manifest(root, **fields)
     for options in ([], ["--json"], ["--corpus", "tests.fakes.tiny.Tiny"]):
-        assert check_run("data check", [str(root), "--quiet", *options]) in (0, 1)
+        assert run("data check", [str(root), "--quiet", *options]) in (0, 1)
         assert capsys.readouterr().out.strip()

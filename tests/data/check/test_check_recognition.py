@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.cli.data import check_run
+from facediff.cli.app import run
 from facediff.data.check import check, text
 from facediff.errors import FaceDiffError
 from tests.data.check.small import kinds, message, rows
@@ -55,7 +55,7 @@ def test_a_data_module_in_the_working_folder(
     lines = ["from facediff.data import Biwi", "class Mine(Biwi):", "    n_vertices = 64", "    corpus_name = 'mine'"]
     Path("corpus_in_working_folder.py").write_text("\n".join(lines))
     arguments = [str(fakes / "biwi"), "--corpus", "corpus_in_working_folder.Mine", "--quick", "--json"]
-    assert check_run("data check", arguments) == 0
+    assert run("data check", arguments) == 0
     assert json.loads(capsys.readouterr().out)["corpus"] == "mine"
 
 
@@ -108,7 +108,7 @@ def test_a_preparation_that_has_not_ended(copies: Path) -> None:
 def test_a_folder_that_is_nothing_known(tmp_path: Path, capsys: pytest.CaptureFixture[str], files: list[str]) -> None:
     root = write_raw(tmp_path / "x", files)
     root.mkdir(exist_ok=True)
-    assert check_run("data check", [str(root), "--quiet"]) == 1
+    assert run("data check", [str(root), "--quiet"]) == 1
     out = capsys.readouterr().out
     assert "not recognised" in out
     assert "--corpus" in out
@@ -117,9 +117,9 @@ def test_a_folder_that_is_nothing_known(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="no such folder"):
-        check_run("data check", [str(tmp_path / "nowhere")])
+        run("data check", [str(tmp_path / "nowhere")])
     with pytest.raises(FaceDiffError, match="--workers"):
-        check_run("data check", [str(tmp_path), "--workers", "0"])
+        run("data check", [str(tmp_path), "--workers", "0"])
 
 
 def test_a_persons_folder(copies: Path) -> None:
@@ -174,7 +174,7 @@ def test_the_table_groups_equal_findings_and_names_the_first(copies: Path, capsy
         array = np.load(path)
         array[2] = np.nan
         np.save(path, array)
-    assert check_run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--quiet"]) == 1
+    assert run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--quiet"]) == 1
     lines = capsys.readouterr().out.splitlines()
     (error,) = [line for line in lines if line.startswith("ERROR")]
     assert error.startswith("ERROR    9 times motion_not_finite, the first: vertices_npy/A_e01.npy: 1 of 14 frames")
@@ -193,7 +193,7 @@ def test_names_that_would_steer_a_terminal_are_spelled_out(copies: Path, capsys:
     (root / "wav" / "\x07c.mp3").write_bytes(b"")
     (root / "wav" / os.fsdecode(b"\xff_e01.wav")).write_bytes(b"")
     for options in ([], ["--json"]):
-        assert check_run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--quiet", *options]) in (0, 1)
+        assert run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--quiet", *options]) in (0, 1)
         out = capsys.readouterr().out
         assert "\x1b" not in out
         assert "\x07" not in out

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli.app import main
-from facediff.cli.data import import_person_run
+from facediff.cli.app import main, run
 from facediff.data.corpus import Corpus, read_manifest
 from facediff.errors import FaceDiffError
 from facediff.utils.pickles import load_pickle
@@ -67,7 +66,7 @@ def imported(out: Path) -> Array:
 @pytest.fixture(scope="module")
 def entry(files: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out") / "deep" / "target"
-    assert import_person_run("data", words(files, "motion.npy", out)) == 0
+    assert run("data import-person", words(files, "motion.npy", out)) == 0
     return out
 
 
@@ -109,7 +108,7 @@ def test_translation_removed_is_that_of_the_head(files: Path, tmp_path: Path, kn
     np.save(tmp_path / "motion.npy", 1000 * known.truth + known.places[:, None])
     arguments = words(files, "motion.npy", tmp_path / "out")
     arguments[0] = str(tmp_path / "motion.npy")
-    assert import_person_run("data", arguments) == 0
+    assert run("data import-person", arguments) == 0
     report = read_manifest(tmp_path / "out")["report"]
     away = np.linalg.norm(known.places - known.places.mean(0), axis=1) / 1000
     assert report["translation_max"] == pytest.approx(away.max(), rel=1e-4)
@@ -181,7 +180,7 @@ def test_every_form_of_motion_gives_the_same(
     path = tmp_path / ("motion" if form in ("obj", "ply") else "motion.npy")
     write_speech(tmp_path / "sound.wav", 3)
     arguments = words(files, "motion.npy", tmp_path / "out", "--audio", str(tmp_path / "sound.wav"))
-    assert import_person_run("data", [str(path), *arguments[1:]]) == 0
+    assert run("data import-person", [str(path), *arguments[1:]]) == 0
     assert np.abs(imported(tmp_path / "out") - known.truth[:90]).max() < MICRON
     report = read_manifest(tmp_path / "out")["report"]
     assert report["faces_compared"] == (form in ("obj", "ply"))
@@ -192,7 +191,7 @@ def test_another_frame_rate_is_resampled(files: Path, tmp_path: Path, known: Per
     corpus = write_auxiliary(tmp_path / "corpus", rate=25.0, manifest=False)
     out = tmp_path / "out"
     arguments = words(files, "motion.npy", out, "--corpus", str(corpus), "--corpus-frame-rate", "25")
-    assert import_person_run("data", arguments) == 0
+    assert run("data import-person", arguments) == 0
     made = imported(out)
     assert made.shape == (200, VERTICES, 3)
     calm = np.setdiff1d(np.arange(VERTICES), known.restless)
@@ -207,7 +206,7 @@ def test_template_and_stable_vertices_may_be_given(files: Path, tmp_path: Path, 
     still = str(files / "corpus" / "regions" / "still.txt")
     out = tmp_path / "out"
     given = ["--template", str(files / "neutral.npy"), "--stable", still]
-    assert import_person_run("data", words(files, "motion.npy", out, *given)) == 0
+    assert run("data import-person", words(files, "motion.npy", out, *given)) == 0
     report = read_manifest(out)["report"]
     assert (report["template_frames"], report["stable_vertices"]) == ([], int((~lower_face()).sum()))
     assert report["template_source"].endswith("neutral.npy")
@@ -222,7 +221,7 @@ def test_a_person_s_size_is_kept_and_another_unit_is_not(files: Path, tmp_path: 
         np.save(tmp_path / f"{name}.npy", factor * known.seen[:90])
         write_speech(tmp_path / "sound.wav", 3)
         arguments = words(files, "motion.npy", tmp_path / name, "--audio", str(tmp_path / "sound.wav"), *more)
-        assert import_person_run("data", [str(tmp_path / f"{name}.npy"), *arguments[1:]]) == 0
+        assert run("data import-person", [str(tmp_path / f"{name}.npy"), *arguments[1:]]) == 0
         made = imported(tmp_path / name)
         factors[name] = np.ptp(made[0, :, 1]) / np.ptp(known.truth[0, :, 1])
     assert factors == pytest.approx({"big": 1.1, "odd": 1.0, "told": 3.7 * 0.5}, rel=1e-4)
@@ -236,7 +235,7 @@ def test_missing_frames_are_filled_and_told(
         (folder / f"frame_{number}.obj").unlink()
     write_speech(tmp_path / "sound.wav", 3)
     arguments = words(files, "motion.npy", tmp_path / "out", "--audio", str(tmp_path / "sound.wav"))
-    assert import_person_run("data", [str(folder), *arguments[1:]]) == 0
+    assert run("data import-person", [str(folder), *arguments[1:]]) == 0
     assert "note: 3 missing frames filled from their neighbours: 19-20, 49" in capsys.readouterr().out
     made = imported(tmp_path / "out")
     there = np.setdiff1d(np.arange(90), [19, 20, 49])
@@ -248,7 +247,7 @@ def test_missing_frames_are_filled_and_told(
 def test_what_is_printed(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_speech(tmp_path / "sound.wav", FRAMES / RATE - 0.5)
     out = tmp_path / "out"
-    assert import_person_run("data", words(files, "motion.npy", out, "--audio", str(tmp_path / "sound.wav"))) == 0
+    assert run("data import-person", words(files, "motion.npy", out, "--audio", str(tmp_path / "sound.wav"))) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"{out}: Target"
     text = "\n".join(lines)
@@ -312,7 +311,7 @@ def test_a_flawed_array_gets_one_sentence(files: Path, tmp_path: Path, known: Pe
     write_speech(tmp_path / "sound.wav", 3)
     arguments = words(files, "motion.npy", tmp_path / "out", "--audio", str(tmp_path / "sound.wav"))
     with pytest.raises(FaceDiffError, match=sentence):
-        import_person_run("data", [str(tmp_path / "motion.npy"), *arguments[1:]])
+        run("data import-person", [str(tmp_path / "motion.npy"), *arguments[1:]])
     assert nothing_left(tmp_path)
 
 
@@ -384,7 +383,7 @@ def test_a_flawed_folder_gets_one_sentence(
     write_speech(tmp_path / "sound.wav", 3)
     arguments = words(files, "motion.npy", tmp_path / "out", "--audio", str(tmp_path / "sound.wav"))
     with pytest.raises(FaceDiffError, match=sentence):
-        import_person_run("data", [str(folder), *arguments[1:]])
+        run("data import-person", [str(folder), *arguments[1:]])
     assert nothing_left(tmp_path)
 
 
@@ -432,7 +431,7 @@ def test_a_wrong_option_gets_one_sentence(files: Path, tmp_path: Path, options: 
     (tmp_path / "line.txt").write_text("5, 6")
     more = [option.format(tmp=tmp_path) for option in options]
     with pytest.raises(FaceDiffError, match=sentence):
-        import_person_run("data", words(files, "motion.npy", tmp_path / "out", *more))
+        run("data import-person", words(files, "motion.npy", tmp_path / "out", *more))
     assert nothing_left(tmp_path)
     assert (tmp_path / "full" / "thesis.txt").read_text() == "mine"
 
@@ -440,12 +439,12 @@ def test_a_wrong_option_gets_one_sentence(files: Path, tmp_path: Path, options: 
 def test_the_corpus_s_frame_rate_must_be_known(files: Path, tmp_path: Path) -> None:
     corpus = write_auxiliary(tmp_path / "corpus", manifest=False)
     with pytest.raises(FaceDiffError, match="add --corpus-frame-rate"):
-        import_person_run("data", words(files, "motion.npy", tmp_path / "out", "--corpus", str(corpus)))
+        run("data import-person", words(files, "motion.npy", tmp_path / "out", "--corpus", str(corpus)))
 
 
 def test_an_empty_folder_may_be_the_output(files: Path, tmp_path: Path) -> None:
     (tmp_path / "target").mkdir()
-    assert import_person_run("data", words(files, "motion.npy", tmp_path / "target")) == 0
+    assert run("data import-person", words(files, "motion.npy", tmp_path / "target")) == 0
     assert (tmp_path / "target" / "manifest.json").is_file()
 
 
@@ -459,7 +458,7 @@ def test_an_interruption_or_a_full_disk_leaves_nothing(
     monkeypatch.setattr("facediff.data.person.importer.write_templates", stop)
     expected = KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else FaceDiffError
     with pytest.raises(expected, match=None if expected is KeyboardInterrupt else "No space left on device"):
-        import_person_run("data", words(files, "motion.npy", tmp_path / "new" / "out"))
+        run("data import-person", words(files, "motion.npy", tmp_path / "new" / "out"))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -467,11 +466,12 @@ def test_faces_of_a_ply_template_are_compared(files: Path, tmp_path: Path, known
     write_plys(tmp_path / "frames", 1000 * face()[None])
     (tmp_path / "frames" / "000000.ply").rename(tmp_path / "face.ply")
     out = tmp_path / "out"
-    assert import_person_run("data", words(files, "motion.npy", out, "--template", str(tmp_path / "face.ply"))) == 0
+    assert run("data import-person", words(files, "motion.npy", out, "--template", str(tmp_path / "face.ply"))) == 0
     flipped = [f"f {a} {b} {c}" for a, b, c in grid_faces()[:, [0, 1, 2]]]  # counted from 0: every triangle is shifted
     points = [f"v {x} {y} {z}" for x, y, z in 1000 * face()]
     (tmp_path / "face.obj").write_text("\n".join([*points, *flipped[1:]]))
     with pytest.raises(FaceDiffError, match=r"face\.obj: \d+ triangles are not those"):
-        import_person_run(
-            "data", words(files, "motion.npy", tmp_path / "out2", "--template", str(tmp_path / "face.obj"))
+        run(
+            "data import-person",
+            words(files, "motion.npy", tmp_path / "out2", "--template", str(tmp_path / "face.obj")),
         )

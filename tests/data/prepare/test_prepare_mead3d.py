@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli import data as command
+from facediff.cli.data import read_prepare
 from facediff.data import Mead3D
 from facediff.data.audio import read_speech
 from facediff.data.prepare import mead3d
@@ -270,7 +270,8 @@ def test_options_of_the_command_line(tmp_path: Path, flame: Path) -> None:
     raw = write_raw_emote(tmp_path / "raw", audio="wav")
     words = ["mead3d", str(raw), str(tmp_path / "out"), "--dtype", "float64", "--quiet", "--flame", str(flame)]
     words += ["--shape", "clip", "--subjects", "M003, W040", "--audio", str(raw / "MEAD")]
-    plan = command.make_plan(command.prepare_parser().parse_args(words))
+    make_plan, values = read_prepare(words)
+    plan = make_plan(values["raw"])
     assert {job.name[:4] for job in plan.jobs} == {"M003", "W040"}
     assert plan.options["dtype"] == "float64"
     assert plan.options["shape"] == "clip"

@@ -7,6 +7,7 @@ import fcntl
 import functools
 import hashlib
 import importlib
+import inspect
 import json
 import os
 import shutil
@@ -23,7 +24,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli.data import CORPORA, grouped, make_plan, own_options, prepare_parser, prepare_run
+from facediff.cli.app import main, run
+from facediff.cli.data import CORPORA, grouped, options_of, plan_options, read_prepare
+from facediff.cli.parsing import Parameter
 from facediff.data.prepare import biwi, runner
 from facediff.data.prepare.runner import Job, Plan, prepare, write_motion, write_speech, write_templates
 from facediff.errors import FaceDiffError, MissingExtraError
@@ -323,7 +326,7 @@ def test_the_command_says_what_came_of_it(tmp_path: Path, capsys: pytest.Capture
     frame = raw / "faces" / "M3" / "e33" / "frame_002.vl"
     frame.write_bytes(vl_bytes(np.zeros((3, 3))))
     arguments = ["biwi", str(raw), str(tmp_path / "out"), "--subjects", "F2,M3", "--workers", "1"]
-    assert prepare_run("prepare", arguments) == 1
+    assert run("data prepare", arguments) == 1
     shown = capsys.readouterr().out
     assert "7 clips" in shown
     assert "7 written now" in shown
@@ -332,7 +335,7 @@ def test_the_command_says_what_came_of_it(tmp_path: Path, capsys: pytest.Capture
     assert "F2_e03 … F2_e40 (36 in all): expected frames in" in shown
     shutil.rmtree(frame.parent)
     shutil.copytree(raw / "faces" / "M3" / "e37", frame.parent)
-    assert prepare_run("prepare", arguments) == 0
+    assert run("data prepare", arguments) == 0
     assert "1 written now" in capsys.readouterr().out
 
 
@@ -341,7 +344,7 @@ def test_the_command_does_not_write_into_the_raw_folder(tmp_path: Path, out: str
     raw = write_raw_biwi(tmp_path / "raw", subjects=["F2"], sentences=["e01"])
     before = contents(raw)
     with pytest.raises(FaceDiffError, match="lies in the raw folder"):
-        prepare_run("prepare", ["biwi", str(raw), str(tmp_path / out)])
+        run("data prepare", ["biwi", str(raw), str(tmp_path / out)])
     assert contents(raw) == before
 
 
@@ -355,10 +358,8 @@ def test_the_command_does_not_write_into_the_raw_folder(tmp_path: Path, out: str
         ["vocaset", "a", "b", "--frame-rate", "25"],
     ],
 )
-def test_wrong_words_end_with_usage(arguments: list[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        prepare_run("prepare", arguments)
-    assert stop.value.code == 2
+def test_wrong_words_are_refused(arguments: list[str]) -> None:
+    assert main(["data", "prepare", *arguments]) == 2
 
 
 def test_lines_for_the_screen_are_grouped_by_subject_and_reason() -> None:
@@ -375,20 +376,22 @@ def test_workers_must_be_positive(tmp_path: Path) -> None:
 @pytest.mark.parametrize("corpus", CORPORA)
 def test_every_option_of_a_corpus_is_explained_and_reaches_its_plan(corpus: str, tmp_path: Path) -> None:
     module = importlib.import_module(f"facediff.data.prepare.{corpus}")
-    (choose,) = (action for action in prepare_parser()._actions if action.dest == "corpus")
-    actions = {action.dest: action for action in choose.choices[corpus]._actions}  # type: ignore[index, call-overload]
-    own = own_options(module.plan)
-    assert {option.name for option in own} <= set(actions)
-    for option in own:
-        assert len(actions[option.name].help) > 10
-        assert actions[option.name].default == (None if option.default is option.empty else option.default)
+    own = plan_options(module.plan)
+    signature = inspect.signature(module.plan).parameters
+    assert set(own) == set(signature) - {"raw", "quiet"}
+    assert set(own) <= set(options_of(module.plan))
+    for name, option in own.items():
+        assert isinstance(option, Parameter)
+        assert len(option.help) > 10
+        assert option.default == signature[name].default
 
 
 def test_options_are_read_by_their_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = {}
     monkeypatch.setattr(biwi, "plan", with_signature_of(biwi.plan, seen))
     words = ["biwi", "r", "o", "--subjects", "F2,F3", "--regions", "lists", "--dtype", "float64"]
-    make_plan(prepare_parser().parse_args(words))
+    make_plan, values = read_prepare(words)
+    make_plan(values["raw"])
     expected = {"normalise": "codetalker", "dtype": "float64", "subjects": ["F2", "F3"], "regions": Path("lists")}
     assert seen == {"raw": Path("r"), **expected}
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli.data import prepare_run
+from facediff.cli.app import run
 from facediff.data.prepare import vocaset
 from facediff.data.prepare.runner import Report, prepare
 from facediff.data.prepare.vocaset import halved, read_samples
@@ -284,10 +284,10 @@ def test_mesh_masks_and_regions_are_copied_if_they_are_there(raw: Path, tmp_path
 
 def test_the_command_line(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = raw.parent / "out"
-    assert prepare_run("prepare", ["vocaset", str(raw), str(out), "--frame-rate", "60", "--workers", "1"]) == 0
+    assert run("data prepare", ["vocaset", str(raw), str(out), "--frame-rate", "60", "--workers", "1"]) == 0
     assert "1 clips, 25 frames" in capsys.readouterr().out
     with pytest.raises(FaceDiffError, match="--frame-rate was 60 and is 30"):
-        prepare_run("prepare", ["vocaset", str(raw), str(out), "--workers", "1"])
+        run("data prepare", ["vocaset", str(raw), str(out), "--workers", "1"])
 
 
 def test_the_fake_pickles_are_python_2s(raw: Path) -> None:

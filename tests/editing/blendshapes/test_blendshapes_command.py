@@ -13,9 +13,9 @@ import pytest
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
-from facediff.cli.blendshapes import puppet_shapes
 from facediff.editing.shapes import ARKIT, read_shapes
 from facediff.mesh import read_mesh
+from facediff.synthetic.arkit import puppet_shapes
 
 
 @pytest.fixture(scope="module")
@@ -126,20 +126,20 @@ def test_shapes_of_another_topology_are_carried(
     [
         (["take.npz", "-o", "w.csv"], "--shapes: is missing"),
         (["take.npz", "--shapes", "shapes"], "-o: is missing"),
-        (["-o", "w.csv", "--shapes", "shapes"], "TAKE: is missing"),
+        (["-o", "w.csv", "--shapes", "shapes"], "ANIMATION: is missing"),
         (["take.npz", "-o", "w.txt", "--shapes", "shapes"], "expected a table .csv"),
         (["take.npz", "-o", "w.csv", "--shapes", "absent"], "absent: no such folder"),
         (["absent.npz", "-o", "w.csv", "--shapes", "shapes"], "absent.npz: no such file"),
         (["nan.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "frame 1 holds NaN"),
         (["empty.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "holds no frames"),
-        (["small.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "1008 vertices and the take's"),
+        (["small.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "1008 vertices and the"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--bounds", "1", "0"], "bounds 1 to 0"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--show", "a.jpg"], "expected a picture .png"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--region", "lips"], "has no regions"),
         (["take.npz", "-o", "mine.csv", "--shapes", "shapes"], "mine.json: is a file that facediff did not write"),
         (["bare.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25", "--show", "a.png"], "without a mesh"),
-        (["take.npz", "--write-puppet-shapes", "new"], "leave the take away"),
-        (["--write-puppet-shapes", "shapes"], "is there already"),
+        (["take.npz", "--write-puppet-shapes", "new"], "omit the animation"),
+        (["--write-puppet-shapes", "shapes"], "exists already"),
         (["--write-puppet-shapes", "new", "--identity", "F9"], 'no speaker "F9"; known are'),
     ],
 )

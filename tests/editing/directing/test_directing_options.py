@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import pickle
 from collections.abc import Callable
@@ -13,7 +12,9 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.cli.options import add_directing_options, check_directing, directed
+from facediff.cli.options import ControlOptions
+from facediff.cli.parsing import parameters_of, parse
+from facediff.editing.controls import AnimationControls
 from facediff.editing.expressiveness import scale_regions
 from facediff.editing.eyes import Eyes, puppet_eyes, read_eyes
 from facediff.editing.procedural import add_blinks, add_gaze, add_sway
@@ -21,23 +22,26 @@ from facediff.errors import FaceDiffError
 from facediff.synthetic.face import build_face
 
 
-def parsed(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seed", type=int, default=0)
-    add_directing_options(parser)
-    return parser.parse_args(list(words))
+def parsed(*words: str) -> AnimationControls:
+    """The controls that the words of a command line ask for."""
+    controls: AnimationControls = parse(parameters_of(with_controls), words, "animate")["controls"].controls()
+    return controls
+
+
+def with_controls(*, controls: ControlOptions) -> None:
+    """A command that has the controls only."""
 
 
 def test_nothing_is_on_by_default(make_animation: Callable[..., Animation]) -> None:
     animation = make_animation(3)
-    assert directed(animation, parsed()) is animation
+    assert parsed().apply(animation) is animation
 
 
 def test_all_options_in_their_order(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
     animation = make_animation(200, jaw_open=0.4, lids_close=0.1)
-    args = parsed("--expressiveness", "upper_face=1.5", "--blinks", "20", "--gaze", "--sway", "3", "--seed", "7")
-    check_directing(args)
-    made = directed(animation, args)
+    controls = parsed("--expressiveness", "upper_face=1.5", "--blinks", "20", "--gaze", "--sway", "3")
+    controls.check(animation.template, animation.faces, animation.regions, "the puppet")
+    made = controls.apply(animation, seed=7)
     by_hand = scale_regions(animation, {"upper_face": 1.5}, eyes)
     by_hand = add_blinks(add_gaze(by_hand, eyes, degrees=4, seed=7), eyes, rate=20, seed=7)
     by_hand = add_sway(by_hand, degrees=3, seed=7)
@@ -51,11 +55,11 @@ def test_all_options_in_their_order(make_animation: Callable[..., Animation], ey
             "procedural": "gaze (4 degrees, seed 7); blinks (20 a minute, seed 7); head sway (3 degrees, seed 7)",
         }
     )
-    own = directed(animation, parsed("--blinks", "--directing-seed", "3", "--seed", "7"))
+    own = parsed("--blinks", "--controls-seed", "3").apply(animation, seed=7)
     assert own.metadata["procedural"] == "blinks (17 a minute, seed 3)"
-    assert directed(animation, parsed("--sway"), seed=9).metadata["procedural"] == "head sway (2 degrees, seed 9)"
+    assert parsed("--sway").apply(animation, seed=9).metadata["procedural"] == "head sway (2 degrees, seed 9)"
     with pytest.raises(FaceDiffError, match="F1: its head sways already"):
-        directed(made, parsed("--blinks"))
+        parsed("--blinks").apply(made)
 
 
 @pytest.mark.parametrize(
@@ -63,16 +67,17 @@ def test_all_options_in_their_order(make_animation: Callable[..., Animation], ey
     [
         (["--expressiveness", "a lot"], "--expressiveness a lot: expected a factor"),
         (["--blinks", "0"], "--blinks 0: expected blinks a minute"),
-        (["--blinks", "speech.wav"], "--blinks speech.wav: expected a number"),
+        (["--blinks", "speech.wav"], "--blinks speech.wav: "),
         (["--gaze", "50"], "--gaze 50: expected degrees"),
         (["--sway", "0"], "--sway 0: expected degrees"),
         (["--eyes", "none.json"], "--eyes none.json: no such file"),
-        (["--directing-seed", "-1"], "--directing-seed -1: expected 0 or more"),
+        (["--controls-seed", "-1"], "--controls-seed -1: "),
+        (["--directing-seed", "1"], "--controls-seed"),
     ],
 )
 def test_words_are_checked_before_anything_is_made(words: list[str], sentence: str) -> None:
     with pytest.raises(FaceDiffError) as caught:
-        check_directing(parsed(*words))
+        parsed(*words)
     assert sentence in str(caught.value)
 
 
@@ -82,10 +87,8 @@ def test_a_topology_without_known_eyes_says_what_to_give(make_animation: Callabl
         with pytest.raises(
             FaceDiffError, match=f"{option}: needs to know where lids and eyeballs are.*give --eyes FILE"
         ):
-            directed(animation, parsed(option))
-    assert (
-        directed(animation, parsed("--sway", "--expressiveness", "1.2")).metadata["procedural"].startswith("head sway")
-    )
+            parsed(option).apply(animation)
+    assert parsed("--sway", "--expressiveness", "1.2").apply(animation).metadata["procedural"].startswith("head sway")
 
 
 def test_the_puppets_own_eyes(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
@@ -174,8 +177,8 @@ def test_eyes_from_files_shut_as_the_rig_does(
     assert found.closing is not None
     np.testing.assert_allclose(found.closing, eyes.closing, atol=1e-6)
     assert np.array_equal(np.sort(found.eyeballs[0]), np.sort(eyes.eyeballs[0]))
-    made = directed(animation, parsed("--blinks", "--gaze", "--eyes", str(eyes_folder / name)))
-    expected = directed(make_animation(200), parsed("--blinks"))
+    made = parsed("--blinks", "--gaze", "--eyes", str(eyes_folder / name)).apply(animation)
+    expected = parsed("--blinks").apply(make_animation(200))
     lids = np.linalg.norm(eyes.closing, axis=1) > 0  # type: ignore[arg-type]
     assert np.abs(made.vertices - expected.vertices)[:, lids].max() < 1e-3
 
@@ -229,7 +232,7 @@ def test_blinks_in_another_unit_and_of_another_topology(
         read_eyes(eyes_folder / "lids_only.npz", template[:900])
     animation = make_animation(2)
     with pytest.raises(FaceDiffError, match="--gaze: --eyes .* does not say which vertices are the eyeballs"):
-        directed(animation, parsed("--gaze", "--eyes", str(eyes_folder / "lids_only.npz")))
+        parsed("--gaze", "--eyes", str(eyes_folder / "lids_only.npz")).apply(animation)
     np.savez(eyes_folder / "balls_only.npz", eyeball=eyes.eyeballs[0])
     with pytest.raises(FaceDiffError, match="does not say how the lids shut"):
-        directed(animation, parsed("--blinks", "--eyes", str(eyes_folder / "balls_only.npz")))
+        parsed("--blinks", "--eyes", str(eyes_folder / "balls_only.npz")).apply(animation)

@@ -10,7 +10,7 @@ import trimesh
 
 from facediff.animation import Animation, read_archive, write_archive
 from facediff.cli.app import main
-from facediff.cli.options import carried
+from facediff.editing.retargeting import retarget
 
 TARGET = ("--target-mesh", "face.obj")
 
@@ -68,8 +68,8 @@ def test_a_take_on_another_mesh(
     assert main([*words, "-o", "again.npz"]) == 0
     assert np.array_equal(read_archive(tmp_path / "again.npz").vertices, made.vertices)
     assert (tmp_path / "map.npz").read_bytes() == kept
-    assert np.array_equal(carried(animation, face, tmp_path / "map.npz").vertices, made.vertices)
-    assert np.array_equal(carried(animation, face).vertices, made.vertices)
+    assert np.array_equal(retarget(animation, face, tmp_path / "map.npz")[0].vertices, made.vertices)
+    assert np.array_equal(retarget(animation, face)[0].vertices, made.vertices)
 
 
 def test_a_reordered_mesh_is_told(

@@ -43,7 +43,7 @@ def test_a_bare_truth_borrows_the_mesh_and_stands_first(files: Path, capsys: pyt
     assert read["frameRate"] == 25
     assert read["animations"][0]["opening"] is not None
     assert read["sound"] is not None
-    assert re.search(r"page.html: 75 frames of 2 take\(s\), 0\.\d MB", capsys.readouterr().out)
+    assert re.search(r"page.html: 75 frames of 2 animations, 0\.\d MB", capsys.readouterr().out)
 
 
 def test_a_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
@@ -62,8 +62,9 @@ def test_a_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
         regions={},
         inner_lip_pairs=None,
     )
-    monkeypatch.setattr("facediff.cli.options.assets_of", lambda path: assets)
-    page, words = files / "page.html", ["--checkpoint", "c.ckpt", "-o", str(files / "page.html")]
+    monkeypatch.setattr("facediff.models.checkpoint.read_assets", lambda path: assets)
+    (files / "c.ckpt").touch()
+    page, words = files / "page.html", ["--checkpoint", str(files / "c.ckpt"), "-o", str(files / "page.html")]
     assert main(["view", str(files / "guess.npz"), *words]) == 0
     assert facts(page)["frameRate"] == 25
     assert facts(page)["animations"][0]["centre"] == [0, 0, -2.5]
@@ -99,7 +100,7 @@ def test_labels_the_shortest_and_the_browser(files: Path, monkeypatch: pytest.Mo
     [
         (["guess.npz", "-o", "page.mp4"], 'unknown suffix ".mp4"; expected .html'),
         (["guess.npz", "-o", "page.html", "--max-mb", "0.01"], "more than the limit of 0.01 MB"),
-        (["guess.npz", "-o", "page.html", "--max-mb", "-1"], "expected a number above 0"),
+        (["guess.npz", "-o", "page.html", "--max-mb", "-1"], "--max-mb -1"),
         (["guess.npz", "-o", "page.html", "--labels", "a", "b"], "2 names for 1 panels"),
         (["missing.npz", "-o", "page.html"], "missing.npz: no such file"),
         (["true.npy", "-o", "page.html"], "does not say its frame rate"),

@@ -1,0 +1,149 @@
+"""Animation controls: expressiveness, and procedural blinks, gaze and head sway, applied to finished animations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation
+from facediff.editing.expressiveness import check_factors, read_factors, scale_regions
+from facediff.editing.eyes import GIVE, Eyes, eyes_for
+from facediff.editing.procedural import (
+    PROCEDURAL,
+    SWAYS,
+    add_blinks,
+    add_gaze,
+    add_sway,
+    blink_curve,
+    gaze_curve,
+    sway_curve,
+)
+from facediff.errors import FaceDiffError
+
+
+@dataclass(frozen=True)
+class AnimationControls:
+    """What is changed in a finished animation. Everything is off by default.
+
+    Attributes:
+        expressiveness: scales the motion: ``1.2``, or by region, ``upper_face=1.5,lips=0.9``.
+        blinks: blinks a minute.
+        gaze: largest angle of wandering eyes in degrees.
+        sway: largest angle of a swaying head in degrees.
+        eyes: file that says where lids and eyeballs are; the built-in puppet needs none.
+        seed: seed of blinks, gaze and sway; that of the sample if None.
+
+    Raises:
+        FaceDiffError: naming the option whose value is impossible, or the file that is missing.
+
+    Example:
+        >>> AnimationControls(blinks=20, seed=1).is_off
+        False
+    """
+
+    expressiveness: str | None = None
+    blinks: float | None = None
+    gaze: float | None = None
+    sway: float | None = None
+    eyes: Path | None = None
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        _ = self.factors
+        # Each of these refuses an impossible value, also for an animation without frames.
+        if self.blinks is not None:
+            blink_curve(0, 25.0, rate=self.blinks)
+        if self.gaze is not None:
+            gaze_curve(0, 25.0, degrees=self.gaze)
+        if self.sway is not None:
+            sway_curve(0, 25.0, degrees=self.sway)
+        if self.seed is not None and self.seed < 0:
+            raise FaceDiffError(f"--controls-seed {self.seed}: expected 0 or more")
+        if self.eyes is not None and not self.eyes.is_file():
+            raise FaceDiffError(
+                f"--eyes {self.eyes}: no such file; expected .json or .npz (see docs/animation_controls.md)"
+            )
+
+    @property
+    def is_off(self) -> bool:
+        """Whether nothing is changed."""
+        return self.expressiveness is None and self.blinks is None and self.gaze is None and self.sway is None
+
+    @property
+    def factors(self) -> dict[str, float]:
+        """The factors of expressiveness by region."""
+        return {} if self.expressiveness is None else read_factors(self.expressiveness)
+
+    def check(
+        self,
+        template: npt.NDArray[np.floating],
+        faces: npt.NDArray[np.integer] | None,
+        regions: Mapping[str, object],
+        name: str,
+    ) -> None:
+        """Refuse what cannot work on a face, before anything is sampled.
+
+        Args:
+            template: the neutral face (V, 3).
+            faces: its triangles (F, 3), if they are known.
+            regions: the face's regions by name.
+            name: what the face is called in the error.
+
+        Raises:
+            FaceDiffError: if a region is unknown, or blinks or gaze are wanted and the eyes are not known.
+        """
+        check_factors(self.factors, regions, name)
+        self._needed_eyes(template, faces)
+
+    def apply(self, animation: Animation, *, seed: int = 0) -> Animation:
+        """The animation with everything changed that is asked for; the very same one if nothing is.
+
+        Expressiveness comes first, then gaze, blinks, and last the head, which takes everything along.
+
+        Args:
+            animation: a finished animation.
+            seed: seed of blinks, gaze and sway, unless the controls have their own.
+
+        Raises:
+            FaceDiffError: naming the option that does not fit the animation, or if its head sways already.
+        """
+        if self.is_off:
+            return animation
+        if SWAYS in animation.metadata.get(PROCEDURAL, ""):
+            raise FaceDiffError(
+                f"{animation.name}: its head sways already; apply the controls to the animation as it was before"
+            )
+        seed = seed if self.seed is None else self.seed
+        eyes = self._needed_eyes(animation.template, animation.faces)
+        if self.expressiveness is not None:
+            animation = scale_regions(animation, self.factors, eyes)
+        if self.gaze is not None and eyes is not None:
+            animation = add_gaze(animation, eyes, degrees=self.gaze, seed=seed)
+        if self.blinks is not None and eyes is not None:
+            animation = add_blinks(animation, eyes, rate=self.blinks, seed=seed)
+        if self.sway is not None:
+            animation = add_sway(animation, degrees=self.sway, seed=seed)
+        return animation
+
+    def _needed_eyes(self, template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None) -> Eyes | None:
+        """The face's eyes, if anything needs them; expressiveness only works better where they are known."""
+        asking = "--blinks" if self.blinks is not None else "--gaze" if self.gaze is not None else None
+        if asking is None and self.expressiveness is None:
+            return None
+        eyes = eyes_for(template, faces, self.eyes)
+        if asking is None:
+            return eyes
+        if eyes is None:
+            raise FaceDiffError(
+                f"{asking}: needs to know where lids and eyeballs are, which is known for the built-in puppet only; "
+                f"{GIVE}"
+            )
+        if self.blinks is not None:
+            eyes.lids()
+        if self.gaze is not None and not eyes.eyeballs:
+            raise FaceDiffError(f"--gaze: {eyes.source} does not say which vertices are the eyeballs; add them")
+        return eyes

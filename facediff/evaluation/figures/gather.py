@@ -1,0 +1,181 @@
+"""What figures need in addition to the files of vertices: templates, mesh, frame rate, sound, phonemes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data import SpeechMotionDataModule
+from facediff.data.audio import read_speech
+from facediff.data.check.layouts import by_name, list_folder, recognise
+from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
+from facediff.data.puppet import built_in_mesh, cache_root
+from facediff.errors import FaceDiffError
+from facediff.evaluation.figures.frames import Phoneme, phonemes_file, read_phonemes
+from facediff.evaluation.figures.material import Material, find_clips
+from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
+from facediff.mesh.mesh import SUFFIXES, Mesh, read_mesh
+
+Module = type[SpeechMotionDataModule]
+
+PUPPET = Path("puppet")
+"""Stands for the built-in corpus in the user's cache folder."""
+
+
+def gather(
+    methods: Mapping[str, Path],
+    truth: Path,
+    *,
+    patterns: Sequence[str] = DEFAULT_PATTERNS,
+    truth_pattern: str = TRUTH_PATTERN,
+    identity: str = OWN,
+    topology: str | None = None,
+    templates: Path | None = None,
+    mesh: Path | None = None,
+    frame_rate: float | None = None,
+    truth_stride: int | None = None,
+    unit: str | None = None,
+) -> Material:
+    """Find truth, methods and what is known about their mesh.
+
+    Args:
+        methods: each method's folder of predictions.
+        truth: a corpus folder, any folder of .npy files, or ``puppet``.
+        patterns: how predictions are named.
+        truth_pattern: how truths are named.
+        identity: whose style the predictions were given.
+        topology: the corpus that the mesh belongs to; recognised by itself if None.
+        templates: file of each speaker's neutral face; the corpus's if None.
+        mesh: file with the faces; the corpus's if None.
+        frame_rate: frames a second of the predictions; the corpus's if None.
+        truth_stride: use every n-th frame of the truth; by the frame rates if None.
+        unit: unit of the vertices; the corpus's if None.
+
+    Raises:
+        FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others.
+    """
+    folder, corpus = find_truths(_truth_folder(truth))
+    manifest = read_manifest(corpus) if corpus else {}
+    module = _recognise(topology, corpus or folder, manifest)
+    if templates is None and corpus is not None and (corpus / "templates.pkl").is_file():
+        templates = corpus / "templates.pkl"
+    n_vertices = module.n_vertices if module else _count_vertices(templates, folder)
+    faces = {} if templates is None else read_templates(templates, n_vertices)
+    found_mesh = _find_mesh(mesh, corpus or folder, module, n_vertices)
+    rate, stride = _rates(frame_rate, truth_stride, manifest, module)
+    truths, found = find_clips(
+        methods, folder, subjects=list(faces), patterns=patterns, truth_pattern=truth_pattern, identity=identity
+    )
+    return Material(
+        truths,
+        found,
+        n_vertices,
+        rate,
+        stride,
+        unit or str(manifest.get("unit") or getattr(module, "unit", "")),
+        faces,
+        None if found_mesh is None else found_mesh.faces,
+        None if found_mesh is None else found_mesh.vertices,
+        None if found_mesh is None else found_mesh.colours,
+        corpus,
+        f"{module.corpus_name}: synthetic corpus" if module and module.synthetic else "",
+    )
+
+
+def sound_of(material: Material, clip: str, file: Path | None = None) -> npt.NDArray[np.float32] | None:
+    """Speech (S,) of a clip at 16 kHz: from the file given, else the corpus's; None if there is none.
+
+    Raises:
+        FaceDiffError: if the file given is missing or unreadable.
+    """
+    if file is None and material.corpus is not None:
+        file = material.corpus / "wav" / f"{material.truths[clip].path.stem}.wav"
+        file = file if file.is_file() else None
+    return None if file is None else read_speech(file)
+
+
+def phonemes_of(material: Material, clip: str, file: Path | None = None) -> list[Phoneme]:
+    """Phonemes of a clip: from the table given, else the corpus's; none if there is no table.
+
+    Raises:
+        FaceDiffError: if the table is missing or damaged.
+    """
+    path = file or phonemes_file(material.corpus, material.truths[clip].path.stem)
+    return read_phonemes(path) if path else []
+
+
+def _truth_folder(truth: Path) -> Path:
+    if truth != PUPPET or truth.is_dir():
+        return truth
+    root = cache_root(0)
+    if not root.is_dir():
+        raise FaceDiffError(f"{root}: the built-in corpus does not exist yet; `facediff demo` makes it")
+    return root
+
+
+def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module | None:
+    """The data module whose topology this is; None if it is not recognised."""
+    folder = list_folder(root, MOTION_FOLDERS)
+    if name is not None:
+        if "." in name:
+            sys.path.append(os.getcwd())  # a data module of one's own may lie in the working folder
+        return by_name(name, folder.n_vertices())
+    if not folder.motions or isinstance(manifest.get("person"), str):
+        return None
+    module = recognise(folder, manifest.get("corpus"), folder.n_vertices())
+    return module if module is not None and module.n_vertices == folder.n_vertices() else None
+
+
+def _count_vertices(templates_file: Path | None, truth: Path) -> int:
+    """Vertices of the mesh where no data module tells: as the templates have it, else the first readable truth."""
+    if templates_file is None and not any(truth.glob("**/*.npy")):
+        raise FaceDiffError(f"{truth}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
+    return count_vertices(None, templates_file, truth)
+
+
+def _find_mesh(given: Path | None, root: Path, module: Module | None, n_vertices: int) -> Mesh | None:
+    """The mesh given, else the one that lies in the corpus folder, else the built-in corpus's own; None without one."""
+    if given is not None:
+        mesh = read_mesh(given)
+        if len(mesh.vertices) != n_vertices:
+            raise FaceDiffError(f"{given}: has {len(mesh.vertices)} vertices, the motion {n_vertices}; give its mesh")
+        return mesh
+    places = [root, root / "templates"]
+    files = [place / file for file in (module.mesh_files if module else ()) for place in places]
+    files += [file for place in places for file in sorted(place.glob("*")) if file.suffix.lower() in SUFFIXES]
+    for file in files:
+        if file.is_file() and len((mesh := read_mesh(file)).vertices) == n_vertices:
+            return mesh
+    if module is not None and module.corpus_name == "puppet":
+        return built_in_mesh()
+    return None
+
+
+def _rates(
+    frame_rate: float | None, truth_stride: int | None, manifest: dict[str, Any], module: Module | None
+) -> tuple[float | None, int]:
+    """Frames a second of the predictions, and every how many-th frame of the truth belongs to them."""
+    said = manifest.get("frame_rate") or (module and (module.stored_frame_rate or module.frame_rate))
+    stored = float(said) if isinstance(said, int | float) else None
+    rate = frame_rate if frame_rate is not None else module.frame_rate if module else stored
+    if rate is not None and not 0 < rate < 10_000:
+        raise FaceDiffError(f"--frame-rate {rate:g}: expected frames a second, e.g. 25")
+    if truth_stride is not None:
+        if truth_stride < 1:
+            raise FaceDiffError(f"--truth-stride {truth_stride}: expected a number from 1")
+        return rate, truth_stride
+    if rate is None or stored is None:
+        return rate, 1
+    stride = round(stored / rate)
+    if stride < 1 or abs(stride * rate - stored) > 1e-6:
+        raise FaceDiffError(
+            f"the truth has {stored:g} frames a second, no whole multiple of the predictions' {rate:g}; say what is "
+            f"so with --frame-rate and --truth-stride"
+        )
+    return rate, stride

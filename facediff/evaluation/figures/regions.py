@@ -1,0 +1,131 @@
+"""A picture of the vertices that the scores of a corpus look at: its lips and upper face, drawn on its mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.check import Report
+from facediff.data.check.layouts import MANIFEST, View, identify, list_folder, read_record
+from facediff.data.corpus import MOTION_FOLDERS, Corpus, find_region
+from facediff.errors import FaceDiffError
+from facediff.mesh.mesh import Mesh
+from facediff.metrics import Region
+from facediff.render import Renderer, save_image, side_by_side
+from facediff.render.panels import draw_text
+
+COLOURS: dict[str, tuple[int, int, int]] = {"lips": (214, 40, 57), "upper_face": (38, 102, 207)}
+"""Colour (sRGB) of each region; vertices of both take the last."""
+
+REST = (219, 209, 200)
+"""Colour (sRGB) of all other vertices."""
+
+VIEWS = {"front": "front", "three_quarter": "three-quarter"}
+"""Views from left to right, with what is written above them."""
+
+
+def draw_regions(
+    root: Path,
+    output: Path,
+    *,
+    corpus: str | None = None,
+    lips: str | None = None,
+    upper_face: str | None = None,
+    size: int = 640,
+) -> list[str]:
+    """Draw a corpus's lips and upper face, the vertices that LVE and FDD look at, on its mesh.
+
+    Args:
+        root: the corpus folder; its mesh and region files are needed, no clips.
+        output: the picture (.png).
+        corpus: what the folder is: a corpus's name, or the import path of its data module; recognised if None.
+        lips: source of the lips; the corpus's own if None.
+        upper_face: likewise.
+        size: height of each view in pixels.
+
+    Returns:
+        a line for each region: name, vertex count, hash, source.
+
+    Raises:
+        FaceDiffError: if the folder is no corpus, or its mesh or a region is missing or damaged.
+    """
+    view = find_view(root, corpus)
+    mesh = find_mesh(root, view)
+    regions, lines = {}, {}
+    for part, own in (("lips", lips), ("upper_face", upper_face)):
+        sources = view.region_sources.get(part, ()) if own is None else (own,)
+        regions[part] = find_region(root, sources, part, view.n_vertices, view.region_help)
+        lines[part] = legend(root, sources, regions[part])
+    save_image(output, draw(mesh, regions, lines, f"{view.corpus}, {view.n_vertices} vertices", size))
+    return list(lines.values())
+
+
+def find_view(root: Path, corpus: str | None) -> View:
+    """What a folder is, as ``facediff data check`` recognises it.
+
+    Args:
+        root: the folder.
+        corpus: name of the corpus, or import path of its data module; recognised if None.
+
+    Raises:
+        FaceDiffError: if there is no such folder or corpus, or the folder is not recognised.
+    """
+    if not root.is_dir():
+        raise FaceDiffError(f"{root}: no such folder; expected a corpus folder with a mesh and regions/")
+    report = Report(root, quick=True)
+    manifest = read_record(root, MANIFEST, report.findings)
+    folder = list_folder(root, MOTION_FOLDERS)
+    view = identify(report, folder, manifest.get("corpus"), corpus, None, manifest)
+    if view is None:
+        raise FaceDiffError(f"{root}: {report.findings[-1].message}")
+    return view
+
+
+def find_mesh(root: Path, view: View) -> Mesh:
+    """The corpus's mesh: its neutral vertices and its faces.
+
+    Raises:
+        FaceDiffError: if there is no mesh file, or it is none of this corpus.
+    """
+    mesh = Corpus(root, view.n_vertices, view.frame_rate, stored_frame_rate=view.frame_rate).read_mesh(view.mesh_files)
+    if mesh is None and not view.mesh_files:
+        whose = "a person's folder" if view.data_module is None else view.corpus
+        raise FaceDiffError(f"{root}: {whose} has no mesh of its own; give a corpus folder of the same topology")
+    if mesh is None:
+        wanted = " or ".join(view.mesh_files)
+        raise FaceDiffError(f"{root}: no mesh to draw the regions on; put {wanted} into this folder")
+    return mesh
+
+
+def legend(root: Path, sources: Sequence[str], region: Region) -> str:
+    """A region in one line: name, vertex count, hash, source, and how often its source repeats itself."""
+    used = next((source for source in sources if (root / source.partition(":")[0]).is_file()), sources[0])
+    repeated = f", {region.duplicates} repeated indices counted once" if region.duplicates else ""
+    return f"{region} from {used}{repeated}"
+
+
+def draw(mesh: Mesh, regions: dict[str, Region], lines: dict[str, str], title: str, size: int) -> npt.NDArray[np.uint8]:
+    """The picture: the views side by side, the regions coloured, a line in its colour for each below.
+
+    Args:
+        mesh: what to draw on.
+        regions: vertices by name, the names of `COLOURS`.
+        lines: text for each region.
+        title: text for all.
+        size: height and width of each view in pixels.
+
+    Returns:
+        (height, width, 3), sRGB.
+    """
+    colours = np.full((len(mesh.vertices), 3), REST, np.uint8)
+    for part, region in regions.items():
+        colours[list(region.indices)] = COLOURS[part]
+    renderers = [Renderer(mesh.faces, template=mesh.vertices, size=size, view=view, colours=colours) for view in VIEWS]
+    still = [mesh.vertices[None]] * len(VIEWS)
+    picture = next(side_by_side(renderers, still, list(VIEWS.values()), footer=title))
+    blank = np.full((max(size // 16, 20), picture.shape[1], 3), 255, np.uint8)
+    strips = [draw_text(blank, line, colour=COLOURS[part], scale=0.5) for part, line in lines.items()]
+    return np.concatenate([picture, *strips])
