@@ -161,7 +161,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     """Import a command and run it with its arguments."""
     function = load(name)
     if function.__name__ == "run":  # reads its words by a parser of its own
-        return int(function(name, arguments))
+        return int(function(name, arguments) or 0)
     from facediff.cli.parsing import arguments_of
 
     return int(function(**arguments_of(function, f"facediff {name}", arguments)) or 0)
