@@ -22,7 +22,8 @@ Indices = npt.NDArray[np.int64]
 Vertices = npt.NDArray[np.floating]
 
 GIVE = (
-    "give --eyes FILE, which says where lids and eyeballs are (docs/animation_controls.md shows one for FLAME and for any mesh)"
+    "give --eyes FILE, which says where lids and eyeballs are (docs/animation_controls.md shows one for FLAME and for "
+    "any mesh)"
 )
 STILL = 0.01
 """Vertices that a blink moves by less than this share of its largest way are left alone."""
