@@ -87,7 +87,8 @@ class SourceOptions:
             given |= {"template": mesh.vertices.astype(np.float32), "faces": mesh.faces}
             given |= {} if mesh.colours is None else {"colours": mesh.colours}
         if self.speech is not None:
-            from facediff.data.audio import SAMPLE_RATE, read_speech
+            from facediff.data.audio import read_speech
+            from facediff.utils import SAMPLE_RATE
 
             given |= {"speech": read_speech(self.speech), "sample_rate": SAMPLE_RATE}
         given |= {} if self.frame_rate is None else {"frame_rate": self.frame_rate}
