@@ -23,7 +23,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from enum import Enum
-from functools import partial
+from functools import partial, wraps
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar
@@ -301,6 +301,24 @@ def defaults(component: type) -> dict[str, Any]:
             if all(p.kind is not p.VAR_KEYWORD for p in parameters):
                 break
     return found
+
+
+def keeps_arguments(init: Callable[..., None]) -> Callable[..., None]:
+    """Let a constructor pass its arguments to the object's ``keep_hyperparameters`` once it has run.
+
+    Of the constructors that run on the way, only that of the object's own class does so: a base class's constructor
+    sees only some of the arguments.
+    """
+
+    @wraps(init)
+    def wrapped(self: Any, *values: Any, **options: Any) -> None:  # noqa: ANN401
+        init(self, *values, **options)
+        if type(self).__init__ is wrapped:
+            bound = inspect.signature(init).bind_partial(self, *values).arguments
+            bound.pop("self", None)
+            self.keep_hyperparameters({**bound, **options})
+
+    return wrapped
 
 
 def describe(factory: Any, component: object) -> dict[str, Any]:  # noqa: ANN401

@@ -18,9 +18,9 @@ SENTENCES = {"train": range(1, 33), "val": range(33, 37), "test": range(37, 41)}
 class Biwi(SpeechMotionDataModule):
     """BIWI (B3D(AC)^2) in the layout of FaceFormer, CodeTalker, SelfTalk and FaceDiffuser.
 
-    25 frames a second, 23 370 vertices, emotional sentences e01 to e40. F2 F3 F4 M3 M4 M5 are trained on: sentences
-    1–32 train, 33–36 validate, 37–40 test (test A: 24 sequences); the other eight people's 37–40 are test B (32). The
-    other sentences of these eight give style references only.
+    25 frames per second, 23 370 vertices, emotional sentences e01 to e40. F2 F3 F4 M3 M4 M5 are trained on: sentences
+    1–32 train, 33–36 validate, 37–40 test (test A: 24 sequences); the other eight speakers' 37–40 are test B (32). The
+    other sentences of these eight serve as style references only.
     """
 
     corpus_name: ClassVar[str] = "biwi"
@@ -39,14 +39,14 @@ class Biwi(SpeechMotionDataModule):
     )
     licence: ClassVar[str] = "B3D(AC)^2 end-user licence of ETH Zurich: non-commercial research"
     obtain: ClassVar[str] = (
-        "ETH Zurich gave BIWI (B3D(AC)^2) out on request; since 2024 its page is reported gone and no request is "
+        "ETH Zurich distributed BIWI (B3D(AC)^2) on request; since 2024 its page is reported gone and no request is "
         "known to have succeeded, so only those who have a copy can use it. `facediff data prepare biwi RAW OUT` makes "
         "the corpus folder from the raw files."
     )
 
     @classmethod
     def parse_name(cls, name: str) -> Clip | None:
-        """``F2_e01``; the neutral sequences (``F2_01``) are no part of what the field trains and tests on."""
+        """``F2_e01``; the neutral sequences (``F2_01``) are not used by the field."""
         found = re.fullmatch(r"([FM]\d)_(e\d\d)", name)
         return Clip(name, found[1], found[2]) if found else None
 
@@ -54,8 +54,8 @@ class Biwi(SpeechMotionDataModule):
     def expected_clips(cls) -> dict[str, list[str]]:
         """192 training, 24 validation, 24 test A and 32 test B sequences."""
 
-        def names(people: tuple[str, ...], part: str) -> list[str]:
-            return [f"{person}_e{number:02d}" for person in people for number in SENTENCES[part]]
+        def names(speakers: tuple[str, ...], part: str) -> list[str]:
+            return [f"{speaker}_e{number:02d}" for speaker in speakers for number in SENTENCES[part]]
 
         return {
             "train": names(SEEN, "train"),
@@ -65,7 +65,7 @@ class Biwi(SpeechMotionDataModule):
         }
 
     def split_of(self, clip: Clip) -> str | None:
-        """By person and sentence number."""
+        """By speaker and sentence number."""
         part = next((part for part, numbers in SENTENCES.items() if clip.number in numbers), None)
         if clip.identity in UNSEEN:
             return "test_b" if part == "test" else None

@@ -1,10 +1,13 @@
-"""What every corpus's data module shares; a corpus adds its facts and its splits."""
+"""The base of all corpora's data modules: options, splits, style references, loaders, and what a checkpoint keeps.
+
+A corpus adds its facts (class attributes) and says which clip belongs to which split.
+"""
 
 from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -24,141 +27,64 @@ from facediff.data.dataset import (
     ReferencePolicy,
 )
 from facediff.errors import FaceDiffError
-from facediff.registry import plain
-
-# What the options of data modules have in common.
-
-
-def person_name(folder: Path) -> str:
-    """Whose folder it is, as ``facediff data import-person`` wrote it.
-
-    Raises:
-        FaceDiffError: if it is no such folder.
-    """
-    name = read_manifest(folder).get("person")
-    if not isinstance(name, str):
-        raise FaceDiffError(
-            f"data.people: {folder} is no person's folder (its manifest.json names none); make one with "
-            f"`facediff data import-person`"
-        )
-    return name
-
-
-def check_positive(**values: int | None) -> None:
-    """Refuse numbers below one.
-
-    Raises:
-        FaceDiffError: naming the argument.
-    """
-    for name, value in values.items():
-        if value is not None and value < 1:
-            raise FaceDiffError(f"data.{name}: is {value}, expected a whole number above zero")
-
-
-# What is measured on the training motion before training: its size and its principal components.
+from facediff.registry import defaults, keeps_arguments, plain
 
 FRAMES = 16
-"""Frames of each training clip, evenly spread, that are looked at."""
+"""Frames of each training clip, evenly spread, from which size and principal components of motion are measured."""
 
 PRINCIPAL_NUMBERS = 30_000_000
 """Coordinates from which principal components are computed, about; bounds the memory (8 bytes each, twice)."""
-
-
-def motion_scale(corpus: Corpus, clips: Sequence[Clip]) -> float:
-    """Factor that gives motion unit variance: one over the root mean square of its coordinates.
-
-    Offsets from the template are centred near zero.
-
-    Args:
-        corpus: where the clips are.
-        clips: the training clips.
-
-    Raises:
-        FaceDiffError: if they hold no motion at all.
-    """
-    total, count = 0.0, 0
-    for motion in spread_frames(corpus, clips, FRAMES):
-        total += float(motion.double().square().sum())
-        count += motion.numel()
-    if not total:
-        raise FaceDiffError(f"{corpus.root}: the training split holds no motion at all; check vertices_npy/")
-    return float((count / total) ** 0.5)
-
-
-def principal_motion(corpus: Corpus, clips: Sequence[Clip], count: int) -> tuple[Tensor, Tensor]:
-    """Mean and principal components of motion.
-
-    Args:
-        corpus: where the clips are.
-        clips: the training clips.
-        count: at most so many components are given.
-
-    Returns:
-        the mean (3V,), and components (at most count, 3V), each as long as its standard deviation, the largest first;
-        in the corpus's unit.
-    """
-    most = max(2, PRINCIPAL_NUMBERS // (3 * corpus.n_vertices * max(1, len(clips))))
-    frames = torch.cat([motion.flatten(1) for motion in spread_frames(corpus, clips, min(most, FRAMES))]).double()
-    mean = frames.mean(0)
-    frames -= mean
-    # Of the frames' own products: a matrix as wide as the vertices would not fit into memory.
-    values, vectors = torch.linalg.eigh(frames @ frames.T)
-    kept = [i for i in reversed(range(len(values))) if values[i] > 1e-10 * values[-1]][:count]
-    shapes = vectors[:, kept].T @ frames / len(frames) ** 0.5
-    return mean.float(), shapes.float()
-
-
-def spread_frames(corpus: Corpus, clips: Sequence[Clip], count: int) -> Iterator[Tensor]:
-    """At most ``count`` evenly spread frames of every clip, one at a time (1, V, 3)."""
-    for clip in clips:
-        frames = corpus.frames(clip)
-        for index in torch.linspace(0, frames - 1, min(frames, count)).long().tolist():
-            yield corpus.read_motion(clip, index, index + 1)
-
 
 Split = Literal["train", "val", "test_a", "test_b"]
 
 
 class SpeechMotionDataModule(LightningDataModule, ABC):
-    """Speech with motion for training, validation and two tests: seen people (test A) and unseen ones (test B).
+    """Speech with motion for training, validation and two tests: seen speakers (test A) and unseen ones (test B).
 
-    A corpus subclasses this, states the facts below and says which clips belong to a split.
+    A corpus subclasses this, states the facts below and says which clips belong to a split. Options of its own go into
+    a constructor that passes the others on::
+
+        def __init__(self, *, seed: int = 0, **options: Any) -> None:
+            super().__init__(**options)
+
+    All options, its own and those of this class, are kept as hyper-parameters.
 
     Class attributes:
         corpus_name: what the corpus is called, in tables and checkpoints.
         synthetic: whether a program made it.
-        unit: unit of length; what a prepared folder's ``manifest.json`` says goes before it.
-        frame_rate: motion frames a second that the models see.
-        stored_frame_rate: motion frames a second of circulating copies, where that is another.
+        unit: unit of length; ``unit`` in a prepared folder's ``manifest.json`` overrides it.
+        frame_rate: motion frames per second that the models see.
+        stored_frame_rate: motion frames per second of circulating copies, where that differs.
         n_vertices: vertices of its topology.
-        identities: people of the training split, in the order of the identity index.
-        mesh_files: files with the faces, in the order of preference.
-        region_sources: files that say which vertices the regions are, in the order of preference.
-        region_help: where such files are had.
+        identities: speakers of the training split, in the order of the identity index.
+        mesh_files: files with the faces, in order of preference.
+        region_sources: files that list the vertices of the regions, in order of preference.
+        region_help: where to get such files.
         reference_attributes: what a style reference shares with its target where possible.
-        licence: under which terms the corpus is given out.
-        obtain: how the corpus is had.
+        licence: the terms under which the corpus is distributed.
+        obtain: how to obtain the corpus.
 
     Attributes:
-        pair_sentences: whether neighbours in training batches say the same sentence; a model that learns from such
+        pair_sentences: whether neighbours in training batches speak the same sentence; a model that learns from such
             pairs sets it in its ``setup``.
 
     Args:
         root: the corpus folder.
-        batch_size: clips a batch; looked at where no frame budget is given.
-        max_frames_per_batch: frame budget: training and evaluation batches hold clips of like length that fit into so
-            many frames once they are padded.
+        batch_size: clips a batch; used where no frame budget is given.
+        max_frames_per_batch: frame budget: training and evaluation batches hold clips of similar length that fit into
+            this many frames once they are padded.
         num_workers: loader processes.
         window: longest training window in frames; whole clips if None.
-        reference: where a training target's style reference comes from: another clip of the same speaker, or itself.
+        reference: where a training target's style reference comes from: another clip of the same speaker, where
+            possible with the same attributes (such as the mood), or the target itself.
         reference_frames: longest style reference, in frames.
         predict_split: the split that ``predict`` runs over; the first test split if None.
-        people: folders of further people to train on, as ``facediff data import-person`` writes them; they come first
+        people: folders of further speakers to train on, as ``facediff data import-person`` writes them; they come first
             in the order of the identity index.
-        extra_identities: further identities of the corpus to train on, with those of their clips that belong to no split; they
-            come next in the order of the identity index.
-        train_identities: train on the clips of these people only; of all if None.
-        lips: file that says which vertices are the lips, e.g. ``regions/lve.txt`` or ``FLAME_masks.pkl:lips``, or
+        extra_identities: further identities of the corpus to train on, with those of their clips that belong to no
+            split; they come next in the order of the identity index.
+        train_identities: train on the clips of these identities only; of all if None.
+        lips: file that lists the vertices of the lips, e.g. ``regions/lve.txt`` or ``FLAME_masks.pkl:lips``, or
             ``all``; the corpus's usual one if None.
         upper_face: the same for the upper face.
     """
@@ -180,6 +106,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     licence: ClassVar[str] = "unknown"
     obtain: ClassVar[str] = ""
 
+    @keeps_arguments
     def __init__(
         self,
         *,
@@ -197,7 +124,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         lips: str | None = None,
         upper_face: str | None = None,
     ) -> None:
-        arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        numbers = {"batch_size": batch_size, "window": window, "reference_frames": reference_frames}
+        for name, value in {**numbers, "max_frames_per_batch": max_frames_per_batch}.items():
+            if value is not None and value < 1:
+                raise FaceDiffError(f"data.{name}: is {value}, expected a whole number above zero")
         super().__init__()
         self.root = Path(root).expanduser()
         self.batch_size = batch_size
@@ -217,26 +147,33 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.identities = [*map(person_name, self.people), *self.extra_identities, *type(self).identities]
         for name in self.identities:
             if self.identities.count(name) > 1:
-                told = "among the corpus's people and data.extra_identities; import the person by a new name, or leave one away"
-                raise FaceDiffError(f"data.people: {name} is there more than once {told}")
+                raise FaceDiffError(
+                    f"data.people: {name} is there more than once among the corpus's identities, the imported speakers "
+                    f"and data.extra_identities; import the speaker under a new name, or omit one"
+                )
         self.features = FeatureSlot()
         self.pair_sentences = False
         self._corpus: Corpus | None = None
         self._assets: Assets | None = None
-        check_positive(batch_size=batch_size, window=window, reference_frames=reference_frames)
-        check_positive(max_frames_per_batch=max_frames_per_batch)
-        self.remember(arguments)
 
-    def remember(self, arguments: dict[str, Any]) -> None:
-        """Keep constructor arguments as plain data, so that checkpoints load with ``weights_only=True``."""
-        self.save_hyperparameters(plain(arguments))
+    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+        """Let every corpus keep its constructor's arguments."""
+        super().__init_subclass__(**words)
+        if "__init__" in vars(cls):
+            cls.__init__ = keeps_arguments(cls.__init__)  # type: ignore[method-assign]
+
+    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
+        """Save the constructor's arguments as plain data, so that checkpoints load with ``weights_only=True``."""
+        self.save_hyperparameters(plain({**defaults(type(self)), **given}))
+
+    # What a corpus adds.
 
     @abstractmethod
     def split_of(self, clip: Clip) -> str | None:
         """The split a clip belongs to (``train``, ``val``, ``test_a``, ``test_b``), or None for none of them.
 
         Clips of no split may serve as style references of their speaker; clips of an evaluated split only where their
-        speaker has no others. An imported person's clips are not asked for.
+        speaker has no others. The clips of imported speakers are not passed to this method.
         """
 
     @classmethod
@@ -249,12 +186,25 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """The clips of a complete corpus by split; empty where the corpus has no fixed list."""
         return {}
 
+    def default_reference(self, clips: list[Clip]) -> Clip:
+        """The one of an identity's clips whose style is used when no other is chosen."""
+        return clips[0]
+
+    def prepare_data(self) -> None:
+        """Report the clips that a complete corpus has and this folder has not; called on one process only."""
+        missing = {split: len(names) for split, names in self.missing_clips().items() if names}
+        if missing:
+            counts = ", ".join(f"{count} of {split}" for split, count in missing.items())
+            print(f"{self.corpus_name}: missing clips, which are left out: {counts}", flush=True)
+
+    # The clips.
+
     @property
     def corpus(self) -> Corpus:
         """The corpus on disk.
 
         Raises:
-            FaceDiffError: if the folder is not there; it says how the corpus is had.
+            FaceDiffError: if the folder does not exist; the message says how to obtain the corpus.
         """
         if self._corpus is None:
             if not self.root.is_dir():
@@ -277,33 +227,36 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def clips(self, split: str) -> list[Clip]:
         """The clips of a split, sorted by name."""
         found = [clip for clip in self.corpus.clips.values() if self.find_split(clip) == split]
-        if split != "train" or self.train_identities is None:
-            return found
-        return [clip for clip in found if clip.identity in self.train_identities]
+        if split == "train" and self.train_identities is not None:
+            found = [clip for clip in found if clip.identity in self.train_identities]
+        return found
 
     def find_split(self, clip: Clip) -> str | None:
         """The split of any clip.
 
-        An imported person's own list says it of theirs, :meth:`split_of` of all others, and what extra_identities have in no
-        split is trained on.
+        An imported speaker's ``clips.csv`` decides for their clips, :meth:`split_of` for all others; clips of no split
+        are trained on where they belong to ``extra_identities``.
         """
         if clip.root in self.people:
-            said = clip.attributes.get("split")
-            if said not in ("train", "val", "test"):
-                raise FaceDiffError(f"{clip.root / 'clips.csv'}: split of {clip.name} is {said!r}; train, val or test")
-            return "test_a" if said == "test" else said
+            listed = clip.attributes.get("split")
+            if listed not in ("train", "val", "test"):
+                raise FaceDiffError(
+                    f"{clip.root / 'clips.csv'}: split of {clip.name} is {listed!r}, expected train, val or test"
+                )
+            return "test_a" if listed == "test" else listed
         split = self.split_of(clip)
         return "train" if split is None and clip.identity in self.extra_identities else split
 
     def missing_clips(self) -> dict[str, list[str]]:
-        """Clips of a complete corpus that are not there, by split."""
-        there = self.corpus.clips
-        return {split: [name for name in names if name not in there] for split, names in self.expected_clips().items()}
+        """Clips of a complete corpus that are missing in this copy, by split."""
+        present = self.corpus.clips
+        expected = self.expected_clips()
+        return {split: [name for name in names if name not in present] for split, names in expected.items()}
 
     def reference_policy(self) -> ReferencePolicy:
-        """References come from training clips, and from clips of no split for people who are not trained on.
+        """References come from training clips, and from clips of no split for speakers who are not trained on.
 
-        Whoever has clips in evaluated splits only is given another of these clips, never the target itself.
+        A speaker with clips in evaluated splits only is given another of these clips, never the target itself.
         """
         candidates: dict[str, list[Clip]] = {}
         evaluated: dict[str, list[Clip]] = {}
@@ -323,7 +276,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         clips = self.clips(split)
         if not clips:
             raise FaceDiffError(
-                f"{self.root}: no clip of split {split}; `facediff data check {self.root}` tells what is missing"
+                f"{self.root}: no clip of split {split}; `facediff data check {self.root}` lists what is missing"
             )
         policy = self.reference_policy()
         if not training or self.reference != "self":
@@ -340,7 +293,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         )
 
     def assets(self) -> Assets:
-        """What a checkpoint keeps of this corpus; the motion scale is left for :meth:`motion_scale` to measure."""
+        """What a checkpoint keeps of this corpus; the motion scale is measured by :meth:`motion_scale`."""
         if self._assets is None:
             corpus = self.corpus
             mesh = corpus.read_mesh(self.mesh_files)
@@ -362,18 +315,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             )
         return self._assets
 
-    def motion_scale(self) -> float:
-        """Factor that gives the training motion unit variance.
-
-        Raises:
-            FaceDiffError: if the training clips hold no motion at all.
-        """
-        return motion_scale(self.corpus, self.clips("train"))
-
-    def principal_motion(self, count: int) -> tuple[Tensor, Tensor]:
-        """Mean (3V,) and at most ``count`` principal components (components, 3V) of the training motion."""
-        return principal_motion(self.corpus, self.clips("train"), count)
-
     def _default_references(self) -> dict[str, Reference]:
         references = {}
         for identity, clips in sorted(self.reference_policy().candidates.items()):
@@ -383,16 +324,51 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 references[identity] = Reference(clip.name, motion.half())
         return references
 
-    def default_reference(self, clips: list[Clip]) -> Clip:
-        """The clip whose style stands for an identity when nobody asks for another."""
-        return clips[0]
+    # What is measured on the training motion before training.
 
-    def prepare_data(self) -> None:
-        """Say what a complete corpus has and this folder has not; called on one process only."""
-        missing = {split: len(names) for split, names in self.missing_clips().items() if names}
-        if missing:
-            counts = ", ".join(f"{count} of {split}" for split, count in missing.items())
-            print(f"{self.corpus_name}: clips that are not there and are left out: {counts}", flush=True)
+    def motion_scale(self) -> float:
+        """Factor that gives the training motion unit variance: one over the root mean square of its coordinates.
+
+        The mean is not subtracted, since offsets from the template are centred near zero.
+
+        Raises:
+            FaceDiffError: if the training clips hold no motion at all.
+        """
+        total, count = 0.0, 0
+        for motion in self._spread_frames(self.clips("train"), FRAMES):
+            total += float(motion.double().square().sum())
+            count += motion.numel()
+        if not total:
+            raise FaceDiffError(f"{self.root}: the training split holds no motion at all; check vertices_npy/")
+        return float((count / total) ** 0.5)
+
+    def principal_motion(self, count: int) -> tuple[Tensor, Tensor]:
+        """Mean and principal components of the training motion, in the corpus's unit.
+
+        Returns:
+            the mean (3V,), and components (at most ``count``, 3V), each as long as its standard deviation, the largest
+            first.
+        """
+        clips = self.clips("train")
+        most = max(2, PRINCIPAL_NUMBERS // (3 * self.n_vertices * max(1, len(clips))))
+        frames = torch.cat([motion.flatten(1) for motion in self._spread_frames(clips, min(most, FRAMES))]).double()
+        mean = frames.mean(0)
+        frames -= mean
+        # The eigenvectors of the frames' products with one another give the same components as those of the
+        # covariance, a matrix of (3V, 3V) that would not fit into memory.
+        values, vectors = torch.linalg.eigh(frames @ frames.T)
+        kept = [i for i in reversed(range(len(values))) if values[i] > 1e-10 * values[-1]][:count]
+        shapes = vectors[:, kept].T @ frames / len(frames) ** 0.5
+        return mean.float(), shapes.float()
+
+    def _spread_frames(self, clips: list[Clip], count: int) -> Iterator[Tensor]:
+        """At most ``count`` evenly spread frames of every clip, one at a time (1, V, 3)."""
+        for clip in clips:
+            frames = self.corpus.frames(clip)
+            for index in torch.linspace(0, frames - 1, min(frames, count)).long().tolist():
+                yield self.corpus.read_motion(clip, index, index + 1)
+
+    # The loaders.
 
     def train_dataloader(self) -> DataLoader[list[Sample]]:
         """Shuffled training batches, each process its own."""
@@ -424,7 +400,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             world_size=trainer.world_size if trainer is not None else 1,
             groups=[clip.sentence for clip in samples.clips] if self.pair_sentences else None,
         )
-        # The sampler gives whole batches, so the loader must not batch again.
+        # The sampler yields whole batches, so the loader must not batch again.
         return DataLoader(
             BatchDataset(samples), sampler=batches, batch_size=None, collate_fn=collate, **self._loader_options()
         )
@@ -439,3 +415,18 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Move every tensor of the batch."""
         return batch.to(device)
+
+
+def person_name(folder: Path) -> str:
+    """The speaker of a folder, as ``facediff data import-person`` wrote it.
+
+    Raises:
+        FaceDiffError: if it is no such folder.
+    """
+    name = read_manifest(folder).get("person")
+    if not isinstance(name, str):
+        raise FaceDiffError(
+            f"data.people: {folder} is no speaker's folder (its manifest.json names none); make one with "
+            f"`facediff data import-person`"
+        )
+    return name

@@ -7,8 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from facediff import registry
 from facediff.data.corpus import FLAME_SOURCES, Clip
-from facediff.data.datamodule import SpeechMotionDataModule, Split
-from facediff.data.dataset import ReferenceChoice
+from facediff.data.datamodule import SpeechMotionDataModule
 
 EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry", "contempt")
 TRAIN = (
@@ -25,26 +24,13 @@ EMOTIONAL_SENTENCES = {"train": range(1, 25), "val": range(25, 28), "test_a": ra
 class Mead3D(SpeechMotionDataModule):
     """3DMEAD as vertices, from EMOTE's reconstructions or in ProbTalk3D's layout.
 
-    25 frames a second, FLAME topology (5 023 vertices, metres), 47 people, eight emotions at three intensities; the
-    clip attributes ``emotion`` and ``intensity`` tell them, and style references share the emotion of their target.
+    25 frames a second, FLAME topology (5 023 vertices, metres), 47 speakers, eight emotions at three intensities; the
+    clip attributes are ``emotion`` and ``intensity``, and style references share the emotion of their target.
 
     Args:
-        root: the corpus folder.
-        split: ``sentence`` is ProbTalk3D's: the 32 training people, the last sentences of each emotion are for
-            validation and test (test A). ``identity`` is EMOTE's: 32 people train, 7 validate, 8 test (test B).
-        batch_size: clips a batch; looked at where no frame budget is given.
-        max_frames_per_batch: frame budget of a batch of clips of like length, counted with their padding.
-        num_workers: loader processes.
-        window: longest training window in frames; whole clips if None.
-        reference: where a training target's style reference comes from: another clip of the same speaker and emotion,
-            or itself.
-        reference_frames: longest style reference, in frames.
-        predict_split: the split that ``predict`` runs over; the first test split if None.
-        people: folders of further people with FLAME's topology to train on.
-        extra_identities: further identities of the corpus to train on, with their clips of no split.
-        train_identities: train on the clips of these people only; of all if None.
-        lips: file that says which vertices are the lips, or ``all``; the corpus's usual one if None.
-        upper_face: the same for the upper face.
+        split: ``sentence`` is ProbTalk3D's: the 32 training speakers, the last sentences of each emotion are for
+            validation and test (test A). ``identity`` is EMOTE's: 32 speakers train, 7 validate, 8 test (test B).
+        options: those of every data module.
     """
 
     corpus_name: ClassVar[str] = "mead3d"
@@ -62,39 +48,20 @@ class Mead3D(SpeechMotionDataModule):
     reference_attributes: ClassVar[tuple[str, ...]] = ("emotion",)
     licence: ClassVar[str] = "MEAD and FLAME licences: non-commercial research"
     obtain: ClassVar[str] = (
-        "3DMEAD is MEAD (wywu.github.io/projects/MEAD) with the reconstructions that EMOTE's authors give out (see the "
-        "inferno repository, github.com/radekd91/inferno); `facediff data prepare mead3d RAW OUT --flame MODEL` makes "
-        "the corpus folder from them."
+        "3DMEAD is MEAD (wywu.github.io/projects/MEAD) with the reconstructions that EMOTE's authors distribute (see "
+        "the inferno repository, github.com/radekd91/inferno); `facediff data prepare mead3d RAW OUT --flame MODEL` "
+        "makes the corpus folder from them."
     )
 
-    def __init__(
-        self,
-        *,
-        root: str,
-        split: Literal["sentence", "identity"] = "sentence",
-        batch_size: int = 1,
-        max_frames_per_batch: int | None = None,
-        num_workers: int = 0,
-        window: int | None = None,
-        reference: ReferenceChoice = "same_subject",
-        reference_frames: int = 100,
-        predict_split: Split | None = None,
-        people: list[str] | None = None,
-        extra_identities: list[str] | None = None,
-        train_identities: list[str] | None = None,
-        lips: str | None = None,
-        upper_face: str | None = None,
-    ) -> None:
-        arguments: dict[str, Any] = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        super().__init__(**{name: value for name, value in arguments.items() if name != "split"})
+    def __init__(self, *, split: Literal["sentence", "identity"] = "sentence", **options: Any) -> None:  # noqa: ANN401
+        super().__init__(**options)
         self.split = split
-        self.remember(arguments)
 
     @classmethod
     def parse_name(cls, name: str) -> Clip | None:
         """``M003_001_0_0``: identity, sequence, emotion, intensity.
 
-        Sequences of one number say the same words within one emotion only.
+        Sequences of one number have the same words within one emotion only.
         """
         found = re.fullmatch(r"([MW]\d{3})_(\d{3})_([0-7])_([0-2])", name)
         if found is None:
@@ -104,10 +71,10 @@ class Mead3D(SpeechMotionDataModule):
         return Clip(name, found[1], f"{emotion}_{found[2]}", attributes)
 
     def split_of(self, clip: Clip) -> str | None:
-        """By person (``identity``), or by sentence for the training people (``sentence``)."""
+        """By speaker (``identity``), or by sentence for the training speakers (``sentence``)."""
         if self.split == "identity":
             groups = {"train": TRAIN, "val": VALIDATION, "test_b": TEST}
-            return next((split for split, people in groups.items() if clip.identity in people), None)
+            return next((split for split, speakers in groups.items() if clip.identity in speakers), None)
         if clip.identity not in TRAIN:
             return None
         sentences = NEUTRAL_SENTENCES if clip.attributes["emotion"] == "neutral" else EMOTIONAL_SENTENCES

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from facediff import registry
 from facediff import synthetic as puppet
 from facediff.data.corpus import Clip
-from facediff.data.datamodule import SpeechMotionDataModule, Split
-from facediff.data.dataset import ReferenceChoice
+from facediff.data.datamodule import SpeechMotionDataModule
 from facediff.mesh import Mesh
 from facediff.synthetic.face import build_face
 from facediff.utils.files import cache_dir
@@ -30,25 +29,14 @@ def built_in_mesh() -> Mesh:
 class Puppet(SpeechMotionDataModule):
     """The built-in corpus: a face made by code that speaks with a real speech synthesiser; made on first use.
 
-    Synthetic: figures on it say nothing about real people. Eight speakers, 25 frames a second, metres; sentences
+    Synthetic: scores on it say nothing about real people. Eight speakers, 25 frames a second, metres; sentences
     1–24 train, 25–27 validate, 28–32 test six seen speakers (test A) and two unseen ones (test B).
 
     Args:
         root: the corpus folder; the user's cache folder if None.
         seed: seed of the corpus; another seed makes another corpus.
-        batch_size: clips a batch; looked at where no frame budget is given.
-        max_frames_per_batch: frame budget of a batch of clips of like length, counted with their padding.
-        num_workers: loader processes.
-        window: longest training window in frames; whole clips if None.
-        reference: where a training target's style reference comes from: another clip of the same speaker and mood,
-            or itself.
-        reference_frames: longest style reference, in frames.
-        predict_split: the split that ``predict`` runs over; test A if None.
-        people: folders of further people with this face's topology to train on.
-        extra_identities: further identities of the corpus to train on, with their clips of no split.
-        train_identities: train on the clips of these people only; of all if None.
-        lips: file that says which vertices are the lips, or ``all``; the corpus's own if None.
-        upper_face: the same for the upper face.
+        batch_size: clips a batch; used where no frame budget is given.
+        options: those of every data module.
     """
 
     corpus_name: ClassVar[str] = "puppet"
@@ -60,39 +48,17 @@ class Puppet(SpeechMotionDataModule):
     mesh_files: ClassVar[tuple[str, ...]] = ("PUPPET.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
 
-    def __init__(
-        self,
-        *,
-        root: str | None = None,
-        seed: int = 0,
-        batch_size: int = 8,
-        max_frames_per_batch: int | None = None,
-        num_workers: int = 0,
-        window: int | None = None,
-        reference: ReferenceChoice = "same_subject",
-        reference_frames: int = 100,
-        predict_split: Split | None = None,
-        people: list[str] | None = None,
-        extra_identities: list[str] | None = None,
-        train_identities: list[str] | None = None,
-        lips: str | None = None,
-        upper_face: str | None = None,
-    ) -> None:
-        arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        super().__init__(
-            root=str(cache_root(seed)) if root is None else root,
-            **{name: value for name, value in arguments.items() if name not in ("root", "seed")},
-        )
+    def __init__(self, *, root: str | None = None, seed: int = 0, batch_size: int = 8, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(root=str(cache_root(seed)) if root is None else root, batch_size=batch_size, **options)
         self.seed = seed
-        self.remember(arguments)
 
     def prepare_data(self) -> None:
-        """Make the corpus if it is not there; called on one process only."""
+        """Make the corpus if it does not exist; called on one process only."""
         if not puppet.is_complete(self.root, seed=self.seed):
             puppet.generate(self.root, seed=self.seed)
 
     def split_of(self, clip: Clip) -> str | None:
-        """BIWI's way: by speaker and sentence number."""
+        """By speaker and sentence number, like BIWI."""
         seen = clip.identity in puppet.SEEN_IDENTITIES
         if clip.number in puppet.TEST_SENTENCES:
             return "test_a" if seen else "test_b"

@@ -28,10 +28,10 @@ EVALUATED = range(21, 41)
 class Vocaset(SpeechMotionDataModule):
     """VOCASET in the layout of FaceFormer, CodeTalker, SelfTalk and TalkingStyle.
 
-    12 people, 40 sentences, FLAME topology (5 023 vertices, metres). Circulating copies hold 60 frames a second, of
-    which every second is taken, as all projects do; a folder made by ``facediff data prepare vocaset`` says itself how
-    many it holds. Eight people train (all sentences), two validate and two test (sentences 21–40 of each): all of
-    these are strangers to the model, so the test is test B. Some clips do not exist and are left out.
+    12 speakers, 40 sentences, FLAME topology (5 023 vertices, metres). Circulating copies hold 60 frames per second, of
+    which every second one is read, as in all projects; a folder made by ``facediff data prepare vocaset`` records its
+    own frame rate. Eight speakers train (all sentences), two validate and two test (sentences 21–40 of each). The last
+    four are unseen speakers, so the test is test B. Some clips were never recorded and are left out.
     """
 
     corpus_name: ClassVar[str] = "vocaset"
@@ -43,14 +43,14 @@ class Vocaset(SpeechMotionDataModule):
     mesh_files: ClassVar[tuple[str, ...]] = ("FLAME_sample.ply",)
     region_sources: ClassVar[dict[str, tuple[str, ...]]] = FLAME_SOURCES
     region_help: ClassVar[str] = (
-        "FLAME_masks.pkl is had from flame.is.tue.mpg.de (FLAME vertex masks); put it into your corpus folder. Or take "
+        "Get FLAME_masks.pkl from flame.is.tue.mpg.de (FLAME vertex masks); put it into your corpus folder. Or take "
         "lve.txt and fdd.txt from data/vocaset/regions of the FaceDiffuser repository "
         "(github.com/uuembodiedsocialai/FaceDiffuser) into regions/."
     )
     licence: ClassVar[str] = "VOCASET licence of the Max Planck Society: non-commercial research"
     obtain: ClassVar[str] = (
-        "VOCASET is had after registration at voca.is.tue.mpg.de; `facediff data prepare vocaset RAW OUT` makes the "
-        "corpus folder from its files."
+        "VOCASET is distributed after registration at voca.is.tue.mpg.de; `facediff data prepare vocaset RAW OUT` "
+        "makes the corpus folder from its files."
     )
 
     @classmethod
@@ -62,14 +62,14 @@ class Vocaset(SpeechMotionDataModule):
     @classmethod
     def expected_clips(cls) -> dict[str, list[str]]:
         """320 training, 40 validation and 40 test clips; a few of them were never recorded."""
-        people = {"train": (TRAIN, range(1, 41)), "val": (VALIDATION, EVALUATED), "test_b": (TEST, EVALUATED)}
+        speakers = {"train": (TRAIN, range(1, 41)), "val": (VALIDATION, EVALUATED), "test_b": (TEST, EVALUATED)}
         return {
             split: [f"{name}_sentence{number:02d}" for name in names for number in numbers]
-            for split, (names, numbers) in people.items()
+            for split, (names, numbers) in speakers.items()
         }
 
     def split_of(self, clip: Clip) -> str | None:
-        """By person, and for validation and test by sentence number."""
+        """By speaker, and for validation and test by sentence number."""
         if clip.identity in TRAIN:
             return "train"
         if clip.number not in EVALUATED:

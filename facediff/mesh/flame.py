@@ -208,7 +208,9 @@ def read_flame_arrays(path: Path) -> FlameArrays:
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; {HELP}")
-    content = read_arrays(path, KEYS, remedy=HELP) if path.suffix.lower() == ".npz" else load_pickle(path, stand_ins=PACKAGES)
+    content = (
+        read_arrays(path, KEYS, remedy=HELP) if path.suffix.lower() == ".npz" else load_pickle(path, stand_ins=PACKAGES)
+    )
     if not isinstance(content, Mapping):
         raise FaceDiffError(f"{path}: holds a {type(content).__name__}, no FLAME model; {HELP}")
     absent = [key for key in KEYS if key not in content]

@@ -6,10 +6,9 @@ A model adds its network and three methods: ``__init__`` with its own options, `
 from __future__ import annotations
 
 import functools
-import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -27,26 +26,10 @@ from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
 from facediff.models.inference import Inference, Prediction, WindowPlan
 from facediff.models.mesh_encoders import MeshEncoder
-from facediff.registry import COMPONENTS, component_class, defaults, describe, plain
+from facediff.registry import COMPONENTS, component_class, defaults, describe, keeps_arguments, plain
 
 Schedule = Literal["constant", "cosine"]
 MotionScale = Literal["unit", "none"]
-Constructor = Callable[..., None]
-
-
-def keeps_arguments(init: Constructor) -> Constructor:
-    """Let a model's constructor keep its arguments as hyper-parameters, those left at their defaults included."""
-
-    @functools.wraps(init)
-    def wrapped(self: AnimationModel, *values: Any, **options: Any) -> None:  # noqa: ANN401
-        init(self, *values, **options)
-        # A base class's constructor, which runs on the way, sees only some of the arguments.
-        if type(self).__init__ is wrapped:
-            bound = inspect.signature(init).bind_partial(self, *values).arguments
-            bound.pop("self", None)
-            self.keep_hyperparameters({**bound, **options})
-
-    return wrapped
 
 
 def lr_factor(step: int, *, total: int, warmup_steps: int, schedule: Schedule) -> float:

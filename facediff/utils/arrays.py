@@ -142,7 +142,7 @@ class ArrayStore:
         return self.folder / key[:2] / f"{key}.npy"
 
     def get(self, key: str) -> npt.NDArray[Any] | None:
-        """The array, memory-mapped; None if there is none, or if its file is damaged, which is reported as a warning."""
+        """The array, memory-mapped; None if there is none, or with a warning if its file is damaged."""
         path = self.path(key)
         if not path.is_file():
             return None

@@ -321,7 +321,7 @@ def test_an_imported_person_is_trained_on_beside_the_corpus(tmp_path: Path) -> N
 
 def test_a_persons_folder_must_be_one(tmp_path: Path) -> None:
     root = write(tmp_path / "biwi", ["F2_e01", "F2_e02"], {"F2"})
-    with pytest.raises(FaceDiffError, match=r"data\.people: .*biwi is no person's folder"):
+    with pytest.raises(FaceDiffError, match=r"data\.people: .*biwi is no speaker's folder"):
         MiniBiwi(root=str(root), people=[str(root)])
     for name, sentence in (("F2", "data.people: F2 is there more than once"), ("M6", "M6 already")):
         own = write(tmp_path / f"with {name}", ["F2_e01", "F2_e02"], {"F2", "M6"})
@@ -342,7 +342,7 @@ def test_a_persons_table_may_come_from_a_spreadsheet_but_must_name_splits(tmp_pa
     (person / "clips.csv").write_text(table.replace(",val", ", val "), encoding="utf-8-sig")
     assert [clip.name for clip in MiniBiwi(root=str(root), people=[str(person)]).clips("val")] == ["Ada_s03"]
     (person / "clips.csv").write_text(table.replace(",test", ",tset"))
-    with pytest.raises(FaceDiffError, match=r"clips\.csv: split of Ada_s04 is 'tset'; train, val or test"):
+    with pytest.raises(FaceDiffError, match=r"clips\.csv: split of Ada_s04 is 'tset'"):
         MiniBiwi(root=str(root), people=[str(person)]).clips("val")
 
 
