@@ -33,7 +33,7 @@ def test_the_table_of_formats_is_complete() -> None:
     for suffix, row in rows:
         speech = row.split("|")[4]
         assert ("in it" in speech) == (FORMATS[suffix].speech == "in the file")
-        assert ("beside" in speech or "in the folder" in speech) == (FORMATS[suffix].speech == "next to it")
+        assert ("next to it" in speech or "in the folder" in speech) == (FORMATS[suffix].speech == "next to it")
         assert ("y up" in row and "any" not in row) == (FORMATS[suffix].units == "m")
 
 
