@@ -1,4 +1,4 @@
-"""A small audio encoder trained from scratch: log-mel spectrogram and convolutions."""
+"""Audio encoders: a small one trained from scratch, and pretrained HuBERT (dual-path paper, section 1.2)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from facediff.data.audio import SAMPLE_RATE
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.models.layers import frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
@@ -25,27 +26,24 @@ if TYPE_CHECKING:
     from transformers import HubertModel
 
 
-# What every audio encoder is.
-
-
 class AudioEncoder(nn.Module, ABC):
     """Speech to one feature per motion frame.
 
-    A clip's feature must not depend on how far it is padded, nor on the clips beside it.
+    A clip's feature must not depend on how far it is padded, nor on the other clips of a batch.
 
-    An encoder whose first part is frozen may let it be computed once per clip and kept on disk: it then overrides
+    The frozen first part of an encoder may be computed once per clip and kept on disk. Such an encoder overrides
     :meth:`frozen_key` and :meth:`frozen_features`, and takes their result as ``features`` and ``feature_lengths``,
     two further arguments of its :meth:`forward` that no other encoder is given.
 
-    An encoder that looks at how loud the speech is takes it through :meth:`standardise`, so that a piece of a long
-    recording is heard as loud as it is in the whole.
+    An encoder for which loudness matters calls :meth:`standardise`, so that a piece of a long recording is as loud as
+    it is in the whole.
     """
 
     _level: tuple[float, float] | None = None
 
     @contextmanager
     def at_level(self, mean: float, deviation: float) -> Iterator[None]:
-        """Within it, speech is standardised by this mean and standard deviation and not by its own."""
+        """A context in which speech is standardised by this mean and standard deviation instead of its own."""
         before, self._level = self._level, (mean, deviation)
         try:
             yield
@@ -62,7 +60,7 @@ class AudioEncoder(nn.Module, ABC):
         return (audio - mean) / deviation * frame_mask(lengths, audio.shape[1])
 
     def frozen_key(self) -> str | None:
-        """A hash of all that decides :meth:`frozen_features`; None if nothing is frozen, or something is random."""
+        """A hash of all that :meth:`frozen_features` depends on; None if nothing is frozen, or something is random."""
         return None
 
     def frozen_features(
@@ -113,7 +111,101 @@ def standardise(
     return (audio - mean) / (variance + 1e-7).sqrt() * mask
 
 
-# Pretrained HuBERT as audio encoder (dual-path style diffusion paper, section 1.2).
+@audio_encoder.register("mel")
+class MelEncoder(AudioEncoder):
+    """Log-mel spectrogram and residual dilated convolutions, trained from scratch.
+
+    The default where no pretrained weights are at hand. 100 spectra a second are halved to 50 steps a second by a
+    strided convolution and interpolated to the motion's frame rate at the end.
+
+    Args:
+        dim: channels of the result; given by the model.
+        n_mels: mel bands between 60 Hz and 7 600 Hz.
+        hidden_dim: channels of the convolutions.
+        num_layers: residual blocks, with dilations 1, 2, 4, 1, 2, 4 …
+        dropout: dropout in each block.
+    """
+
+    filters: Tensor
+    window: Tensor
+    n_fft = 512
+    hop = 160
+
+    def __init__(
+        self, *, dim: int, n_mels: int = 64, hidden_dim: int = 128, num_layers: int = 4, dropout: float = 0.1
+    ) -> None:
+        super().__init__()
+        self.register_buffer("filters", mel_filters(n_mels, self.n_fft, 60.0, 7600.0), persistent=False)
+        self.register_buffer("window", torch.hann_window(400), persistent=False)
+        self.stem = nn.Conv1d(n_mels, hidden_dim, kernel_size=4, stride=2, padding=1)
+        self.blocks = nn.ModuleList(ConvBlock(hidden_dim, 2 ** (i % 3), dropout) for i in range(num_layers))
+        self.out = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, dim))
+
+    def forward(
+        self,
+        audio: Float[Tensor, "batch samples"],
+        audio_lengths: Int[Tensor, " batch"],
+        frame_lengths: Int[Tensor, " batch"],
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Encode; see :class:`AudioEncoder`."""
+        spectrum, lengths = self._log_mel(self.standardise(audio, audio_lengths), audio_lengths)
+        x = self.stem(spectrum.transpose(1, 2)).transpose(1, 2)
+        lengths = (lengths // 2).clamp_min(1)
+        mask = frame_mask(lengths, x.shape[1])[..., None].to(x.dtype)
+        x = nn.functional.gelu(x) * mask
+        for block in self.blocks:
+            x = block(x, mask)
+        return interpolate_frames(self.out(x), lengths, frame_lengths)
+
+    def _log_mel(self, audio: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+        """Standardised log-mel spectra (batch, steps, mels), zero on padding, and each clip's steps."""
+        # Autocast has no complex numbers: the spectrum is always taken in float32.
+        with torch.autocast(audio.device.type, enabled=False):
+            short = max(0, 2 * self.hop - audio.shape[1])
+            padded = nn.functional.pad(audio.float(), (self.n_fft // 2, self.n_fft // 2 + short))
+            window = nn.functional.pad(self.window, (56, 56))
+            frames = padded.unfold(1, self.n_fft, self.hop) * window
+            power = torch.fft.rfft(frames).abs().square()
+            spectrum = torch.log(power @ self.filters.T + 1e-5)
+        steps = (lengths // self.hop).clamp(min=2)
+        mask = frame_mask(steps, spectrum.shape[1])[..., None]
+        return (spectrum + 2.0) / 4.0 * mask, steps
+
+
+class ConvBlock(nn.Module):
+    """Pre-norm residual block: dilated convolution over time, then a position-wise mix."""
+
+    def __init__(self, dim: int, dilation: int, dropout: float) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(dim)
+        self.conv = nn.Conv1d(dim, dim, kernel_size=5, dilation=dilation, padding=2 * dilation)
+        self.mix = nn.Linear(dim, dim)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """``x`` (batch, steps, dim) and ``mask`` (batch, steps, 1), which keeps padding at zero."""
+        hidden = self.norm(x) * mask
+        hidden = nn.functional.gelu(self.conv(hidden.transpose(1, 2)).transpose(1, 2))
+        return (x + self.dropout(self.mix(hidden))) * mask
+
+
+def mel_filters(n_mels: int, n_fft: int, low: float, high: float) -> Float[Tensor, "mels bins"]:
+    """Triangular filters equally spaced on the mel scale 2595·log10(1 + f/700) (O'Shaughnessy 1987).
+
+    Each filter is scaled to unit area in Hz, so that a flat spectrum gives a flat result.
+    """
+
+    def to_mel(hertz: float) -> float:
+        return 2595.0 * math.log10(1.0 + hertz / 700.0)
+
+    mels = torch.linspace(to_mel(low), to_mel(high), n_mels + 2, dtype=torch.float64)
+    edges = 700.0 * (10.0 ** (mels / 2595.0) - 1.0)
+    bins = torch.arange(n_fft // 2 + 1, dtype=torch.float64) * (SAMPLE_RATE / n_fft)
+    rise = (bins[None] - edges[:-2, None]) / (edges[1:-1] - edges[:-2])[:, None]
+    fall = (edges[2:, None] - bins[None]) / (edges[2:] - edges[1:-1])[:, None]
+    triangles = torch.minimum(rise, fall).clamp_min(0.0)
+    return (triangles * (2.0 / (edges[2:] - edges[:-2]))[:, None]).float()
+
 
 # With 40 zeros at either end the convolutions (receptive field 400, stride 320) give one step for every 320
 # samples, each centred in its own stretch of audio.
@@ -124,9 +216,8 @@ EDGE = 40
 class HubertEncoder(AudioEncoder):
     """Pretrained HuBERT; lower layers frozen, upper layers and the projection fine-tuned.
 
-    Clips are encoded one by one, or together where their lengths are equal: HuBERT normalises over time, so padding
-    would change its features. The 50 steps a second are interpolated to the motion's frames. Frozen layers run without
-    dropout, also in training, so that their result can be kept on disk.
+    The 50 steps a second are interpolated to the motion's frames. Frozen layers run without dropout, also in training,
+    so that their result can be kept on disk.
 
     Args:
         dim: channels of the result; given by the model.
@@ -163,7 +254,7 @@ class HubertEncoder(AudioEncoder):
         self.out = nn.Linear(self.hubert.config.hidden_size, dim)
 
     def checkpoint_init_args(self) -> dict[str, Any]:
-        """What a checkpoint stores in place of a look at ``source``: the configuration as plain data."""
+        """What a checkpoint stores in place of ``source``: the configuration as plain data."""
         return {"config": self.hubert.config.to_dict()}
 
     def _freeze(self, count: int) -> list[str]:
@@ -175,7 +266,7 @@ class HubertEncoder(AudioEncoder):
                 names.append("encoder.layer_norm")
         for name in names:
             self.hubert.get_submodule(name).requires_grad_(False)
-        # Else transformers marks what enters the convolutions as differentiable and training goes back through them.
+        # Otherwise transformers marks the convolutions' input as differentiable and computes gradients for them.
         self.hubert.feature_extractor._freeze_parameters()
         # The embedding that SpecAugment writes over masked steps is of no use without SpecAugment.
         mask = getattr(self.hubert, "masked_spec_embed", None)
@@ -196,10 +287,10 @@ class HubertEncoder(AudioEncoder):
         return self
 
     def frozen_key(self) -> str | None:
-        """A hash of the frozen weights, the configuration and the number of frozen layers."""
+        """A hash of the frozen weights, the configuration and the number of frozen layers; None with SpecAugment."""
         if self.hubert.config.apply_spec_augment:
             return None
-        # Where the weights came from, and how they are to be trained, decides nothing.
+        # Neither where the weights came from nor how they are trained changes the features.
         config = {k: v for k, v in self.hubert.config.to_dict().items() if k not in ("_name_or_path", "layerdrop")}
         digest = hashlib.sha256(json.dumps([self.frozen_layers, EDGE, config], sort_keys=True, default=str).encode())
         for name in self._frozen:
@@ -264,6 +355,7 @@ def with_edges(wave: Float[Tensor, "batch samples"]) -> Float[Tensor, "batch pad
 
 def by_length(padded: Tensor, lengths: Tensor, encode: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
     """Encode clips of equal length together, without their padding; the padded results and their lengths."""
+    # HuBERT normalises over time, so padding would change its features.
     parts: dict[int, Tensor] = {}
     for length in sorted(set(lengths.tolist())):
         rows = (lengths == length).nonzero().flatten()
@@ -312,99 +404,3 @@ def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
         )
     # from_pretrained leaves evaluation mode on, and Lightning trains modules in the mode that it finds them in.
     return model.train()
-
-
-def mel_filters(n_mels: int, n_fft: int, low: float, high: float) -> Float[Tensor, "mels bins"]:
-    """Triangular filters equally spaced on the mel scale 2595·log10(1 + f/700) (O'Shaughnessy 1987).
-
-    Each filter is scaled to unit area in Hz, so that a flat spectrum gives a flat result.
-    """
-
-    def to_mel(hertz: float) -> float:
-        return 2595.0 * math.log10(1.0 + hertz / 700.0)
-
-    mels = torch.linspace(to_mel(low), to_mel(high), n_mels + 2, dtype=torch.float64)
-    edges = 700.0 * (10.0 ** (mels / 2595.0) - 1.0)
-    bins = torch.arange(n_fft // 2 + 1, dtype=torch.float64) * (SAMPLE_RATE / n_fft)
-    rise = (bins[None] - edges[:-2, None]) / (edges[1:-1] - edges[:-2])[:, None]
-    fall = (edges[2:, None] - bins[None]) / (edges[2:] - edges[1:-1])[:, None]
-    triangles = torch.minimum(rise, fall).clamp_min(0.0)
-    return (triangles * (2.0 / (edges[2:] - edges[:-2]))[:, None]).float()
-
-
-class ConvBlock(nn.Module):
-    """Pre-norm residual block: dilated convolution over time, then a position-wise mix."""
-
-    def __init__(self, dim: int, dilation: int, dropout: float) -> None:
-        super().__init__()
-        self.norm = nn.LayerNorm(dim)
-        self.conv = nn.Conv1d(dim, dim, kernel_size=5, dilation=dilation, padding=2 * dilation)
-        self.mix = nn.Linear(dim, dim)
-        self.dropout = nn.Dropout(dropout)
-
-    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """``x`` (batch, steps, dim) and ``mask`` (batch, steps, 1), which keeps padding at zero."""
-        hidden = self.norm(x) * mask
-        hidden = nn.functional.gelu(self.conv(hidden.transpose(1, 2)).transpose(1, 2))
-        return (x + self.dropout(self.mix(hidden))) * mask
-
-
-@audio_encoder.register("mel")
-class MelEncoder(AudioEncoder):
-    """Log-mel spectrogram and residual dilated convolutions, trained from scratch.
-
-    The default where no pretrained weights are at hand. 100 spectra a second are halved to 50 steps a second by a
-    strided convolution and interpolated to the motion's frame rate at the end.
-
-    Args:
-        dim: channels of the result; given by the model.
-        n_mels: mel bands between 60 Hz and 7 600 Hz.
-        hidden_dim: channels of the convolutions.
-        num_layers: residual blocks, with dilations 1, 2, 4, 1, 2, 4 …
-        dropout: dropout in each block.
-    """
-
-    filters: Tensor
-    window: Tensor
-    n_fft = 512
-    hop = 160
-
-    def __init__(
-        self, *, dim: int, n_mels: int = 64, hidden_dim: int = 128, num_layers: int = 4, dropout: float = 0.1
-    ) -> None:
-        super().__init__()
-        self.register_buffer("filters", mel_filters(n_mels, self.n_fft, 60.0, 7600.0), persistent=False)
-        self.register_buffer("window", torch.hann_window(400), persistent=False)
-        self.stem = nn.Conv1d(n_mels, hidden_dim, kernel_size=4, stride=2, padding=1)
-        self.blocks = nn.ModuleList(ConvBlock(hidden_dim, 2 ** (i % 3), dropout) for i in range(num_layers))
-        self.out = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, dim))
-
-    def forward(
-        self,
-        audio: Float[Tensor, "batch samples"],
-        audio_lengths: Int[Tensor, " batch"],
-        frame_lengths: Int[Tensor, " batch"],
-    ) -> Float[Tensor, "batch frames dim"]:
-        """Encode; see :class:`AudioEncoder`."""
-        spectrum, lengths = self._log_mel(self.standardise(audio, audio_lengths), audio_lengths)
-        x = self.stem(spectrum.transpose(1, 2)).transpose(1, 2)
-        lengths = (lengths // 2).clamp_min(1)
-        mask = frame_mask(lengths, x.shape[1])[..., None].to(x.dtype)
-        x = nn.functional.gelu(x) * mask
-        for block in self.blocks:
-            x = block(x, mask)
-        return interpolate_frames(self.out(x), lengths, frame_lengths)
-
-    def _log_mel(self, audio: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-        """Standardised log-mel spectra (batch, steps, mels), zero on padding, and each clip's steps."""
-        # Autocast has no complex numbers: the spectrum is always taken in float32.
-        with torch.autocast(audio.device.type, enabled=False):
-            short = max(0, 2 * self.hop - audio.shape[1])
-            padded = nn.functional.pad(audio.float(), (self.n_fft // 2, self.n_fft // 2 + short))
-            window = nn.functional.pad(self.window, (56, 56))
-            frames = padded.unfold(1, self.n_fft, self.hop) * window
-            power = torch.fft.rfft(frames).abs().square()
-            spectrum = torch.log(power @ self.filters.T + 1e-5)
-        steps = (lengths // self.hop).clamp(min=2)
-        mask = frame_mask(steps, spectrum.shape[1])[..., None]
-        return (spectrum + 2.0) / 4.0 * mask, steps

@@ -1,4 +1,4 @@
-"""The style-conditioned rotary Transformer decoder of the dual-path style diffusion paper, section 1.4, figure 3."""
+"""Decoders of fused features under a style: a rotary Transformer (dual-path paper, figure 3) and a recurrent one."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from facediff.models.layers import Attention, FeedForward, KeysValues, Rotation, needed_mask
 from facediff.registry import decoder
-
-# What every decoder is.
 
 
 class Decoder(nn.Module, ABC):
@@ -47,104 +45,6 @@ class DecoderFactory(Protocol):
         ...
 
 
-# A recurrent decoder, the form that FaceDiffuser uses, for comparison by name.
-
-
-class GruConstants(NamedTuple):
-    """What the decoding of a clip does not compute in every step.
-
-    Attributes:
-        lengths: valid frames of each clip, on the CPU.
-        scale: factor on the result, (batch, 1, dim).
-        shift: what is added to it, (batch, 1, dim).
-    """
-
-    lengths: Tensor
-    scale: Tensor
-    shift: Tensor
-
-
-@decoder.register("gru")
-class GruDecoder(Decoder):
-    """Gated recurrent units over time, scaled and shifted by the mean style token.
-
-    Args:
-        dim: channels; given by the model.
-        style_dim: channels of a style token; given by the model.
-        num_layers: recurrent layers.
-        bidirectional: also read the sequence backwards (needs an even ``dim``).
-        dropout: dropout between recurrent layers.
-    """
-
-    def __init__(
-        self,
-        *,
-        dim: int,
-        style_dim: int,
-        num_layers: int = 2,
-        bidirectional: bool = True,
-        dropout: float = 0.1,
-    ) -> None:
-        super().__init__()
-        if bidirectional and dim % 2:
-            raise ValueError(f"dim must be even for a bidirectional gru decoder, got {dim}")
-        self.gru = nn.GRU(
-            dim,
-            dim // 2 if bidirectional else dim,
-            num_layers,
-            batch_first=True,
-            bidirectional=bidirectional,
-            dropout=dropout if num_layers > 1 else 0.0,
-        )
-        self.modulation = nn.Linear(style_dim, 2 * dim)
-        self.norm = nn.LayerNorm(dim)
-
-    def forward(
-        self,
-        fused: Float[Tensor, "batch frames dim"],
-        style: Float[Tensor, "batch tokens style_dim"],
-        mask: Bool[Tensor, "batch frames"],
-        prepared: GruConstants | None = None,
-    ) -> Float[Tensor, "batch frames dim"]:
-        """F_dec of each frame.
-
-        Args:
-            fused: F_fused.
-            style: style tokens.
-            mask: True on valid frames.
-            prepared: as :meth:`prepare` gives it.
-        """
-        lengths, scale, shift = self.prepare(style, mask) if prepared is None else prepared
-        packed = pack_padded_sequence(fused, lengths, batch_first=True, enforce_sorted=False)
-        hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])
-        return torch.addcmul(shift, self.norm(hidden + fused), scale)
-
-    def prepare(
-        self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> GruConstants:
-        """The lengths, for which the device must be waited for, and the modulation by the style."""
-        scale, shift = self.modulation(style.mean(1, keepdim=True)).chunk(2, dim=-1)
-        return GruConstants(mask.sum(1).cpu(), 1 + scale, shift)
-
-
-class TokenProducts(NamedTuple):
-    """Keys and values of a few tokens with the attention's outer maps multiplied in.
-
-    Attributes:
-        keys: from a frame's features to its scores, (batch, dim, heads * tokens).
-        offset: added to the scores, (batch, 1, heads * tokens).
-        values: from the scores' softmax to the result, (batch, heads * tokens, dim).
-    """
-
-    keys: Tensor
-    offset: Tensor
-    values: Tensor
-
-
-PreparedTokens = TokenProducts | KeysValues
-"""What an attention to a few tokens makes of them."""
-
-
 class DecoderConstants(NamedTuple):
     """What the decoding of a clip does not compute in every step.
 
@@ -157,71 +57,6 @@ class DecoderConstants(NamedTuple):
     tokens: Sequence[Tensor | PreparedTokens]
     mask: Tensor | None
     rotation: Rotation | None
-
-
-class TokenAttention(Attention):
-    """Attention to a few tokens, with the query's map multiplied into the keys and the last map into the values.
-
-    The scores (W_q x + b_q)·k and the mixture Σ_k a_k W_o v_k are the same numbers in another order, and for fewer than
-    ``dim`` pairs of head and token two narrow products replace two of ``dim`` by ``dim`` per frame.
-    """
-
-    def forward(
-        self,
-        x: Float[Tensor, "batch frames dim"],
-        context: Float[Tensor, "batch keys context_dim"] | PreparedTokens,
-        context_mask: Bool[Tensor, "batch keys"] | None = None,
-        rotation: Rotation | None = None,
-    ) -> Float[Tensor, "batch frames dim"]:
-        """Attend from ``x`` to all of ``context``, which may be what :meth:`prepare` made of it."""
-        if isinstance(context, Tensor):
-            if context_mask is not None:
-                return super().forward(x, context, context_mask, rotation)
-            context = self.prepare(context, rotation)
-        if isinstance(context, KeysValues):
-            return self.attend(self.queries(x, rotation), context)
-        scores = x @ context.keys + context.offset
-        weights = scores.view(*scores.shape[:2], self.num_heads, -1).softmax(dim=-1).flatten(2)
-        return weights @ context.values + self.out.bias
-
-    def prepare(
-        self, context: Float[Tensor, "batch keys context_dim"], rotation: Rotation | None = None
-    ) -> PreparedTokens:
-        """What does not depend on what asks: the products, or keys and values where there are too many tokens."""
-        dim = self.query.in_features
-        key, value = found = self.keys_values(context, rotation)
-        if self.rotary is not None or self.dropout or self.num_heads * context.shape[1] >= dim:
-            return found
-        key = key / math.sqrt(key.shape[-1])
-        # Weights by head: (heads, head_dim, dim).
-        into = self.query.weight.view(self.num_heads, -1, dim)
-        out = self.out.weight.T.reshape(self.num_heads, -1, dim)
-        keys = (key @ into).flatten(1, 2).transpose(1, 2)
-        offset = (key @ self.query.bias.view(self.num_heads, -1, 1)).flatten(1)[:, None]
-        return TokenProducts(keys, offset, (value @ out).flatten(1, 2))
-
-
-class Block(nn.Module):
-    """Rotary self-attention over time, cross-attention to the style tokens, feed-forward; pre-norm, residual."""
-
-    def __init__(self, dim: int, style_dim: int, num_heads: int, hidden_dim: int, dropout: float) -> None:
-        super().__init__()
-        self.time_norm = nn.LayerNorm(dim)
-        self.time_attention = Attention(dim, dim, num_heads, rotary=True, dropout=dropout)
-        self.style_norm = nn.LayerNorm(dim)
-        self.style_attention = TokenAttention(dim, style_dim, num_heads)
-        self.feed_forward_norm = nn.LayerNorm(dim)
-        self.feed_forward = FeedForward(dim, hidden_dim, dropout)
-        self.dropout = nn.Dropout(dropout)
-
-    def forward(
-        self, x: Tensor, style: Tensor | PreparedTokens, mask: Tensor | None, rotation: Rotation | None
-    ) -> Tensor:
-        """``x`` (batch, frames, dim), ``style`` (batch, tokens, style_dim), ``mask`` (batch, frames)."""
-        normed = self.time_norm(x)
-        x = x + self.dropout(self.time_attention(normed, normed, mask, rotation))
-        x = x + self.dropout(self.style_attention(self.style_norm(x), style))
-        return x + self.dropout(self.feed_forward(self.feed_forward_norm(x)))
 
 
 @decoder.register("style_transformer")
@@ -284,3 +119,161 @@ class StyleTransformer(Decoder):
     def _rotation(self, frames: int) -> Rotation | None:
         blocks = cast(Sequence[Block], self.blocks)
         return blocks[0].time_attention.rotation(frames) if len(blocks) else None
+
+
+class Block(nn.Module):
+    """Rotary self-attention over time, cross-attention to the style tokens, feed-forward; pre-norm, residual."""
+
+    def __init__(self, dim: int, style_dim: int, num_heads: int, hidden_dim: int, dropout: float) -> None:
+        super().__init__()
+        self.time_norm = nn.LayerNorm(dim)
+        self.time_attention = Attention(dim, dim, num_heads, rotary=True, dropout=dropout)
+        self.style_norm = nn.LayerNorm(dim)
+        self.style_attention = TokenAttention(dim, style_dim, num_heads)
+        self.feed_forward_norm = nn.LayerNorm(dim)
+        self.feed_forward = FeedForward(dim, hidden_dim, dropout)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self, x: Tensor, style: Tensor | PreparedTokens, mask: Tensor | None, rotation: Rotation | None
+    ) -> Tensor:
+        """``x`` (batch, frames, dim), ``style`` (batch, tokens, style_dim), ``mask`` (batch, frames)."""
+        normed = self.time_norm(x)
+        x = x + self.dropout(self.time_attention(normed, normed, mask, rotation))
+        x = x + self.dropout(self.style_attention(self.style_norm(x), style))
+        return x + self.dropout(self.feed_forward(self.feed_forward_norm(x)))
+
+
+class TokenProducts(NamedTuple):
+    """Keys and values of a few tokens with the attention's outer maps multiplied in.
+
+    Attributes:
+        keys: from a frame's features to its scores, (batch, dim, heads * tokens).
+        offset: added to the scores, (batch, 1, heads * tokens).
+        values: from the scores' softmax to the result, (batch, heads * tokens, dim).
+    """
+
+    keys: Tensor
+    offset: Tensor
+    values: Tensor
+
+
+PreparedTokens = TokenProducts | KeysValues
+"""What an attention to a few tokens makes of them."""
+
+
+class TokenAttention(Attention):
+    """Attention to a few tokens, with the query's map multiplied into the keys and the last map into the values."""
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch frames dim"],
+        context: Float[Tensor, "batch keys context_dim"] | PreparedTokens,
+        context_mask: Bool[Tensor, "batch keys"] | None = None,
+        rotation: Rotation | None = None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Attend from ``x`` to all of ``context``, which may be what :meth:`prepare` made of it."""
+        if isinstance(context, Tensor):
+            if context_mask is not None:
+                return super().forward(x, context, context_mask, rotation)
+            context = self.prepare(context, rotation)
+        if isinstance(context, KeysValues):
+            return self.attend(self.queries(x, rotation), context)
+        scores = x @ context.keys + context.offset
+        weights = scores.view(*scores.shape[:2], self.num_heads, -1).softmax(dim=-1).flatten(2)
+        return weights @ context.values + self.out.bias
+
+    def prepare(
+        self, context: Float[Tensor, "batch keys context_dim"], rotation: Rotation | None = None
+    ) -> PreparedTokens:
+        """What does not depend on the queries: the products, or keys and values where there are too many tokens."""
+        # The scores (W_q x + b_q)·k and the mixture Σ_k a_k W_o v_k are the same numbers in another order. For fewer
+        # than ``dim`` pairs of head and token, two narrow products replace two of ``dim`` by ``dim`` per frame.
+        dim = self.query.in_features
+        key, value = found = self.keys_values(context, rotation)
+        if self.rotary is not None or self.dropout or self.num_heads * context.shape[1] >= dim:
+            return found
+        key = key / math.sqrt(key.shape[-1])
+        # Weights by head: (heads, head_dim, dim).
+        into = self.query.weight.view(self.num_heads, -1, dim)
+        out = self.out.weight.T.reshape(self.num_heads, -1, dim)
+        keys = (key @ into).flatten(1, 2).transpose(1, 2)
+        offset = (key @ self.query.bias.view(self.num_heads, -1, 1)).flatten(1)[:, None]
+        return TokenProducts(keys, offset, (value @ out).flatten(1, 2))
+
+
+class GruConstants(NamedTuple):
+    """What the decoding of a clip does not compute in every step.
+
+    Attributes:
+        lengths: valid frames of each clip, on the CPU.
+        scale: factor on the result, (batch, 1, dim).
+        shift: what is added to it, (batch, 1, dim).
+    """
+
+    lengths: Tensor
+    scale: Tensor
+    shift: Tensor
+
+
+@decoder.register("gru")
+class GruDecoder(Decoder):
+    """Gated recurrent units over time, the form of FaceDiffuser, scaled and shifted by the mean style token.
+
+    Args:
+        dim: channels; given by the model.
+        style_dim: channels of a style token; given by the model.
+        num_layers: recurrent layers.
+        bidirectional: also read the sequence backwards (needs an even ``dim``).
+        dropout: dropout between recurrent layers.
+    """
+
+    def __init__(
+        self,
+        *,
+        dim: int,
+        style_dim: int,
+        num_layers: int = 2,
+        bidirectional: bool = True,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        if bidirectional and dim % 2:
+            raise ValueError(f"dim must be even for a bidirectional gru decoder, got {dim}")
+        self.gru = nn.GRU(
+            dim,
+            dim // 2 if bidirectional else dim,
+            num_layers,
+            batch_first=True,
+            bidirectional=bidirectional,
+            dropout=dropout if num_layers > 1 else 0.0,
+        )
+        self.modulation = nn.Linear(style_dim, 2 * dim)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(
+        self,
+        fused: Float[Tensor, "batch frames dim"],
+        style: Float[Tensor, "batch tokens style_dim"],
+        mask: Bool[Tensor, "batch frames"],
+        prepared: GruConstants | None = None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """F_dec of each frame.
+
+        Args:
+            fused: F_fused.
+            style: style tokens.
+            mask: True on valid frames.
+            prepared: as :meth:`prepare` gives it.
+        """
+        lengths, scale, shift = self.prepare(style, mask) if prepared is None else prepared
+        packed = pack_padded_sequence(fused, lengths, batch_first=True, enforce_sorted=False)
+        hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])
+        return torch.addcmul(shift, self.norm(hidden + fused), scale)
+
+    def prepare(
+        self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> GruConstants:
+        """The lengths, for which the device must be waited for, and the modulation by the style."""
+        scale, shift = self.modulation(style.mean(1, keepdim=True)).chunk(2, dim=-1)
+        return GruConstants(mask.sum(1).cpu(), 1 + scale, shift)

@@ -1,4 +1,4 @@
-"""Bidirectional cross-attention of the dual-path style diffusion paper, section 1.4 and figure 2."""
+"""Fusions of speech with noisy motion: bidirectional cross-attention (dual-path paper, section 1.4) and a plain sum."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from torch import Tensor, nn
 
 from facediff.models.layers import Attention, Rotation, needed_mask
 from facediff.registry import fusion
-
-# What every fusion is.
 
 
 class Fusion(nn.Module, ABC):
@@ -41,30 +39,6 @@ class FusionFactory(Protocol):
     def __call__(self, *, dim: int) -> Fusion:
         """Make one for ``dim`` channels."""
         ...
-
-
-# The plain sum, for the ablation.
-
-
-@fusion.register("add")
-class AddFusion(Fusion):
-    """Plain sum of speech and motion features (ablation of the cross-attention).
-
-    Args:
-        dim: channels; given by the model.
-    """
-
-    def __init__(self, *, dim: int) -> None:
-        super().__init__()
-
-    def forward(
-        self,
-        audio: Float[Tensor, "batch frames dim"],
-        motion: Float[Tensor, "batch frames dim"],
-        mask: Bool[Tensor, "batch frames"],
-    ) -> Float[Tensor, "batch frames dim"]:
-        """F_am = F_a + F_m."""
-        return audio + motion
 
 
 class FusionConstants(NamedTuple):
@@ -120,18 +94,40 @@ class BidirectionalCrossAttention(Fusion):
             mask: True on valid frames.
             prepared: as :meth:`prepare` gives it.
         """
+        # Training does not prepare, and keeps the mask: looking whether it is needed would wait for the device.
         query, needed, rotation = self._constants(audio, mask) if prepared is None else prepared
         normed_motion = self.motion_norm(motion)
-        heard = self.audio_from_motion.keys_values(normed_motion, rotation)
-        audio = audio + self.dropout(self.audio_from_motion.attend(query, heard, needed))
+        of_motion = self.audio_from_motion.keys_values(normed_motion, rotation)
+        audio = audio + self.dropout(self.audio_from_motion.attend(query, of_motion, needed))
         enriched = self.enriched_norm(audio)
         motion = motion + self.dropout(self.motion_from_audio(normed_motion, enriched, needed, rotation))
         return audio + motion
 
     def prepare(self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]) -> FusionConstants:
-        """The speech asks the same in every step; what it is answered depends on the motion, and so does F'_a."""
+        """The speech's queries; keys and values depend on the noisy motion, and so does F'_a."""
         return self._constants(audio, needed_mask(mask))
 
     def _constants(self, audio: Tensor, mask: Tensor | None) -> FusionConstants:
         rotation = self.audio_from_motion.rotation(audio.shape[1])
         return FusionConstants(self.audio_from_motion.queries(self.audio_norm(audio), rotation), mask, rotation)
+
+
+@fusion.register("add")
+class AddFusion(Fusion):
+    """Plain sum of speech and motion features (ablation of the cross-attention).
+
+    Args:
+        dim: channels; given by the model.
+    """
+
+    def __init__(self, *, dim: int) -> None:
+        super().__init__()
+
+    def forward(
+        self,
+        audio: Float[Tensor, "batch frames dim"],
+        motion: Float[Tensor, "batch frames dim"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Float[Tensor, "batch frames dim"]:
+        """F_am = F_a + F_m."""
+        return audio + motion

@@ -1,4 +1,4 @@
-"""The identity path left out, for the ablation."""
+"""Identity encoders: the static path of the dual-path paper, section 1.3.2, and its ablation."""
 
 from __future__ import annotations
 
@@ -10,11 +10,6 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.registry import identity_encoder
-
-# What every identity encoder is.
-
-UNKNOWN = -1
-"""The identity index of a person who is not among the training identities."""
 
 
 class IdentityEncoder(nn.Module, ABC):
@@ -32,8 +27,8 @@ class IdentityEncoder(nn.Module, ABC):
         """Encode.
 
         Args:
-            identity: index into the training identities, or :data:`UNKNOWN` (−1) for anybody else, who gets the
-                mean of the training identities' features.
+            identity: index into the training identities, or −1 for an unseen speaker, who gets the mean of the
+                training identities' features.
         """
 
 
@@ -41,11 +36,8 @@ class IdentityEncoderFactory(Protocol):
     """Makes an identity encoder once the model's sizes are known."""
 
     def __call__(self, *, dim: int, n_identities: int) -> IdentityEncoder:
-        """Make one for ``n_identities`` people in a model of ``dim`` channels."""
+        """Make one for ``n_identities`` identities in a model of ``dim`` channels."""
         ...
-
-
-# The three-level identity embedding of the dual-path style diffusion paper, section 1.3.2.
 
 
 @identity_encoder.register("hierarchical")
@@ -73,17 +65,17 @@ class HierarchicalIdentity(IdentityEncoder):
 
     def level_weights(self) -> Float[Tensor, "identities 3"]:
         """β_c, β_m, β_f of every identity (eq. 10); each row sums to one."""
-        tables = (self.coarse.weight, self.mid.weight, self.fine.weight)
-        return self.attention(torch.cat(tables, dim=-1)).softmax(-1)
+        return self.attention(torch.cat(self._tables(), dim=-1)).softmax(-1)
 
     def forward(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identity_dim"]:
-        """F_id of each clip; the mean over all identities for an unknown one."""
-        tables = (self.coarse.weight, self.mid.weight, self.fine.weight)
-        weights = self.level_weights()
-        weighted = torch.cat([weights[:, i : i + 1] * table for i, table in enumerate(tables)], dim=-1)
-        features = self.norm(weighted)
-        known = features[identity.clamp_min(0)]
-        return torch.where((identity >= 0)[:, None], known, features.mean(0, keepdim=True))
+        """F_id of each clip; the mean over all identities for an unseen speaker."""
+        weights = self.level_weights().unbind(-1)
+        weighted = [weight[:, None] * table for weight, table in zip(weights, self._tables(), strict=True)]
+        features = self.norm(torch.cat(weighted, dim=-1))  # eq. 11, of every identity, for the mean over all of them
+        return torch.where((identity >= 0)[:, None], features[identity.clamp_min(0)], features.mean(0, keepdim=True))
+
+    def _tables(self) -> list[Tensor]:
+        return [self.coarse.weight, self.mid.weight, self.fine.weight]
 
 
 @identity_encoder.register("none")

@@ -1,4 +1,4 @@
-"""Building blocks shared by components: masks, rotary attention, feed-forward."""
+"""Building blocks shared by components: frame masks, resampling over time, rotary attention, feed-forward."""
 
 from __future__ import annotations
 
@@ -42,19 +42,18 @@ def interpolate_frames(
     own length are zero.
     """
     frames = int(frame_lengths.max())
-    position = torch.arange(frames, device=features.device, dtype=torch.float32)
     ratio = lengths.float() / frame_lengths.float()
-    position = (position[None, :] + 0.5) * ratio[:, None] - 0.5
     last = (lengths - 1)[:, None].float()
+    # PyTorch's own interpolation has one ratio for the whole batch, which padding would change.
+    position = (torch.arange(frames, device=features.device, dtype=torch.float32)[None, :] + 0.5) * ratio[:, None] - 0.5
     position = torch.minimum(position.clamp_min(0.0), last)
     low = position.floor()
     weight = (position - low)[..., None].to(features.dtype)
-    high = torch.minimum(low + 1, last)
 
-    def animation(index: Tensor) -> Tensor:
-        return features.gather(1, index.long()[..., None].expand(-1, -1, features.shape[-1]))
+    def at(step: Tensor) -> Tensor:
+        return features.gather(1, step.long()[..., None].expand(-1, -1, features.shape[-1]))
 
-    mixed = animation(low) * (1 - weight) + animation(high) * weight
+    mixed = at(low) * (1 - weight) + at(torch.minimum(low + 1, last)) * weight
     return mixed * frame_mask(frame_lengths, frames)[..., None]
 
 
@@ -92,16 +91,20 @@ class RotaryEmbedding(nn.Module):
 
         Args:
             x: queries or keys.
-            table: as :meth:`table` gives it, of a rotary embedding like this one; made anew if None.
+            table: as :meth:`table` gives it, of a rotary embedding like this one; computed if None.
         """
         frames = x.shape[-2]
         cos, sin = (part[:frames].to(x.dtype) for part in (self.table(frames) if table is None else table))
+        # (a, b) → (a cos − b sin, b cos + a sin): the halves change places, and the table's sines carry the signs.
         first, second = x.chunk(2, dim=-1)
         return x * cos + torch.cat([second, first], dim=-1) * sin
 
 
 class Attention(nn.Module):
     """Multi-head attention from ``dim`` to ``dim`` channels with optional rotary positions.
+
+    :meth:`forward` is :meth:`queries`, :meth:`keys_values` and :meth:`attend`, which may be called one by one where one
+    side does not change.
 
     Args:
         dim: channels of the query and of the result.
@@ -134,10 +137,10 @@ class Attention(nn.Module):
         """Attend from ``x`` to the valid positions of ``context``.
 
         Args:
-            x: what asks.
-            context: what answers.
+            x: source of the queries.
+            context: source of the keys and values.
             context_mask: True on valid positions; all are if None.
-            rotation: as :meth:`rotation` gives it; made anew if None.
+            rotation: as :meth:`rotation` gives it; computed if None.
         """
         return self.attend(self.queries(x, rotation), self.keys_values(context, rotation), context_mask)
 
@@ -148,14 +151,14 @@ class Attention(nn.Module):
     def queries(
         self, x: Float[Tensor, "batch frames dim"], rotation: Rotation | None = None
     ) -> Float[Tensor, "batch heads frames head_dim"]:
-        """The first part of :meth:`forward`: all that ``x`` is needed for."""
+        """All that ``x`` is needed for."""
         query = self._split(self.query(x))
         return query if self.rotary is None else self.rotary(query, rotation)
 
     def keys_values(
         self, context: Float[Tensor, "batch keys context_dim"], rotation: Rotation | None = None
     ) -> KeysValues:
-        """The second part of :meth:`forward`: all that ``context`` is needed for."""
+        """All that ``context`` is needed for."""
         key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
         return KeysValues(key if self.rotary is None else self.rotary(key, rotation), value)
 
@@ -165,7 +168,7 @@ class Attention(nn.Module):
         context: KeysValues,
         context_mask: Bool[Tensor, "batch keys"] | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
-        """The last part of :meth:`forward`, from what the two before gave."""
+        """The attention itself, and the map of its result."""
         key, value = context
         mask = None if context_mask is None else context_mask[:, None, None, :]
         dropout = self.dropout if self.training else 0.0

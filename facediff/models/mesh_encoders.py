@@ -1,4 +1,4 @@
-"""Spiral convolutions over the mesh with vertex down-sampling between them."""
+"""Mesh encoders: the vertices of a frame to one feature, by one linear map or by spiral convolutions."""
 
 from __future__ import annotations
 
@@ -15,21 +15,19 @@ from torch.utils.checkpoint import checkpoint
 from facediff.errors import FaceDiffError
 from facediff.registry import mesh_encoder
 
-# What every mesh encoder is, and what it is told about the mesh.
-
 
 class MeshEncoder(nn.Module, ABC):
     """The vertices of each frame to one feature of ``dim`` channels; frames do not see one another.
 
-    An encoder is made from sizes alone and told about the mesh later, before its first use: weight averaging copies the
+    An encoder is made from sizes alone and given the mesh later, before its first use: weight averaging copies the
     module before a corpus is known. What it keeps of the mesh are buffers whose shapes follow from the sizes; they are
-    in its state dict, next to the weights that were trained on them, so that a checkpoint means the same wherever and
-    with whichever simplifier it is opened.
+    in its state dict, next to the weights that were trained on them, so that a checkpoint does not depend on the
+    version of the mesh simplifier.
     """
 
     @property
     def attached(self) -> bool:
-        """Whether the encoder knows all that it needs of the mesh."""
+        """Whether the encoder has all that it needs of the mesh."""
         return True
 
     @property
@@ -61,13 +59,10 @@ def check_vertices(motion: Tensor, n_vertices: int) -> None:
     """Refuse motion (batch, frames, vertices, 3) on another mesh.
 
     Raises:
-        ValueError: if the number of vertices is another one; a larger one would be encoded without a complaint.
+        ValueError: if the number of vertices is another one; a larger one would be encoded without an error.
     """
     if motion.shape[2] != n_vertices:
         raise ValueError(f"motion has {motion.shape[2]} vertices, but the mesh encoder was made for {n_vertices}")
-
-
-# All coordinates of a frame through one linear map.
 
 
 @mesh_encoder.register("linear")
@@ -150,8 +145,8 @@ class SpiralMeshEncoder(MeshEncoder):
         pooling: whether down-sampling takes one vertex of each group, which leaves a few vertices of the motion unseen,
             or the mean of the group, which sees all of them and takes five to ten times as long.
         negative_slope: slope of the leaky ReLU below zero.
-        max_frames: frames to encode at a time in training; what lies between is computed again for the gradient, so
-            that memory grows with this number only. None for all at once, which is faster.
+        max_frames: frames to encode at a time in training; activations are computed again for the gradient, so that
+            memory grows with this number only. None for all in one pass, which is faster.
     """
 
     steps: Sequence[SpiralDown]
@@ -196,7 +191,7 @@ class SpiralMeshEncoder(MeshEncoder):
     @property
     def attached(self) -> bool:
         """Whether the tables of spirals are there; before, they are zero."""
-        if not self._attached:  # looked up until it is true, since a device is waited for
+        if not self._attached:  # cached once it is true, since reading the table waits for the device
             self._attached = not self.steps or bool(self.steps[0].table.any())
         return self._attached
 
@@ -240,14 +235,14 @@ class SpiralMeshEncoder(MeshEncoder):
             if step.rows is not None and step.weights is not None:
                 step.rows.copy_(torch.as_tensor(level.down.rows))
                 step.weights.copy_(torch.as_tensor(level.down.weights))
-        # From here on known, also while a weight average that was copied earlier lends its tables of zeros.
+        # True from here on, also while averaged weights are in place: a copy made earlier has tables of zeros.
         self._attached = True
 
     def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
         """The feature of each frame.
 
         Raises:
-            FaceDiffError: if the encoder has not been told about the mesh.
+            FaceDiffError: if the encoder has not been given a mesh.
         """
         check_vertices(motion, self.n_vertices)
         if not self.attached:
@@ -265,6 +260,6 @@ class SpiralMeshEncoder(MeshEncoder):
         return self.map(x.flatten(1))
 
     def _part(self, x: Tensor) -> Tensor:
-        # Nothing here is random, so there is no generator's state to keep.
+        # Nothing here is random, so the state of the random generator need not be kept.
         part: Tensor = checkpoint(self.encode, x, use_reentrant=False, preserve_rng_state=False)
         return part

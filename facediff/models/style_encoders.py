@@ -1,4 +1,4 @@
-"""The dynamic style encoder of the dual-path style diffusion paper, section 1.3.1."""
+"""Style encoders: the dynamic path of the dual-path paper, section 1.3.1, a recurrent one, and the ablation."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from facediff.models.layers import Attention, FeedForward, interpolate_frames
 from facediff.registry import style_encoder
-
-# What every style encoder is.
 
 
 class StyleEncoder(nn.Module, ABC):
@@ -42,68 +40,71 @@ class StyleEncoderFactory(Protocol):
         ...
 
 
-# A causal recurrent style encoder: the last state of an LSTM over the frames.
+@style_encoder.register("tcn_gru_transformer")
+class TcnGruTransformer(StyleEncoder):
+    """Five dilated TCN branches, Bi-GRU, Pre-Norm Transformer, attention pooling, MLP (eq. 2 to 9).
 
-
-@style_encoder.register("lstm")
-class LstmStyle(StyleEncoder):
-    """Last state of an LSTM that reads the frames in order (Chai et al., style-content disentanglement).
+    The learnt position embedding P serves references of any length: it is a table of ``n_positions`` rows that is
+    interpolated to each clip's own number of frames, so a row stands for a relative place in the clip.
 
     Args:
-        dim: channels of a frame; given by the model.
-        style_dim: channels of the style.
-        num_layers: recurrent layers.
-        pooling: the ``last`` state, as in the published work, or the ``mean`` of the states over all frames, which
-            forgets less of a long reference.
+        dim: channels; given by the model. Must be even.
+        dilations: dilation of each parallel TCN branch.
+        kernel_size: taps of the TCN convolutions.
+        causal: causal convolutions as in Bai et al. 2018; else centred ones.
+        num_layers: Transformer layers (the paper's L).
+        num_heads: attention heads.
+        n_positions: rows of the position embedding.
+        dropout: dropout everywhere.
     """
 
     def __init__(
-        self, *, dim: int, style_dim: int = 32, num_layers: int = 1, pooling: Literal["last", "mean"] = "last"
+        self,
+        *,
+        dim: int,
+        dilations: tuple[int, ...] = (1, 2, 4, 8, 16),
+        kernel_size: int = 3,
+        causal: bool = True,
+        num_layers: int = 2,
+        num_heads: int = 4,
+        n_positions: int = 64,
+        dropout: float = 0.1,
     ) -> None:
         super().__init__()
-        self.lstm = nn.LSTM(dim, style_dim, num_layers, batch_first=True)
-        self.pooling = pooling
-        self.token_dims = (style_dim,)
+        if dim % 2:
+            raise ValueError(f"dim must be even for the bidirectional GRU, got {dim}")
+        self.branches = nn.ModuleList(
+            TemporalBlock(dim, d, kernel_size, causal=causal, dropout=dropout) for d in dilations
+        )
+        self.gru = nn.GRU(dim, dim // 2, batch_first=True, bidirectional=True)
+        self.positions = nn.Parameter(torch.randn(n_positions, dim) * 0.02)
+        self.layers = nn.ModuleList(EncoderLayer(dim, num_heads, dropout) for _ in range(num_layers))
+        self.norm = nn.LayerNorm(dim)
+        self.pooling = AttentionPooling(dim)
+        self.mlp = nn.Sequential(nn.Linear(dim, dim), nn.GELU(), nn.Linear(dim, dim))
+        self.token_dims = (dim,)
 
     def forward(
         self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
-        """The state after each clip's last frame."""
-        states = self.states(reference, mask)
-        if self.pooling == "mean":
-            return (states * mask[..., None]).sum(1) / mask.sum(1)[:, None].clamp_min(1)
-        last = mask.sum(1) - 1
-        return states[torch.arange(len(states), device=states.device), last]
+        """F_dyn of each clip (eq. 9)."""
+        return self.mlp(self.pooling(self.features(reference, mask), mask))
 
-    def states(
-        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch frames style_dim"]:
-        """The state after each frame: it depends on that frame and those before it alone."""
-        # Padding comes after all valid frames; zeros keep what is not finite there out of the gradient.
-        states: Tensor = self.lstm(reference.masked_fill(~mask[..., None], 0.0))[0]
-        return states
-
-
-# The dynamic style path left out, for the ablation.
-
-
-@style_encoder.register("none")
-class NoStyle(StyleEncoder):
-    """No dynamic style condition (ablation).
-
-    Args:
-        dim: the model's channels; given by the model.
-    """
-
-    def __init__(self, *, dim: int) -> None:
-        super().__init__()
-        self.token_dims = ()
-
-    def forward(
-        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch style_dim"]:
-        """A feature of width zero."""
-        return reference.new_zeros((reference.shape[0], 0))
+    def features(self, reference: Tensor, mask: Tensor) -> Tensor:
+        """F_attn (batch, frames, dim)."""
+        column = mask[..., None].to(reference.dtype)
+        lengths = mask.sum(1)
+        x = torch.stack([branch(reference, column) for branch in self.branches]).mean(0)  # F_TCN, eq. 2
+        # Packed, so that the backward direction starts at a clip's own last frame and not in its padding (eq. 3 to 5).
+        packed = pack_padded_sequence(x, lengths.cpu(), batch_first=True, enforce_sorted=False)
+        x, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=mask.shape[1])
+        # The position embedding P, stretched to each clip's length, and the Transformer (eq. 6).
+        rows = torch.full_like(lengths, self.positions.shape[0])
+        positions = interpolate_frames(self.positions.expand(len(lengths), -1, -1), rows, lengths)
+        x = x + nn.functional.pad(positions, (0, 0, 0, mask.shape[1] - positions.shape[1]))
+        for layer in self.layers:
+            x = layer(x, mask)
+        return self.norm(x)
 
 
 class TemporalBlock(nn.Module):
@@ -174,67 +175,59 @@ class AttentionPooling(nn.Module):
         return torch.einsum("bt,btc->bc", self.weights(features, mask), features)
 
 
-@style_encoder.register("tcn_gru_transformer")
-class TcnGruTransformer(StyleEncoder):
-    """Five dilated TCN branches, Bi-GRU, Pre-Norm Transformer, attention pooling, MLP (eq. 2 to 9).
-
-    The learnt position embedding P serves references of any length: it is a table of ``n_positions`` rows that is
-    interpolated to each clip's own number of frames, so a row stands for a relative place in the clip.
+@style_encoder.register("lstm")
+class LstmStyle(StyleEncoder):
+    """Last state of an LSTM that reads the frames in order (Chai et al., style-content disentanglement).
 
     Args:
-        dim: channels; given by the model. Must be even.
-        dilations: dilation of each parallel TCN branch.
-        kernel_size: taps of the TCN convolutions.
-        causal: causal convolutions as in Bai et al. 2018; else centred ones.
-        num_layers: Transformer layers (the paper's L).
-        num_heads: attention heads.
-        n_positions: rows of the position embedding.
-        dropout: dropout everywhere.
+        dim: channels of a frame; given by the model.
+        style_dim: channels of the style.
+        num_layers: recurrent layers.
+        pooling: the ``last`` state, as in the published work, or the ``mean`` of the states over all frames, which
+            forgets less of a long reference.
     """
 
     def __init__(
-        self,
-        *,
-        dim: int,
-        dilations: tuple[int, ...] = (1, 2, 4, 8, 16),
-        kernel_size: int = 3,
-        causal: bool = True,
-        num_layers: int = 2,
-        num_heads: int = 4,
-        n_positions: int = 64,
-        dropout: float = 0.1,
+        self, *, dim: int, style_dim: int = 32, num_layers: int = 1, pooling: Literal["last", "mean"] = "last"
     ) -> None:
         super().__init__()
-        if dim % 2:
-            raise ValueError(f"dim must be even for the bidirectional GRU, got {dim}")
-        self.branches = nn.ModuleList(
-            TemporalBlock(dim, d, kernel_size, causal=causal, dropout=dropout) for d in dilations
-        )
-        self.gru = nn.GRU(dim, dim // 2, batch_first=True, bidirectional=True)
-        self.positions = nn.Parameter(torch.randn(n_positions, dim) * 0.02)
-        self.layers = nn.ModuleList(EncoderLayer(dim, num_heads, dropout) for _ in range(num_layers))
-        self.norm = nn.LayerNorm(dim)
-        self.pooling = AttentionPooling(dim)
-        self.mlp = nn.Sequential(nn.Linear(dim, dim), nn.GELU(), nn.Linear(dim, dim))
-        self.token_dims = (dim,)
+        self.lstm = nn.LSTM(dim, style_dim, num_layers, batch_first=True)
+        self.pooling = pooling
+        self.token_dims = (style_dim,)
 
     def forward(
         self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
-        """F_dyn of each clip."""
-        features = self.features(reference, mask)
-        return self.mlp(self.pooling(features, mask))
+        """The state after each clip's last frame."""
+        states = self.states(reference, mask)
+        if self.pooling == "mean":
+            return (states * mask[..., None]).sum(1) / mask.sum(1)[:, None].clamp_min(1)
+        last = mask.sum(1) - 1
+        return states[torch.arange(len(states), device=states.device), last]
 
-    def features(self, reference: Tensor, mask: Tensor) -> Tensor:
-        """F_attn (batch, frames, dim), eq. 2 to 6."""
-        column = mask[..., None].to(reference.dtype)
-        lengths = mask.sum(1)
-        x = torch.stack([branch(reference, column) for branch in self.branches]).mean(0)
-        packed = pack_padded_sequence(x, lengths.cpu(), batch_first=True, enforce_sorted=False)
-        x, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=mask.shape[1])
-        rows = torch.full_like(lengths, self.positions.shape[0])
-        positions = interpolate_frames(self.positions.expand(len(lengths), -1, -1), rows, lengths)
-        x = x + nn.functional.pad(positions, (0, 0, 0, mask.shape[1] - positions.shape[1]))
-        for layer in self.layers:
-            x = layer(x, mask)
-        return self.norm(x)
+    def states(
+        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames style_dim"]:
+        """The state after each frame: it depends on that frame and those before it alone."""
+        # Padding comes after all valid frames; zeros keep what is not finite there out of the gradient.
+        states: Tensor = self.lstm(reference.masked_fill(~mask[..., None], 0.0))[0]
+        return states
+
+
+@style_encoder.register("none")
+class NoStyle(StyleEncoder):
+    """No dynamic style condition (ablation).
+
+    Args:
+        dim: the model's channels; given by the model.
+    """
+
+    def __init__(self, *, dim: int) -> None:
+        super().__init__()
+        self.token_dims = ()
+
+    def forward(
+        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """A feature of width zero."""
+        return reference.new_zeros((reference.shape[0], 0))
