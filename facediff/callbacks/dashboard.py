@@ -1,4 +1,4 @@
-"""What every run tells its loggers under stable names, beside losses and scores; listed in docs/dashboard.md."""
+"""What every run logs under stable names next to losses and scores; listed in docs/dashboard.md."""
 
 from __future__ import annotations
 
@@ -25,115 +25,8 @@ from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
 from facediff.utils.files import sha256
 
-# Sound and error pictures of single test clips, for the dashboard's table.
-
 PICTURE_SIZE = 320
 """Pixels of a picture's sides."""
-
-
-@dataclass(frozen=True)
-class ClipErrors:
-    """Where on the face a clip's motion is wrong.
-
-    Attributes:
-        split: its test split.
-        clip: its name.
-        identity: whose face.
-        audio: its speech (S,), 16 kHz.
-        errors: distance between prediction and truth (V,), mean over the frames, in the corpus's unit.
-    """
-
-    split: str
-    clip: str
-    identity: str
-    audio: npt.NDArray[np.float32]
-    errors: npt.NDArray[np.float32]
-
-
-def worst_clips(rows: list[dict[str, Any]], count: int) -> list[dict[str, Any]]:
-    """The rows of the model's worst clips by LVE, the worst first; equal ones in the rows' order."""
-    mine = [row for row in rows if row["method"] == "model"]
-    return sorted(mine, key=lambda row: -float(row["lve"]))[:count]
-
-
-@torch.inference_mode()
-def measure_clips(trainer: Trainer, model: AnimationModel, rows: list[dict[str, Any]]) -> list[ClipErrors]:
-    """Predict some test clips again, one after the other, and say where they are wrong.
-
-    A clip's noise follows from its name, so this is the motion that the test has scored. Doing it again costs less than
-    keeping the motion of every clip that might turn out to be among the worst, and it lets one process show the worst
-    clips of all.
-
-    Args:
-        trainer: the trainer in its test.
-        model: the model tested.
-        rows: rows of the table of sequences.
-    """
-    data = trainer.datamodule  # type: ignore[attr-defined]
-    if not isinstance(data, SpeechMotionDataModule):
-        raise TypeError("the model's setup accepts no other data module")
-    datasets = {split: data.dataset(split) for split in {row["split"] for row in rows}}
-    measured = []
-    for row in rows:
-        dataset = datasets[row["split"]]
-        place = [clip.name for clip in dataset.clips].index(row["clip"])
-        sample = dataset[place]
-        batch = collate([sample]).to(model.device)
-        with trainer.precision_plugin.forward_context():
-            motion = model.generate(batch, seed=0)
-        errors = (motion[0].float() - batch.motion[0]).norm(dim=-1).mean(dim=0)
-        measured.append(
-            ClipErrors(row["split"], sample.name, sample.identity_name, sample.audio.numpy(), errors.cpu().numpy())
-        )
-    return measured
-
-
-def draw_errors(model: AnimationModel, clips: list[ClipErrors]) -> list[npt.NDArray[np.uint8] | None]:
-    """The errors as colours on each clip's template, all on one scale from zero to :func:`highest_error`.
-
-    Returns:
-        Pictures (height, width, 3), sRGB; None in the place of those that cannot be drawn, with a warning that says
-        why: the corpus has no faces, the packages for drawing are missing, or an error is not finite.
-    """
-    assets = model.assets
-    if assets.faces is None:
-        rank_zero_warn(f"test/sequences has no error pictures: the corpus {assets.corpus} has no mesh file")
-        return [None] * len(clips)
-    try:
-        from facediff.render import Renderer
-        from facediff.render.panels import heat_colours
-
-        pictures: list[npt.NDArray[np.uint8] | None] = []
-        for clip in clips:
-            template = assets.template(clip.identity).numpy()
-            renderer = Renderer(assets.faces.numpy(), template=template, size=PICTURE_SIZE)
-            pictures.append(renderer.render(template, colours=heat_colours(clip.errors, highest_error(clips))))
-        return pictures
-    except FaceDiffError as error:
-        # The scores are printed and written by now; a picture is not worth losing the rest of the test's report.
-        rank_zero_warn(f"test/sequences has no error pictures: {error}")
-        return [None] * len(clips)
-
-
-def highest_error(clips: list[ClipErrors]) -> float:
-    """The largest error of any clip at any vertex: the end of the colour scale; above zero."""
-    return max([*(float(clip.errors.max()) for clip in clips), 1e-12])
-
-
-def wandb_media(model: AnimationModel, clips: list[ClipErrors]) -> dict[tuple[str, str], list[Any]]:
-    """``wandb.Audio`` and ``wandb.Image`` (or None) of every clip, by split and name."""
-    import wandb
-
-    from facediff.data.audio import SAMPLE_RATE
-
-    scale = f"mean error of each vertex, 0 to {highest_error(clips):.3g} {model.assets.unit}" if clips else ""
-    return {
-        (clip.split, clip.clip): [
-            wandb.Audio(clip.audio, sample_rate=SAMPLE_RATE, caption=clip.clip),
-            None if picture is None else wandb.Image(picture, caption=f"{clip.clip}: {scale}"),
-        ]
-        for clip, picture in zip(clips, draw_errors(model, clips), strict=True)
-    }
 
 
 class RunDescription(Callback):
@@ -162,7 +55,7 @@ class RunDescription(Callback):
 
 
 def log_description(trainer: Trainer, pl_module: LightningModule) -> None:
-    """Give every logger the description of a run of facediff's models; others have none."""
+    """Give every logger the description of a run of facediff's models; other models have none."""
     data = trainer.datamodule  # type: ignore[attr-defined]
     if isinstance(pl_module, AnimationModel) and isinstance(data, SpeechMotionDataModule):
         facts = describe_run(pl_module, data)
@@ -213,9 +106,9 @@ def manifest_hash(folder: Path) -> str:
 class GradientNorm(Callback):
     """Logs the Euclidean norm of the gradient at every optimiser step, before it is clipped.
 
-    It is the norm of what the optimiser gets but for clipping: summed over accumulated batches, averaged over the
-    processes of data-parallel training, and without the scale of mixed precision. A step that mixed precision skips for
-    an overflow has the norm infinity or NaN.
+    The gradient is the one that the optimiser would get without clipping: summed over accumulated batches, averaged
+    over the processes of data-parallel training, and without the scale of mixed precision. A step that mixed precision
+    skips because of an overflow has the norm infinity or NaN.
 
     Args:
         components: also log the norm of every part's gradient, ``gradient/decoder`` and the like. Their squares add up
@@ -227,7 +120,10 @@ class GradientNorm(Callback):
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         """Log the norms; Lightning clips after this and removes the scale of mixed precision before."""
-        gradients = gradients_by_part(pl_module) if self.components else {"": all_gradients(pl_module)}
+        if self.components:
+            gradients = gradients_by_part(pl_module)
+        else:
+            gradients = {"": [parameter.grad for parameter in pl_module.parameters() if parameter.grad is not None]}
         norms = {name: get_total_norm(parts) for name, parts in gradients.items() if parts}
         if not norms:
             return
@@ -236,13 +132,8 @@ class GradientNorm(Callback):
         pl_module.log_dict({**logged, "gradient/norm": total}, on_step=True, on_epoch=False)
 
 
-def all_gradients(module: LightningModule) -> list[Tensor]:
-    """The gradients of all parameters that have one."""
-    return [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
-
-
 def gradients_by_part(module: LightningModule) -> dict[str, list[Tensor]]:
-    """The same by the part of the module that the parameter belongs to.
+    """The gradients of all parameters that have one, by the part of the module that the parameter belongs to.
 
     The part is the first word in which the parameters' names differ: ``network.decoder.…`` belongs to ``decoder``.
     """
@@ -253,3 +144,110 @@ def gradients_by_part(module: LightningModule) -> dict[str, list[Tensor]]:
         if gradient is not None:
             parts.setdefault(words[shared], []).append(gradient)
     return parts
+
+
+# Sound and error pictures of single test clips, for the table of sequences.
+
+
+@dataclass(frozen=True)
+class ClipErrors:
+    """The errors of a clip's motion by vertex.
+
+    Attributes:
+        split: its test split.
+        clip: its name.
+        identity: whose face.
+        audio: its speech (S,), 16 kHz.
+        errors: distance between prediction and truth (V,), mean over the frames, in the corpus's unit.
+    """
+
+    split: str
+    clip: str
+    identity: str
+    audio: npt.NDArray[np.float32]
+    errors: npt.NDArray[np.float32]
+
+
+def worst_clips(rows: list[dict[str, Any]], count: int) -> list[dict[str, Any]]:
+    """The rows of the model's worst clips by LVE, the worst first; equal ones in the rows' order."""
+    mine = [row for row in rows if row["method"] == "model"]
+    return sorted(mine, key=lambda row: -float(row["lve"]))[:count]
+
+
+@torch.inference_mode()
+def measure_clips(trainer: Trainer, model: AnimationModel, rows: list[dict[str, Any]]) -> list[ClipErrors]:
+    """Predict some test clips again, one after the other, and measure their errors per vertex.
+
+    A clip's noise follows from its name, so this is the motion that the test has scored. Predicting it again costs less
+    than keeping the motion of every clip that might be among the worst, and lets one process show the worst of all.
+
+    Args:
+        trainer: the trainer in its test.
+        model: the model tested.
+        rows: rows of the table of sequences.
+    """
+    data = trainer.datamodule  # type: ignore[attr-defined]
+    if not isinstance(data, SpeechMotionDataModule):
+        raise TypeError("the model's setup accepts no other data module")
+    datasets = {split: data.dataset(split) for split in {row["split"] for row in rows}}
+    measured = []
+    for row in rows:
+        dataset = datasets[row["split"]]
+        place = [clip.name for clip in dataset.clips].index(row["clip"])
+        sample = dataset[place]
+        batch = collate([sample]).to(model.device)
+        with trainer.precision_plugin.forward_context():
+            motion = model.generate(batch, seed=0)
+        errors = (motion[0].float() - batch.motion[0]).norm(dim=-1).mean(dim=0)
+        measured.append(
+            ClipErrors(row["split"], sample.name, sample.identity_name, sample.audio.numpy(), errors.cpu().numpy())
+        )
+    return measured
+
+
+def draw_errors(model: AnimationModel, clips: list[ClipErrors]) -> list[npt.NDArray[np.uint8] | None]:
+    """The errors as colours on each clip's template, all on one scale from zero to :func:`highest_error`.
+
+    Returns:
+        pictures (height, width, 3), sRGB; None in place of those that cannot be drawn, with a warning that gives the
+        reason: the corpus has no faces, the packages for drawing are missing, or an error is not finite.
+    """
+    assets = model.assets
+    if assets.faces is None:
+        rank_zero_warn(f"test/sequences has no error pictures: the corpus {assets.corpus} has no mesh file")
+        return [None] * len(clips)
+    try:
+        from facediff.render import Renderer
+        from facediff.render.panels import heat_colours
+
+        pictures: list[npt.NDArray[np.uint8] | None] = []
+        for clip in clips:
+            template = assets.template(clip.identity).numpy()
+            renderer = Renderer(assets.faces.numpy(), template=template, size=PICTURE_SIZE)
+            pictures.append(renderer.render(template, colours=heat_colours(clip.errors, highest_error(clips))))
+        return pictures
+    except FaceDiffError as error:
+        # The scores are printed and written by now; the rest of the test's report must not fail for a picture.
+        rank_zero_warn(f"test/sequences has no error pictures: {error}")
+        return [None] * len(clips)
+
+
+def highest_error(clips: list[ClipErrors]) -> float:
+    """The largest error of any clip at any vertex: the end of the colour scale; above zero."""
+    return max([*(float(clip.errors.max()) for clip in clips), 1e-12])
+
+
+def wandb_media(model: AnimationModel, clips: list[ClipErrors]) -> dict[tuple[str, str], list[Any]]:
+    """``wandb.Audio`` and ``wandb.Image`` (or None) of every clip, by split and name."""
+    import wandb
+
+    from facediff.data.audio import SAMPLE_RATE
+
+    scale = f"mean error of each vertex, 0 to {highest_error(clips):.3g} {model.assets.unit}" if clips else ""
+    return {
+        (clip.split, clip.clip): [
+            wandb.Audio(clip.audio, sample_rate=SAMPLE_RATE, caption=clip.clip),
+            None if picture is None else wandb.Image(picture, caption=f"{clip.clip}: {scale}"),
+        ]
+        for clip, picture in zip(clips, draw_errors(model, clips), strict=True)
+    }

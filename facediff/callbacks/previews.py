@@ -1,4 +1,8 @@
-"""Pictures of what the model can do by now, while it trains."""
+"""Pictures and videos of what a model can do so far, while it trains.
+
+From top to bottom: when the callback draws and with which weights; how one clip is generated and drawn; how the loggers
+show it.
+"""
 
 from __future__ import annotations
 
@@ -32,34 +36,269 @@ from facediff.metrics.base import align
 from facediff.models import AnimationModel
 from facediff.render import VIEWS, Renderer, comparison, contact_sheet, save_image, write_video
 
-# A clip of a preview: which, how it is sampled, and how it is drawn.
-
 Picture = npt.NDArray[np.uint8]
 
 PICTURES = 6
 """Frames on a sheet of pictures."""
 
+COLUMNS = 2
+"""Pictures in a row of a sheet."""
+
 ASPECT = 0.75
 """Width of a panel as a share of its height: heads are higher than wide, and empty ground costs as much as a face."""
 
 
-@dataclass(frozen=True)
-class ClipPreview:
-    """What was drawn of a clip.
+class SamplingPreview(Callback):
+    """Draws the same few validation clips again and again: truth, prediction and error heat map, with sound.
 
-    Attributes:
-        name: the clip.
-        video: the mp4 file.
-        sheet: frames of it on one picture (height, width, 3), sRGB.
-        audio: its sound (samples,) at 16 kHz.
-        scores: the protocol's metrics of the seconds drawn, by name.
+    Where a callback averages weights (EMA), the averaged weights are what is drawn. Files appear in the run's folder as
+    ``previews/epoch_0020/<clip>.mp4`` and ``.png``; Weights & Biases gets the videos and the table ``preview/clips``,
+    TensorBoard a sheet of pictures and the sound; ``preview/seconds`` is the time that it took. One process draws.
+    Training is the same, digit for digit, with and without; a preview that fails is a warning. Where there are several
+    of these callbacks, the last one counts, so that a config given later replaces the options.
+
+    Args:
+        every_n_epochs: draws at the first validation after every so many epochs; None draws at the end only.
+        at_end: draws when training ends, unless its last weights have been drawn already.
+        clips: how many clips: the first of each of so many speakers.
+        names: validation clips to draw instead, by name.
+        seconds: longest piece of a clip that is drawn, from its beginning.
+        sampler: registered name of the sampler; the model's own if None.
+        steps: its denoising steps; its own default if None.
+        seed: seed of the noise, the same in every epoch.
+        size: height of a panel in pixels; it is three quarters as wide.
+        view: from where: ``front``, ``three_quarter`` or ``side``.
+        error_scale: error that gets the last colour, in the corpus's unit of length; if None, the distance from the
+            neutral face that one in a hundred vertices of the true motion exceed. The same in every epoch.
+
+    Raises:
+        FaceDiffError: if an option is impossible, or a named clip is no validation clip.
     """
 
-    name: str
-    video: Path
-    sheet: Picture
-    audio: npt.NDArray[np.float32]
-    scores: dict[str, float]
+    def __init__(
+        self,
+        every_n_epochs: int | None = 10,
+        at_end: bool = True,
+        clips: int = 2,
+        names: list[str] | None = None,
+        seconds: float = 4.0,
+        sampler: str | None = "dpm_solver",
+        steps: int | None = 10,
+        seed: int = 0,
+        size: int = 256,
+        view: str = "front",
+        error_scale: float | None = None,
+    ) -> None:
+        positive = {"every_n_epochs": every_n_epochs, "clips": clips, "seconds": seconds}
+        for option, value in {**positive, "steps": steps, "size": size, "error_scale": error_scale}.items():
+            if value is not None and not value > 0:
+                raise FaceDiffError(f"SamplingPreview: {option} is {value}, expected a number above zero")
+        if view not in VIEWS:
+            raise FaceDiffError(f'SamplingPreview: there is no view "{view}": {choices(view, VIEWS)}')
+        if sampler is not None:
+            registry.sampler.get(sampler)  # a wrong name is an error here, not after hours of training
+        self.every_n_epochs = every_n_epochs
+        self.at_end = at_end
+        self.clips = clips
+        self.names = names
+        self.seconds = seconds
+        self.sampler = sampler
+        self.steps = steps
+        self.seed = seed
+        self.size = size
+        self.view = view
+        self.error_scale = error_scale
+        self._chosen: list[str] = []
+        self._tables: dict[int, Any] = {}
+        self._scale = error_scale
+        self._drawn_epochs = 0
+        self._drawn_step = -1
+
+    @property
+    def state_key(self) -> str:
+        """Differs by the options, since several of these callbacks may be given."""
+        return self._generate_state_key(
+            every_n_epochs=self.every_n_epochs,
+            at_end=self.at_end,
+            clips=self.names or self.clips,
+            seconds=self.seconds,
+            size=self.size,
+            view=self.view,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """The error scale and what has been drawn, so that a resumed run continues with both."""
+        return {"error_scale": self._scale, "drawn_epochs": self._drawn_epochs, "drawn_step": self._drawn_step}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue from a checkpoint's state; an error scale given as an option takes precedence."""
+        self._scale = self.error_scale or state_dict["error_scale"]
+        self._drawn_epochs, self._drawn_step = state_dict["drawn_epochs"], state_dict["drawn_step"]
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Choose the clips, or report why there will be no preview."""
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(pl_module, AnimationModel) or not isinstance(data, SpeechMotionDataModule):
+            raise FaceDiffError("SamplingPreview works with facediff's models and data modules only")
+        self._chosen = []
+        if [found for found in trainer.callbacks if type(found) is type(self)][-1] is not self:  # type: ignore[attr-defined]
+            return
+        clips = data.clips("val")
+        missing = [name for name in self.names or [] if name not in {clip.name for clip in clips}]
+        if missing:
+            raise FaceDiffError(f"SamplingPreview: {missing[0]} is no validation clip of {data.root}; see data.clips")
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return
+        # DeepSpeed's strategy is a DDPStrategy, but spreads the weights over processes like FSDP.
+        sharded = isinstance(trainer.strategy, DeepSpeedStrategy) or not isinstance(trainer.strategy, DDPStrategy)
+        if pl_module.assets.faces is None:
+            if trainer.is_global_zero:  # no fault: the bundled configs ask for previews, whatever the corpus has
+                files = " or ".join(data.mesh_files)
+                print(f"no previews in this run: {data.root} holds no mesh to draw ({files})", flush=True)
+        elif trainer.world_size > 1 and sharded:
+            self._warn(trainer, f"{type(trainer.strategy).__name__} spreads a model over processes, and one draws")
+        elif not clips:
+            self._warn(trainer, f"there are no validation clips in {data.root}")
+        else:
+            self._chosen = self.names or first_of_each_identity(clips, self.clips)
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,  # noqa: ANN401
+        batch: Any,  # noqa: ANN401
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Draw after the first batch, which every process has, if it is time: averaged weights are in place here."""
+        fitting = trainer.state.fn == TrainerFn.FITTING and not trainer.sanity_checking
+        if batch_idx or dataloader_idx or not fitting or self.every_n_epochs is None:
+            return
+        epochs = trainer.current_epoch + int(trainer.is_last_batch)
+        if epochs // self.every_n_epochs > self._drawn_epochs // self.every_n_epochs:
+            self._preview(trainer, pl_module, epochs)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the last weights, averaged ones if there are any, in whatever order the callbacks stand."""
+        if self.at_end and self._drawn_step != trainer.global_step:
+            self._preview(trainer, pl_module, trainer.current_epoch, averaged_weights(trainer, pl_module))
+
+    def _preview(
+        self,
+        trainer: Trainer,
+        model: LightningModule,
+        epochs: int,
+        weights: AbstractContextManager[None] = nullcontext(),  # noqa: B008 - holds nothing
+    ) -> None:
+        """Draw with certain weights in place, on one process; nothing here waits for another process."""
+        if not self._chosen or not trainer.is_global_zero:
+            return
+        start = time.perf_counter()
+        self._drawn_epochs, self._drawn_step = epochs, trainer.global_step
+        drawn: list[ClipPreview] = []
+        # What fails is caught inside, since the random state would not be put back after an error.
+        with isolate_rng(), self._surviving(f"after epoch {epochs}"), weights:
+            folder = run_folder(trainer) / "previews" / f"epoch_{epochs:04d}"
+            samples = short_samples(trainer.datamodule, self._chosen, self.seconds)  # type: ignore[attr-defined]
+            self._scale = self._scale or default_error_scale(samples)
+            for sample in samples:
+                if not self._chosen:
+                    break  # a package is missing, of which a warning has been given
+                with self._surviving(f"of {sample.name} after epoch {epochs}"):
+                    drawn.append(self._clip(trainer, cast(AnimationModel, model), sample, folder, epochs))
+            for logger in trainer.loggers if drawn else []:
+                with self._surviving(f"after epoch {epochs} for {type(logger).__name__}"):
+                    show(logger, drawn, epochs, trainer.global_step, self._tables)
+                    seconds = time.perf_counter() - start
+                    logger.log_metrics({"preview/seconds": seconds}, step=trainer.global_step)
+            if drawn:
+                names, seconds = ", ".join(clip.name for clip in drawn), time.perf_counter() - start
+                print(f"preview after epoch {epochs}: {names} in {seconds:.1f} s, written to {folder}", flush=True)
+
+    def _clip(self, trainer: Trainer, model: AnimationModel, sample: Sample, folder: Path, epochs: int) -> ClipPreview:
+        precision = trainer.precision_plugin.forward_context()
+        with borrowed(model, self.sampler, self.steps), precision, torch.inference_mode():
+            motion = model.generate(collate([sample]).to(model.device), seed=self.seed)[0].float().cpu()
+        scale = self._scale or default_error_scale([sample])
+        return draw_clip(model, sample, motion, folder, epochs, error_scale=scale, size=self.size, view=self.view)
+
+    @contextmanager
+    def _surviving(self, what: str) -> Iterator[None]:
+        """Turn an error into a warning; one that will come again each time ends the previews."""
+        try:
+            yield
+        except MissingExtraError as error:
+            self._chosen = []
+            warnings.warn(f"no previews in this run: {error}", stacklevel=4)
+        except Exception as error:
+            reason = str(error) or type(error).__name__
+            warnings.warn(f"the preview {what} failed, and training goes on: {reason}", stacklevel=4)
+
+    def _warn(self, trainer: Trainer, why: str) -> None:
+        if trainer.is_global_zero:
+            warnings.warn(f"no previews in this run: {why}", stacklevel=3)
+
+
+@contextmanager
+def averaged_weights(trainer: Trainer, model: LightningModule) -> Iterator[None]:
+    """A context with the weights in the model that a checkpoint would hold; its own are put back afterwards.
+
+    Args:
+        trainer: its callbacks are looked at; nothing happens if none of them averages weights.
+        model: the module, not wrapped by a strategy.
+    """
+    # At the end of training, callbacks before the averaging one see the raw weights and later ones the averaged. Saved
+    # as into a checkpoint, the averaged ones are obtained in any order.
+    averaging = next((found for found in trainer.callbacks if isinstance(found, WeightAveraging)), None)  # type: ignore[attr-defined]
+    checkpoint: dict[str, Any] = {"state_dict": {}}
+    if averaging is not None:
+        averaging.on_save_checkpoint(trainer, model, checkpoint)
+    averaged: dict[str, Tensor] = checkpoint["state_dict"]
+    own = {name: tensor for name, tensor in model.state_dict().items() if name in averaged}
+    kept = {name: tensor.clone() for name, tensor in own.items()}
+    try:
+        copy_weights(averaged, own)
+        yield
+    finally:
+        copy_weights(kept, own)
+
+
+@torch.no_grad()
+def copy_weights(source: dict[str, Tensor], target: dict[str, Tensor]) -> None:
+    """Copy all weights of ``target`` from those of the same name."""
+    for name, tensor in target.items():
+        tensor.copy_(source[name])
+
+
+@contextmanager
+def borrowed(model: AnimationModel, sampler: str | None, steps: int | None) -> Iterator[None]:
+    """A model in evaluation mode with another sampler, if it samples; both are put back afterwards."""
+    modes = [(module, module.training) for module in model.modules()]
+    kept = {name: value for name, value in vars(model).items() if name == "sampler"}
+    model.eval()
+    try:
+        if model.samples and (sampler is not None or steps is not None):
+            model.choose_sampler(sampler, steps)
+        yield
+    finally:
+        vars(model).update(kept)
+        for module, training in modes:
+            module.training = training
+
+
+def run_folder(trainer: Trainer) -> Path:
+    """The run's folder, where Lightning keeps its checkpoints too.
+
+    Unlike ``trainer.log_dir``, which every process must ask for, this may be asked for by the first one alone.
+    """
+    logger = trainer.logger
+    if logger is None:
+        return Path(trainer.default_root_dir)
+    if logger.log_dir:
+        return Path(logger.log_dir)
+    version = logger.version if isinstance(logger.version, str) else f"version_{logger.version}"
+    return Path(logger.save_dir or trainer.default_root_dir) / str(logger.name) / version
 
 
 def first_of_each_identity(clips: Sequence[Clip], count: int) -> list[str]:
@@ -91,26 +330,90 @@ def default_error_scale(samples: Sequence[Sample]) -> float:
     return float(f"{np.quantile(reach.numpy(), 0.99) or 0.01 * size:.2g}")
 
 
-@contextmanager
-def borrowed(model: AnimationModel, sampler: str | None, steps: int | None) -> Iterator[None]:
-    """A model in evaluation mode with another sampler, if it samples; both are as they were afterwards."""
-    modes = [(module, module.training) for module in model.modules()]
-    kept = {name: value for name, value in vars(model).items() if name == "sampler"}
-    model.eval()
-    try:
-        if model.samples and (sampler is not None or steps is not None):
-            model.choose_sampler(sampler, steps)
-        yield
-    finally:
-        vars(model).update(kept)
-        for module, training in modes:
-            module.training = training
+@dataclass(frozen=True)
+class ClipPreview:
+    """What was drawn of a clip.
+
+    Attributes:
+        name: the clip.
+        video: the mp4 file.
+        sheet: frames of it on one picture (height, width, 3), sRGB.
+        audio: its sound (samples,) at 16 kHz.
+        scores: the protocol's metrics of the seconds drawn, by name.
+    """
+
+    name: str
+    video: Path
+    sheet: Picture
+    audio: npt.NDArray[np.float32]
+    scores: dict[str, float]
 
 
-@torch.inference_mode()
-def sampled(model: AnimationModel, sample: Sample, seed: int) -> Float[Tensor, "frames vertices 3"]:
-    """The motion of one clip, offsets from its template, on the CPU."""
-    return model.generate(collate([sample]).to(model.device), seed=seed)[0].float().cpu()
+def draw_clip(
+    model: AnimationModel,
+    sample: Sample,
+    motion: Float[Tensor, "frames vertices 3"],
+    folder: Path,
+    epochs: int,
+    *,
+    error_scale: float,
+    size: int,
+    view: str,
+) -> ClipPreview:
+    """Draw truth, prediction and error of one clip, and write the video and the sheet; each whole or not at all.
+
+    Args:
+        model: gives faces, colours, unit and metrics.
+        sample: the true clip.
+        motion: predicted offsets from the template.
+        folder: where the files go, under the clip's name.
+        epochs: epochs trained so far.
+        error_scale: error that gets the last colour, in the corpus's unit.
+        size: height of a panel in pixels.
+        view: from where the face is seen.
+
+    Raises:
+        FaceDiffError: if the corpus has no mesh, the motion is not finite, or a file cannot be written.
+    """
+    assets = model.assets
+    if assets.faces is None:
+        raise FaceDiffError(f"{assets.corpus} has no mesh to draw")
+    found = scores(model, sample, motion)
+    corpus = f"{assets.corpus}, synthetic corpus" if assets.synthetic else assets.corpus
+    renderer = Renderer(
+        assets.faces.numpy(),
+        template=sample.template.numpy(),
+        view=view,
+        size=(size, round(ASPECT * size)),
+        colours=None if assets.colours is None else assets.colours.numpy(),
+    )
+    frames = comparison(
+        renderer,
+        (sample.motion + sample.template).numpy(),
+        (motion + sample.template).numpy(),
+        highest=error_scale,
+        scale_label=length(error_scale, assets.unit),
+        labels=("truth", "facediff", "error"),
+        footer=f"{sample.name} after epoch {epochs}: LVE {found['lve']:.3g} ({corpus})",
+    )
+    count, rate = len(motion), assets.frame_rate
+    picks = [round((i + 0.5) * (count - 1) / PICTURES) for i in range(PICTURES)]
+    picked: dict[int, Picture] = {}
+
+    def remembering(frames: Iterable[Picture]) -> Iterator[Picture]:
+        # The video is written while it is drawn; the sheet's frames are kept on the way.
+        for place, frame in enumerate(frames):
+            if place in picks:
+                picked[place] = frame
+            yield frame
+
+    sound = fit_length(sample.audio.numpy(), samples_for(count, rate))
+    video = folder / f"{sample.name}.mp4"
+    write_video(video, remembering(frames), rate, sound, SAMPLE_RATE)
+    times = [f"{pick / rate:.2f} s" for pick in picks]
+    sheet = contact_sheet([picked[pick] for pick in picks], COLUMNS, labels=times)
+    save_image(video.with_suffix(".png"), sheet)
+    return ClipPreview(sample.name, video, sheet, sound, found)
 
 
 def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, float]:
@@ -125,357 +428,38 @@ def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, f
     return {name: float(metric.clip_value(clip)) for name, metric in metrics}
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """How clips are drawn.
-
-    Attributes:
-        size: height of a panel in pixels.
-        view: from where the face is seen.
-        columns: pictures in a row of a sheet.
-    """
-
-    size: int = 256
-    view: str = "front"
-    columns: int = 2
-
-    def write(
-        self, model: AnimationModel, sample: Sample, motion: Tensor, folder: Path, *, epochs: int, error_scale: float
-    ) -> ClipPreview:
-        """Draw truth, prediction and error of one clip, and write the video and the sheet; each whole or not at all.
-
-        Args:
-            model: gives faces, colours, unit and metrics.
-            sample: the true clip.
-            motion: predicted offsets from the template, (frames, vertices, 3).
-            folder: where the files go, under the clip's name.
-            epochs: epochs trained so far.
-            error_scale: error that gets the last colour, in the corpus's unit.
-
-        Raises:
-            FaceDiffError: if the corpus has no mesh, the motion is not finite, or a file cannot be written.
-        """
-        assets = model.assets
-        if assets.faces is None:
-            raise FaceDiffError(f"{assets.corpus} has no mesh to draw")
-        found = scores(model, sample, motion)
-        colours = None if assets.colours is None else assets.colours.numpy()
-        template = sample.template.numpy()
-        size = (self.size, round(ASPECT * self.size))
-        renderer = Renderer(assets.faces.numpy(), template=template, view=self.view, size=size, colours=colours)
-        corpus = f"{assets.corpus}, synthetic corpus" if assets.synthetic else assets.corpus
-        frames = comparison(
-            renderer,
-            (sample.motion + sample.template).numpy(),
-            (motion + sample.template).numpy(),
-            highest=error_scale,
-            scale_label=length(error_scale, assets.unit),
-            labels=("truth", "facediff", "error"),
-            footer=f"{sample.name} after epoch {epochs}: LVE {found['lve']:.3g} ({corpus})",
-        )
-        count, rate = len(motion), assets.frame_rate
-        picks = [round((i + 0.5) * (count - 1) / PICTURES) for i in range(PICTURES)]
-        picked: dict[int, Picture] = {}
-        sound = fit_length(sample.audio.numpy(), samples_for(count, rate))
-        video = folder / f"{sample.name}.mp4"
-        write_video(video, remembering(frames, set(picks), picked), rate, sound, SAMPLE_RATE)
-        times = [f"{pick / rate:.2f} s" for pick in picks]
-        sheet = contact_sheet([picked[pick] for pick in picks], self.columns, labels=times)
-        save_image(video.with_suffix(".png"), sheet)
-        return ClipPreview(sample.name, video, sheet, sound, found)
-
-
-def remembering(frames: Iterable[Picture], places: set[int], found: dict[int, Picture]) -> Iterator[Picture]:
-    """The frames as they are; those at some places are kept in ``found``."""
-    for place, frame in enumerate(frames):
-        if place in places:
-            found[place] = frame
-        yield frame
-
-
 def length(value: float, unit: str) -> str:
-    """A length for people: small parts of a metre in millimetres."""
+    """A length in a readable unit: small parts of a metre in millimetres."""
     return f"{value * 1000:.3g} mm" if unit == "m" else f"{value:.3g} {unit}"
 
 
-# Where previews are shown beside the files.
+def show(logger: Logger, clips: Sequence[ClipPreview], epochs: int, step: int, tables: dict[int, Any]) -> None:
+    """Give the clips of one epoch to a logger; those without pictures leave them to the files in the run's folder.
 
+    Weights & Biases gets a video per clip and a table that grows by the clips of every epoch, TensorBoard the sheet of
+    pictures and the sound.
 
-def run_folder(trainer: Trainer) -> Path:
-    """The run's folder, where Lightning keeps its checkpoints too.
-
-    Unlike ``trainer.log_dir``, which every process must ask for, this may be asked for by the first one alone.
+    Args:
+        logger: any logger.
+        clips: what was drawn.
+        epochs: epochs trained so far.
+        step: optimiser steps so far.
+        tables: the growing tables of Weights & Biases, one for each logger.
     """
-    logger = trainer.logger
-    if logger is None:
-        return Path(trainer.default_root_dir)
-    if logger.log_dir:
-        return Path(logger.log_dir)
-    version = logger.version if isinstance(logger.version, str) else f"version_{logger.version}"
-    return Path(logger.save_dir or trainer.default_root_dir) / str(logger.name) / version
-
-
-class Showcase:
-    """Gives previews to the loggers that can show them; others find the files in the run's folder."""
-
-    def __init__(self) -> None:
-        self._tables: dict[int, Any] = {}
-
-    def show(self, logger: Logger, clips: Sequence[ClipPreview], epochs: int, step: int) -> None:
-        """Show the clips of one epoch.
-
-        Args:
-            logger: any logger; only Weights & Biases and TensorBoard are given something.
-            clips: what was drawn.
-            epochs: epochs trained so far.
-            step: optimiser steps so far.
-        """
-        if isinstance(logger, WandbLogger):
-            self._show_wandb(logger, clips, epochs, step)
-        elif isinstance(logger, TensorBoardLogger):
-            for clip in clips:
-                name = f"preview/{clip.name}"
-                logger.experiment.add_image(name, clip.sheet, step, dataformats="HWC")
-                logger.experiment.add_audio(name, clip.audio[None], step, sample_rate=SAMPLE_RATE)
-
-    def _show_wandb(self, logger: WandbLogger, clips: Sequence[ClipPreview], epochs: int, step: int) -> None:
-        """A video per clip, and a table that grows by the clips of every epoch."""
+    if isinstance(logger, TensorBoardLogger):
+        for clip in clips:
+            name = f"preview/{clip.name}"
+            logger.experiment.add_image(name, clip.sheet, step, dataformats="HWC")
+            logger.experiment.add_audio(name, clip.audio[None], step, sample_rate=SAMPLE_RATE)
+    elif isinstance(logger, WandbLogger):
         import wandb
 
         def video(clip: ClipPreview) -> wandb.Video:
             return wandb.Video(str(clip.video), caption=f"{clip.name} after epoch {epochs}", format="mp4")
 
         columns = ["clip", "epoch", "video", *clips[0].scores]
-        made = wandb.Table(columns=columns, log_mode="INCREMENTAL")
-        table = self._tables.setdefault(id(logger), made)
+        table = tables.setdefault(id(logger), wandb.Table(columns=columns, log_mode="INCREMENTAL"))
         for clip in clips:
             table.add_data(clip.name, epochs, video(clip), *clip.scores.values())
         shown: dict[str, Any] = {f"preview/{clip.name}": video(clip) for clip in clips}
         logger.log_metrics({**shown, "preview/clips": table}, step)
-
-
-# Averaged weights for a moment, when they are not in place.
-
-
-@contextmanager
-def averaged_weights(trainer: Trainer, model: LightningModule) -> Iterator[None]:
-    """The weights that a checkpoint would hold are in the model; its own are back afterwards.
-
-    At the end of training, callbacks before the averaging one see the raw weights and later ones the averaged. Asked
-    for as for a checkpoint, the averaged ones are had in any order.
-
-    Args:
-        trainer: its callbacks are looked at; nothing happens if none of them averages weights.
-        model: the module, not wrapped by a strategy.
-    """
-    averaging = next((found for found in trainer.callbacks if isinstance(found, WeightAveraging)), None)  # type: ignore[attr-defined]
-    checkpoint: dict[str, Any] = {"state_dict": {}}
-    if averaging is not None:
-        averaging.on_save_checkpoint(trainer, model, checkpoint)
-    averaged: dict[str, torch.Tensor] = checkpoint["state_dict"]
-    own = {name: tensor for name, tensor in model.state_dict().items() if name in averaged}
-    kept = {name: tensor.clone() for name, tensor in own.items()}
-    try:
-        with torch.no_grad():
-            for name, tensor in own.items():
-                tensor.copy_(averaged[name])
-        yield
-    finally:
-        with torch.no_grad():
-            for name, tensor in own.items():
-                tensor.copy_(kept[name])
-
-
-class SamplingPreview(Callback):
-    """Draws the same few validation clips again and again: truth, prediction and error heat map, with sound.
-
-    Where a callback averages weights (EMA), the averaged weights are what is drawn. Files appear in the run's folder as
-    ``previews/epoch_0020/<clip>.mp4`` and ``.png``; Weights & Biases gets the videos and the table ``preview/clips``,
-    TensorBoard a sheet of pictures and the sound; ``preview/seconds`` says what it cost. One process draws. Training is
-    the same, digit for digit, with and without; a preview that fails is a warning. Where there are several of these
-    callbacks, the last one counts, so that a config given later replaces the options.
-
-    Args:
-        every_n_epochs: draws at the first validation after every so many epochs; None draws at the end only.
-        at_end: draws when training ends, unless its last weights have been drawn already.
-        clips: how many clips: the first of each of so many people.
-        names: validation clips to draw instead, by name.
-        seconds: longest piece of a clip that is drawn, from its beginning.
-        sampler: registered name of the sampler; the model's own if None.
-        steps: its denoising steps; its own default if None.
-        seed: seed of the noise, the same in every epoch.
-        size: height of a panel in pixels; it is three quarters as wide.
-        view: from where: ``front``, ``three_quarter`` or ``side``.
-        error_scale: error that gets the last colour, in the corpus's unit of length; if None, the distance from the
-            neutral face that one in a hundred vertices of the true motion exceed. The same in every epoch.
-
-    Raises:
-        FaceDiffError: if an option is impossible, or a named clip is no validation clip.
-    """
-
-    def __init__(
-        self,
-        every_n_epochs: int | None = 10,
-        at_end: bool = True,
-        clips: int = 2,
-        names: list[str] | None = None,
-        seconds: float = 4.0,
-        sampler: str | None = "dpm_solver",
-        steps: int | None = 10,
-        seed: int = 0,
-        size: int = 256,
-        view: str = "front",
-        error_scale: float | None = None,
-    ) -> None:
-        for option, value in (
-            ("every_n_epochs", every_n_epochs),
-            ("clips", clips),
-            ("seconds", seconds),
-            ("steps", steps),
-            ("size", size),
-            ("error_scale", error_scale),
-        ):
-            if value is not None and not value > 0:
-                raise FaceDiffError(f"SamplingPreview: {option} is {value}, expected a number above zero")
-        if view not in VIEWS:
-            raise FaceDiffError(f'SamplingPreview: there is no view "{view}": {choices(view, VIEWS)}')
-        if sampler is not None:
-            registry.sampler.get(sampler)  # a wrong name is told now, not after hours of training
-        self.every_n_epochs = every_n_epochs
-        self.at_end = at_end
-        self.clips = clips
-        self.names = names
-        self.seconds = seconds
-        self.sampler = sampler
-        self.steps = steps
-        self.seed = seed
-        self.drawing = Drawing(size=size, view=view)
-        self.error_scale = error_scale
-        self._chosen: list[str] = []
-        self._showcase = Showcase()
-        self._scale = error_scale
-        self._drawn_epochs = 0
-        self._drawn_step = -1
-
-    @property
-    def state_key(self) -> str:
-        """Differs by the options, since several of these callbacks may be given."""
-        return self._generate_state_key(
-            every_n_epochs=self.every_n_epochs,
-            at_end=self.at_end,
-            clips=self.names or self.clips,
-            seconds=self.seconds,
-            size=self.drawing.size,
-            view=self.drawing.view,
-        )
-
-    def state_dict(self) -> dict[str, Any]:
-        """The error scale and what has been drawn, so that a resumed run goes on alike."""
-        return {"error_scale": self._scale, "drawn_epochs": self._drawn_epochs, "drawn_step": self._drawn_step}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on where a checkpoint was; an error scale given as an option stays."""
-        self._scale = self.error_scale or state_dict["error_scale"]
-        self._drawn_epochs, self._drawn_step = state_dict["drawn_epochs"], state_dict["drawn_step"]
-
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Settle the clips, or say why there will be no preview."""
-        data = trainer.datamodule  # type: ignore[attr-defined]
-        if not isinstance(pl_module, AnimationModel) or not isinstance(data, SpeechMotionDataModule):
-            raise FaceDiffError("SamplingPreview works with facediff's models and data modules only")
-        self._chosen = []
-        if [found for found in trainer.callbacks if type(found) is type(self)][-1] is not self:  # type: ignore[attr-defined]
-            return
-        sharded = isinstance(trainer.strategy, DeepSpeedStrategy) or not isinstance(trainer.strategy, DDPStrategy)
-        clips = data.clips("val")
-        missing = [name for name in self.names or [] if name not in {clip.name for clip in clips}]
-        if missing:
-            raise FaceDiffError(f"SamplingPreview: {missing[0]} is no validation clip of {data.root}; see data.clips")
-        if trainer.fast_dev_run:  # type: ignore[attr-defined]
-            return
-        if pl_module.assets.faces is None:
-            if trainer.is_global_zero:  # no fault: the shipped configs ask for previews, whatever the corpus has
-                files = " or ".join(data.mesh_files)
-                print(f"no previews in this run: {data.root} holds no mesh to draw ({files})", flush=True)
-        elif trainer.world_size > 1 and sharded:
-            self._warn(trainer, f"{type(trainer.strategy).__name__} spreads a model over processes, and one draws")
-        elif not clips:
-            self._warn(trainer, f"there are no validation clips in {data.root}")
-        else:
-            self._chosen = self.names or first_of_each_identity(clips, self.clips)
-
-    def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,  # noqa: ANN401
-        batch: Any,  # noqa: ANN401
-        batch_idx: int,
-        dataloader_idx: int = 0,
-    ) -> None:
-        """Draw beside the first batch, which every process has, if it is time: averaged weights are in place here."""
-        fitting = trainer.state.fn == TrainerFn.FITTING and not trainer.sanity_checking
-        if batch_idx or dataloader_idx or not fitting or self.every_n_epochs is None:
-            return
-        epochs = trainer.current_epoch + int(trainer.is_last_batch)
-        if epochs // self.every_n_epochs > self._drawn_epochs // self.every_n_epochs:
-            self._preview(trainer, pl_module, epochs)
-
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the last weights, averaged ones if there are any, whichever callback comes first."""
-        if self.at_end and self._drawn_step != trainer.global_step:
-            self._preview(trainer, pl_module, trainer.current_epoch, averaged_weights(trainer, pl_module))
-
-    def _preview(
-        self,
-        trainer: Trainer,
-        model: LightningModule,
-        epochs: int,
-        weights: AbstractContextManager[None] = nullcontext(),  # noqa: B008 - holds nothing
-    ) -> None:
-        """Draw with certain weights in place, on one process; nothing here waits for another process."""
-        if not self._chosen or not trainer.is_global_zero:
-            return
-        start = time.perf_counter()
-        self._drawn_epochs, self._drawn_step = epochs, trainer.global_step
-        drawn: list[ClipPreview] = []
-        # What fails is caught inside, since the random state would not be put back after an error.
-        with isolate_rng(), self._surviving(f"after epoch {epochs}"), weights:
-            folder = run_folder(trainer) / "previews" / f"epoch_{epochs:04d}"
-            samples = short_samples(trainer.datamodule, self._chosen, self.seconds)  # type: ignore[attr-defined]
-            self._scale = self._scale or default_error_scale(samples)
-            for sample in samples:
-                if not self._chosen:
-                    break  # a package is missing, which has been told
-                with self._surviving(f"of {sample.name} after epoch {epochs}"):
-                    drawn.append(self._clip(trainer, cast(AnimationModel, model), sample, folder, epochs))
-            for logger in trainer.loggers if drawn else []:
-                with self._surviving(f"after epoch {epochs} for {type(logger).__name__}"):
-                    self._showcase.show(logger, drawn, epochs, trainer.global_step)
-                    seconds = time.perf_counter() - start
-                    logger.log_metrics({"preview/seconds": seconds}, step=trainer.global_step)
-            if drawn:
-                names, seconds = ", ".join(clip.name for clip in drawn), time.perf_counter() - start
-                print(f"preview after epoch {epochs}: {names} in {seconds:.1f} s, written to {folder}", flush=True)
-
-    def _clip(self, trainer: Trainer, model: AnimationModel, sample: Sample, folder: Path, epochs: int) -> ClipPreview:
-        with borrowed(model, self.sampler, self.steps), trainer.precision_plugin.forward_context():
-            motion = sampled(model, sample, self.seed)
-        scale = self._scale or default_error_scale([sample])
-        return self.drawing.write(model, sample, motion, folder, epochs=epochs, error_scale=scale)
-
-    @contextmanager
-    def _surviving(self, what: str) -> Iterator[None]:
-        """Turn an error into a warning; one that will come again each time ends the previews."""
-        try:
-            yield
-        except MissingExtraError as error:
-            self._chosen = []
-            warnings.warn(f"no previews in this run: {error}", stacklevel=4)
-        except Exception as error:
-            reason = str(error) or type(error).__name__
-            warnings.warn(f"the preview {what} failed, and training goes on: {reason}", stacklevel=4)
-
-    def _warn(self, trainer: Trainer, why: str) -> None:
-        if trainer.is_global_zero:
-            warnings.warn(f"no previews in this run: {why}", stacklevel=3)

@@ -1,4 +1,4 @@
-"""Training with parts of the network compiled by PyTorch."""
+"""Callbacks that make training quicker: cached speech features, and parts of the network compiled by PyTorch."""
 
 from __future__ import annotations
 
@@ -17,14 +17,12 @@ from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
 from facediff.utils.progress import track
 
-# Running the frozen part of an audio encoder once per clip instead of in every training step.
-
 
 class SpeechFeatureCache(Callback):
-    """Keeps what the frozen part of the audio encoder makes of every training and validation clip on disk.
+    """Runs the frozen part of the audio encoder once per clip, and keeps its features on disk.
 
     The files are keyed by the frozen weights, the number of frozen layers, the precision and the speech itself, so a
-    changed encoder or a changed recording never meets old features. Training on whole clips gives the same losses as
+    changed encoder or a changed recording never gets old features. Training on whole clips gives the same losses as
     without. Training on windows differs a little: the frozen part then hears the whole clip, not the window alone.
 
     Args:
@@ -36,7 +34,7 @@ class SpeechFeatureCache(Callback):
 
     @torch.no_grad()
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Encode what is not there yet, each process its share, and let the data module read it.
+        """Encode the clips that have no features yet, each process its share, and let the data module read all.
 
         Raises:
             FaceDiffError: if the audio encoder has no frozen part.
@@ -49,7 +47,7 @@ class SpeechFeatureCache(Callback):
         if key is None:
             raise FaceDiffError(
                 f"SpeechFeatureCache: the audio encoder {type(encoder).__name__} has no frozen part to keep (or "
-                f"spec_augment is on); leave the callback away, or take one that has, e.g. --model.audio_encoder=hubert"
+                f"spec_augment is on); omit the callback, or use one that has, e.g. --model.audio_encoder=hubert"
             )
         features = CachedFeatures(ArrayStore(self.folder), f"{key}:{trainer.precision}")
         clips = [*data.clips("train"), *data.clips("val")]
@@ -70,9 +68,9 @@ class SpeechFeatureCache(Callback):
 class CompiledTraining(Callback):
     """Compiles parts of the network with ``torch.compile`` for the training steps.
 
-    Checkpoints are as without it: parts are compiled in place and keep their names. Validation, previews and whatever
-    comes after training run the parts as they are. Each part is compiled once for all lengths of clips; the first steps
-    wait for that, a minute or so. Losses are the same but for rounding and dropout's draws.
+    Checkpoints are as without it: parts are compiled in place and keep their names. Validation, previews and everything
+    after training run the uncompiled parts. Each part is compiled once for all lengths of clips; the first steps wait
+    for that, a minute or so. Losses are the same but for rounding and dropout's random numbers.
 
     Args:
         parts: names of submodules of the model's network, such as ``decoder`` or ``style_encoder``.
@@ -86,7 +84,7 @@ class CompiledTraining(Callback):
         self._compiled: list[nn.Module] = []
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Look whether anything can be compiled here.
+        """Check that the parts exist and that this machine can compile.
 
         Raises:
             FaceDiffError: if a part is not there, or nothing can be compiled on this machine.
@@ -94,8 +92,8 @@ class CompiledTraining(Callback):
         network = getattr(pl_module, "network", None)
         if not isinstance(network, nn.Module):
             raise FaceDiffError(
-                f"CompiledTraining: {type(pl_module).__name__} has no network whose parts could be compiled; leave the "
-                f"callback away"
+                f"CompiledTraining: {type(pl_module).__name__} has no network whose parts could be compiled; omit "
+                f"the callback"
             )
         known = dict(network.named_modules())
         for name in self.parts:
@@ -111,30 +109,30 @@ class CompiledTraining(Callback):
             reason = text.splitlines()[0] if text else type(error).__name__
             raise FaceDiffError(
                 f"CompiledTraining: torch.compile does not work on this machine ({reason}); install a C++ compiler "
-                f"such as g++, or leave the callback away"
+                f"such as g++, or omit the callback"
             ) from error
         self._compiled = [known[name] for name in self.parts]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Compile; nothing happens before a part is first used."""
+        """Mark the parts; each is compiled when it is first used."""
         for part in self._compiled:
             if part._compiled_call_impl is None:
                 part.compile(backend=self.backend, dynamic=True)
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Go on with the compiled parts; a run that is resumed within an epoch has no such moment at first."""
+        """Use the compiled parts again; a run that is resumed within an epoch begins without this hook."""
         self.on_train_start(trainer, pl_module)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """What other callbacks do when training has ended, such as a last preview, runs the parts as they are."""
+        """Other callbacks that act when training has ended, such as a last preview, run the uncompiled parts."""
         self._undo()
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Sampling runs a part many times on shapes of its own, and would have it compiled for each."""
+        """Sampling runs a part on shapes of its own, and would compile it for each of them."""
         self._undo()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Go on with the compiled parts."""
+        """Use the compiled parts again."""
         if self._compiled and not trainer.sanity_checking:
             self.on_train_start(trainer, pl_module)
 

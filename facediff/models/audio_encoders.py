@@ -106,6 +106,7 @@ def standardise(
     """Zero mean and unit variance over each clip's valid samples, zero on padding, as HuBERT's processor does."""
     mask = frame_mask(lengths, audio.shape[1])
     count = lengths[:, None].to(audio.dtype)
+    # Over the valid samples alone: zeros of padding would make a short clip louder in a batch than by itself.
     mean = (audio * mask).sum(1, keepdim=True) / count
     variance = ((audio - mean).square() * mask).sum(1, keepdim=True) / count
     return (audio - mean) / (variance + 1e-7).sqrt() * mask
@@ -149,6 +150,7 @@ class MelEncoder(AudioEncoder):
     ) -> Float[Tensor, "batch frames dim"]:
         """Encode; see :class:`AudioEncoder`."""
         spectrum, lengths = self._log_mel(self.standardise(audio, audio_lengths), audio_lengths)
+        # Padding is zeroed again after every layer: a convolution next to it would let its values into the clip.
         x = self.stem(spectrum.transpose(1, 2)).transpose(1, 2)
         lengths = (lengths // 2).clamp_min(1)
         mask = frame_mask(lengths, x.shape[1])[..., None].to(x.dtype)
@@ -162,6 +164,8 @@ class MelEncoder(AudioEncoder):
         # Autocast has no complex numbers: the spectrum is always taken in float32.
         with torch.autocast(audio.device.type, enabled=False):
             short = max(0, 2 * self.hop - audio.shape[1])
+            # Padded by half a spectrum's length, so that spectrum i is centred on sample 160 i. The window of 25 ms
+            # stands in the middle of 512 samples, a length that the Fourier transform is quick at.
             padded = nn.functional.pad(audio.float(), (self.n_fft // 2, self.n_fft // 2 + short))
             window = nn.functional.pad(self.window, (56, 56))
             frames = padded.unfold(1, self.n_fft, self.hop) * window
@@ -169,6 +173,7 @@ class MelEncoder(AudioEncoder):
             spectrum = torch.log(power @ self.filters.T + 1e-5)
         steps = (lengths // self.hop).clamp(min=2)
         mask = frame_mask(steps, spectrum.shape[1])[..., None]
+        # Shifted and scaled, so that what the first convolution gets of speech at unit variance lies around 0.
         return (spectrum + 2.0) / 4.0 * mask, steps
 
 
@@ -322,6 +327,7 @@ class HubertEncoder(AudioEncoder):
             hidden = hidden + encoder.pos_conv_embed(hidden)
             hidden = encoder.dropout(hidden if self._normalises_last else encoder.layer_norm(hidden))
         for layer in encoder.layers[first:last]:
+            # Layer drop, as transformers does it in its own loop, which cannot be entered in the middle.
             if layer.training and self.hubert.config.layerdrop > 0 and torch.rand(()) < self.hubert.config.layerdrop:
                 continue
             hidden = layer(hidden)

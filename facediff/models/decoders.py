@@ -104,6 +104,7 @@ class StyleTransformer(Decoder):
             prepared: as :meth:`prepare` gives it.
         """
         if prepared is None:
+            # Training: the attention of each block computes its keys and values from the tokens themselves.
             prepared = DecoderConstants([style] * len(self.blocks), mask, self._rotation(mask.shape[1]))
         for block, tokens in zip(self.blocks, prepared.tokens, strict=True):
             fused = block(fused, tokens, prepared.mask, prepared.rotation)
@@ -179,6 +180,7 @@ class TokenAttention(Attention):
             context = self.prepare(context, rotation)
         if isinstance(context, KeysValues):
             return self.attend(self.queries(x, rotation), context)
+        # One product for all heads; the softmax is over each head's own tokens.
         scores = x @ context.keys + context.offset
         weights = scores.view(*scores.shape[:2], self.num_heads, -1).softmax(dim=-1).flatten(2)
         return weights @ context.values + self.out.bias
@@ -194,7 +196,7 @@ class TokenAttention(Attention):
         if self.rotary is not None or self.dropout or self.num_heads * context.shape[1] >= dim:
             return found
         key = key / math.sqrt(key.shape[-1])
-        # Weights by head: (heads, head_dim, dim).
+        # The maps by head, (heads, head_dim, dim); the bias of W_q becomes the offset, that of W_o is added last.
         into = self.query.weight.view(self.num_heads, -1, dim)
         out = self.out.weight.T.reshape(self.num_heads, -1, dim)
         keys = (key @ into).flatten(1, 2).transpose(1, 2)
@@ -267,6 +269,7 @@ class GruDecoder(Decoder):
             prepared: as :meth:`prepare` gives it.
         """
         lengths, scale, shift = self.prepare(style, mask) if prepared is None else prepared
+        # Packed, so that the backward direction starts at a clip's own last frame and not in its padding.
         packed = pack_padded_sequence(fused, lengths, batch_first=True, enforce_sorted=False)
         hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])
         return torch.addcmul(shift, self.norm(hidden + fused), scale)

@@ -138,8 +138,10 @@ class FoldedSpace(Space):
 
     def denoise(self, state: Float[Tensor, "batch frames width"], step: int) -> Float[Tensor, "batch frames width"]:
         """E M̂⁰ = E U h + E b."""
+        # The bias e of the first map is no part of y, which would not obey the recursion with it.
         bias = self.network.embed.bias
         features = self.features(state if bias is None else state + bias, step)
+        # In the weights' own precision: errors of the state add up over the steps.
         with torch.autocast(features.device.type, enabled=False):
             prediction = nn.functional.linear(features.to(state.dtype), self.fold.product, self.fold.offset)
         self._last = features, prediction
@@ -195,6 +197,8 @@ def fold(
     # Not every accelerator knows float64.
     device = torch.device("cpu") if first.device.type == "mps" else first.device
     dim, coordinates = first.shape
+    # In float64, since products over 70 000 coordinates lose digits in float32; by chunks, since both maps in float64
+    # would double the memory of the model.
     product = torch.zeros(dim, dim, dtype=torch.float64, device=device)
     covariance = torch.zeros_like(product)
     offset = torch.zeros(dim, dtype=torch.float64, device=device)

@@ -96,9 +96,11 @@ class BidirectionalCrossAttention(Fusion):
         """
         # Training does not prepare, and keeps the mask: looking whether it is needed would wait for the device.
         query, needed, rotation = self._constants(audio, mask) if prepared is None else prepared
+        # F'_a: each frame of speech looks for the motion that belongs to it.
         normed_motion = self.motion_norm(motion)
         of_motion = self.audio_from_motion.keys_values(normed_motion, rotation)
         audio = audio + self.dropout(self.audio_from_motion.attend(query, of_motion, needed))
+        # F'_m: each frame of motion looks at the speech that knows of the motion by now.
         enriched = self.enriched_norm(audio)
         motion = motion + self.dropout(self.motion_from_audio(normed_motion, enriched, needed, rotation))
         return audio + motion

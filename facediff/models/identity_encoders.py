@@ -69,9 +69,10 @@ class HierarchicalIdentity(IdentityEncoder):
 
     def forward(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identity_dim"]:
         """F_id of each clip; the mean over all identities for an unseen speaker."""
+        # Of every identity, not of the batch's alone: an unseen speaker gets the mean over all of them.
         weights = self.level_weights().unbind(-1)
         weighted = [weight[:, None] * table for weight, table in zip(weights, self._tables(), strict=True)]
-        features = self.norm(torch.cat(weighted, dim=-1))  # eq. 11, of every identity, for the mean over all of them
+        features = self.norm(torch.cat(weighted, dim=-1))  # eq. 11
         return torch.where((identity >= 0)[:, None], features[identity.clamp_min(0)], features.mean(0, keepdim=True))
 
     def _tables(self) -> list[Tensor]:

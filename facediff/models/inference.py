@@ -126,6 +126,7 @@ class Inference(ABC):
             FaceDiffError: as :meth:`animate`.
         """
         clip = self.clip_of(audio, identity, style)
+        # Long speech is a stream that happens to be known: the same windows, the same noise, the same motion.
         if self.windows.in_one_pass(clip.motion.shape[1], self.frame_rate):
             motions = self.generate_samples(clip, seeds, progress=progress)
         else:
@@ -156,6 +157,7 @@ class Inference(ABC):
         Raises:
             FaceDiffError: as :meth:`animate`.
         """
+        # The speech is not known yet; a clip of one silent frame carries the face and the style.
         frame = torch.zeros(samples_for(1, self.frame_rate), device=self.device)
         return SpeechStream(self, self.clip_of(frame, identity, style), seeds=seeds, plan=plan)
 
@@ -498,6 +500,8 @@ class SpeechStream:
         self._refuse_finished()
         self._speech = torch.cat([self._speech, samples.to(self._speech)])
         parts = []
+        # A window is generated once the speech after it has been heard too. Its last frames are held back: the next
+        # window blends into them.
         while self._heard >= self._sample(self._end + self.plan.after):
             parts.append(self._next_window(self._end + self.plan.after))
         return self._joined(parts)
@@ -524,6 +528,8 @@ class SpeechStream:
         parts = []
         while self._end < total:
             parts.append(self._next_window(min(total, self._end + self.plan.after)))
+        # The rest lies within the last window. If it is no longer than what the window before has animated already, its
+        # frames are certain now, since no later window will blend into them.
         left = total - self._start
         if self._held is not None and left <= self.plan.overlap:
             parts.append(self._held[:, :left])
@@ -541,6 +547,7 @@ class SpeechStream:
             frames: how many frames it lasts; as many as fit its length if None.
             progress: wraps the iteration over its seconds.
         """
+        # Fed by the second, as from a microphone, so that memory does not grow with the recording.
         last = max(0, math.ceil(len(speech) / SAMPLE_RATE) - 1)
         seconds = range(last + 1)
         for second in progress(seconds) if progress is not None else seconds:
@@ -567,6 +574,7 @@ class SpeechStream:
         """The present window's frames before the overlap, with speech up to frame ``heard``; go on to the next one."""
         motion = self._generate(self._end, heard)
         self._index += 1
+        # Speech before the next window's context will not be heard again, unless the level has not counted it yet.
         needed = self._sample(self._start - min(self.plan.before, self._start))
         drop = max(0, min(needed, self._level.count) - self._dropped)
         self._speech = self._speech[drop:]
@@ -576,10 +584,13 @@ class SpeechStream:
     def _generate(self, end: int, heard: int) -> Tensor:
         """The present window up to frame ``end``, with speech up to frame ``heard``."""
         window = Window(self.plan, self._index, end - self._start)
+        # Places in the whole recording; the kept speech starts at sample ``_dropped`` of it. Windows overlap, so the
+        # level counts only what it has not counted yet.
         first, last = self._sample(self._start - window.context), self._sample(heard)
         self._level.hear(self._speech[max(0, self._level.count - self._dropped) : last - self._dropped])
         speech = self._speech[first - self._dropped : last - self._dropped]
         clip = with_speech(self.clip, speech, heard - self._start + window.context)
+        # A window that is mostly a pause, standardised by itself, would turn its noise into loud speech.
         with self.model.speech_encoder.at_level(self._level.mean, max(self._level.deviation, QUIETEST)):
             motion, self._tail = self.model.generate_window(clip, window, self.seeds, self._tail)
         self._held = motion[:, -self.plan.overlap :]
@@ -639,6 +650,7 @@ def with_speech(clip: Batch, speech: Float[Tensor, " samples"], frames: int) -> 
 
 def noise_stream(name: str, seed: int, device: torch.device) -> torch.Generator:
     """A stream of random numbers of its own for a name and a seed."""
+    # crc32 and not hash(), which is another number in every process.
     return torch.Generator(device).manual_seed(zlib.crc32(name.encode()) + seed)
 
 
@@ -678,6 +690,8 @@ class WindowNoise:
 
     def __init__(self, name: str, window: Window, seeds: Sequence[int], device: torch.device) -> None:
         self.window = window
+        # Each window has a stream of its own for the frames that are new in it, so that its neighbour can draw the same
+        # numbers again without keeping them.
         self.new, self.old = (
             [noise_stream(f"{name}/{index}", seed, device) for seed in seeds]
             for index in (window.index, window.index - 1)
@@ -704,11 +718,6 @@ class WindowNoise:
 class WindowOverlap:
     """Blends, step by step, the features of the shared frames with those that the window before had there.
 
-    The map from features to clean motion is affine and the shares add up to one, so this is a blend of the two
-    predictions of clean motion, at the width of the model. The first shared frame keeps the old window's predictions
-    and its noise in every step, and so the old window's motion; the network sees the shared frames as they are and
-    continues them. So no jump is left at a window boundary that would have to be smoothed afterwards.
-
     Args:
         before: features of the window before in the shared frames, one tensor for each step; None for the first window.
         kept: frames at the end that the next window will share.
@@ -724,6 +733,10 @@ class WindowOverlap:
 
     def __call__(self, features: Float[Tensor, "seeds frames dim"]) -> Float[Tensor, "seeds frames dim"]:
         """The features of the next step, blended."""
+        # The map from features to clean motion is affine and the shares add up to one, so this is a blend of the two
+        # predictions of clean motion, at the width of the model. The first shared frame keeps the old window's
+        # predictions and its noise in every step, and so its motion; the network sees the shared frames as they are
+        # and continues them. No jump is left at the boundary that would have to be smoothed afterwards.
         if self.before is not None:
             features = crossfaded(self.before[len(self.features)], features)
         self.features.append(features[:, -self.kept :].clone())

@@ -44,7 +44,8 @@ def interpolate_frames(
     frames = int(frame_lengths.max())
     ratio = lengths.float() / frame_lengths.float()
     last = (lengths - 1)[:, None].float()
-    # PyTorch's own interpolation has one ratio for the whole batch, which padding would change.
+    # PyTorch's own interpolation has one ratio for the whole batch; here each clip has its own, so that its features do
+    # not depend on how far it is padded.
     position = (torch.arange(frames, device=features.device, dtype=torch.float32)[None, :] + 0.5) * ratio[:, None] - 0.5
     position = torch.minimum(position.clamp_min(0.0), last)
     low = position.floor()
@@ -170,6 +171,7 @@ class Attention(nn.Module):
     ) -> Float[Tensor, "batch frames dim"]:
         """The attention itself, and the map of its result."""
         key, value = context
+        # One mask for all heads and queries. None where possible, since masks rule out the quickest kernels.
         mask = None if context_mask is None else context_mask[:, None, None, :]
         dropout = self.dropout if self.training else 0.0
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask, dropout_p=dropout)

@@ -89,6 +89,7 @@ class _FusedLosses(torch.autograd.Function):
         for block, rows in enumerate(blocks.rows):
             part = weight[rows]
             prediction = frames @ part.T if bias is None else torch.addmm(bias[rows], frames, part.T)
+            # The prediction exists for one block at a time, and its memory becomes the gradient's.
             values, slope = blocks.losses(block, prediction.view(*features.shape[:2], -1))
             terms += values
             if slope is None:
@@ -102,6 +103,7 @@ class _FusedLosses(torch.autograd.Function):
             if of_bias is not None:
                 of_bias[rows] = slope.sum((0, 1))
         ctx.save_for_backward(None if of_frames is None else of_frames.view_as(features), of_weight, of_bias)
+        # Weighted in the wide type, and only then rounded to the weights' own.
         total = sum((factor * term for factor, term in zip(blocks.factors, terms, strict=True)), terms.new_zeros(()))
         terms = terms.to(weight.dtype)
         ctx.mark_non_differentiable(terms)

@@ -120,10 +120,12 @@ class SpiralDown(nn.Module):
 
     def forward(self, x: Float[Tensor, "frames vertices in_channels"]) -> Float[Tensor, "frames coarse out_channels"]:
         """Features of the next level's vertices."""
+        # The features along each vertex's spiral, one after the other: one gather for all, then one linear map.
         around = x.index_select(1, self.table.flatten()).view(len(x), len(self.table), -1)
         out = self.map(around)
         if self.rows is None or self.weights is None:
             return out
+        # A sparse matrix product by scattering: each vertex adds its share to the one coarse vertex of its group.
         shares = out * self.weights[:, None]
         return shares.new_zeros(len(x), self.sizes[1], out.shape[-1]).index_add(1, self.rows, shares)
 
@@ -230,6 +232,7 @@ class SpiralMeshEncoder(MeshEncoder):
                     f"mesh encoder: the mesh has spirals of the shape {tuple(tables[-1].shape)}; expected "
                     f"{tuple(step.table.shape)}: make the hierarchy with the encoder's mesh_options"
                 )
+        # Only now, when all shapes have been checked: an encoder is attached completely or not at all.
         for step, level, table in zip(self.steps, topology.levels, tables, strict=False):
             step.table.copy_(table)
             if step.rows is not None and step.weights is not None:

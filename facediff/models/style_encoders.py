@@ -77,6 +77,7 @@ class TcnGruTransformer(StyleEncoder):
             TemporalBlock(dim, d, kernel_size, causal=causal, dropout=dropout) for d in dilations
         )
         self.gru = nn.GRU(dim, dim // 2, batch_first=True, bidirectional=True)
+        # Small at the start, as usual for learnt positions, so that they do not drown the features.
         self.positions = nn.Parameter(torch.randn(n_positions, dim) * 0.02)
         self.layers = nn.ModuleList(EncoderLayer(dim, num_heads, dropout) for _ in range(num_layers))
         self.norm = nn.LayerNorm(dim)
@@ -129,6 +130,7 @@ class TemporalBlock(nn.Module):
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """``x`` (batch, frames, dim), ``mask`` (batch, frames, 1); padding is zero before each convolution."""
         hidden = x
+        # Padding is zeroed before each convolution, so that a clip's last frames see the same as at a batch's end.
         for conv in (self.first, self.second):
             columns = nn.functional.pad((hidden * mask).transpose(1, 2), self.padding)
             hidden = self.dropout(torch.relu(conv(columns).transpose(1, 2)))
@@ -165,6 +167,7 @@ class AttentionPooling(nn.Module):
         self, features: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch frames"]:
         """γ: sums to one over each clip's frames and is exactly zero on padding."""
+        # −∞ before the softmax gives padding a weight of exactly zero.
         score = self.score(torch.tanh(self.hidden(features))).squeeze(-1)
         return score.masked_fill(~mask, -torch.inf).softmax(-1)
 
