@@ -23,6 +23,7 @@ from facediff import registry
 from facediff.data import SpeechMotionDataModule, collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
+from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import sha256
 
 PICTURE_SIZE = 320
@@ -240,8 +241,6 @@ def highest_error(clips: list[ClipErrors]) -> float:
 def wandb_media(model: AnimationModel, clips: list[ClipErrors]) -> dict[tuple[str, str], list[Any]]:
     """``wandb.Audio`` and ``wandb.Image`` (or None) of every clip, by split and name."""
     import wandb
-
-    from facediff.data.audio import SAMPLE_RATE
 
     scale = f"mean error of each vertex, 0 to {highest_error(clips):.3g} {model.assets.unit}" if clips else ""
     return {

@@ -28,13 +28,14 @@ from torch import Tensor
 
 from facediff import registry
 from facediff.data import Sample, SpeechMotionDataModule, collate
-from facediff.data.audio import SAMPLE_RATE, fit_length, samples_for
+from facediff.data.audio import fit_length, samples_for
 from facediff.data.corpus import Clip
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.metrics import Region, SequenceMetric
 from facediff.metrics.base import align
 from facediff.models import AnimationModel
 from facediff.render import VIEWS, Renderer, comparison, contact_sheet, save_image, write_video
+from facediff.utils import SAMPLE_RATE
 
 Picture = npt.NDArray[np.uint8]
 

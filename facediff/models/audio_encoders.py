@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.data.audio import SAMPLE_RATE
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.models.layers import frame_mask, interpolate_frames
 from facediff.registry import audio_encoder

@@ -19,9 +19,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, collate
-from facediff.data.audio import SAMPLE_RATE, samples_for
+from facediff.data.audio import samples_for
 from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder
+from facediff.utils import SAMPLE_RATE
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps an iteration, e.g. in a progress bar."""
