@@ -23,6 +23,7 @@ ADDED = {
     ("decoder", "moving_average"),
     ("model", "AutoregressiveTransformer"),
     ("corpus", "ThreeSpeakers"),
+    ("metric", "lip_range"),
     ("export_format", "bounds"),
 }
 
@@ -92,12 +93,13 @@ def test_an_installed_model_trains_tests_animates_and_exports(site: Path, tiny_r
     printed = facediff(
         site,
         ["fit", *fit, *trainer],
-        ["test", "--ckpt_path", str(checkpoint), *trainer],
+        ["test", "--ckpt_path", str(checkpoint), "--model.metrics=[lip_range]", *trainer],
         # Twelve seconds: longer than what is animated in one pass.
         ["animate", str(speech), "--checkpoint", str(checkpoint), "--identity", "C", "-o", str(archive), "--quiet"],
         ["export", str(archive), "-o", str(boxes)],
     )
     assert "three_speakers" in printed
+    assert "metric lip_range: in each sequence" in printed
     hparams = torch.load(checkpoint, weights_only=True)["hyper_parameters"]
     assert hparams["_class_path"] == "facediff_example.model.AutoregressiveTransformer"
     assert (hparams["dim"], hparams["num_layers"], hparams["protocol"]) == (16, 1, "paper")
@@ -105,6 +107,10 @@ def test_an_installed_model_trains_tests_animates_and_exports(site: Path, tiny_r
     table = np.loadtxt(boxes)
     assert table.shape == (300, 6)
     assert (table[:, :3] < table[:, 3:]).any(1).all()
+
+
+def test_a_metric_of_its_own_needs_one_short_file() -> None:
+    assert len((PROJECT / "facediff_example" / "metric.py").read_text().splitlines()) <= 40
 
 
 def test_a_model_of_its_own_needs_little_more_than_network_and_loss() -> None:
