@@ -132,23 +132,15 @@ class Scorer:
         self.chosen = dict(metrics or {})
         self.inputs = inputs
         for name, chosen in self.chosen.items():
-            region = getattr(chosen, "pairs", None) or getattr(chosen, "region", None)
-            if region is not None:
+            over = chosen.over if isinstance(chosen, SequenceMetric) else None
+            if over is not None:
                 try:
-                    region.check(n_vertices)
+                    over.check(n_vertices)
                 except ValueError as error:
                     raise FaceDiffError(f"metric {name}: {error}") from error
-            # The scores of single sequences are known where the metric is a mean of them.
-            self.columns.append(
-                Column(
-                    METRICS,
-                    name,
-                    getattr(chosen, "pooling", "sequences"),
-                    getattr(chosen, "length_rule", "min"),
-                    name,
-                    region="all vertices" if region is None else region.as_dict(),
-                )
-            )
+            pooling, rule = getattr(chosen, "pooling", "sequences"), getattr(chosen, "length_rule", "min")
+            region = "all vertices" if over is None else over.as_dict()
+            self.columns.append(Column(METRICS, name, pooling, rule, name, region=region))
         self.needs_template |= any("template" in getattr(chosen, "needs", ()) for chosen in self.chosen.values())
 
     def _add(self, protocol: Protocol, name: str, metric: SequenceMetric) -> None:

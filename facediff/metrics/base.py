@@ -15,7 +15,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from facediff.errors import choices
-from facediff.metrics.regions import Region, RegionLike, as_region
+from facediff.metrics.regions import LipPairs, Region, RegionLike, as_region
 
 # Options: the words that distinguish one definition of a metric from another.
 
@@ -479,6 +479,11 @@ class SequenceMetric(ExactMetric):
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(5, dtype=torch.int64), dist_reduce_fx="sum")
 
+    @property
+    def over(self) -> Region | LipPairs | None:
+        """The vertices, or pairs of vertices, that the metric reads; None for all vertices."""
+        return self.region
+
     def clip_value(self, clip: Clip) -> Tensor:
         """The metric of one sequence, a float64 scalar; NaN only if it `leaves_out` the sequence."""
         raise NotImplementedError
@@ -489,8 +494,8 @@ class SequenceMetric(ExactMetric):
 
     def check_vertices(self, n_vertices: int) -> None:
         """Refuse motion of a mesh that the metric's region cannot belong to."""
-        if self.region is not None:
-            self.region.check(n_vertices)
+        if self.over is not None:
+            self.over.check(n_vertices)
 
     def update(
         self,

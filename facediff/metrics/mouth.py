@@ -27,7 +27,7 @@ from facediff.metrics.base import (
     functional,
 )
 from facediff.metrics.one_pass import frames_per_step, squared_norm
-from facediff.metrics.regions import LipPairsLike, RegionLike, as_lip_pairs, as_region
+from facediff.metrics.regions import LipPairs, LipPairsLike, RegionLike, as_lip_pairs, as_region
 from facediff.registry import metric
 
 
@@ -122,9 +122,10 @@ class OpeningMetric(SequenceMetric):
         self.pair_indices: Tensor
         self.register_buffer("pair_indices", named.tensor(), persistent=False)
 
-    def check_vertices(self, n_vertices: int) -> None:
-        """Refuse motion of a mesh that the pairs cannot belong to."""
-        self.pairs.check(n_vertices)
+    @property
+    def over(self) -> LipPairs:
+        """The pairs of vertices that the metric reads."""
+        return self.pairs
 
     def openings(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """The mouth's opening in each frame of prediction and truth, (frames,) float64 each."""

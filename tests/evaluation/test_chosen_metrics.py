@@ -1,0 +1,206 @@
+"""Metrics chosen by name for files: every registered one is computed, or refused with the reason."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+import facediff.metrics as fm
+from facediff import registry
+from facediff.data.phonemes import closures, read_phonemes
+from facediff.errors import FaceDiffError
+from facediff.evaluation import Report, text
+from facediff.metrics import LipPairs, parse
+from tests.evaluation.conftest import LENGTHS, LIPS, VERTICES, Files, write_corpus
+
+PAIRS = [(1, 2), (7, 11)]
+OF_A_MODEL = {
+    "sample_diversity",
+    "mean_estimate_error",
+    "coverage_error",
+    "style_retrieval_accuracy",
+    "real_time_factor",
+}
+PHONEMES = "start,end,ipa,viseme\n0.00,0.08,m,PP\n0.08,0.2,a,aa\n0.2,0.28,ˈb,PP\n"
+
+
+@pytest.fixture
+def corpus(tmp_path: Path) -> Files:
+    """A corpus with speech, phonemes, pairs of lip vertices and a frame rate; each clip predicted in two styles."""
+    files = write_corpus(tmp_path / "corpus")
+    rng = np.random.default_rng(3)
+    for folder in ("wav", "phonemes"):
+        (files.root / folder).mkdir()
+    for clip, frames in LENGTHS.items():
+        soundfile.write(files.root / "wav" / f"{clip}.wav", rng.uniform(-0.5, 0.5, 640 * frames), 16_000)
+        (files.root / "phonemes" / f"{clip}.csv").write_text(PHONEMES, encoding="utf-8")
+        other = "B_C" if clip.startswith("A") else "A"
+        motion = files.read(files.truth / f"{clip}.npy")
+        files.write(files.method() / f"{clip}_condition_{other}.npy", motion + 0.03 * rng.standard_normal(motion.shape))
+    (files.root / "regions" / "inner_lip_pairs.txt").write_text("1, 2\n7, 11\n")
+    (files.root / "manifest.json").write_text(json.dumps({"frame_rate": 25}))
+    return files
+
+
+def scored(files: Files, *metrics: str, **options: object) -> Report:
+    return files.evaluate(metrics=metrics, corpus=files.root, protocols=["meshtalk"], **options)
+
+
+def values(report: Report) -> dict[str, float]:
+    return {score.metric: score.value for score in report.methods[0].scores if score.protocol == "metrics"}
+
+
+def batches(files: Files) -> list[dict[str, Any]]:
+    """Prediction under the own identity, truth and template of each clip."""
+    found = []
+    for clip in sorted(LENGTHS):
+        identity = clip.rpartition("_")[0]
+        paths = files.method() / f"{clip}_condition_{identity}.npy", files.truth / f"{clip}.npy"
+        prediction, truth = (torch.from_numpy(files.read(path)) for path in paths)
+        found.append({"prediction": prediction, "truth": truth, "clip": clip, "identity": identity})
+    return found
+
+
+@pytest.mark.parametrize("name", registry.metric.names())
+def test_every_registered_metric_is_computed_or_refused_with_the_reason(corpus: Files, name: str) -> None:
+    if name in OF_A_MODEL:
+        with pytest.raises(FaceDiffError, match=rf"metric {name}: needs .*facediff test --model.metrics"):
+            scored(corpus, name)
+        return
+    report = scored(corpus, name, identity="all" if name == "identity_diversity" else "own", bootstrap=20)
+    (score,) = [score for score in report.methods[0].scores if score.protocol == "metrics"]
+    assert score.metric == name
+    assert np.isfinite(score.value)
+    assert 0 < score.sequences <= len(LENGTHS)
+    assert f"  {name}: " in report.protocols["metrics"]
+    printed = text(report)
+    assert "further metrics" in printed
+    assert f"\n{name} " in printed
+    data = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    assert data["methods"][0]["scores"][-1]["metric"] == name
+    if name != "clip_speech_lip_correlation":  # which has no value of a single clip
+        assert score.interval is None or score.interval.low <= score.value <= score.interval.high
+        assert f"metrics/{name}" in report.rows()[0]
+
+
+def test_scores_are_those_of_the_classes(corpus: Files) -> None:
+    pairs = LipPairs.from_pairs("inner_lip_pairs", PAIRS)
+    texts = ["lip_warping_distance", "mouth_opening_difference:pooling=sequences", "clip_speech_lip_correlation:of=gap"]
+    texts += ["bilabial_closure_rate:count=closures,of=truth", "lip_vertex_error:squared=false"]
+    found = values(scored(corpus, *texts))
+    rates = {"sample_rate": 16_000, "frames_per_second": 25.0}
+    expected: list[Any] = [
+        fm.LipWarpingDistance(LIPS),
+        fm.MouthOpeningDifference(pairs, pooling="sequences"),
+        fm.ClipSpeechLipCorrelation(LIPS, n_identities=2, of="gap", **rates),  # type: ignore[arg-type]
+        fm.BilabialClosureRate(pairs, count="closures", of="truth"),
+        fm.LipVertexError(LIPS, squared=False),
+    ]
+    for batch in batches(corpus):
+        clip, identity = batch.pop("clip"), batch.pop("identity")
+        waveform = torch.from_numpy(soundfile.read(corpus.root / "wav" / f"{clip}.wav", dtype="float32")[0])
+        spoken = closures(read_phonemes(corpus.root / "phonemes" / f"{clip}.csv"), 25)
+        batch |= {"waveform": waveform, "closures": spoken, "identities": ["A", "B_C"].index(identity)}
+        for metric in expected:
+            fm.feed(metric, batch)
+    for name, metric in zip(texts, expected, strict=True):
+        assert found[name] == pytest.approx(metric.compute().item(), rel=1e-12), name
+
+
+def test_workers_order_and_other_metrics_change_no_digit(corpus: Files) -> None:
+    texts = ["frame_speech_lip_correlation", "clip_speech_lip_correlation", "temporal_misalignment:at=path"]
+    one = values(scored(corpus, *texts, workers=1))
+    assert values(scored(corpus, *texts[::-1], workers=3)) == one
+    assert values(scored(corpus, texts[1])) == {texts[1]: one[texts[1]]}
+
+
+def test_clips_without_a_value_are_left_out(corpus: Files) -> None:
+    (corpus.root / "phonemes" / "A_e01.csv").unlink()
+    report = scored(corpus, "bilabial_closure_rate", bootstrap=30)
+    (score,) = [score for score in report.methods[0].scores if score.protocol == "metrics"]
+    assert score.sequences == len(LENGTHS) - 1
+    rows = {row["clip"]: row["metrics/bilabial_closure_rate"] for row in report.rows()}
+    assert rows["A_e01"] is None
+    assert all(value is not None for clip, value in rows.items() if clip != "A_e01")
+
+
+def test_methods_are_compared_by_them(corpus: Files) -> None:
+    report = scored(corpus, "lip_speed_correlation", "clip_speech_lip_correlation", bootstrap=30)
+    two = corpus.evaluate(
+        "ours", "theirs", metrics=["lip_speed_correlation"], corpus=corpus.root, protocols=["meshtalk"], bootstrap=30
+    )
+    assert values(report)["lip_speed_correlation"] == values(two)["lip_speed_correlation"]
+    (difference,) = [each for each in two.comparisons if each.metric == "lip_speed_correlation"]
+    theirs = [score.value for score in two.methods[1].scores if score.protocol == "metrics"]
+    assert difference.difference == pytest.approx(theirs[0] - values(two)["lip_speed_correlation"], abs=1e-12)
+    assert "theirs − ours: lip_speed_correlation" in text(two)
+
+
+@pytest.mark.parametrize(
+    ("metric", "missing", "names"),
+    [
+        ("mouth_opening_difference", "regions/inner_lip_pairs.txt", ["--lip-pairs"]),
+        ("bilabial_closure_rate", "phonemes", ["phonemes"]),
+        ("frame_speech_lip_correlation", "wav", ["wav"]),
+        ("frame_speech_lip_correlation", "manifest.json", ["--frame-rate"]),
+        ("identity_diversity", "", ["--identity all"]),
+        ("upper_face_vertex_error", "regions/fdd.txt", ["--upper-face"]),
+        ("face_dynamics_deviation", "", ["--templates"]),
+    ],
+)
+def test_what_is_missing_is_asked_for_by_name(corpus: Files, metric: str, missing: str, names: list[str]) -> None:
+    path = corpus.root / missing
+    if missing:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    options = {"upper_face": None} if metric == "upper_face_vertex_error" else {}
+    options |= {"templates": None} if metric == "face_dynamics_deviation" else {}
+    with pytest.raises(FaceDiffError) as error:
+        scored(corpus, metric, **options)
+    assert all(name in str(error.value) for name in [metric, *names])
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        ("lip_vertex_eror", ["lip_vertex_error"]),
+        ("lip_vertex_error:square=true", ["square", "squared"]),
+        ("lip_vertex_error:squared=maybe", ["squared", "maybe", "true or false"]),
+        ("lip_vertex_error:squared", ["squared=VALUE"]),
+        ("temporal_misalignment:smoothing=wide", ["smoothing", "wide", "number"]),
+        ("temporal_misalignment:at=paths", ["at", "path"]),
+        ("lip_vertex_error:length_rule=mix", ["length rule", "min"]),
+    ],
+)
+def test_wrong_words_are_refused_with_what_was_expected(corpus: Files, words: str, names: list[str]) -> None:
+    with pytest.raises(FaceDiffError) as error:
+        scored(corpus, words)
+    assert all(name in str(error.value) for name in names)
+
+
+def test_options_have_the_kind_of_their_defaults() -> None:
+    request = parse("sample_diversity: n_samples=4, pairing=all, region=lips")
+    assert (request.name, dict(request.options)) == (
+        "sample_diversity",
+        {"n_samples": 4, "pairing": "all", "region": "lips"},
+    )
+    assert parse("temporal_misalignment:frames_per_second=25").options == {"frames_per_second": 25.0}
+    assert parse("temporal_misalignment:frames_per_second=none").options == {"frames_per_second": None}
+
+
+def test_regions_are_options_too(corpus: Files) -> None:
+    found = values(scored(corpus, "identity_diversity", "identity_diversity:region=lips", identity="all"))
+    assert found["identity_diversity"] != found["identity_diversity:region=lips"]
+    with pytest.raises(FaceDiffError, match="upper_face"):
+        scored(corpus, "identity_diversity:region=uper_face", identity="all")
+
+
+def test_the_mesh_is_checked(corpus: Files) -> None:
+    with pytest.raises(FaceDiffError, match=rf"mouth_opening_difference: .*{VERTICES}"):
+        scored(corpus, "mouth_opening_difference", lip_pairs=LipPairs.from_pairs("far", [(0, 99)]))
