@@ -13,7 +13,7 @@ import soundfile
 
 from facediff.cli.app import run
 from facediff.data.check import check
-from facediff.data.check import findings as facts
+from facediff.data.check import shared as facts
 from facediff.errors import FaceDiffError
 from tests.data.check import small
 from tests.data.check.small import BIWI, MEAD, VOCASET, kinds, message, rows

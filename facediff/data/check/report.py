@@ -1,0 +1,290 @@
+"""The report of a check: its findings, as data and as text for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.tables import format_table
+
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+FEW = 3
+"""How many names of a list are printed."""
+LISTED = 4
+"""Findings of a kind that are printed one by one; of more, only the first is."""
+FORMAT = 1
+"""Goes up when a field of the JSON object changes its meaning; new fields do not count."""
+
+SPLIT_NAMES = {"test_a": "test A", "test_b": "test B", "none": "(style references only)"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One remark.
+
+    Attributes:
+        severity: ``error``: training or scores would fail or be wrong; ``warning``: it works, and something is lost;
+            ``note``: good to know.
+        kind: a word for remarks of this sort; stable, for programs.
+        where: the file or the field, relative to the corpus folder.
+        message: what is the matter, and what to do.
+    """
+
+    severity: Severity
+    kind: str
+    where: str
+    message: str
+
+
+class Findings(list[Finding]):
+    """A list of findings, in the order in which they were made."""
+
+    def error(self, kind: str, where: str, message: str) -> None:
+        """Add an error."""
+        self.append(Finding("error", kind, where, message))
+
+    def warning(self, kind: str, where: str, message: str) -> None:
+        """Add a warning."""
+        self.append(Finding("warning", kind, where, message))
+
+    def note(self, kind: str, where: str, message: str) -> None:
+        """Add a note."""
+        self.append(Finding("note", kind, where, message))
+
+    @contextmanager
+    def guard(self, kind: str, path: Path, root: Path) -> Iterator[None]:
+        """Turn whatever goes wrong with a file into an error: the folder is not trusted.
+
+        Args:
+            kind: the kind of the error.
+            path: the file that is read.
+            root: the corpus folder.
+
+        Raises:
+            MissingExtraError: unchanged, since that is not the folder's fault.
+        """
+        try:
+            yield
+        except MissingExtraError:
+            raise
+        except FaceDiffError as error:
+            self.error(kind, relative(path, root), str(error).removeprefix(f"{path}: ").removeprefix(f"{root}: "))
+        except Exception as error:  # a damaged file can fail anywhere in the library that reads it
+            message = f"cannot be read ({type(error).__name__}: {error}); get it again or remove it"
+            self.error(kind, relative(path, root), message)
+
+
+@dataclass
+class Report:
+    """What a folder is and what is wrong in it.
+
+    Attributes:
+        root: the folder.
+        quick: whether headers only were read.
+        corpus: name of the corpus; None if it was not recognised.
+        data_module: import path of the data module that reads it; None for a person's folder, or if unknown.
+        raw: name of the raw distribution that the folder holds instead of a corpus; None if it does not.
+        frame_rate: motion frames a second that models see; None if unknown, as the next two.
+        stored_frame_rate: motion frames a second on disk.
+        n_vertices: vertices of the topology.
+        findings: errors first, then warnings, then notes.
+        splits: one row a split: way, split, expected, present, missing, frames, seconds, missing_clips.
+        subjects: one row a subject: subject, trained_on, clips, frames, seconds, template.
+        templates: file, subjects, broken (subjects whose template cannot be used), blob (git blob id), origin (whose
+            file it is), areas.
+        mesh: the mesh file that is used; None if there is none.
+        regions: by name: source, count, hash, duplicates, circulating_count; None for one that cannot be used.
+        manifest: there, ended (whether preparation has ended), facediff (version that wrote it), changed, missing.
+    """
+
+    root: Path
+    quick: bool = False
+    corpus: str | None = None
+    data_module: str | None = None
+    raw: str | None = None
+    frame_rate: float | None = None
+    stored_frame_rate: float | None = None
+    n_vertices: int | None = None
+    findings: Findings = field(default_factory=Findings)
+    splits: list[dict[str, Any]] = field(default_factory=list)
+    subjects: list[dict[str, Any]] = field(default_factory=list)
+    templates: dict[str, Any] = field(default_factory=dict)
+    mesh: str | None = None
+    regions: dict[str, dict[str, Any] | None] = field(default_factory=dict)
+    manifest: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def sound(self) -> bool:
+        """Whether there is no error; warnings are allowed."""
+        return not any(finding.severity == "error" for finding in self.findings)
+
+    def sort(self) -> None:
+        """Put errors first, then warnings, then notes; within these, the order stays."""
+        self.findings.sort(key=lambda finding: SEVERITIES.index(finding.severity))
+
+    def state(self) -> dict[str, Any]:
+        """The report as plain data, ready for JSON; the fields are those above with ``format`` and ``sound``."""
+        self.sort()
+        return {"format": FORMAT, "sound": self.sound, **asdict(self), "root": str(self.root)}
+
+
+# The words of findings.
+
+
+def relative(path: Path, root: Path) -> str:
+    """A path as findings show it: relative to the corpus folder if it lies there."""
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+
+
+def few(names: Iterable[object]) -> str:
+    """The first few names of a list, and how many more there are."""
+    words = [str(name) for name in names]
+    more = f" and {number(len(words) - FEW)} more" if len(words) > FEW else ""
+    return ", ".join(words[:FEW]) + more
+
+
+def number(value: int) -> str:
+    """A whole number with spaces between thousands.
+
+    >>> number(23370)
+    '23 370'
+    """
+    return f"{value:,}".replace(",", " ")
+
+
+def counted(value: int, one: str, many: str | None = None) -> str:
+    """A number and its noun.
+
+    >>> counted(1, "clip"), counted(3879, "frame"), counted(2, "vertex", "vertices")
+    ('1 clip', '3 879 frames', '2 vertices')
+    """
+    return f"{number(value)} {one if value == 1 else many or one + 's'}"
+
+
+# The report as text.
+
+
+def text(report: Report) -> str:
+    """The report as text for a terminal; characters that could control it are escaped."""
+    blocks = [_heading(report)]
+    if report.splits:
+        blocks.append(_splits(report))
+    if report.subjects:
+        blocks.append(_subjects(report))
+    if report.corpus is not None:
+        blocks.append(_shared_files(report))
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for finding in report.findings:
+        groups.setdefault((finding.severity, finding.kind), []).append(finding)
+    if groups:
+        blocks.append("\n".join(line for group in groups.values() for line in _remark(group)))
+    blocks.append(_verdict(report))
+    return "\n".join(printable(line) for line in "\n\n".join(blocks).split("\n"))
+
+
+def printable(line: str) -> str:
+    r"""A line in which characters that do not print are escaped: names of files may hold anything.
+
+    >>> printable("a\x1b[2Jb")
+    'a\\x1b[2Jb'
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+
+
+def _heading(report: Report) -> str:
+    if report.corpus is None:
+        return f"{report.root}: {f'raw distribution of {report.raw}' if report.raw else 'not recognised'}"
+    module = f", data module {report.data_module}" if report.data_module else ""
+    rate = f"{report.frame_rate:g} frames a second"
+    if report.stored_frame_rate != report.frame_rate:
+        rate += f" ({report.stored_frame_rate:g} on disk)"
+    read = "headers only" if report.quick else "all files"
+    return f"{report.root}: {report.corpus}{module}\n{number(report.n_vertices or 0)} vertices, {rate}; {read} read"
+
+
+def _splits(report: Report) -> str:
+    ways = ["way"] if any(row["way"] is not None for row in report.splits) else []
+    counts = ["expected", "present", "missing", "frames", "seconds"]
+    rows = [
+        [
+            *(printable(row[way] or "") for way in ways),
+            printable(SPLIT_NAMES.get(row["split"], row["split"])),
+            *(_figure(row[key]) for key in counts),
+        ]
+        for row in report.splits
+    ]
+    return format_table([*ways, "split", *counts], rows, left=1 + len(ways))
+
+
+def _subjects(report: Report) -> str:
+    rows = [
+        [
+            printable(row["subject"]),
+            *(_figure(row[key]) for key in ("clips", "frames", "seconds")),
+            "yes" if row["template"] else "no",
+            "yes" if row["trained_on"] else "no",
+        ]
+        for row in report.subjects
+    ]
+    return format_table(["subject", "clips", "frames", "seconds", "template", "trained on"], rows)
+
+
+def _shared_files(report: Report) -> str:
+    rows = [["templates", _templates(report.templates)], ["mesh", report.mesh or "none"]]
+    for name, region in report.regions.items():
+        words = "none that can be used"
+        if region is not None:
+            words = f"{region['source']}, {counted(region['count'], 'vertex', 'vertices')}, hash {region['hash']}"
+            if region["count"] == region["circulating_count"]:
+                words += ", as many as the list that circulates has"
+        rows.append([name.replace("_", " "), words])
+    rows.append(["manifest", _manifest(report.manifest)])
+    return format_table([], [[printable(cell) for cell in row] for row in rows], left=2)
+
+
+def _templates(templates: Mapping[str, Any]) -> str:
+    if not templates["file"]:
+        return "none that can be read"
+    words = f"templates.pkl, {counted(len(templates['subjects']), 'subject')}, git blob {str(templates['blob'])[:8]}"
+    words += f" ({templates['origin']})" if templates["origin"] else ""
+    areas = list((templates["areas"] or {}).values())
+    return words + (f", surface areas {min(areas):.6g} to {max(areas):.6g}" if areas else "")
+
+
+def _manifest(manifest: Mapping[str, Any]) -> str:
+    if not manifest["there"]:
+        return "none: not made by `facediff data prepare`"
+    writer = f"written by facediff {manifest['facediff']}" if manifest["facediff"] else "there"
+    wrong = [f"{number(len(manifest[key]))} {key}" for key in ("changed", "missing") if manifest[key]]
+    return f"{writer}; files {' and '.join(wrong) if wrong else 'as recorded'}"
+
+
+def _remark(group: Sequence[Finding]) -> list[str]:
+    """Findings of one kind: each of them if they are few, else the first and where the others are."""
+    first = group[0]
+    label = first.severity.upper() if first.severity != "note" else "note"
+    if len(group) <= LISTED:
+        return [f"{label:<8} {finding.where}: {finding.message}" for finding in group]
+    return [
+        f"{label:<8} {number(len(group))} times {first.kind}, the first: {first.where}: {first.message}",
+        f"{'':<8} also {few(finding.where for finding in group[1:])}",
+    ]
+
+
+def _verdict(report: Report) -> str:
+    counts = {s: sum(finding.severity == s for finding in report.findings) for s in ("error", "warning")}
+    words = ", ".join(counted(count, severity) for severity, count in counts.items() if count)
+    if report.sound and not words:
+        return "sound: nothing is wrong with this copy"
+    return f"{'sound' if report.sound else 'not sound'}{f': {words}' if words else ''}"
+
+
+def _figure(value: float | None) -> str | None:
+    if value is None:
+        return None
+    return f"{value:.1f}" if isinstance(value, float) else number(value)

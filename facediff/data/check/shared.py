@@ -1,0 +1,282 @@
+"""Checking what the clips of a folder share: manifest, templates, mesh and regions."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.check.clip import Array
+from facediff.data.check.layouts import MANIFEST, STATE, View
+from facediff.data.check.report import Findings, counted, few, number, relative
+from facediff.errors import FaceDiffError
+from facediff.mesh.mesh import surface_area
+from facediff.utils.files import sha256
+from facediff.utils.pickles import load_pickle
+
+if TYPE_CHECKING:
+    from facediff.data.corpus import Corpus
+
+TEMPLATES = {
+    "biwi": {"606284c0": "FaceFormer and TalkingStyle", "d436309f": "FaceDiffuser and DiffSpeaker"},
+    "vocaset": {"2fc95570": "TalkingStyle and DiffSpeaker"},
+}
+"""``templates.pkl`` in the repositories of which projects, by the beginning of the file's git blob id."""
+
+UNIT_AREA = {"biwi"}
+"""Corpora whose circulating templates have a surface area of one."""
+AREA_TOLERANCE = 1e-3
+"""How far a surface area may be from one; float32 templates are within 1e-6."""
+
+FLAME_REGIONS = {
+    "regions/lve.txt": 428,
+    "regions/fdd.txt": 1501,
+    "FLAME_masks.pkl:lips": 250,
+    "regions/FLAME_masks.pkl:lips": 250,
+    "FLAME_masks.pkl:forehead+eye_region": 827,
+    "regions/FLAME_masks.pkl:forehead+eye_region": 827,
+    "regions/lip.txt": 648,
+}
+REGIONS = {
+    "biwi": {"regions/lve.txt": 4996, "regions/lip.txt": 4996, "BIWI_lip.pkl": 4996, "regions/fdd.txt": 7784},
+    "vocaset": FLAME_REGIONS,
+    "mead3d": FLAME_REGIONS,
+}
+"""Number of distinct vertices in the lists that circulate."""
+
+
+# What ``facediff data prepare`` has recorded, and whether the files are still those.
+
+
+def check_ended(root: Path, corpus: str | None, findings: Findings) -> bool:
+    """Whether preparation has ended, where it was begun at all."""
+    if not (root / STATE).exists():
+        return True
+    message = (
+        f"preparation of this folder has not ended: run the same `facediff data prepare {corpus or 'CORPUS'} RAW "
+        f"{root}` again (it continues where it stopped), or wait if it is running"
+    )
+    findings.error("unfinished", STATE, message)
+    return False
+
+
+def check_files(
+    root: Path, manifest: Mapping[str, Any], hashes: Mapping[str, str], findings: Findings, *, quick: bool
+) -> dict[str, list[str]]:
+    """Compare the files with their sizes (``quick``), or their SHA-256, in ``manifest.json``.
+
+    Args:
+        root: the corpus folder.
+        manifest: the content of ``manifest.json``.
+        hashes: SHA-256 of the files that were read already.
+        findings: what is wrong is added here.
+        quick: compare sizes only.
+
+    Returns:
+        the names of the files that are not as recorded: ``changed`` and ``missing``.
+    """
+    files = manifest.get("files")
+    found: dict[str, list[str]] = {"changed": [], "missing": []}
+    for name, recorded in files.items() if isinstance(files, dict) else ():
+        path = root / name
+        if not isinstance(recorded, dict) or not _is_below(root, path):
+            message = f'"{name}" is no entry of a file below the folder; prepare the folder again'
+            findings.error("manifest_entry", MANIFEST, message)
+            continue
+        with findings.guard("file_unreadable", path, root):
+            if not path.is_file():
+                found["missing"].append(name)
+                message = "is in manifest.json but not there; prepare the folder again"
+                findings.error("file_missing", name, message)
+            elif path.stat().st_size != recorded.get("bytes") or not (
+                quick or (hashes.get(name) or sha256(path)) == recorded.get("sha256")
+            ):
+                found["changed"].append(name)
+                message = "is not what was written (manifest.json): changed since, or damaged; prepare the folder again"
+                findings.error("file_changed", name, message)
+    return found
+
+
+def _is_below(root: Path, path: Path) -> bool:
+    """Whether a name from the manifest stays in the folder: an untrusted manifest must not have other files opened."""
+    try:
+        return path.resolve().is_relative_to(root.resolve())
+    except (OSError, ValueError, RuntimeError):
+        return False
+
+
+def check_account(manifest: Mapping[str, Any], findings: Findings) -> None:
+    """Repeat what preparation itself has reported: clips that failed, and what the raw folder lacked."""
+    failed, missing = manifest.get("failed"), manifest.get("missing")
+    if isinstance(failed, dict) and failed:
+        name, reason = next(iter(failed.items()))
+        message = f"{counted(len(failed), 'clip')} could not be prepared, the first: {name}: {reason}"
+        findings.warning("prepare_failed", MANIFEST, message)
+    if isinstance(missing, dict) and missing:
+        message = f"the raw folder was not complete: {few(missing)}; the reasons are in {MANIFEST}"
+        findings.note("prepare_missing", MANIFEST, message)
+
+
+# Templates, the neutral faces.
+
+
+def check_templates(root: Path, view: View, findings: Findings) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Check ``templates.pkl``.
+
+    Args:
+        root: the corpus folder.
+        view: the corpus.
+        findings: what is wrong is added here.
+
+    Returns:
+        the usable templates (V, 3) by subject, float32, and the report's section.
+    """
+    from facediff.data.corpus import as_template
+
+    path = root / "templates.pkl"
+    section: dict[str, Any] = {"file": None, "subjects": [], "broken": [], "blob": None, "origin": None, "areas": None}
+    templates: dict[str, Array] = {}
+    with findings.guard("templates_unreadable", path, root):
+        loaded = load_pickle(path)
+        if not isinstance(loaded, dict):
+            raise FaceDiffError(f"expected a dict from subject to (V, 3) array, got {type(loaded).__name__}")
+        section["file"] = path.name
+        for subject, value in loaded.items():
+            try:
+                templates[str(subject)] = as_template(value, view.n_vertices)
+            except ValueError as error:
+                section["broken"].append(str(subject))
+                where = f"templates.pkl:{subject}"
+                findings.error("template_broken", where, f"{error}; get templates.pkl again")
+        section["subjects"] = sorted(templates)
+        content = path.read_bytes()
+        # Git's name for the file's content, by which a file in a repository can be found.
+        section["blob"] = hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
+        section["origin"] = _origin(view, section["blob"], findings)
+    return templates, section
+
+
+def _origin(view: View, blob: str, findings: Findings) -> str | None:
+    """Whose templates these are; None for corpora of which nothing circulates."""
+    circulating = TEMPLATES.get(view.corpus)
+    if circulating is None:
+        return None
+    origin = next((who for start, who in circulating.items() if blob.startswith(start)), "own")
+    if len(circulating) > 1:
+        others = ", ".join(f"{who} ({start})" for start, who in circulating.items() if who != origin)
+        whose = "none of the files that circulate" if origin == "own" else f"the templates of {origin}"
+        message = (
+            f"{whose} (git blob {blob[:8]}); a checkpoint needs the templates that it was trained with, and there are "
+            f"others: {others}"
+        )
+        findings.note("templates_origin", "templates.pkl", message)
+    return origin
+
+
+def check_areas(
+    view: View, unit: object, templates: dict[str, Array], faces: npt.NDArray[np.int32], findings: Findings
+) -> dict[str, float] | None:
+    """Surface area of every template, which must be one in a corpus whose unit is defined by it.
+
+    Args:
+        view: the corpus.
+        unit: unit of length in ``manifest.json``, if it has one.
+        templates: neutral faces (V, 3) by subject.
+        faces: triangles (F, 3).
+        findings: what is wrong is added here.
+
+    Returns:
+        the areas; None for a corpus for which they mean nothing.
+    """
+    if view.corpus not in UNIT_AREA or not templates:
+        return None
+    areas = {subject: surface_area(template, faces) for subject, template in sorted(templates.items())}
+    other = {subject: area for subject, area in areas.items() if abs(area - 1) > AREA_TOLERANCE}
+    if other and (not isinstance(unit, str) or unit.startswith("normalised")):
+        message = (
+            f"the surface area is not 1 ({few(f'{subject} {area:.4g}' for subject, area in other.items())}): not "
+            f"CodeTalker's normalisation, so scores are not comparable with published ones; prepare the folder again "
+            f"from the raw files unless this is intended"
+        )
+        findings.warning("template_area", "templates.pkl", message)
+    return areas
+
+
+# Mesh and regions.
+
+
+def check_mesh(root: Path, view: View, findings: Findings) -> tuple[npt.NDArray[np.int32] | None, str | None]:
+    """Check the mesh file.
+
+    Returns:
+        its faces (F, 3), None if they cannot be used; and its path relative to the folder, None if there is none.
+    """
+    from facediff.mesh import read_mesh
+
+    places = [folder / file for file in view.mesh_files for folder in (root, root / "templates")]
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        if places:
+            looked = " or ".join(relative(place, root) for place in places)
+            message = f"no mesh file (looked for {looked}): without faces no picture can be drawn; put one there"
+            findings.warning("mesh_missing", view.mesh_files[0], message)
+        return None, None
+    faces: npt.NDArray[np.int32] | None = None
+    with findings.guard("mesh_broken", path, root):
+        mesh = read_mesh(path)
+        if len(mesh.vertices) != view.n_vertices:
+            raise FaceDiffError(
+                f"has {number(len(mesh.vertices))} vertices, expected {number(view.n_vertices)}; put the corpus's own "
+                f"mesh there"
+            )
+        if mesh.faces.min() < 0 or mesh.faces.max() >= view.n_vertices:
+            raise FaceDiffError(f"has faces of vertices beyond {view.n_vertices - 1}; get it again")
+        faces = mesh.faces
+    return faces, relative(path, root)
+
+
+def check_regions(root: Path, view: View, findings: Findings) -> dict[str, dict[str, Any] | None]:
+    """Check which vertices the regions are, region by region; None for one that cannot be used."""
+    return {name: _check_region(root, view, name, sources, findings) for name, sources in view.region_sources.items()}
+
+
+def _check_region(
+    root: Path, view: View, name: str, sources: Sequence[str], findings: Findings
+) -> dict[str, Any] | None:
+    from facediff.data.corpus import find_region
+
+    # The first source whose file is there is used, as in training.
+    source = next((source for source in sources if (root / source.partition(":")[0]).is_file()), None)
+    path = root / (sources[0] if source is None else source).partition(":")[0]
+    section: dict[str, Any] | None = None
+    with findings.guard("region_missing" if source is None else "region_broken", path, root):
+        region = find_region(root, sources, name, view.n_vertices, view.region_help)
+        if region.duplicates:
+            message = f"{counted(region.duplicates, 'index', 'indices')} of {name} repeated; counted once"
+            findings.note("region_repeats", str(source), message)
+        usual = REGIONS.get(view.corpus, {}).get(str(source))
+        if usual is not None and usual != region.count:
+            message = (
+                f"{name} has {counted(region.count, 'vertex', 'vertices')}, the list that circulates under this name "
+                f"has {number(usual)}: scores over it differ from published ones"
+            )
+            findings.note("region_unusual", str(source), message)
+        section = {
+            "source": source,
+            "count": region.count,
+            "hash": region.hash,
+            "duplicates": region.duplicates,
+            "circulating_count": usual,
+        }
+    return section
+
+
+def check_pairs(opened: Corpus, findings: Findings) -> None:
+    """Check the pairs of vertices on the inner lips, where a corpus has them."""
+    path = opened.root / "regions" / "inner_lip_pairs.txt"
+    with findings.guard("region_broken", path, opened.root):
+        opened.read_pairs(path.name)
