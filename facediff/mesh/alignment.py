@@ -1,4 +1,4 @@
-"""Laying one set of points onto another: least squares, and a robust fit that part of the points may disagree with."""
+"""Alignment of one set of points with another: by least squares, robustly, and frame by frame over a sequence."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 TUKEY = 4.685
 """Residuals beyond this many scales have no weight (Holland and Welsch, 1977: 95 % efficient for normal residuals)."""
 MEDIAN_TO_SCALE = 1.5382
 """Median length of a 3-D normal vector of unit standard deviation (the Maxwell distribution's median)."""
 TRIALS = 64
-"""Random triples for the robust start: with 42 % outliers, all triples hold one once in ten million times."""
+"""Random triples for the robust start: with 42 % outliers, every triple holds one only once in ten million times."""
 JUDGES = 256
-"""Points that judge the trials."""
+"""Points by which the triples' fits are compared."""
 ITERATIONS = 60
 TOLERANCE = 1e-9
 DEGENERATE = 1e-12
@@ -45,9 +46,8 @@ class Similarity:
         return moved
 
     def inverse(self) -> Similarity:
-        """The way back."""
-        turned = self.rotation.T
-        return Similarity(turned, -(turned @ self.translation) / self.scale, 1.0 / self.scale)
+        """The map from the target to the source."""
+        return Similarity(self.rotation.T, -(self.rotation.T @ self.translation) / self.scale, 1.0 / self.scale)
 
     def then(self, other: Similarity) -> Similarity:
         """This map followed by another one."""
@@ -76,9 +76,16 @@ def align(
     Raises:
         FaceDiffError: if shapes differ, a value is not finite, or the points do not determine a rotation: fewer than
             three with weight, all in one place or all on a line.
+
+    Example:
+        >>> points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0.0]])
+        >>> found = align(points, 3 * points + 1, scale=True)
+        >>> round(found.scale, 6), found.translation.round(6)
+        (3.0, array([1., 1., 1.]))
     """
     source, target, weights = _checked(source, target, weights)
-    return _similarity(*_fit(source[None], target, weights[None], scale))
+    rotation, translation, factor = _fit(source[None], target, weights[None], scale)
+    return Similarity(rotation[0], translation[0], float(factor[0]))
 
 
 def robust_align(
@@ -91,29 +98,30 @@ def robust_align(
     """The map from source to target that most points agree on; up to some 40 % of them may have moved.
 
     An MM-estimate: it starts from the triple of points whose fit has the least median residual (Rousseeuw, "Least
-    median of squares regression", JASA 1984), since a least-squares start is drawn along by a jaw that moves as one,
-    and goes on by iteratively re-weighted least squares with Tukey's biweight, whose scale is the median residual.
-    The triples are drawn with a fixed seed: equal input gives equal output.
+    median of squares regression", JASA 1984), since a least-squares start follows a jaw that moves as one, and
+    continues by iteratively re-weighted least squares with Tukey's biweight, whose scale is the median residual. The
+    triples are chosen with a fixed seed: equal input gives equal output.
 
     Args:
         source: points to move (N, 3).
         target: where they should come to lie (N, 3).
-        weights: (N,), none negative, which multiply the robust ones; points of weight 0 are left out. Alike if None.
+        weights: (N,), none negative, which multiply the robust ones; points of weight 0 are ignored. Alike if None.
         scale: whether to fit the scale; 1 otherwise.
 
     Raises:
         FaceDiffError: as :func:`align`.
     """
     source, target, weights = _checked(source, target, weights)
-    return _similarity(*robust_fit(source[None], target, weights, scale=scale))
+    rotation, translation, factor = robust_fit(source[None], target, weights, scale=scale)
+    return Similarity(rotation[0], translation[0], float(factor[0]))
 
 
 def robust_fit(
     source: Array, target: Array, weights: Array | None = None, *, scale: bool = False, near: bool = False
 ) -> tuple[Array, Array, Array]:
-    """:func:`robust_align` of many sources (B, N, 3) to one target (N, 3) at a time; inputs are not checked.
+    """:func:`robust_align` of many sources (B, N, 3) to one target (N, 3) in one pass; inputs are not checked.
 
-    With ``near``, the sources lie on the target but for little, and the search for a start is left out.
+    With ``near``, the sources are nearly aligned already, and the search for a start is skipped.
 
     Returns:
         rotations (B, 3, 3), translations (B, 3) and scales (B,).
@@ -124,7 +132,8 @@ def robust_fit(
         source, target, base = source[:, used], target[used], base[used]
     size = face_size(target)
     if near:
-        rotation, translation, factor = _unmoved(len(source))
+        count = len(source)
+        rotation, translation, factor = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.ones(count)
     else:
         rotation, translation, factor = _start(source, target, base, scale)
     for _ in range(ITERATIONS):
@@ -133,10 +142,9 @@ def robust_fit(
         spread = np.maximum(np.median(residual, axis=-1, keepdims=True) / MEDIAN_TO_SCALE, DEGENERATE * size)
         robust = np.square(np.clip(1.0 - np.square(residual / (TUKEY * spread)), 0.0, None))
         rotation, translation, factor = _fit(source, target, base * robust, scale)
-        moved = max(
-            np.abs(rotation - before[0]).max(), np.abs(translation - before[1]).max() / max(size, DEGENERATE)
-        )  # the scale cannot change without moving what lies off the origin
-        if moved < TOLERANCE:
+        # The scale is not compared: where points lie off the origin, it cannot change without the translation.
+        shift = np.abs(translation - before[1]).max() / max(size, DEGENERATE)
+        if max(np.abs(rotation - before[0]).max(), shift) < TOLERANCE:
             break
     return rotation, translation, factor
 
@@ -145,10 +153,6 @@ def face_size(vertices: npt.NDArray[np.floating]) -> float:
     """Size of a set of points (N, 3): their root-mean-square distance from their mean."""
     centred = np.asarray(vertices, np.float64) - np.mean(vertices, axis=0, dtype=np.float64)
     return float(np.sqrt(np.square(centred).sum(axis=-1).mean()))
-
-
-def _unmoved(count: int) -> tuple[Array, Array, Array]:
-    return np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.ones(count)
 
 
 def _start(source: Array, target: Array, base: Array, scale: bool) -> tuple[Array, Array, Array]:
@@ -198,15 +202,11 @@ def _fit(
 
 
 def _residuals(source: Array, target: Array, rotation: Array, translation: Array, factor: Array) -> Array:
-    """Distances (B, N) that are left."""
+    """Distances (B, N) between moved points and their targets."""
     left = source @ (factor[:, None, None] * rotation).swapaxes(1, 2)
     left += translation[:, None]
     left -= target
     return np.sqrt(np.einsum("bni,bni->bn", left, left))
-
-
-def _similarity(rotation: Array, translation: Array, factor: Array) -> Similarity:
-    return Similarity(rotation[0], translation[0], float(factor[0]))
 
 
 def _checked(
@@ -224,18 +224,16 @@ def _checked(
             f"alignment: weights have shape {used.shape} for {len(points)} points; expected one each, none negative"
         )
     if not (np.isfinite(points).all() and np.isfinite(goal).all() and np.isfinite(used).all()):
-        raise FaceDiffError("alignment: a point or a weight is NaN or infinite; leave it out")
+        raise FaceDiffError("alignment: a point or a weight is NaN or infinite; remove it")
     if np.count_nonzero(used) < 3:
         raise FaceDiffError("alignment: fewer than three points have weight; expected three that are not on a line")
     return points, goal, used
 
 
-# Taking the head's rigid motion out of a sequence of faces, for sequences too large to be held in memory twice.
-
-Indices = npt.NDArray[np.int64]
+# Removing the head's rigid motion from a sequence of faces that may be too large to be held in memory twice.
 
 CHUNK_BYTES = 32 * 2**20
-"""Size of the frames that are worked on at a time, as float64; the work needs a few times as much."""
+"""Size of the frames that are processed at a time, as float64; processing needs a few times as much."""
 SAMPLE = 64
 """Frames, evenly spread, from which a sequence's median face and its stable vertices are found."""
 STILLEST = 0.3
@@ -244,17 +242,17 @@ ROUNDS = 10
 AGREED = 0.98
 """Share of the stable vertices that two rounds must have in common to end the search."""
 ANCHORS = 2000
-"""As many vertices, evenly spread over the list, are enough to lay sampled frames onto one another."""
+"""As many vertices, evenly spread over the list, are enough to align sampled frames with one another."""
 
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """What :func:`remove_rigid_motion` found.
+    """Result of :func:`remove_rigid_motion`.
 
     Attributes:
-        frames: (T, V, 3) the frames laid onto the target.
+        frames: (T, V, 3) the frames aligned with the target.
         rotations: (T, 3, 3) from a frame to the target.
-        translations: (T, 3); frame t comes to lie at ``frames[t] @ rotations[t].T + translations[t]``.
+        translations: (T, 3); frame t is moved to ``frames[t] @ rotations[t].T + translations[t]``.
         residuals: (T,) root-mean-square distance of the stable vertices from the target that is left.
     """
 
@@ -272,16 +270,16 @@ def remove_rigid_motion(
     out: npt.NDArray[np.floating] | None = None,
     chunk_bytes: int = CHUNK_BYTES,
 ) -> RigidMotion:
-    """Lay every frame onto the target by rotation and translation, each by a robust fit of the stable vertices.
+    """Align every frame with the target by rotation and translation, each by a robust fit of the stable vertices.
 
-    Works chunk by chunk: ``frames`` and ``out`` may be memory-mapped and never lie in memory as a whole.
+    Works chunk by chunk: ``frames`` and ``out`` may be memory-mapped and are never in memory as a whole.
 
     Args:
         frames: (T, V, 3) vertices.
-        target: (V, 3) the face to lay them onto.
-        stable: indices of the vertices that the fit looks at; all if None.
+        target: (V, 3) the face to align them with.
+        stable: indices of the vertices that the fit uses; all if None.
         out: where to write the result, shape (T, V, 3); may be ``frames`` itself. A new array if None.
-        chunk_bytes: how much to take into memory at a time.
+        chunk_bytes: how much to read into memory at a time.
 
     Raises:
         FaceDiffError: if shapes differ, a frame holds NaN, or the stable vertices do not determine a rotation.
@@ -297,11 +295,8 @@ def remove_rigid_motion(
         raise FaceDiffError(f"rigid motion: out has shape {out.shape}, expected that of the frames, {frames.shape}")
     every = np.arange(len(target)) if stable is None else np.asarray(stable)
     goal = np.asarray(target, np.float64)[every]
-    rotations, translations, residuals = (
-        np.empty((len(frames), 3, 3)),
-        np.empty((len(frames), 3)),
-        np.empty(len(frames)),
-    )
+    count = len(frames)
+    rotations, translations, residuals = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty(count)
     for part, chunk in chunks(frames, chunk_bytes):
         rotation, translation, _ = robust_fit(chunk[:, every], goal)
         chunk = chunk @ rotation.swapaxes(1, 2)
@@ -315,26 +310,26 @@ def remove_rigid_motion(
 def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST, sample: int = SAMPLE) -> Indices:
     """The vertices that move least against one another: skull, forehead, bridge of the nose.
 
-    Frames evenly spread over the sequence are laid onto their median by a robust fit of all vertices; the stillest
-    ones are taken, the frames laid anew onto their median by these only, and so on until the choice hardly changes.
+    Frames evenly spread over the sequence are aligned with their median by a robust fit of all vertices; the stillest
+    vertices are chosen, the frames are aligned again by these only, and so on until the choice hardly changes.
 
     Args:
         frames: (T, V, 3) vertices, with or without the head's motion; may be memory-mapped.
-        share: how many of the vertices to take, 0 to 1; at least 10 are taken.
-        sample: how many frames to look at.
+        share: how many of the vertices to choose, 0 to 1; at least 10 are chosen.
+        sample: how many frames to use.
 
     Returns:
         Sorted vertex indices.
 
     Raises:
-        FaceDiffError: if a frame that was looked at holds NaN, or its vertices do not determine a rotation.
+        FaceDiffError: if a frame that was used holds NaN, or its vertices do not determine a rotation.
     """
     some = _sample(frames, sample)
     count = min(some.shape[1], max(10, round(share * some.shape[1])))
     stable = np.arange(some.shape[1])
     for _ in range(ROUNDS):
-        laid, median = _laid_onto_median(some, stable)
-        restlessness = np.square(laid - median).sum(axis=-1).mean(axis=0)
+        aligned, median = _aligned_with_median(some, stable)
+        restlessness = np.square(aligned - median).sum(axis=-1).mean(axis=0)
         before, stable = stable, np.sort(np.argsort(restlessness, kind="stable")[:count])
         if len(np.intersect1d(stable, before)) >= AGREED * len(before):
             break
@@ -342,25 +337,25 @@ def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST
 
 
 def median_face(frames: npt.NDArray[np.floating], stable: Indices | None = None, *, sample: int = SAMPLE) -> Array:
-    """The median over frames of every vertex (V, 3), once the head's rigid motion is out; centred at the origin.
+    """The median over frames of every vertex (V, 3), without the head's rigid motion; centred at the origin.
 
-    It has the pose of the frame in the middle, and takes the part of a template where there is none.
+    It has the pose of the frame in the middle, and serves as a template where there is none.
 
     Args:
         frames: (T, V, 3) vertices; may be memory-mapped.
-        stable: vertices that tell the head's motion; all, by a robust fit, if None.
-        sample: how many frames to look at.
+        stable: vertices that determine the head's motion; all, by a robust fit, if None.
+        sample: how many frames to use.
 
     Raises:
         FaceDiffError: as :func:`stable_vertices`.
     """
     some = _sample(frames, sample)
-    _, median = _laid_onto_median(some, np.arange(some.shape[1]) if stable is None else np.asarray(stable))
+    _, median = _aligned_with_median(some, np.arange(some.shape[1]) if stable is None else np.asarray(stable))
     return median - median.mean(axis=0)
 
 
 def chunks(frames: npt.NDArray[np.floating], chunk_bytes: int = CHUNK_BYTES) -> Iterator[tuple[slice, Array]]:
-    """Consecutive pieces of (T, V, 3) as float64 copies, with where they stand.
+    """Consecutive pieces of (T, V, 3) as float64 copies, each with its slice of frames.
 
     Raises:
         FaceDiffError: naming the frame, if one holds NaN or infinity.
@@ -368,33 +363,32 @@ def chunks(frames: npt.NDArray[np.floating], chunk_bytes: int = CHUNK_BYTES) -> 
     step = max(1, chunk_bytes // (24 * frames.shape[1]))
     for first in range(0, len(frames), step):
         chunk = np.array(frames[first : first + step], np.float64)
-        finite = np.isfinite(chunk).all(axis=(1, 2))
-        if not finite.all():
-            raise FaceDiffError(_not_finite(first + int(np.argmin(finite))))
+        _refuse_not_finite(chunk, np.arange(first, first + len(chunk)))
         yield slice(first, first + len(chunk)), chunk
 
 
-def _not_finite(frame: int) -> str:
-    return f"frame {frame} (counted from 0) holds NaN or infinity; repair or remove it"
+def _refuse_not_finite(frames: Array, numbers: npt.NDArray[np.integer]) -> None:
+    finite = np.isfinite(frames).all(axis=(1, 2))
+    if not finite.all():
+        bad = int(numbers[np.argmin(finite)])
+        raise FaceDiffError(f"frame {bad} (counted from 0) holds NaN or infinity; repair or remove it")
 
 
 def _sample(frames: npt.NDArray[np.floating], sample: int) -> Array:
     """Evenly spread frames, each moved to the origin."""
     taken = np.unique(np.linspace(0, len(frames) - 1, min(sample, len(frames))).round().astype(int))
     some = np.array(frames[taken], np.float64)
-    finite = np.isfinite(some).all(axis=(1, 2))
-    if not finite.all():
-        raise FaceDiffError(_not_finite(int(taken[np.argmin(finite)])))
+    _refuse_not_finite(some, taken)
     return some - some.mean(axis=1, keepdims=True)
 
 
-def _laid_onto_median(some: Array, stable: Indices) -> tuple[Array, Array]:
-    """Frames (S, V, 3) laid onto the middle one, then twice onto their median; and that median (V, 3)."""
+def _aligned_with_median(some: Array, stable: Indices) -> tuple[Array, Array]:
+    """Frames (S, V, 3) aligned with the middle one, then twice with their median; and that median (V, 3)."""
     anchors = stable[np.linspace(0, len(stable) - 1, min(len(stable), ANCHORS)).round().astype(int)]
     median = some[len(some) // 2]
-    laid = some
+    aligned = some
     for near in (False, True, True):
-        rotation, translation, _ = robust_fit(laid[:, anchors], median[anchors], near=near)
-        laid = laid @ rotation.swapaxes(1, 2) + translation[:, None]
-        median = np.median(laid, axis=0)
-    return laid, median
+        rotation, translation, _ = robust_fit(aligned[:, anchors], median[anchors], near=near)
+        aligned = aligned @ rotation.swapaxes(1, 2) + translation[:, None]
+        median = np.median(aligned, axis=0)
+    return aligned, median
