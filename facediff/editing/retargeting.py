@@ -1,4 +1,4 @@
-"""Motion through a correspondence."""
+"""Motion carried from one mesh to another through a correspondence, and correspondences on disk."""
 
 from __future__ import annotations
 
@@ -11,199 +11,26 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.animation import METRES
-from facediff.editing.correspondence import Correspondence, Surface, averaging, correspond, refuse_other_mesh
+from facediff.editing.correspondence import (
+    Array,
+    Correspondence,
+    Indices,
+    Surface,
+    averaging,
+    correspond,
+    refuse_other_mesh,
+)
 from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
 
-# Correspondences and landmarks on disk.
-
-FORMAT = "facediff correspondence 1"
-ARRAYS = {
-    "corners": ("i", 2),
-    "weights": ("f", 2),
-    "distances": ("f", 1),
-    "trust": ("f", 1),
-    "share": ("f", 1),
-    "source_vertices": ("f", 2),
-    "source_faces": ("i", 2),
-    "target_vertices": ("f", 2),
-    "target_faces": ("i", 2),
-}
-SIMILARITY = {"rotation": ("f", 2), "translation": ("f", 1), "scale": ("f", 0)}
-
-
-def save_correspondence(path: Path, correspondence: Correspondence) -> None:
-    """Write a correspondence as .npz, which ``numpy.load`` opens without pickle.
-
-    Raises:
-        FaceDiffError: if the suffix is another one or the file cannot be written.
-    """
-    if path.suffix != ".npz":
-        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a correspondence .npz')
-    similarity = correspondence.similarity
-    with atomic(path) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(
-            stream,
-            allow_pickle=False,
-            format=np.array(FORMAT),
-            rotation=similarity.rotation,
-            translation=similarity.translation,
-            scale=np.array(similarity.scale),
-            **{name: getattr(correspondence, name) for name in ARRAYS},
-        )
-
-
-def load_correspondence(path: Path) -> Correspondence:
-    """Read what :func:`save_correspondence` wrote.
-
-    Raises:
-        FaceDiffError: if the file is missing, broken or something else.
-    """
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; expected a correspondence that `facediff retarget` wrote")
-    held = read_arrays(path)
-    if "format" not in held or str(held["format"]) != FORMAT:
-        raise FaceDiffError(f"{path}: is no correspondence; expected one that `facediff retarget` wrote")
-    for name, (kind, axes) in {**ARRAYS, **SIMILARITY}.items():
-        if name not in held:
-            raise FaceDiffError(f"{path}: has no {name}; make it anew")
-        if held[name].dtype.kind != kind or held[name].ndim != axes or not np.isfinite(held[name]).all():
-            raise FaceDiffError(f"{path}: its {name} are damaged; make it anew")
-    made = Correspondence(
-        **{name: held[name] for name in ARRAYS},
-        similarity=Similarity(held["rotation"], held["translation"], float(held["scale"])),
-    )
-    if not _consistent(made):
-        raise FaceDiffError(f"{path}: its parts do not fit one another; make it anew")
-    return made
-
-
-def read_landmarks(path: Path) -> npt.NDArray[np.int64]:
-    """Pairs (L, 2) of a source and a target vertex from a CSV of two columns, with or without a header.
-
-    Raises:
-        FaceDiffError: if the file is missing, or a line holds no two numbers.
-    """
-    try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error}); expected a CSV of vertex pairs") from error
-    pairs = []
-    for number, line in enumerate(lines, 1):
-        words = [word.strip() for word in line if word.strip()]
-        if not words or (number == 1 and not words[0].isdigit()):
-            continue
-        if len(words) != 2 or not all(word.isdigit() for word in words):
-            raise FaceDiffError(
-                f"{path}: line {number} is {','.join(line)}; expected two vertices, source and target, counted from 0"
-            )
-        pairs.append([int(word) for word in words])
-    if not pairs:
-        raise FaceDiffError(f"{path}: holds no pairs; expected lines `source vertex,target vertex`")
-    return np.array(pairs, np.int64)
-
-
-def _consistent(made: Correspondence) -> bool:
-    sources, targets = len(made.source_vertices), len(made.target_vertices)
-    return (
-        made.corners.shape == made.weights.shape == (targets, 3)
-        and made.distances.shape == made.trust.shape == made.share.shape == (targets,)
-        and made.similarity.rotation.shape == (3, 3)
-        and made.similarity.translation.shape == (3,)
-        and made.similarity.scale > 0
-        and made.source_vertices.shape == (sources, 3)
-        and made.target_vertices.shape == (targets, 3)
-        and all(
-            faces.shape[1] == 3 and faces.size > 0 and faces.min() >= 0 and faces.max() < count
-            for faces, count in ((made.source_faces, sources), (made.corners, sources), (made.target_faces, targets))
-        )
-    )
-
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-
 ROUNDS = 20
 """How often vertices whose place is not well known are averaged with their neighbours."""
 CHUNK_BYTES = 32 * 2**20
 SAME_UNIT = 1.4
-"""Named units lie further apart than this factor, and people's heads differ by less."""
-
-
-def carry_displacements(correspondence: Correspondence, displacements: npt.NDArray[np.floating]) -> Array:
-    """Displacements of the source's vertices (T, Vs, 3) as those of the target's (T, Vt, 3), in its unit and axes.
-
-    Each target vertex takes the weighted mean of its triangle's corners, turned and scaled by the similarity. Where
-    its place on the source is not well known, neighbours are averaged; where it is far from anything, motion fades.
-    """
-    matrix = correspondence.similarity.scale * correspondence.similarity.rotation
-    moved = np.asarray(displacements, np.float64)
-    made = sum(correspondence.weights[:, k, None] * moved[:, correspondence.corners[:, k]] for k in range(3)) @ matrix.T
-    smoothing = averaging(correspondence.trust, correspondence.target_faces)
-    if smoothing is not None:
-        flat = made.transpose(1, 0, 2).reshape(made.shape[1], -1)
-        known = correspondence.trust[:, None] * flat
-        for _ in range(ROUNDS):
-            flat = known + smoothing @ flat
-        made = flat.reshape(made.shape[1], made.shape[0], 3).transpose(1, 0, 2)
-    result: Array = correspondence.share[:, None] * made
-    return result
-
-
-def carry(animation: Animation, correspondence: Correspondence, target: Mesh) -> Animation:
-    """A take's motion on another mesh.
-
-    The target's vertices, triangles and colours are kept as they are; its unit follows from how large it is.
-
-    Args:
-        animation: of the correspondence's source mesh, of the same or another identity.
-        correspondence: from :func:`facediff.editing.correspondence.correspond`.
-        target: its target mesh.
-
-    Raises:
-        FaceDiffError: if one of the meshes is not the correspondence's, or has its vertices in another order, or a
-            frame is not finite.
-    """
-    refuse_other_mesh(
-        animation.name,
-        animation.template,
-        animation.triangles,
-        correspondence.source_vertices,
-        correspondence.source_faces,
-    )
-    refuse_other_mesh(
-        "target mesh", target.vertices, target.faces, correspondence.target_vertices, correspondence.target_faces
-    )
-    animation.refuse_not_finite()
-    rest = np.asarray(target.vertices, np.float64)
-    neutral = np.asarray(animation.template, np.float64)
-    vertices = np.empty((len(animation.vertices), len(rest), 3), np.float32)
-    step = max(1, CHUNK_BYTES // (24 * max(len(rest), len(neutral))))
-    for first in range(0, len(vertices), step):
-        some = slice(first, first + step)
-        vertices[some] = rest + carry_displacements(
-            correspondence, np.asarray(animation.vertices[some], np.float64) - neutral
-        )
-    return Animation(
-        name=animation.name,
-        vertices=vertices,
-        template=rest.astype(np.float32),
-        frame_rate=animation.frame_rate,
-        faces=np.asarray(target.faces, np.int32),
-        unit=unit_of(animation.unit, correspondence.similarity.scale),
-        speech=animation.speech,
-        sample_rate=animation.sample_rate,
-        colours=target.colours,
-        regions={name: carried_region(correspondence, indices) for name, indices in animation.regions.items()},
-        inner_lip_pairs=carried_pairs(correspondence, animation.inner_lip_pairs),
-        metadata={
-            **animation.metadata,
-            "carried": f"from a mesh of {len(neutral)} vertices to one of {len(rest)} by nearest points of its surface",
-        },
-    )
+"""Named units lie further apart than this factor, and heads differ by less."""
 
 
 def retarget(
@@ -247,6 +74,116 @@ def retarget(
     return made, found
 
 
+def carry(animation: Animation, correspondence: Correspondence, target: Mesh) -> Animation:
+    """An animation's motion on another mesh.
+
+    The target's vertices, triangles and colours are kept as they are; its unit follows from how large it is.
+
+    Args:
+        animation: of the correspondence's source mesh, of the same or another identity.
+        correspondence: from :func:`facediff.editing.correspondence.correspond`.
+        target: its target mesh.
+
+    Raises:
+        FaceDiffError: if one of the meshes is not the correspondence's, or has its vertices in another order, or a
+            frame is not finite.
+    """
+    found = correspondence
+    refuse_other_mesh(
+        animation.name, animation.template, animation.triangles, found.source_vertices, found.source_faces
+    )
+    refuse_other_mesh("target mesh", target.vertices, target.faces, found.target_vertices, found.target_faces)
+    animation.refuse_not_finite()
+    rest = np.asarray(target.vertices, np.float64)
+    neutral = np.asarray(animation.template, np.float64)
+    vertices = np.empty((len(animation.vertices), len(rest), 3), np.float32)
+    step = max(1, CHUNK_BYTES // (24 * max(len(rest), len(neutral))))
+    for first in range(0, len(vertices), step):
+        some = slice(first, first + step)
+        vertices[some] = rest + carry_displacements(found, np.asarray(animation.vertices[some], np.float64) - neutral)
+    return Animation(
+        name=animation.name,
+        vertices=vertices,
+        template=rest.astype(np.float32),
+        frame_rate=animation.frame_rate,
+        faces=np.asarray(target.faces, np.int32),
+        unit=unit_of(animation.unit, found.similarity.scale),
+        speech=animation.speech,
+        sample_rate=animation.sample_rate,
+        colours=target.colours,
+        regions={name: carried_region(found, indices) for name, indices in animation.regions.items()},
+        inner_lip_pairs=carried_pairs(found, animation.inner_lip_pairs),
+        metadata={
+            **animation.metadata,
+            "carried": f"from a mesh of {len(neutral)} vertices to one of {len(rest)} by nearest points of its surface",
+        },
+    )
+
+
+def carry_displacements(correspondence: Correspondence, displacements: npt.NDArray[np.floating]) -> Array:
+    """Displacements of the source's vertices (T, Vs, 3) as those of the target's (T, Vt, 3), in its unit and axes.
+
+    Each target vertex takes the weighted mean of its triangle's corners, turned and scaled by the similarity. Where
+    its place on the source is not well known, neighbours are averaged; where it is far from anything, motion fades.
+    """
+    matrix = correspondence.similarity.scale * correspondence.similarity.rotation
+    moved = np.asarray(displacements, np.float64)
+    made = sum(correspondence.weights[:, k, None] * moved[:, correspondence.corners[:, k]] for k in range(3)) @ matrix.T
+    smoothing = averaging(correspondence.trust, correspondence.target_faces)
+    if smoothing is not None:
+        # Frames and coordinates become columns, so that one sparse product averages all of them.
+        columns = made.transpose(1, 0, 2).reshape(made.shape[1], -1)
+        known = correspondence.trust[:, None] * columns
+        for _ in range(ROUNDS):
+            columns = known + smoothing @ columns
+        made = columns.reshape(made.shape[1], made.shape[0], 3).transpose(1, 0, 2)
+    result: Array = correspondence.share[:, None] * made
+    return result
+
+
+def unit_of(unit: str, scale: float) -> str:
+    """The target's unit: the source's own or a named one, if the sizes differ by no more than heads do; else a number.
+
+    Args:
+        unit: the source's.
+        scale: target units to a source unit.
+
+    Example:
+        >>> unit_of("m", 1000.0), unit_of("m", 1.1), unit_of("m", 20.0)
+        ('mm', 'm', '0.05')
+    """
+    if 1 / SAME_UNIT < scale < SAME_UNIT:
+        return unit
+    metres = metres_per_unit(unit) / scale
+    near = [name for name, value in METRES.items() if 1 / SAME_UNIT < metres / value < SAME_UNIT]
+    return near[0] if near else f"{metres:.6g}"
+
+
+def carried_region(correspondence: Correspondence, indices: npt.NDArray[np.integer]) -> Indices:
+    """A region of the source as that of the target: vertices whose place is more inside than out, and that move."""
+    member = np.zeros(len(correspondence.source_vertices))
+    member[indices] = 1.0
+    inside = (member[correspondence.corners] * correspondence.weights).sum(axis=1)
+    return np.flatnonzero((inside > 0.5) & (correspondence.share > 0))
+
+
+def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer] | None) -> Indices | None:
+    """Pairs of facing vertices of the source as those of the target's vertices that lie nearest on the same sheet."""
+    if pairs is None or not len(pairs):
+        return None
+    source = Surface(correspondence.source_vertices, correspondence.source_faces)
+    shown = np.einsum("vc,vcd->vd", correspondence.weights, source.vertices[correspondence.corners])
+    facing = np.einsum("vc,vcd->vd", correspondence.weights, source.normals[correspondence.corners])
+    wanted, places = np.unique(np.asarray(pairs).ravel(), return_inverse=True)
+    away = np.linalg.norm(shown[None] - source.vertices[wanted, None], axis=2)
+    # Lips touch at rest: a vertex of the other lip is nearer than none, but never nearer than one of the same lip.
+    away += source.size * ((facing[None] * source.normals[wanted, None]).sum(axis=2) <= 0)
+    # Of vertices in one place, the first is the same one in both meshes where these have one topology.
+    found = away.argmin(axis=1)[places].reshape(-1, 2)
+    made = np.unique(found[found[:, 0] != found[:, 1]], axis=0)
+    return made if len(made) else None
+
+
 def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
     """Blendshapes of another topology, transferred to an animation's mesh.
 
@@ -279,39 +216,105 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
     return fitted(moved, animation.template, animation.unit)
 
 
-def unit_of(unit: str, scale: float) -> str:
-    """The target's unit: the take's own or a named one, if the sizes say so within what people differ; else a number.
+# Correspondences and landmarks on disk.
 
-    Args:
-        unit: the source's.
-        scale: target units to a source unit.
+FORMAT = "facediff correspondence 1"
+ARRAYS = {
+    "corners": ("i", 2),
+    "weights": ("f", 2),
+    "distances": ("f", 1),
+    "trust": ("f", 1),
+    "share": ("f", 1),
+    "source_vertices": ("f", 2),
+    "source_faces": ("i", 2),
+    "target_vertices": ("f", 2),
+    "target_faces": ("i", 2),
+}
+SIMILARITY = {"rotation": ("f", 2), "translation": ("f", 1), "scale": ("f", 0)}
+"""Kind and number of axes of each array in the file."""
+
+
+def save_correspondence(path: Path, correspondence: Correspondence) -> None:
+    """Write a correspondence as .npz, which ``numpy.load`` opens without pickle.
+
+    Raises:
+        FaceDiffError: if the suffix is another one or the file cannot be written.
     """
-    if 1 / SAME_UNIT < scale < SAME_UNIT:
-        return unit
-    metres = metres_per_unit(unit) / scale
-    near = [name for name, value in METRES.items() if 1 / SAME_UNIT < metres / value < SAME_UNIT]
-    return near[0] if near else f"{metres:.6g}"
+    if path.suffix != ".npz":
+        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a correspondence .npz')
+    similarity = correspondence.similarity
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(
+            stream,
+            allow_pickle=False,
+            format=np.array(FORMAT),
+            **{name: np.asarray(getattr(similarity, name)) for name in SIMILARITY},
+            **{name: getattr(correspondence, name) for name in ARRAYS},
+        )
 
 
-def carried_region(correspondence: Correspondence, indices: npt.NDArray[np.integer]) -> Indices:
-    """A region of the source as that of the target: vertices whose place is more inside than out, and that move."""
-    member = np.zeros(len(correspondence.source_vertices))
-    member[indices] = 1.0
-    inside = (member[correspondence.corners] * correspondence.weights).sum(axis=1)
-    return np.flatnonzero((inside > 0.5) & (correspondence.share > 0))
+def load_correspondence(path: Path) -> Correspondence:
+    """Read what :func:`save_correspondence` wrote.
+
+    Raises:
+        FaceDiffError: if the file is missing, broken or something else.
+    """
+    if not path.is_file():
+        raise FaceDiffError(f"{path}: no such file; expected a correspondence that `facediff retarget` wrote")
+    held = read_arrays(path)
+    if "format" not in held or str(held["format"]) != FORMAT:
+        raise FaceDiffError(f"{path}: is no correspondence; expected one that `facediff retarget` wrote")
+    for name, (kind, axes) in {**ARRAYS, **SIMILARITY}.items():
+        if name not in held:
+            raise FaceDiffError(f"{path}: has no {name}; make a new correspondence")
+        if held[name].dtype.kind != kind or held[name].ndim != axes or not np.isfinite(held[name]).all():
+            raise FaceDiffError(f"{path}: its {name} are damaged; make a new correspondence")
+    made = Correspondence(
+        **{name: held[name] for name in ARRAYS},
+        similarity=Similarity(held["rotation"], held["translation"], float(held["scale"])),
+    )
+    if not _consistent(made):
+        raise FaceDiffError(f"{path}: its parts do not fit one another; make a new correspondence")
+    return made
 
 
-def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer] | None) -> Indices | None:
-    """Pairs of facing vertices of the source as those of the target's vertices that lie nearest on the same sheet."""
-    if pairs is None or not len(pairs):
-        return None
-    source = Surface(correspondence.source_vertices, correspondence.source_faces)
-    shown = np.einsum("vc,vcd->vd", correspondence.weights, source.vertices[correspondence.corners])
-    facing = np.einsum("vc,vcd->vd", correspondence.weights, source.normals[correspondence.corners])
-    wanted, places = np.unique(np.asarray(pairs).ravel(), return_inverse=True)
-    away = np.linalg.norm(shown[None] - source.vertices[wanted, None], axis=2)
-    away += source.size * ((facing[None] * source.normals[wanted, None]).sum(axis=2) <= 0)
-    # Of vertices in one place, the first is the same one in both meshes where these have one topology.
-    found = away.argmin(axis=1)[places].reshape(-1, 2)
-    made = np.unique(found[found[:, 0] != found[:, 1]], axis=0)
-    return made if len(made) else None
+def _consistent(made: Correspondence) -> bool:
+    sources, targets = len(made.source_vertices), len(made.target_vertices)
+    return (
+        made.corners.shape == made.weights.shape == (targets, 3)
+        and made.distances.shape == made.trust.shape == made.share.shape == (targets,)
+        and made.similarity.rotation.shape == (3, 3)
+        and made.similarity.translation.shape == (3,)
+        and made.similarity.scale > 0
+        and made.source_vertices.shape == (sources, 3)
+        and made.target_vertices.shape == (targets, 3)
+        and all(
+            faces.shape[1] == 3 and faces.size > 0 and faces.min() >= 0 and faces.max() < count
+            for faces, count in ((made.source_faces, sources), (made.corners, sources), (made.target_faces, targets))
+        )
+    )
+
+
+def read_landmarks(path: Path) -> npt.NDArray[np.int64]:
+    """Pairs (L, 2) of a source and a target vertex from a CSV of two columns, with or without a header.
+
+    Raises:
+        FaceDiffError: if the file is missing, or a line does not hold two numbers.
+    """
+    try:
+        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error}); expected a CSV of vertex pairs") from error
+    pairs = []
+    for number, line in enumerate(lines, 1):
+        words = [word.strip() for word in line if word.strip()]
+        if not words or (number == 1 and not words[0].isdigit()):
+            continue
+        if len(words) != 2 or not all(word.isdigit() for word in words):
+            raise FaceDiffError(
+                f"{path}: line {number} is {','.join(line)}; expected two vertices, source and target, counted from 0"
+            )
+        pairs.append([int(word) for word in words])
+    if not pairs:
+        raise FaceDiffError(f"{path}: holds no pairs; expected lines `source vertex,target vertex`")
+    return np.array(pairs, np.int64)
