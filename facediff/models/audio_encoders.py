@@ -17,12 +17,22 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.models.layers import frame_mask, interpolate_frames
+from facediff.models.layers import Frames, frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
 from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:
     from transformers import HubertModel
+
+
+Waves = Float[Tensor, "batch samples"]
+"""Speech at 16 kHz, mono, padded with zeros."""
+
+Features = Float[Tensor, "batch steps channels"]
+"""What the frozen part of an encoder makes of speech."""
+
+Lengths = Int[Tensor, " batch"]
+"""Valid samples, steps or frames of each clip."""
 
 
 class AudioEncoder(nn.Module, ABC):
@@ -49,9 +59,7 @@ class AudioEncoder(nn.Module, ABC):
         finally:
             self._level = before
 
-    def standardise(
-        self, audio: Float[Tensor, "batch samples"], lengths: Int[Tensor, " batch"]
-    ) -> Float[Tensor, "batch samples"]:
+    def standardise(self, audio: Waves, lengths: Lengths) -> Waves:
         """Speech of zero mean and unit variance, as :func:`standardise` makes it or by the level that is set."""
         if self._level is None:
             return standardise(audio, lengths)
@@ -62,9 +70,7 @@ class AudioEncoder(nn.Module, ABC):
         """A hash of all that :meth:`frozen_features` depends on; None if nothing is frozen, or something is random."""
         return None
 
-    def frozen_features(
-        self, audio: Float[Tensor, "batch samples"], audio_lengths: Int[Tensor, " batch"]
-    ) -> tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]]:
+    def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
         """What the frozen part makes of speech, and each clip's valid steps.
 
         Raises:
@@ -73,12 +79,7 @@ class AudioEncoder(nn.Module, ABC):
         raise NotImplementedError(f"{type(self).__name__} has no frozen part")
 
     @abstractmethod
-    def forward(
-        self,
-        audio: Float[Tensor, "batch samples"],
-        audio_lengths: Int[Tensor, " batch"],
-        frame_lengths: Int[Tensor, " batch"],
-    ) -> Float[Tensor, "batch frames dim"]:
+    def forward(self, audio: Waves, audio_lengths: Lengths, frame_lengths: Lengths) -> Frames:
         """Encode.
 
         Args:
@@ -99,9 +100,7 @@ class AudioEncoderFactory(Protocol):
         ...
 
 
-def standardise(
-    audio: Float[Tensor, "batch samples"], lengths: Int[Tensor, " batch"]
-) -> Float[Tensor, "batch samples"]:
+def standardise(audio: Waves, lengths: Lengths) -> Waves:
     """Zero mean and unit variance over each clip's valid samples, zero on padding, as HuBERT's processor does."""
     mask = frame_mask(lengths, audio.shape[1])
     count = lengths[:, None].to(audio.dtype)
@@ -141,12 +140,7 @@ class MelEncoder(AudioEncoder):
         self.blocks = nn.ModuleList(ConvBlock(hidden_dim, 2 ** (i % 3), dropout) for i in range(num_layers))
         self.out = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, dim))
 
-    def forward(
-        self,
-        audio: Float[Tensor, "batch samples"],
-        audio_lengths: Int[Tensor, " batch"],
-        frame_lengths: Int[Tensor, " batch"],
-    ) -> Float[Tensor, "batch frames dim"]:
+    def forward(self, audio: Waves, audio_lengths: Lengths, frame_lengths: Lengths) -> Frames:
         """Encode; see :class:`AudioEncoder`."""
         spectrum, lengths = self._log_mel(self.standardise(audio, audio_lengths), audio_lengths)
         # Padding is zeroed again after every layer: a convolution next to it would let its values into the clip.
@@ -303,9 +297,7 @@ class HubertEncoder(AudioEncoder):
                 digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
         return digest.hexdigest()
 
-    def frozen_features(
-        self, audio: Float[Tensor, "batch samples"], audio_lengths: Int[Tensor, " batch"]
-    ) -> tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]]:
+    def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
         """Hidden states below the first layer that is trained, at 50 steps a second."""
         return by_length(self.standardise(audio, audio_lengths), audio_lengths, self._lower)
 
@@ -334,12 +326,12 @@ class HubertEncoder(AudioEncoder):
 
     def forward(
         self,
-        audio: Float[Tensor, "batch samples"],
-        audio_lengths: Int[Tensor, " batch"],
-        frame_lengths: Int[Tensor, " batch"],
-        features: Float[Tensor, "batch steps channels"] | None = None,
-        feature_lengths: Int[Tensor, " batch"] | None = None,
-    ) -> Float[Tensor, "batch frames dim"]:
+        audio: Waves,
+        audio_lengths: Lengths,
+        frame_lengths: Lengths,
+        features: Features | None = None,
+        feature_lengths: Lengths | None = None,
+    ) -> Frames:
         """Encode; see :class:`AudioEncoder`."""
         if self.hubert.config.apply_spec_augment:
             hidden, steps = by_length(self.standardise(audio, audio_lengths), audio_lengths, self._whole)
@@ -353,7 +345,7 @@ class HubertEncoder(AudioEncoder):
         return self.hubert(with_edges(wave)).last_hidden_state
 
 
-def with_edges(wave: Float[Tensor, "batch samples"]) -> Float[Tensor, "batch padded"]:
+def with_edges(wave: Waves) -> Float[Tensor, "batch padded"]:
     """Speech with the zeros at either end that make its steps fall where they belong; at least one step long."""
     return nn.functional.pad(wave, (EDGE, EDGE + max(0, 400 - wave.shape[1] - 2 * EDGE)))
 

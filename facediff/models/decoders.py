@@ -12,14 +12,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
-from facediff.models.layers import Attention, FeedForward, KeysValues, Rotation, needed_mask
+from facediff.models.layers import Attention, FeedForward, FrameMask, Frames, KeysValues, Rotation, needed_mask
 from facediff.registry import decoder
+
+Tokens = Float[Tensor, "batch tokens style_dim"]
+"""The style condition F_s."""
 
 
 class Decoder(nn.Module, ABC):
     """Fused features F_fused and style tokens F_s to features that one linear map turns into clean motion."""
 
-    def prepare(self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]) -> object:
+    def prepare(self, style: Tokens, mask: FrameMask) -> object:
         """What stays the same over the denoising steps, computed once a clip; None if there is nothing.
 
         A decoder that overrides this takes the result as a fourth, optional argument of ``forward`` and gives the same
@@ -28,12 +31,7 @@ class Decoder(nn.Module, ABC):
         return None
 
     @abstractmethod
-    def forward(
-        self,
-        fused: Float[Tensor, "batch frames dim"],
-        style: Float[Tensor, "batch tokens style_dim"],
-        mask: Bool[Tensor, "batch frames"],
-    ) -> Float[Tensor, "batch frames dim"]:
+    def forward(self, fused: Frames, style: Tokens, mask: FrameMask) -> Frames:
         """Decode; there is at least one style token; frames where ``mask`` is False are padding."""
 
 
@@ -89,12 +87,8 @@ class StyleTransformer(Decoder):
         self.norm = nn.LayerNorm(dim)
 
     def forward(
-        self,
-        fused: Float[Tensor, "batch frames dim"],
-        style: Float[Tensor, "batch tokens style_dim"],
-        mask: Bool[Tensor, "batch frames"],
-        prepared: DecoderConstants | None = None,
-    ) -> Float[Tensor, "batch frames dim"]:
+        self, fused: Frames, style: Tokens, mask: FrameMask, prepared: DecoderConstants | None = None
+    ) -> Frames:
         """F_dec of each frame.
 
         Args:
@@ -110,9 +104,7 @@ class StyleTransformer(Decoder):
             fused = block(fused, tokens, prepared.mask, prepared.rotation)
         return self.norm(fused)
 
-    def prepare(
-        self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> DecoderConstants:
+    def prepare(self, style: Tokens, mask: FrameMask) -> DecoderConstants:
         """Each block's products of the style tokens, and the rotary positions that all blocks share."""
         tokens = [block.style_attention.prepare(style) for block in cast(Sequence[Block], self.blocks)]
         return DecoderConstants(tokens, needed_mask(mask), self._rotation(mask.shape[1]))
@@ -168,11 +160,11 @@ class TokenAttention(Attention):
 
     def forward(
         self,
-        x: Float[Tensor, "batch frames dim"],
+        x: Frames,
         context: Float[Tensor, "batch keys context_dim"] | PreparedTokens,
         context_mask: Bool[Tensor, "batch keys"] | None = None,
         rotation: Rotation | None = None,
-    ) -> Float[Tensor, "batch frames dim"]:
+    ) -> Frames:
         """Attend from ``x`` to all of ``context``, which may be what :meth:`prepare` made of it."""
         if isinstance(context, Tensor):
             if context_mask is not None:
@@ -231,13 +223,7 @@ class GruDecoder(Decoder):
     """
 
     def __init__(
-        self,
-        *,
-        dim: int,
-        style_dim: int,
-        num_layers: int = 2,
-        bidirectional: bool = True,
-        dropout: float = 0.1,
+        self, *, dim: int, style_dim: int, num_layers: int = 2, bidirectional: bool = True, dropout: float = 0.1
     ) -> None:
         super().__init__()
         if bidirectional and dim % 2:
@@ -253,13 +239,7 @@ class GruDecoder(Decoder):
         self.modulation = nn.Linear(style_dim, 2 * dim)
         self.norm = nn.LayerNorm(dim)
 
-    def forward(
-        self,
-        fused: Float[Tensor, "batch frames dim"],
-        style: Float[Tensor, "batch tokens style_dim"],
-        mask: Bool[Tensor, "batch frames"],
-        prepared: GruConstants | None = None,
-    ) -> Float[Tensor, "batch frames dim"]:
+    def forward(self, fused: Frames, style: Tokens, mask: FrameMask, prepared: GruConstants | None = None) -> Frames:
         """F_dec of each frame.
 
         Args:
@@ -274,9 +254,7 @@ class GruDecoder(Decoder):
         hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])
         return torch.addcmul(shift, self.norm(hidden + fused), scale)
 
-    def prepare(
-        self, style: Float[Tensor, "batch tokens style_dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> GruConstants:
+    def prepare(self, style: Tokens, mask: FrameMask) -> GruConstants:
         """The lengths, for which the device must be waited for, and the modulation by the style."""
         scale, shift = self.modulation(style.mean(1, keepdim=True)).chunk(2, dim=-1)
         return GruConstants(mask.sum(1).cpu(), 1 + scale, shift)

@@ -23,8 +23,15 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError
+from facediff.models.layers import Frames
 
 SamplingSpace = Literal["folded", "vertices"]
+
+State = Float[Tensor, "batch frames width"]
+"""Noisy or clean motion in a space, as a sampler sees it."""
+
+ScaledMotion = Float[Tensor, "batch frames coordinates"]
+"""Motion on the vertices, in the scale of the network."""
 
 Blend = Callable[[Tensor], Tensor]
 """From the features that the network gave in a step to those that are used."""
@@ -51,14 +58,14 @@ class Network(Protocol):
 
     def core(
         self,
-        motion: Float[Tensor, "batch frames dim"],
+        motion: Frames,
         step: Int[Tensor, " batch"],
         conditions: Any,  # noqa: ANN401 - the network's own
-    ) -> Float[Tensor, "batch frames dim"]:
+    ) -> Frames:
         """Everything between the two maps."""
         ...
 
-    def leave(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames coordinates"]:
+    def leave(self, features: Frames) -> ScaledMotion:
         """The last map in the weights' own precision."""
         ...
 
@@ -79,21 +86,21 @@ class Space(ABC):
         self.width = width
         self.blend = blend
 
-    def features(self, embedded: Float[Tensor, "batch frames dim"], step: int) -> Float[Tensor, "batch frames dim"]:
+    def features(self, embedded: Frames, step: int) -> Frames:
         """The network's blended last features of embedded noisy motion, at a step counted from 0."""
         steps = torch.full((len(embedded),), step, device=embedded.device)
         return self.blend(self.network.core(embedded, steps, self.conditions))
 
     @abstractmethod
-    def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
+    def noise(self, unit: State) -> State:
         """From independent unit Gaussian noise to the image of unit Gaussian noise on vertices."""
 
     @abstractmethod
-    def denoise(self, state: Float[Tensor, "batch frames width"], step: int) -> Float[Tensor, "batch frames width"]:
+    def denoise(self, state: State, step: int) -> State:
         """The image of the predicted clean motion."""
 
     @abstractmethod
-    def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
+    def motion(self, sample: State) -> ScaledMotion:
         """Scaled motion of the sampler's result."""
 
 
@@ -103,15 +110,15 @@ class VertexSpace(Space):
     def __init__(self, network: Network, conditions: object, blend: Blend = unchanged) -> None:
         super().__init__(network, conditions, network.coordinates, blend)
 
-    def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
+    def noise(self, unit: State) -> State:
         """Unit noise as it is."""
         return unit
 
-    def denoise(self, state: Float[Tensor, "batch frames width"], step: int) -> Float[Tensor, "batch frames width"]:
+    def denoise(self, state: State, step: int) -> State:
         """M̂⁰."""
         return self.network.leave(self.features(self.network.embed(state), step))
 
-    def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
+    def motion(self, sample: State) -> ScaledMotion:
         """The sample as it is."""
         return sample
 
@@ -131,12 +138,12 @@ class FoldedSpace(Space):
         self.fold = fold
         self._last: tuple[Tensor, Tensor] | None = None  # features and prediction of the latest step
 
-    def noise(self, unit: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
+    def noise(self, unit: State) -> State:
         """Noise with the covariance E Eᵀ, independent over frames; zero where ``unit`` is."""
         with torch.autocast(unit.device.type, enabled=False):
             return unit @ self.fold.root
 
-    def denoise(self, state: Float[Tensor, "batch frames width"], step: int) -> Float[Tensor, "batch frames width"]:
+    def denoise(self, state: State, step: int) -> State:
         """E M̂⁰ = E U h + E b."""
         # The bias e of the first map is no part of y, which would not obey the recursion with it.
         bias = self.network.embed.bias
@@ -147,7 +154,7 @@ class FoldedSpace(Space):
         self._last = features, prediction
         return prediction
 
-    def motion(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
+    def motion(self, sample: State) -> ScaledMotion:
         """U h + b, the only step over the vertices.
 
         Raises:

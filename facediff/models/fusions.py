@@ -5,17 +5,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
 
-from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from facediff.models.layers import Attention, Rotation, needed_mask
+from facediff.models.layers import Attention, FrameMask, Frames, Rotation, needed_mask
 from facediff.registry import fusion
 
 
 class Fusion(nn.Module, ABC):
     """Speech features F_a and embedded noisy motion F_m to one sequence F_am."""
 
-    def prepare(self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]) -> object:
+    def prepare(self, audio: Frames, mask: FrameMask) -> object:
         """What stays the same over the denoising steps, computed once a clip; None if there is nothing.
 
         A fusion that overrides this takes the result as a fourth, optional argument of ``forward`` and gives the same
@@ -24,12 +23,7 @@ class Fusion(nn.Module, ABC):
         return None
 
     @abstractmethod
-    def forward(
-        self,
-        audio: Float[Tensor, "batch frames dim"],
-        motion: Float[Tensor, "batch frames dim"],
-        mask: Bool[Tensor, "batch frames"],
-    ) -> Float[Tensor, "batch frames dim"]:
+    def forward(self, audio: Frames, motion: Frames, mask: FrameMask) -> Frames:
         """Fuse; frames where ``mask`` is False are padding and never influence the others."""
 
 
@@ -80,12 +74,8 @@ class BidirectionalCrossAttention(Fusion):
         self.dropout = nn.Dropout(dropout)
 
     def forward(
-        self,
-        audio: Float[Tensor, "batch frames dim"],
-        motion: Float[Tensor, "batch frames dim"],
-        mask: Bool[Tensor, "batch frames"],
-        prepared: FusionConstants | None = None,
-    ) -> Float[Tensor, "batch frames dim"]:
+        self, audio: Frames, motion: Frames, mask: FrameMask, prepared: FusionConstants | None = None
+    ) -> Frames:
         """F_am = F'_a + F'_m.
 
         Args:
@@ -105,7 +95,7 @@ class BidirectionalCrossAttention(Fusion):
         motion = motion + self.dropout(self.motion_from_audio(normed_motion, enriched, needed, rotation))
         return audio + motion
 
-    def prepare(self, audio: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]) -> FusionConstants:
+    def prepare(self, audio: Frames, mask: FrameMask) -> FusionConstants:
         """The speech's queries; keys and values depend on the noisy motion, and so does F'_a."""
         return self._constants(audio, needed_mask(mask))
 
@@ -125,11 +115,6 @@ class AddFusion(Fusion):
     def __init__(self, *, dim: int) -> None:
         super().__init__()
 
-    def forward(
-        self,
-        audio: Float[Tensor, "batch frames dim"],
-        motion: Float[Tensor, "batch frames dim"],
-        mask: Bool[Tensor, "batch frames"],
-    ) -> Float[Tensor, "batch frames dim"]:
+    def forward(self, audio: Frames, motion: Frames, mask: FrameMask) -> Frames:
         """F_am = F_a + F_m."""
         return audio + motion

@@ -9,6 +9,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+Frames = Float[Tensor, "batch frames dim"]
+"""One feature per frame of motion."""
+
+FrameMask = Bool[Tensor, "batch frames"]
+"""True on valid frames, False on padding."""
+
 Rotation = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary embedding, both (frames, head_dim)."""
 
@@ -20,21 +26,19 @@ class KeysValues(NamedTuple):
     value: Tensor
 
 
-def frame_mask(lengths: Int[Tensor, " batch"], frames: int) -> Bool[Tensor, "batch frames"]:
+def frame_mask(lengths: Int[Tensor, " batch"], frames: int) -> FrameMask:
     """True on valid frames, False on padding."""
     return torch.arange(frames, device=lengths.device)[None, :] < lengths[:, None]
 
 
-def needed_mask(mask: Bool[Tensor, "batch frames"]) -> Bool[Tensor, "batch frames"] | None:
+def needed_mask(mask: FrameMask) -> FrameMask | None:
     """The mask, or None where nothing is padded; it looks at the values, so it waits for the device."""
     return None if bool(mask.all()) else mask
 
 
 def interpolate_frames(
-    features: Float[Tensor, "batch steps dim"],
-    lengths: Int[Tensor, " batch"],
-    frame_lengths: Int[Tensor, " batch"],
-) -> Float[Tensor, "batch frames dim"]:
+    features: Float[Tensor, "batch steps dim"], lengths: Int[Tensor, " batch"], frame_lengths: Int[Tensor, " batch"]
+) -> Frames:
     """Resample each clip's own ``lengths[b]`` feature steps to ``frame_lengths[b]`` frames, linearly in time.
 
     Steps and frames are cells that tile the same stretch of time, so frame j lies at step
@@ -130,11 +134,11 @@ class Attention(nn.Module):
 
     def forward(
         self,
-        x: Float[Tensor, "batch frames dim"],
+        x: Frames,
         context: Float[Tensor, "batch keys context_dim"],
         context_mask: Bool[Tensor, "batch keys"] | None = None,
         rotation: Rotation | None = None,
-    ) -> Float[Tensor, "batch frames dim"]:
+    ) -> Frames:
         """Attend from ``x`` to the valid positions of ``context``.
 
         Args:
@@ -149,9 +153,7 @@ class Attention(nn.Module):
         """The table of rotary positions for so many frames and keys; None without such positions."""
         return None if self.rotary is None else self.rotary.table(frames)
 
-    def queries(
-        self, x: Float[Tensor, "batch frames dim"], rotation: Rotation | None = None
-    ) -> Float[Tensor, "batch heads frames head_dim"]:
+    def queries(self, x: Frames, rotation: Rotation | None = None) -> Float[Tensor, "batch heads frames head_dim"]:
         """All that ``x`` is needed for."""
         query = self._split(self.query(x))
         return query if self.rotary is None else self.rotary(query, rotation)
@@ -168,7 +170,7 @@ class Attention(nn.Module):
         query: Float[Tensor, "batch heads frames head_dim"],
         context: KeysValues,
         context_mask: Bool[Tensor, "batch keys"] | None = None,
-    ) -> Float[Tensor, "batch frames dim"]:
+    ) -> Frames:
         """The attention itself, and the map of its result."""
         key, value = context
         # One mask for all heads and queries. None where possible, since masks rule out the quickest kernels.

@@ -13,7 +13,11 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from facediff.errors import FaceDiffError
+from facediff.models.layers import Frames
 from facediff.registry import mesh_encoder
+
+Motion = Float[Tensor, "batch frames vertices 3"]
+"""Offsets from the template."""
 
 
 class MeshEncoder(nn.Module, ABC):
@@ -43,7 +47,7 @@ class MeshEncoder(nn.Module, ABC):
         """
 
     @abstractmethod
-    def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
+    def forward(self, motion: Motion) -> Frames:
         """Encode each frame's offsets from the template, in the motion's unit."""
 
 
@@ -79,7 +83,7 @@ class LinearMeshEncoder(MeshEncoder):
         self.n_vertices = n_vertices
         self.map = nn.Linear(3 * n_vertices, dim)
 
-    def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
+    def forward(self, motion: Motion) -> Frames:
         """The feature of each frame."""
         check_vertices(motion, self.n_vertices)
         return self.map(motion.flatten(2))
@@ -241,7 +245,7 @@ class SpiralMeshEncoder(MeshEncoder):
         # True from here on, also while averaged weights are in place: a copy made earlier has tables of zeros.
         self._attached = True
 
-    def forward(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames dim"]:
+    def forward(self, motion: Motion) -> Frames:
         """The feature of each frame.
 
         Raises:

@@ -6,13 +6,16 @@ from abc import ABC, abstractmethod
 from typing import Literal, Protocol
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
-from facediff.models.layers import Attention, FeedForward, interpolate_frames
+from facediff.models.layers import Attention, FeedForward, FrameMask, Frames, interpolate_frames
 from facediff.registry import style_encoder
+
+StyleVectors = Float[Tensor, "batch style_dim"]
+"""F_dyn of each clip."""
 
 
 class StyleEncoder(nn.Module, ABC):
@@ -26,9 +29,7 @@ class StyleEncoder(nn.Module, ABC):
     token_dims: tuple[int, ...]
 
     @abstractmethod
-    def forward(
-        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch style_dim"]:
+    def forward(self, reference: Frames, mask: FrameMask) -> StyleVectors:
         """Encode; frames where ``mask`` is False are padding and never count."""
 
 
@@ -85,9 +86,7 @@ class TcnGruTransformer(StyleEncoder):
         self.mlp = nn.Sequential(nn.Linear(dim, dim), nn.GELU(), nn.Linear(dim, dim))
         self.token_dims = (dim,)
 
-    def forward(
-        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch style_dim"]:
+    def forward(self, reference: Frames, mask: FrameMask) -> StyleVectors:
         """F_dyn of each clip (eq. 9)."""
         return self.mlp(self.pooling(self.features(reference, mask), mask))
 
@@ -163,17 +162,13 @@ class AttentionPooling(nn.Module):
         self.hidden = nn.Linear(dim, dim)
         self.score = nn.Linear(dim, 1, bias=False)
 
-    def weights(
-        self, features: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch frames"]:
+    def weights(self, features: Frames, mask: FrameMask) -> Float[Tensor, "batch frames"]:
         """γ: sums to one over each clip's frames and is exactly zero on padding."""
         # −∞ before the softmax gives padding a weight of exactly zero.
         score = self.score(torch.tanh(self.hidden(features))).squeeze(-1)
         return score.masked_fill(~mask, -torch.inf).softmax(-1)
 
-    def forward(
-        self, features: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch dim"]:
+    def forward(self, features: Frames, mask: FrameMask) -> Float[Tensor, "batch dim"]:
         """The weighted mean s."""
         return torch.einsum("bt,btc->bc", self.weights(features, mask), features)
 
@@ -198,9 +193,7 @@ class LstmStyle(StyleEncoder):
         self.pooling = pooling
         self.token_dims = (style_dim,)
 
-    def forward(
-        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch style_dim"]:
+    def forward(self, reference: Frames, mask: FrameMask) -> StyleVectors:
         """The state after each clip's last frame."""
         states = self.states(reference, mask)
         if self.pooling == "mean":
@@ -208,9 +201,7 @@ class LstmStyle(StyleEncoder):
         last = mask.sum(1) - 1
         return states[torch.arange(len(states), device=states.device), last]
 
-    def states(
-        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch frames style_dim"]:
+    def states(self, reference: Frames, mask: FrameMask) -> Float[Tensor, "batch frames style_dim"]:
         """The state after each frame: it depends on that frame and those before it alone."""
         # Padding comes after all valid frames; zeros keep what is not finite there out of the gradient.
         states: Tensor = self.lstm(reference.masked_fill(~mask[..., None], 0.0))[0]
@@ -229,8 +220,6 @@ class NoStyle(StyleEncoder):
         super().__init__()
         self.token_dims = ()
 
-    def forward(
-        self, reference: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch style_dim"]:
+    def forward(self, reference: Frames, mask: FrameMask) -> StyleVectors:
         """A feature of width zero."""
         return reference.new_zeros((reference.shape[0], 0))
