@@ -18,10 +18,13 @@ def evaluate(
     *,
     method: Annotated[list[str] | None, Option(metavar="NAME=FOLDER")] = None,
     protocol: Annotated[list[str] | None, Option(metavar="NAME")] = None,
+    metric: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     templates: File = None,
     regions: Folder = None,
     lips: Annotated[str | None, Option(metavar="FILE")] = None,
     upper_face: Annotated[str | None, Option(metavar="FILE")] = None,
+    lip_pairs: Annotated[str | None, Option(metavar="FILE")] = None,
+    frame_rate: Annotated[float | None, Option(metavar="FPS", above=0)] = None,
     topology: Annotated[str | None, Option(metavar="NAME")] = None,
     n_vertices: Annotated[int | None, Option(metavar="V", least=1)] = None,
     pattern: Annotated[list[str] | None, Option(metavar="PATTERN")] = None,
@@ -36,7 +39,7 @@ def evaluate(
     csv: File = None,
     quiet: bool = False,
 ) -> None:
-    """Score predictions against the truth by one or several protocols, with confidence intervals.
+    """Score predictions against the truth by one or several protocols and metrics, with confidence intervals.
 
     PREDICTIONS and TRUTH are folders of .npy files of absolute vertices, (frames, V, 3) or (frames, 3V), of any
     floating-point type. TRUTH may also be a corpus folder: then its vertices_npy, templates.pkl and regions are used.
@@ -47,10 +50,13 @@ def evaluate(
         truth: folder of truths, or a corpus folder
         method: a further method, compared with the first; repeatable
         protocol: definition of the scores, repeatable (default: paper)
+        metric: a further metric with its options, such as temporal_misalignment:at=path; repeatable
         templates: templates.pkl, each speaker's neutral face
         regions: folder with lve.txt and fdd.txt, or with FLAME_masks.pkl
         lips: the lips: index file, FLAME_masks.pkl:lips, weights.txt>0.1, or all
         upper_face: the upper face, likewise
+        lip_pairs: pairs of inner-lip vertices: a file, or 3531-3504,… (default: the corpus's)
+        frame_rate: frames per second of the predictions (default: as the corpus's manifest.json says)
         topology: biwi, vocaset, mead3d or multiface: unusual regions are pointed out
         n_vertices: vertices of the mesh (default: as the templates have)
         pattern: how predictions are named, repeatable (default: see the manual)
@@ -81,10 +87,10 @@ def evaluate(
     from facediff.data.corpus import read_templates
     from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN, read_region, text
     from facediff.evaluation import evaluate as score
-    from facediff.evaluation.evaluator import find_protocols
-    from facediff.evaluation.files import count_vertices, find_truths
+    from facediff.evaluation.evaluator import find_protocols, needs_upper_face
+    from facediff.evaluation.files import count_vertices, find_truths, read_pairs
 
-    protocols = find_protocols(protocol or ["paper"], topology)
+    protocols, metrics = find_protocols(protocol or ["paper"], topology), metric or []
     truth, corpus = find_truths(truth)
     if corpus is not None:
         if templates is None and (corpus / "templates.pkl").is_file():
@@ -93,7 +99,7 @@ def evaluate(
             regions = corpus / "regions"
     n_vertices = n_vertices or count_vertices(topology, templates, truth)
     upper = None
-    if any(chosen.fdd for chosen in protocols):
+    if needs_upper_face(protocols, metrics):
         upper = read_region("upper_face", n_vertices, folder=regions, source=upper_face)
     report = score(
         methods,
@@ -103,6 +109,10 @@ def evaluate(
         templates=None if templates is None else read_templates(templates, n_vertices),
         n_vertices=n_vertices,
         protocols=protocols,
+        metrics=metrics,
+        lip_pairs=None if lip_pairs is None else read_pairs(lip_pairs, corpus, n_vertices),
+        corpus=corpus,
+        frame_rate=frame_rate,
         patterns=pattern or DEFAULT_PATTERNS,
         truth_pattern=truth_pattern or TRUTH_PATTERN,
         identity=identity,

@@ -19,6 +19,7 @@ from facediff.errors import FaceDiffError
 from facediff.evaluation.files import (
     DEFAULT_PATTERNS,
     OWN,
+    PAIRS_FILE,
     TRUTH_PATTERN,
     NamePattern,
     Pair,
@@ -26,6 +27,7 @@ from facediff.evaluation.files import (
     index_truths,
     list_names,
     pair_up,
+    read_pairs,
 )
 from facediff.evaluation.report import Bootstrap, MethodTable, Report
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
@@ -102,6 +104,9 @@ def evaluate(
     truths = index_truths(names)
     if frame_rate is None and corpus is not None and "frame_rate" in (manifest := read_manifest(corpus)):
         frame_rate = float(manifest["frame_rate"]) / truth_stride
+    needed = {need for request in requests for need in request.needs}
+    if lip_pairs is None and "lip_pairs" in needed and corpus is not None and (corpus / PAIRS_FILE).is_file():
+        lip_pairs = read_pairs(None, corpus, n_vertices)
     material = Material(
         corpus if requests else None,
         frame_rate,
@@ -117,7 +122,7 @@ def evaluate(
         n_vertices=n_vertices,
         truth_stride=truth_stride,
         metrics=chosen,
-        inputs=partial(material.inputs, needed={need for request in requests for need in request.needs}),
+        inputs=partial(material.inputs, needed=needed),
     )
     readers = [NamePattern(pattern, templates or ()) for pattern in patterns]
     pairings: dict[str, Pairing] = {}
@@ -185,17 +190,7 @@ class Material:
         templated: bool,
         every_condition: bool,
     ) -> Context:
-        """What there is for metrics, and how to get what is missing.
-
-        Raises:
-            FaceDiffError: if the corpus's file of lip pairs is damaged.
-        """
-        pairs_file = None if self.corpus is None else self.corpus / "regions" / "inner_lip_pairs.txt"
-        if lip_pairs is None and pairs_file is not None and pairs_file.is_file():
-            try:
-                lip_pairs = LipPairs.from_file(pairs_file)
-            except ValueError as error:
-                raise FaceDiffError(str(error)) from error
+        """What there is for metrics, and how to get what is missing."""
         has: dict[str, dict[str, Any]] = {"lips": {"lips": lips}, "identities": {"n_identities": len(self.identities)}}
         rates = {"sample_rate": SAMPLE_RATE, "frames_per_second": self.frame_rate}
         for need, there, arguments in (

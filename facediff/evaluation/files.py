@@ -11,7 +11,7 @@ from typing import Literal
 
 from facediff.data.corpus import ALL, MOTION_FOLDERS, find_region, read_templates
 from facediff.errors import FaceDiffError
-from facediff.metrics import TOPOLOGIES, Region
+from facediff.metrics import TOPOLOGIES, LipPairs, Region
 from facediff.utils.arrays import open_vertices
 
 # What a file's name says: who speaks, what is said, and whose style the prediction was given.
@@ -316,3 +316,37 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
         message = str(error)
         raise FaceDiffError(message if str(root / file) in message else f"{root / file}: {message}") from error
     return region
+
+
+PAIRS_FILE = "regions/inner_lip_pairs.txt"
+"""Where a corpus has its pairs of inner-lip vertices."""
+
+
+def read_pairs(source: str | None, corpus: Path | None, n_vertices: int) -> LipPairs:
+    """Pairs of an upper and a lower lip vertex.
+
+    Args:
+        source: a text file of pairs, or the pairs themselves, ``3531-3504,1-2``; the corpus's file if None.
+        corpus: the corpus folder.
+        n_vertices: vertices of the mesh.
+
+    Raises:
+        FaceDiffError: if no pairs are given or found, or they do not belong to this mesh.
+    """
+    if source is None and corpus is not None and (corpus / PAIRS_FILE).is_file():
+        source = str(corpus / PAIRS_FILE)
+    if source is None:
+        where = f"{corpus / PAIRS_FILE}: no such file" if corpus is not None else "the truth is no corpus folder"
+        raise FaceDiffError(
+            f"{where}; give --lip-pairs, a file with one upper and one lower lip vertex a line, or pairs such as "
+            f"3531-3504 (the middle of FLAME's lips)"
+        )
+    try:
+        if not Path(source).is_file() and all(c.isdecimal() or c in "-," for c in source):
+            pairs = LipPairs.from_pairs("given", [[int(i) for i in pair.split("-")] for pair in source.split(",")])
+        else:
+            pairs = LipPairs.from_file(source)
+        pairs.check(n_vertices)
+    except ValueError as error:
+        raise FaceDiffError(f"--lip-pairs {source}: {error}") from error
+    return pairs

@@ -138,9 +138,9 @@ class Scorer:
                     over.check(n_vertices)
                 except ValueError as error:
                     raise FaceDiffError(f"metric {name}: {error}") from error
-            pooling, rule = getattr(chosen, "pooling", "sequences"), getattr(chosen, "length_rule", "min")
-            region = "all vertices" if over is None else over.as_dict()
-            self.columns.append(Column(METRICS, name, pooling, rule, name, region=region))
+            pooling: Pooling = getattr(chosen, "pooling", "sequences")
+            where = "all vertices" if over is None else over.as_dict()
+            self.columns.append(Column(METRICS, name, pooling, "min", name, region=where))
         self.needs_template |= any("template" in getattr(chosen, "needs", ()) for chosen in self.chosen.values())
 
     def _add(self, protocol: Protocol, name: str, metric: SequenceMetric) -> None:

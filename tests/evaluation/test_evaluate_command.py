@@ -63,6 +63,26 @@ def test_json_and_csv_hold_the_same_numbers(
     assert not list(tmp_path.glob("**/.*"))
 
 
+def test_metrics_are_chosen_by_name(files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    chosen = ["--metric", "lip_vertex_error:squared=false", "--metric", "mouth_opening_difference"]
+    words = ["--protocol", "meshtalk", "--lip-pairs", "1-2,7-11", "--csv", tmp_path / "scores.csv", *chosen]
+    assert evaluate(files.method(), files.root, *words, "--json", tmp_path / "scores.json") == 0
+    printed = capsys.readouterr().out
+    data = json.loads((tmp_path / "scores.json").read_text())
+    scores = {f"{each['protocol']}/{each['metric']}": each for each in data["methods"][0]["scores"]}
+    assert scores["metrics/lip_vertex_error:squared=false"]["value"] == scores["meshtalk/lve"]["value"]
+    assert scores["metrics/mouth_opening_difference"]["region"]["count"] == 2
+    assert "mouth_opening_difference: in each frame" in data["protocols"]["metrics"]
+    with (tmp_path / "scores.csv").open(newline="") as stream:
+        row = next(csv.DictReader(stream))
+    assert row["metrics/lip_vertex_error:squared=false"] == row["meshtalk/lve"]
+    assert f"{scores['metrics/mouth_opening_difference']['value']:.4e} [" in printed
+    with pytest.raises(FaceDiffError, match="mouth_opening_difference.*--lip-pairs"):
+        evaluate(files.method(), files.root, "--metric", "mouth_opening_difference")
+    with pytest.raises(FaceDiffError, match="lip_vertex_error"):
+        evaluate(files.method(), files.root, "--metric", "lip_vertex_eror")
+
+
 def test_what_is_missing_stands_under_the_scores(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     ours = files.method()
     files.write(ours / "A_e01_condition_A.npy", files.read(ours / "A_e01_condition_A.npy")[:5])

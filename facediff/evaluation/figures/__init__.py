@@ -13,7 +13,7 @@ from facediff.evaluation.figures.frames import (
     pick_frames,
 )
 from facediff.evaluation.figures.heatmaps import VertexMap, draw_error, draw_heatmap, error_maps, motion_maps
-from facediff.evaluation.figures.lips import Curves, Sound, draw_lips, opening_curves, read_pairs
+from facediff.evaluation.figures.lips import Curves, Sound, draw_lips, opening_curves
 from facediff.evaluation.figures.material import Material, find_clips
 from facediff.evaluation.figures.page import COLUMN, PAGE, Paper
 from facediff.evaluation.figures.training import (
@@ -25,6 +25,7 @@ from facediff.evaluation.figures.training import (
     read_curves,
     smooth,
 )
+from facediff.evaluation.files import read_pairs
 
 __all__ = [
     "COLUMN",
