@@ -133,7 +133,7 @@ def save(view: Workspace) -> str:
         FaceDiffError: if there is no key or no answer, or the server refuses.
     """
     os.environ.setdefault("WANDB_SILENT", "true")
-    from facediff.cli.lightning import why_offline
+    from facediff.cli.lightning_cli import why_offline
 
     try:
         reason = why_offline()

@@ -18,7 +18,7 @@ class Command:
 
     Attributes:
         target: ``module:function``, imported only when the command is used. The function is typed and documented; its
-            parser is made from that (:mod:`facediff.cli.parsing`). A function called ``run`` gets the command's name
+            parser is made from that (:mod:`facediff.cli.parsing`). Functions called ``run`` or ``lightning`` get the command's name
             and the words as they are.
         help: one line.
     """
@@ -36,10 +36,10 @@ COMMANDS = {
     "export": Command("facediff.cli.export:export", "animations for other programs: glb, USD, OBJ, point caches …"),
     "blendshapes": Command("facediff.cli.blendshapes:blendshapes", "animations as weights of blendshapes (ARKit)"),
     "retarget": Command("facediff.cli.retarget:retarget", "transfer animations to another mesh"),
-    "fit": Command("facediff.cli.lightning:run", "train a model"),
-    "validate": Command("facediff.cli.lightning:run", "score a model on the validation split"),
-    "test": Command("facediff.cli.lightning:run", "score a model on the test splits"),
-    "predict": Command("facediff.cli.lightning:run", "write a model's motion for a split"),
+    "fit": Command("facediff.cli.lightning:lightning", "train a model"),
+    "validate": Command("facediff.cli.lightning:lightning", "score a model on the validation split"),
+    "test": Command("facediff.cli.lightning:lightning", "score a model on the test splits"),
+    "predict": Command("facediff.cli.lightning:lightning", "write a model's motion for a split"),
     "evaluate": Command("facediff.cli.evaluate:evaluate", "score anybody's predicted motion files by named protocols"),
     "figure frames": Command("facediff.cli.figure:frames", "faces of truth and methods at chosen moments"),
     "figure heatmap": Command("facediff.cli.figure:heatmap", "mean and deviation of motion at every vertex"),
@@ -160,7 +160,7 @@ def help_wanted(words: Sequence[str]) -> bool:
 def run(name: str, arguments: Sequence[str]) -> int:
     """Import a command and run it with its arguments."""
     function = load(name)
-    if function.__name__ == "run":  # reads its words by a parser of its own
+    if function.__name__ in ("run", "lightning"):  # reads its words by a parser of its own
         return int(function(name, arguments) or 0)
     from facediff.cli.parsing import arguments_of
 

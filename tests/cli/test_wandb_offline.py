@@ -18,7 +18,7 @@ import pytest
 from jsonargparse import Namespace
 
 from facediff.cli.app import main
-from facediff.cli.lightning import answers, settle_wandb_mode
+from facediff.cli.lightning_cli import answers, settle_wandb_mode
 from facediff.errors import MissingExtraError
 from tests.cli.conftest import SMALL
 from tests.fakes.wandb_run import OfflineRun

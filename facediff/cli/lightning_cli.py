@@ -1,0 +1,316 @@
+"""LightningCLI as facediff uses it: components by name, one-sentence errors, callbacks that every run has, and wandb.
+
+It imports Lightning and jsonargparse, seconds that :mod:`facediff.cli.lightning` spends only where nothing was wrong
+with what was typed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import threading
+import urllib.error
+import urllib.request
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+from jsonargparse import set_parsing_settings
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import WandbLogger
+
+from facediff import registry
+from facediff.callbacks import GradientNorm, PredictionWriter, RunDescription, ScoreTable
+from facediff.data import SpeechMotionDataModule
+from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.models import AnimationModel
+
+LINKS = ("n_vertices", "identities", "frame_rate")
+"""Constructor arguments of a model that the data module knows."""
+
+
+def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
+    """Run a subcommand whose words are checked and complete; see :func:`facediff.cli.lightning.run_cli`."""
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
+    # Lightning starts the other processes of a distributed run with the words of this one.
+    argv, sys.argv = sys.argv, [sys.argv[0], name, *words]
+    try:
+        with warnings.catch_warnings():
+            for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, *RESUME_WARNINGS):
+                warnings.filterwarnings("ignore", message)
+            return FaceDiffCLI(
+                AnimationModel,
+                SpeechMotionDataModule,
+                subclass_mode_model=True,
+                subclass_mode_data=True,
+                auto_configure_optimizers=False,
+                trainer_defaults={"callbacks": built_in_callbacks(name), "logger": logger},
+                parser_class=Parser,
+                parser_kwargs={"parser_mode": "omegaconf+"},
+                save_config_callback=RunConfig,
+                save_config_kwargs={"overwrite": True},
+            )
+    except Exception as error:
+        # jsonargparse wraps what a constructor raises; our own sentence is the useful one.
+        ours = next((cause for cause in causes(error) if isinstance(cause, FaceDiffError)), None)
+        if type(error).__module__.startswith("wandb.errors"):
+            raise FaceDiffError(
+                f"wandb could not start the run ({error}); correct the key with `wandb login --relogin`, or set "
+                f"WANDB_MODE=offline and upload the run later"
+            ) from error
+        if ours is None or ours is error:
+            raise
+        raise ours from error
+    finally:
+        sys.argv = argv
+
+
+def built_in_callbacks(name: str) -> list[Callback]:
+    """What every run of a subcommand has beside the callbacks of its config."""
+    callbacks: list[Callback] = [ScoreTable(), RunDescription()]
+    if name == "fit":
+        callbacks.append(GradientNorm())
+    if name == "predict":
+        callbacks.append(PredictionWriter())
+    return callbacks
+
+
+IDLE_WARNINGS = (
+    # Reading is cheap (memory-mapped motion), so worker processes would only add their start-up time.
+    ".*does not have many workers",
+    # Lightning 2.6.6 calls a spelling that torch 2.13 deprecates.
+    ".*isinstance.treespec, LeafSpec.*",
+    # The throughput monitor is there for clips a second.
+    ".*define a `flops_per_batch` attribute",
+    # Frozen layers are in evaluation mode on purpose: no dropout.
+    r"Found \d+ module\(s\) in eval mode at the start of training",
+)
+"""Warnings of Lightning's that nobody needs to act on."""
+
+RESUME_WARNINGS = (".*callbacks used to create the checkpoint need to be provided", "The dirpath has changed from")
+"""They matter to training that goes on; scoring a checkpoint needs none of its callbacks."""
+
+
+class Parser(LightningArgumentParser):
+    """Reports an error in one sentence, in place of the hundred lines of usage that would hide it."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Raise a usage error as one sentence."""
+        if not self.exit_on_error:  # jsonargparse tries something, and looks at the error itself
+            super().error(message, ex)
+        raise FaceDiffError(explain(message)) from ex
+
+
+def explain(message: str) -> str:
+    r"""One sentence for what jsonargparse reports as a tree of the types that it tried.
+
+    >>> explain('Parser key "model":\n- Parser key "dim":\n Expected a <class \'int\'>. Got value: x').partition(";")[0]
+    '--model.dim x: expected int'
+    """
+    # The option is what the keys of the tree spell; a flag of several parts stands in a NestedArg below the first key.
+    keys = list(dict.fromkeys(re.findall(r'Parser key "([\w.]+)"', message)))
+    flag = re.search(r"NestedArg\(key='([\w.]+)'", message)
+    option = ".".join([keys[0], flag[1]] if keys and flag else keys)
+    owner, _, last = option.rpartition(".")
+    if found := re.search(r"dot import path string: (\S+)", message):
+        if last in registry.COMPONENTS:
+            return registry.COMPONENTS[last].unknown(found[1])
+        bases: dict[str, tuple[str, type]] = {
+            "model": ("model", AnimationModel),
+            "data": ("corpus", SpeechMotionDataModule),
+        }
+        if last not in bases:
+            return f"--{option} {found[1]}: there is no such class; expected its import path"
+        kind, base = bases[last]
+        return f'there is no {kind} "{found[1]}": {choices(found[1], subclasses(base))}'
+    chosen = owner if owner.startswith(("model", "data")) else ""
+    see = f"`--{chosen}.help=NAME` lists the options" if chosen else "`facediff fit --help` lists the options"
+    if found := re.search(r"Option '([\w.]+)' is not accepted", message):
+        known = component_options(message)
+        wrong = option if flag else f"{option}.{found[1]}"
+        return f"--{wrong}: there is no such option; {choices(found[1], known) if known else see}"
+    if found := re.search(r"arguments? (?:is|are) required: (.*)", message):
+        missing = [f"--{option}.{name}" if option else f"--{name.partition('.')[2]}" for name in found[1].split(", ")]
+        return f"{' and '.join(missing)} must be given, as an option or in a file with --config; {see}"
+    if found := re.search(r"Expected a path but (\S+) either not accessible or invalid", message):
+        return f"--{option} {found[1]}: no file, no name that `facediff components` lists, and no class of this kind"
+    types = re.findall(r"Expected (?:a |an )?<class '([\w.]+)'>|Literal\[(.*?)\]", message)
+    expected = [word for pair in dict.fromkeys(types) for word in pair if word not in ("", "NoneType")]
+    if expected:
+        given = re.search(r"val='(.*?)'\)|value: (?!Namespace|NestedArg)([^\s.]+)", message)
+        value = f" {given[1] or given[2]}" if given else ""
+        return f"--{option}{value}: expected {' or '.join(expected)}; {see}"
+    return f"{' '.join(message.split())}; {see}"
+
+
+def component_options(message: str) -> list[str]:
+    """The options of the innermost class that an error of jsonargparse names; empty if there is none."""
+    named = re.findall(r"class_path(?: |=)'([\w.]+)'", message)
+    module, _, name = (named or [""])[-1].rpartition(".")
+    if module.startswith("facediff.registry."):
+        kind = registry.COMPONENTS[module.rpartition(".")[2]]
+        return list(registry.defaults(kind.get(name)))
+    found = getattr(sys.modules.get(module), name, None)
+    return list(registry.defaults(found)) if isinstance(found, type) else []
+
+
+def subclasses(base: type) -> list[str]:
+    """Names of all concrete subclasses that are imported."""
+    found: list[str] = []
+    cls: type
+    for cls in base.__subclasses__():
+        found += [] if getattr(cls, "__abstractmethods__", None) else [cls.__name__]
+        found += subclasses(cls)
+    return found
+
+
+class FaceDiffCLI(LightningCLI):
+    """LightningCLI whose model takes its sizes from the data module."""
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Let the model take its sizes from the data module."""
+        for name in LINKS:
+            parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
+
+    def before_instantiate_classes(self) -> None:
+        """Settle whether wandb uploads before anything starts it."""
+        settle_wandb_mode(self.config[str(self.subcommand)].trainer)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:  # noqa: ANN401
+        """Make the trainer; a callback that the config names stands in for the built-in one of its kind."""
+        trainer = super().instantiate_trainer(**kwargs)
+        built_in = self.trainer_defaults["callbacks"]
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        named = {type(callback) for callback in callbacks if callback not in built_in}
+        callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in named]
+        return trainer
+
+    def _parse_ckpt_path(self) -> None:
+        """Upstream merges a checkpoint's hyper-parameters over the flags; the module ``words`` does it under them."""
+
+
+class RunConfig(SaveConfigCallback):
+    """Saves the config as ``config.yaml`` in the run's folder, and as ``config`` in a wandb run's config.
+
+    A run without a logger has no folder of its own; a ``config.yaml`` in the working folder may be the user's and
+    is left alone.
+    """
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Save the config where the run's files lie, unless that is merely the working folder."""
+        if not trainer.loggers and Path(trainer.default_root_dir).resolve() == Path.cwd():
+            self.save_to_log_dir = False
+        super().setup(trainer, pl_module, stage)
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Give wandb the config; called on one process only."""
+        for logger in trainer.loggers:
+            if isinstance(logger, WandbLogger):
+                config = yaml.safe_load(self.parser.dump(self.config, skip_none=False))
+                logger.log_hyperparams({"config": config})
+
+
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception and what it came from, outermost first."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+# Weights & Biases without a question and without waiting: offline where there is no key or no answer.
+
+PATIENCE = 5.0
+"""Seconds that the server has for its first answer."""
+
+
+def settle_wandb_mode(trainer: Mapping[str, Any]) -> None:
+    """Let a run that logs to Weights & Biases record offline where it could not upload.
+
+    Without a key wandb asks a question and waits for an answer, and without a network it waits for a minute and a half
+    and then fails. Here one line says why the run is offline and how it is uploaded later. Whoever has chosen a mode
+    (``WANDB_MODE``, or ``offline: true``) gets that mode.
+
+    Args:
+        trainer: the trainer's options as parsed, before anything is made of them.
+
+    Raises:
+        FaceDiffError: if wandb is not installed or the key is no key.
+    """
+    from lightning.pytorch.utilities import rank_zero_only
+
+    options = wandb_options(trainer)
+    if options is None or getattr(rank_zero_only, "rank", None):  # other processes of a run log nothing
+        return
+    try:
+        import wandb
+    except ModuleNotFoundError as error:
+        raise MissingExtraError("wandb", "wandb", "logging to Weights & Biases") from error
+    if os.environ.get("WANDB_MODE") or options.get("offline") or wandb.run is not None:
+        return
+    silent = os.environ.get("WANDB_SILENT")
+    os.environ.setdefault("WANDB_SILENT", "true")  # else a login is announced, for which wandb asks the server
+    try:
+        reason = why_offline()
+    except (wandb.Error, ValueError) as error:
+        raise FaceDiffError(
+            f"wandb: {error}; put the key right (`wandb login --relogin`), or set WANDB_MODE=offline"
+        ) from error
+    wandb.teardown()  # what comes next reads the environment anew
+    if reason is None:
+        if silent is None:
+            del os.environ["WANDB_SILENT"]  # the run's address is worth a line
+        return
+    os.environ["WANDB_MODE"] = "offline"
+    folder = options.get("save_dir") or options.get("dir") or "."
+    print(
+        f"wandb: {reason}: the run is recorded offline; upload it later with `wandb sync {folder}/wandb/offline-run-*`",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
+def wandb_options(trainer: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Options of the first logger that is a WandbLogger; None if there is none."""
+    loggers = trainer.get("logger")
+    for logger in loggers if isinstance(loggers, list) else [loggers]:
+        if str(getattr(logger, "class_path", "")).endswith("WandbLogger"):
+            return dict(getattr(logger, "init_args", None) or {})
+    return None
+
+
+def why_offline() -> str | None:
+    """What stands in the way of uploading: no key, or no answer; None if nothing does."""
+    import wandb
+
+    if not wandb.login(prompt=False, verify=False):
+        return "no API key found (`wandb login`, WANDB_API_KEY)"
+    address = str(wandb.setup().settings.base_url)
+    return None if answers(address) else f"{address} does not answer"
+
+
+def answers(address: str, patience: float = PATIENCE) -> bool:
+    """Whether a web server answers, with whatever but an error of its own; proxies of the environment are used.
+
+    In a thread of its own, since looking up a name may take longer than any time limit of the connection.
+    """
+    heard = threading.Event()
+
+    def ask() -> None:
+        try:
+            urllib.request.urlopen(address, timeout=patience).close()  # noqa: S310 (the user's own setting)
+        except urllib.error.HTTPError as error:
+            if error.code >= 500:  # a gateway whose server is down; "not found" is an answer
+                return
+        except (OSError, ValueError):
+            return
+        heard.set()
+
+    thread = threading.Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(patience)
+    return heard.is_set()
