@@ -18,8 +18,8 @@ class Command:
 
     Attributes:
         target: ``module:function``, imported only when the command is used. The function is typed and documented; its
-            parser is made from that (:mod:`facediff.cli.parsing`). Functions called ``run`` or ``lightning`` get the command's name
-            and the words as they are.
+            parser is made from that (:mod:`facediff.cli.parsing`). Functions called ``run`` or ``lightning`` get the
+            command's name and the words as they are.
         help: one line.
     """
 

@@ -1,4 +1,4 @@
-"""A trained model that is to know one person more."""
+"""Adapting a trained model to a new speaker: a row more in its identity table, and which weights are trained."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Part = Literal["all", "person"]
 
 
 def with_extra_identities(model: AnimationModel, identities: list[str]) -> AnimationModel:
-    """The same model with further identities in front of those it knows, each starting as the mean of them all.
+    """The same model with further identities in front of those it was trained on, each starting as the mean of them.
 
     Args:
         model: a trained model.
-        identities: what its identities shall be; those it has must be their end.
+        identities: the new list of identities; the model's own must be its end.
 
     Raises:
         FaceDiffError: if the model has other identities.
@@ -31,12 +31,12 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
     if count < 0 or identities[count:] != known:
         raise FaceDiffError(
             f"the checkpoint knows {', '.join(known)}, which is not the end of {', '.join(identities)}: adapt it with "
-            f"the corpus and the people that it was trained on"
+            f"the corpus and the identities that it was trained on"
         )
     if not count:
         return model
-    described = {key: value for key, value in model.hparams.items() if not key.startswith("_")}
-    grown: AnimationModel = instantiate_module(type(model), {**described, "identities": identities})
+    options = {key: value for key, value in model.hparams.items() if not key.startswith("_")}
+    grown: AnimationModel = instantiate_module(type(model), {**options, "identities": identities})
     before = model.state_dict()
     grown.load_state_dict({name: grow(before[name], value) for name, value in grown.state_dict().items()})
     grown.adopt(replace(model.assets, identities=identities))

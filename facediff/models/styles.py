@@ -1,10 +1,15 @@
-"""Styles as words of the command line: a file, the name of a clip, or a mixture of several."""
+"""A speaking style from what was typed after ``--style``: a clip's name, a file, or a weighted mixture of several.
+
+From top to bottom: what was typed is split into names with weights; each name becomes a reference motion or a style
+vector; a motion file is brought to offsets from its speaker's neutral face, and checked against the face that it is
+taken for. Libraries are imported inside the functions, so that splitting alone costs nothing.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,235 +24,15 @@ if TYPE_CHECKING:
     from facediff.data import Assets, Reference
     from facediff.models import AnimationModel, Style
 
-
-# Motions that lend their style: whose they are, which template is taken off them, and whether that can be.
-
-STRANGER = 0.25
-"""How far the stillest vertices may lie from the face, as a share of how far all vertices of a reference do."""
+FILES = (".npy", ".npz")
+"""Suffixes of files that hold a style; anything else is the name of a clip."""
 MEDIAN = "median"
 """Instead of a template's file: the median of the motion's own frames."""
-
-
-@dataclass
-class StyleFile:
-    """A motion or a style vector as read from a file, opened once.
-
-    Attributes:
-        path: the file.
-        array: (T, V, 3) or (T, 3V) absolute vertices, or a style vector.
-        template: (V, 3) of a take, in the motion's unit; None where the file does not say.
-        frame_rate: likewise.
-        unit: likewise.
-    """
-
-    path: Path
-    array: npt.NDArray[np.generic]
-    template: npt.NDArray[np.floating] | None = None
-    frame_rate: float | None = None
-    unit: str | None = None
-
-
-def in_corpus(path: Path) -> bool:
-    """Whether a motion lies in a corpus folder, or a person's, which has templates of its own."""
-    from facediff.data.corpus import MOTION_FOLDERS
-
-    return path.resolve().parent.name in MOTION_FOLDERS
-
-
-def folder_facts(path: Path, assets: Assets, source: Mapping[str, str]) -> tuple[dict[str, Tensor], float]:
-    """Templates that a motion file may belong to, and its motion frames a second."""
-    from facediff.data import SpeechMotionDataModule
-    from facediff.data.corpus import read_manifest, read_templates
-    from facediff.models.checkpoint import find_class
-    from facediff.registry import corpus
-
-    templates: dict[str, Tensor] = dict(assets.templates)
-    root = path.resolve().parent.parent
-    if not in_corpus(path):
-        return templates, assets.frame_rate
-    if (root / "templates.pkl").is_file():
-        templates |= read_templates(root / "templates.pkl", assets.n_vertices)
-    module = find_class(corpus, str(source.get("class_path")), SpeechMotionDataModule)
-    usual = module.stored_frame_rate if module is not None and str(root) == source.get("root") else None
-    return templates, float(read_manifest(root).get("frame_rate") or usual or assets.frame_rate)
-
-
-def stride_of(path: Path, stored: float, wanted: float) -> int:
-    """Every how many-th frame of a file is taken.
-
-    Raises:
-        FaceDiffError: if the file's frame rate is no whole multiple of the checkpoint's.
-    """
-    stride = round(stored / wanted)
-    if stride < 1 or abs(stride * wanted - stored) > 1e-6:
-        raise FaceDiffError(
-            f"--style {path}: has {stored:g} frames a second, the checkpoint {wanted:g}; give a motion at that rate"
-        )
-    return stride
-
-
-def corpus_clip(name: str, source: Mapping[str, str]) -> Path:
-    """Where a clip of the training corpus lies, if the corpus is on this machine."""
-    root = source.get("root")
-    path = Path(root) / "vertices_npy" / f"{name}.npy" if root else None
-    if path is None or not path.is_file():
-        where = f"in the checkpoint nor at {path}" if path else "in the checkpoint, and its corpus is not known"
-        raise FaceDiffError(f"--style {name}: no clip of that name {where}; give a .npy file or another clip")
-    return path
-
-
-def open_style(path: Path) -> StyleFile:
-    """A style's file, memory-mapped where it is an array."""
-    from facediff.utils.arrays import open_array
-
-    if not path.is_file():
-        raise FaceDiffError(f"--style {path}: no such file")
-    if path.suffix == ".npz":
-        from facediff.animation import read_archive
-
-        animation = read_archive(path)
-        return StyleFile(path, animation.vertices, animation.template, animation.frame_rate, animation.unit)
-    return StyleFile(path, open_array(path, kinds="fiu", name=f"--style {path}"))
-
-
-def read_reference(
-    opened: StyleFile, assets: Assets, whose: str | None, template: Tensor, stride: int = 1
-) -> Reference:
-    """Offsets from an identity's template (V, 3), from absolute vertices (T, V, 3) or (T, 3V)."""
-    import torch
-
-    from facediff.data import Reference
-
-    motion = frames_of(opened, assets, stride)
-    offsets = torch.from_numpy(motion) - template
-    refuse_unknown(opened.path, offsets, assets, whose)
-    return Reference(opened.path.stem, offsets)
-
-
-def frames_of(opened: StyleFile, assets: Assets, stride: int) -> npt.NDArray[np.float32]:
-    """Absolute vertices (T, V, 3) of every ``stride``-th frame.
-
-    Raises:
-        FaceDiffError: if the file is of another topology, or not finite.
-    """
-    import numpy as np
-
-    array, vertices = opened.array, assets.n_vertices
-    if array.ndim not in (2, 3) or not len(array) or array.shape[1:] not in ((vertices, 3), (3 * vertices,)):
-        raise FaceDiffError(
-            f"--style {opened.path}: has shape {array.shape}; the checkpoint's faces have {vertices} vertices, "
-            f"so (frames, {vertices}, 3) or (frames, {3 * vertices}) is expected"
-        )
-    motion = np.array(array[::stride], np.float32).reshape(-1, vertices, 3)
-    if not np.isfinite(motion).all():
-        raise FaceDiffError(f"--style {opened.path}: holds NaN or infinity")
-    return motion
-
-
-def reference_of_animation(opened: StyleFile, assets: Assets) -> Reference:
-    """The offsets of a take from its own template, in the checkpoint's unit."""
-    from dataclasses import replace
-
-    import torch
-
-    from facediff.animation import metres_per_unit
-    from facediff.data import Reference
-
-    template, unit = opened.template, opened.unit or assets.unit
-    if template is None:
-        raise FaceDiffError(f"--style {opened.path}: has no template")
-    scale = 1.0 if unit == assets.unit else metres_per_unit(unit) / metres_per_unit(assets.unit)
-    stride = stride_of(opened.path, opened.frame_rate or assets.frame_rate, assets.frame_rate)
-    frames_of(opened, assets, stride)  # refuses another topology before it is compared with the template
-    moved = replace(opened, array=opened.array - template[None])  # type: ignore[operator]
-    offsets = scale * torch.from_numpy(frames_of(moved, assets, stride))
-    refuse_unknown(opened.path, offsets, assets, None)
-    return Reference(opened.path.stem, offsets)
-
-
-def face_of(template: str | Path, opened: StyleFile, assets: Assets) -> Tensor:
-    """The template that was given for a motion: a mesh, an array (V, 3), or ``median``.
-
-    Raises:
-        FaceDiffError: naming the file, if it is none of these or of another topology.
-    """
-    import numpy as np
-    import torch
-
-    from facediff.mesh import read_mesh
-
-    path = Path(template)
-    if str(template) == MEDIAN and not path.is_file():
-        median = np.median(frames_of(opened, assets, 1), axis=0)
-        print(
-            f"note: --style {opened.path}: the median of its {len(opened.array)} frames stands for the neutral face; a "
-            f"mouth that is open most of the time then counts as closed"
-        )
-        return torch.from_numpy(np.asarray(median, np.float32))
-    read = open_style(path).array if path.suffix.lower() == ".npy" else read_mesh(path).vertices
-    fits = read.size == 3 * assets.n_vertices
-    face = np.asarray(read, np.float32).reshape(-1, 3) if fits else np.zeros((0, 3), np.float32)
-    if face.shape != (assets.n_vertices, 3) or not np.isfinite(face).all():
-        raise FaceDiffError(
-            f"--style-template {path}: has shape {read.shape}; expected the neutral face of {assets.n_vertices} finite "
-            f"vertices whose motion is in --style, as .obj, .ply or .npy, or the word {MEDIAN}"
-        )
-    return torch.from_numpy(face)
-
-
-def refuse_unknown(path: Path, offsets: Tensor, assets: Assets, whose: str | None) -> None:
-    """Refuse a motion that is not of the face whose template was taken off it; it would pass for a strange style.
-
-    Told by the quarter of the vertices that move least in the stored references (skull, neck): there the offsets from
-    one's own template are small, and those from another's are not, nor those of a head that moves.
-
-    Args:
-        path: for the message.
-        offsets: (T, V, 3) from the template.
-        assets: of the checkpoint.
-        whose: who is taken for the motion's person; None where the template came with the motion.
-    """
-    import torch
-
-    stored = [reference.motion.float() for reference in assets.references.values()]
-    if not stored:
-        return
-    reach = torch.stack([torch.linalg.vector_norm(motion, dim=-1).amax(0) for motion in stored]).amax(0)
-    still = reach.argsort()[: max(1, len(reach) // 4)]
-    size = float(offsets[:, still].square().mean().sqrt())
-    usual = max(float(motion.square().mean().sqrt()) for motion in stored)
-    if size <= STRANGER * usual:
-        return
-    if whose is None:
-        raise FaceDiffError(
-            f"--style {path}: does not lie on its template: the head moves, or the template is another person's or in "
-            f"another unit; give that person's own, and a head that keeps still (`facediff data import-person` does it)"
-        )
-    raise FaceDiffError(
-        f"--style {path}: is not a motion of {whose}'s face, so it must be another person's; give that person's "
-        f"neutral face with --style-template, or name the file <identity>_<clip>.npy with an identity that the "
-        f"checkpoint knows ({', '.join(sorted(assets.templates))})"
-    )
-
-
-MOTIONS = (".npy", ".npz")
 CANCELLED = 1e-3
 """Weights whose sum is less than this share of their sizes have nothing left to divide by."""
-
+OTHER_FACE = 0.25
+"""How far the stillest vertices may lie from the face, as a share of how far all vertices of a reference do."""
 NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)"
-
-
-@dataclass(frozen=True)
-class Weighted:
-    """One word of a mixture.
-
-    Attributes:
-        name: a file or the name of a clip.
-        weight: None if none was given.
-    """
-
-    name: str
-    weight: float | None
 
 
 def read_styles(
@@ -261,7 +46,7 @@ def read_styles(
             negative, which leads away from a style; they are divided by their sum.
         identity: whose face is animated.
         model: gives the style vectors.
-        template: neutral face of the person whose motion the .npy files hold, or ``median``.
+        template: neutral face of the speaker whose motion the .npy files hold, or ``median``.
 
     Raises:
         FaceDiffError: if the model has no styles, a style cannot be read, or the weights make no mean.
@@ -273,7 +58,7 @@ def read_styles(
     if not style_width(model):
         raise FaceDiffError(
             f"--style {words}: this checkpoint was trained without a dynamic style, so a style would change nothing; "
-            f"leave --style away"
+            f"omit --style"
         )
     parts = split_styles(words, [reference.clip for reference in model.assets.references.values()])
     if len(parts) == 1:
@@ -289,8 +74,21 @@ def read_styles(
     return Style(" + ".join(f"{share:.3g} {name}" for share, name in zip(shares, names, strict=True)), vector)
 
 
+@dataclass(frozen=True)
+class Weighted:
+    """One style of a mixture.
+
+    Attributes:
+        name: a file or the name of a clip.
+        weight: None if none was given.
+    """
+
+    name: str
+    weight: float | None
+
+
 def split_styles(words: str, clips: Sequence[str] = ()) -> list[Weighted]:
-    r"""The words of a mixture, parted at commas; a weight is what stands behind the last colon, if that is a number.
+    r"""The styles of a mixture, split at commas; a weight is what follows the last colon, if that is a number.
 
     Words that are a file, or the name of a clip, as a whole are taken as such: alone, a name may hold commas, or end in
     a colon and a number.
@@ -310,8 +108,13 @@ def split_styles(words: str, clips: Sequence[str] = ()) -> list[Weighted]:
     return parts
 
 
+def style_paths(words: str | None) -> list[Path]:
+    """The files among the words of ``--style``; if one of them has changed, so has the style."""
+    return [Path(part.name) for part in split_styles(words) if Path(part.name).is_file()] if words else []
+
+
 def normalised(words: str, weights: Sequence[float | None]) -> list[float]:
-    """Weights that sum to 1; a note says so where that changed them.
+    """Weights that sum to 1; a note is printed if that changed them.
 
     Raises:
         FaceDiffError: if only some are given, one is not finite, or their sum is too near to 0.
@@ -332,15 +135,6 @@ def normalised(words: str, weights: Sequence[float | None]) -> list[float]:
     return shares
 
 
-def style_width(model: AnimationModel) -> int:
-    """How many numbers a style vector of the model has; 0 if it has no dynamic style."""
-    import torch
-
-    with torch.inference_mode():
-        still = torch.zeros(1, 1, model.n_vertices, 3, device=model.device)
-        return int(model.encode_style(still, torch.ones(1, 1, dtype=torch.bool, device=model.device)).shape[1])
-
-
 def vector_of(style: Reference | Style, model: AnimationModel) -> Tensor:
     """The style vector (style_dim,) of a style, on the CPU."""
     import torch
@@ -354,6 +148,15 @@ def vector_of(style: Reference | Style, model: AnimationModel) -> Tensor:
         encoded = model.encode_style(motion, torch.ones(motion.shape[:2], dtype=torch.bool, device=model.device))
     # A plain tensor: one made in inference mode could not be used outside of it.
     return encoded[0].cpu().clone()
+
+
+def style_width(model: AnimationModel) -> int:
+    """How many numbers a style vector of the model has; 0 if it has no dynamic style."""
+    import torch
+
+    from facediff.data import Reference
+
+    return len(vector_of(Reference("still", torch.zeros(1, model.n_vertices, 3)), model))
 
 
 def extract_style(clips: Sequence[str], identity: str, model: AnimationModel) -> Tensor:
@@ -378,48 +181,98 @@ def extract_style(clips: Sequence[str], identity: str, model: AnimationModel) ->
     return torch.stack([vector_of(style, model) for style in styles]).mean(0)
 
 
-def style_paths(words: str | None) -> list[Path]:
-    """The files among the words of ``--style``, by which to tell whether a style has changed."""
-    return [Path(part.name) for part in split_styles(words) if Path(part.name).is_file()] if words else []
-
-
 def read_style(
     style: str, identity: str, model: AnimationModel, *, template: str | Path | None = None
 ) -> Reference | Style:
     """A style from a file, from the checkpoint, or from the corpus that the checkpoint was trained on.
 
-    A file holds a style vector that ``facediff style extract`` wrote, or a motion in absolute vertices: a take
-    (``.npz``), which says its own template, or a bare array (``.npy``). An array's identity follows from its file name
-    (``F1_e03.npy``), else it is the identity, unless a template is given. A file in the ``vertices_npy`` of a corpus
+    A file holds a style vector that ``facediff style extract`` wrote, or a motion in absolute vertices: an animation
+    (``.npz``), which has its own template, or a bare array (``.npy``). An array's speaker follows from its name
+    (``F1_e03.npy``), else it is ``identity``, unless a template is given. A file in the ``vertices_npy`` of a corpus
     folder comes with that folder's templates and frame rate.
+
+    Args:
+        style: the file, or the name of a clip.
+        identity: whose face is animated.
+        model: the trained model.
+        template: neutral face of the speaker whose motion an array holds, or ``median``.
+
+    Raises:
+        FaceDiffError: if there is no such file or clip, or it is no style for this checkpoint.
     """
-    assets, source = model.assets, model.data_source
-    if not style.endswith(MOTIONS):
+    import torch
+
+    from facediff.animation import metres_per_unit
+    from facediff.data import Reference
+    from facediff.models import Style
+
+    assets = model.assets
+    if not style.endswith(FILES):
         for reference in assets.references.values():
             if reference.clip == style:
                 return reference
-    opened = open_style(Path(style) if style.endswith(MOTIONS) else corpus_clip(style, source))
-    path = opened.path
+    opened = open_style(Path(style) if style.endswith(FILES) else corpus_clip(style, model))
+    path, scale = opened.path, 1.0
     if opened.array.ndim == 1:
-        return read_vector(opened, model)
-    if opened.template is not None:
-        return reference_of_animation(opened, assets)
-    owner = path.stem.split("_condition_")[0].rpartition("_")[0]
-    templates, stored = folder_facts(path, assets, source)
-    stride = stride_of(path, stored, assets.frame_rate)
-    if template is not None and style.endswith(MOTIONS) and not (in_corpus(path) and owner in templates):
-        return read_reference(opened, assets, None, face_of(template, opened, assets), stride)
-    who = next((name for name in (owner, identity) if name in templates), None)
-    face = templates[who] if who is not None else assets.template(identity)
-    return read_reference(opened, assets, who or identity, face, stride)
+        return Style(path.stem, read_vector(opened, model))
+    if opened.template is None:
+        face, whose, rate = face_of_array(opened, identity, model, template if style.endswith(FILES) else None)
+    else:
+        face, whose, rate = torch.from_numpy(opened.template), None, opened.frame_rate or assets.frame_rate
+        if opened.unit not in (None, assets.unit):
+            scale = metres_per_unit(str(opened.unit)) / metres_per_unit(assets.unit)
+    motion = torch.from_numpy(frames_of(opened, assets, stride_of(path, rate, assets.frame_rate)))
+    offsets = scale * (motion - face)
+    check_face(path, offsets, assets, whose)
+    return Reference(path.stem, offsets)
 
 
-def read_vector(opened: StyleFile, model: AnimationModel) -> Style:
+@dataclass(frozen=True)
+class StyleFile:
+    """A motion or a style vector as read from a file.
+
+    Attributes:
+        path: the file.
+        array: (T, V, 3) or (T, 3V) absolute vertices, or a style vector.
+        template: (V, 3) of an animation, in the motion's unit; None for a bare array.
+        frame_rate: likewise.
+        unit: likewise.
+    """
+
+    path: Path
+    array: npt.NDArray[np.generic]
+    template: npt.NDArray[np.float32] | None = None
+    frame_rate: float | None = None
+    unit: str | None = None
+
+
+def open_style(path: Path) -> StyleFile:
+    """A style's file, memory-mapped where it is an array."""
+    from facediff.animation import read_archive
+    from facediff.utils.arrays import open_array
+
+    if not path.is_file():
+        raise FaceDiffError(f"--style {path}: no such file")
+    if path.suffix == ".npz":
+        animation = read_archive(path)
+        return StyleFile(path, animation.vertices, animation.template, animation.frame_rate, animation.unit)
+    return StyleFile(path, open_array(path, kinds="fiu", name=f"--style {path}"))
+
+
+def corpus_clip(name: str, model: AnimationModel) -> Path:
+    """The motion file of a clip of the training corpus, if the corpus is on this machine."""
+    root = model.data_source.get("root")
+    path = Path(root) / "vertices_npy" / f"{name}.npy" if root else None
+    if path is None or not path.is_file():
+        where = f"in the checkpoint nor at {path}" if path else "in the checkpoint, and its corpus is not known"
+        raise FaceDiffError(f"--style {name}: no clip of that name {where}; give a .npy file or another clip")
+    return path
+
+
+def read_vector(opened: StyleFile, model: AnimationModel) -> Tensor:
     """A style vector, if it is as long as this model's are."""
     import numpy as np
     import torch
-
-    from facediff.models import Style
 
     vector, width = np.array(opened.array, np.float32), style_width(model)
     if len(vector) != width or not np.isfinite(vector).all():
@@ -427,4 +280,138 @@ def read_vector(opened: StyleFile, model: AnimationModel) -> Style:
             f"--style {opened.path}: holds {len(vector)} numbers, but this checkpoint's style vectors have {width} (no "
             f"NaN); make one with `facediff style extract` from this very checkpoint"
         )
-    return Style(opened.path.stem, torch.from_numpy(vector))
+    return torch.from_numpy(vector)
+
+
+def frames_of(opened: StyleFile, assets: Assets, stride: int) -> npt.NDArray[np.float32]:
+    """Absolute vertices (T, V, 3) of every ``stride``-th frame.
+
+    Raises:
+        FaceDiffError: if the file is of another topology, or not finite.
+    """
+    import numpy as np
+
+    array, vertices = opened.array, assets.n_vertices
+    if array.ndim not in (2, 3) or not len(array) or array.shape[1:] not in ((vertices, 3), (3 * vertices,)):
+        raise FaceDiffError(
+            f"--style {opened.path}: has shape {array.shape}; the checkpoint's faces have {vertices} vertices, "
+            f"so (frames, {vertices}, 3) or (frames, {3 * vertices}) is expected"
+        )
+    motion = np.array(array[::stride], np.float32).reshape(-1, vertices, 3)
+    if not np.isfinite(motion).all():
+        raise FaceDiffError(f"--style {opened.path}: holds NaN or infinity")
+    return motion
+
+
+def stride_of(path: Path, stored: float, wanted: float) -> int:
+    """Every how many-th frame of a file is taken.
+
+    Raises:
+        FaceDiffError: if the file's frame rate is no whole multiple of the checkpoint's.
+    """
+    stride = round(stored / wanted)
+    if stride < 1 or abs(stride * wanted - stored) > 1e-6:
+        raise FaceDiffError(
+            f"--style {path}: has {stored:g} frames a second, the checkpoint {wanted:g}; give a motion at that rate"
+        )
+    return stride
+
+
+def face_of_array(
+    opened: StyleFile, identity: str, model: AnimationModel, given: str | Path | None
+) -> tuple[Tensor, str | None, float]:
+    """The neutral face of a bare array's speaker, who that is taken to be (None for a given face), and its frame rate.
+
+    Args:
+        opened: the array.
+        identity: the speaker, if the file's name names nobody who is known.
+        model: its checkpoint's templates are known, and those of the corpus folder that the file lies in.
+        given: a template that was given, or ``median``.
+    """
+    from facediff.data import SpeechMotionDataModule
+    from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
+    from facediff.models.checkpoint import find_class
+    from facediff.registry import corpus
+
+    path, assets, source = opened.path, model.assets, model.data_source
+    templates, rate = dict(assets.templates), assets.frame_rate
+    in_corpus = path.resolve().parent.name in MOTION_FOLDERS
+    if in_corpus:
+        root = path.resolve().parent.parent
+        if (root / "templates.pkl").is_file():
+            templates |= read_templates(root / "templates.pkl", assets.n_vertices)
+        module = find_class(corpus, str(source.get("class_path")), SpeechMotionDataModule)
+        usual = module.stored_frame_rate if module is not None and str(root) == source.get("root") else None
+        rate = float(read_manifest(root).get("frame_rate") or usual or rate)
+    named = path.stem.split("_condition_")[0].rpartition("_")[0]
+    if given is not None and not (in_corpus and named in templates):
+        return given_face(given, opened, assets), None, rate
+    whose = next((name for name in (named, identity) if name in templates), None)
+    return assets.template(identity) if whose is None else templates[whose], whose or identity, rate
+
+
+def given_face(template: str | Path, opened: StyleFile, assets: Assets) -> Tensor:
+    """The neutral face (V, 3) that was given for a motion: a mesh, an array, or ``median``.
+
+    Raises:
+        FaceDiffError: naming the file, if it is none of these or of another topology.
+    """
+    import numpy as np
+    import torch
+
+    from facediff.mesh import read_mesh
+
+    path = Path(template)
+    if str(template) == MEDIAN and not path.is_file():
+        median = np.median(frames_of(opened, assets, 1), axis=0)
+        print(
+            f"note: --style {opened.path}: the median of its {len(opened.array)} frames stands for the neutral face; a "
+            f"mouth that is open most of the time then counts as closed"
+        )
+        return torch.from_numpy(np.asarray(median, np.float32))
+    read = open_style(path).array if path.suffix.lower() == ".npy" else read_mesh(path).vertices
+    fits = read.size == 3 * assets.n_vertices
+    face = np.asarray(read, np.float32).reshape(-1, 3) if fits else np.zeros((0, 3), np.float32)
+    if not fits or not np.isfinite(face).all():
+        raise FaceDiffError(
+            f"--style-template {path}: has shape {read.shape}; expected the neutral face of {assets.n_vertices} finite "
+            f"vertices whose motion is in --style, as .obj, .ply or .npy, or the word {MEDIAN}"
+        )
+    return torch.from_numpy(face)
+
+
+def check_face(path: Path, offsets: Tensor, assets: Assets, whose: str | None) -> None:
+    """Refuse a motion that is not of the face whose template was subtracted; it would pass for an odd style.
+
+    Args:
+        path: for the message.
+        offsets: (T, V, 3) from the template.
+        assets: of the checkpoint.
+        whose: the speaker that the motion is taken for; None where the template came with the motion.
+
+    Raises:
+        FaceDiffError: if the motion is another face's, or the head moves.
+    """
+    import torch
+
+    stored = [reference.motion.float() for reference in assets.references.values()]
+    if not stored:
+        return
+    # The quarter of the vertices that move least in the stored references (skull, neck) decides: there the offsets from
+    # one's own template are small, and those from another speaker's are not, nor those of a head that moves.
+    reach = torch.stack([torch.linalg.vector_norm(motion, dim=-1).amax(0) for motion in stored]).amax(0)
+    still = reach.argsort()[: max(1, len(reach) // 4)]
+    size = float(offsets[:, still].square().mean().sqrt())
+    usual = max(float(motion.square().mean().sqrt()) for motion in stored)
+    if size <= OTHER_FACE * usual:
+        return
+    if whose is None:
+        raise FaceDiffError(
+            f"--style {path}: does not lie on its template: the head moves, or the template is another person's or in "
+            f"another unit; give that person's own, and a head that keeps still (`facediff data import-person` does it)"
+        )
+    raise FaceDiffError(
+        f"--style {path}: is not a motion of {whose}'s face, so it must be another person's; give that person's "
+        f"neutral face with --style-template, or name the file <identity>_<clip>.npy with an identity that the "
+        f"checkpoint knows ({', '.join(sorted(assets.templates))})"
+    )
