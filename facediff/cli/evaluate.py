@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-from facediff.cli.options import File, Folder, Seed, Workers, named_folders
+from facediff.cli.options import File, Folder, FrameRate, Seed, Workers, check_folders, named_folders
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 
@@ -24,7 +24,7 @@ def evaluate(
     lips: Annotated[str | None, Option(metavar="FILE")] = None,
     upper_face: Annotated[str | None, Option(metavar="FILE")] = None,
     lip_pairs: Annotated[str | None, Option(metavar="FILE")] = None,
-    frame_rate: Annotated[float | None, Option(metavar="FPS", above=0)] = None,
+    frame_rate: FrameRate = None,
     topology: Annotated[str | None, Option(metavar="NAME")] = None,
     n_vertices: Annotated[int | None, Option(metavar="V", least=1)] = None,
     pattern: Annotated[list[str] | None, Option(metavar="PATTERN")] = None,
@@ -72,9 +72,7 @@ def evaluate(
         quiet: no progress bar
     """
     methods = named_folders([predictions, *(method or [])])
-    for name, folder in methods.items():
-        if not folder.is_dir():
-            raise FaceDiffError(f"{folder}: no such folder of predictions ({name})")
+    check_folders(methods)
     if not truth.is_dir():
         raise FaceDiffError(f"{truth}: no such folder; expected truths, or a corpus folder")
     from facediff.utils.files import atomic, check_writable, write_rows

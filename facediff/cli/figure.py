@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from facediff.cli.options import File, Folder, FrameRate, Output, View, named_folders
+from facediff.cli.options import File, Folder, FrameRate, Output, View, check_folders, named_folders
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 
@@ -57,17 +57,23 @@ class FileOptions:
     truth_stride: Annotated[int | None, Option(metavar="N", least=1)] = None
     unit: Annotated[str | None, Option(metavar="U")] = None
 
-    def gather(self, predictions: str, truth: Path) -> Material:
-        """What is drawn.
+    def gather(self, predictions: str, truth: Path, page: PageOptions, output: Path) -> tuple[Paper, Material]:
+        """The page and what is drawn on it.
 
         Raises:
-            FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others.
+            FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others, or the figure cannot
+                be written.
         """
+        methods = named_folders([predictions, *(self.method or [])])
+        check_folders(methods)
+        if not truth.is_dir() and str(truth) != "puppet":
+            raise FaceDiffError(f"{truth}: no such folder; expected a corpus, a folder of truths, or puppet")
+        paper = page.paper(output)
         from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN
         from facediff.evaluation.figures.gather import gather
 
-        return gather(
-            named_folders([predictions, *(self.method or [])]),
+        material = gather(
+            methods,
             truth,
             patterns=self.pattern or DEFAULT_PATTERNS,
             truth_pattern=self.truth_pattern or TRUTH_PATTERN,
@@ -79,6 +85,7 @@ class FileOptions:
             truth_stride=self.truth_stride,
             unit=self.unit,
         )
+        return paper, material
 
 
 @dataclass(frozen=True)
@@ -144,11 +151,10 @@ def frames(
     """
     if bool(times) == bool(phonemes):
         raise FaceDiffError("choose what the columns show, with either --times or --phonemes")
-    paper = page.paper(output)
+    paper, material = files.gather(predictions, truth, page, output)
     from facediff.evaluation.figures import Moment, draw_frames, find_phoneme
     from facediff.evaluation.figures.gather import phonemes_of
 
-    material = files.gather(predictions, truth)
     chosen = material.choose([clip] if clip else None)[0]
     spoken = phonemes_of(material, chosen, phoneme_file)
     if times:
@@ -196,10 +202,9 @@ def heatmap(
         files: what is drawn.
         page: how it is printed.
     """
-    paper = page.paper(output)
+    paper, material = files.gather(predictions, truth, page, output)
     from facediff.evaluation.figures import draw_heatmap
 
-    material = files.gather(predictions, truth)
     chosen, highest = material.choose(clips), (highest_mean, highest_std)
     report(output, draw_heatmap(material, chosen, output, paper=paper, view=view, highest=highest))
 
@@ -231,10 +236,9 @@ def error(
         files: what is drawn.
         page: how it is printed.
     """
-    paper = page.paper(output)
+    paper, material = files.gather(predictions, truth, page, output)
     from facediff.evaluation.figures import draw_error
 
-    material = files.gather(predictions, truth)
     notes = draw_error(
         material,
         material.choose(clips),
@@ -274,11 +278,10 @@ def lips(
         files: what is drawn.
         page: how it is printed.
     """
-    paper = page.paper(output)
+    paper, material = files.gather(predictions, truth, page, output)
     from facediff.evaluation.figures import Sound, draw_lips, opening_curves, read_pairs
     from facediff.evaluation.figures.gather import phonemes_of, sound_of
 
-    material = files.gather(predictions, truth)
     chosen = material.choose([clip] if clip else None)[0]
     curves, note = opening_curves(material, chosen, read_pairs(lip_pairs, material.corpus, material.n_vertices))
     samples = sound_of(material, chosen, audio)
@@ -312,10 +315,13 @@ def training(
         x: what the curves are over
         page: how it is printed.
     """
+    folders = named_folders(runs, lambda path: "/".join(path.resolve().parts[-2:]).removeprefix("/"))
+    for folder in folders.values():
+        if not folder.exists():
+            raise FaceDiffError(f"{folder / 'metrics.csv'}: no such file; expected the folder of a run")
     paper = page.paper(output)
     from facediff.evaluation.figures import choose_scalars, draw_training, find_gaps, find_metrics, read_curves
 
-    folders = named_folders(runs, lambda path: "/".join(path.resolve().parts[-2:]).removeprefix("/"))
     curves = {name: read_curves(find_metrics(folder), x) for name, folder in folders.items()}
     scalars = choose_scalars(curves, scalar)
     draw_training(curves, scalars, output, paper=paper, axis=x, smoothing=smooth, log=log)

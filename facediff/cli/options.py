@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -207,6 +207,17 @@ def check_picture_path(path: Path | None) -> None:
     if path.suffix != ".png":
         raise FaceDiffError(f'--show {path}: unknown suffix "{path.suffix}"; expected a picture .png')
     check_writable(path)
+
+
+def check_folders(methods: Mapping[str, Path]) -> None:
+    """Refuse, before anything is imported, folders of predictions that do not exist.
+
+    Raises:
+        FaceDiffError: naming the folder.
+    """
+    for folder in methods.values():
+        if not folder.is_dir():
+            raise FaceDiffError(f"{folder}: no such folder; expected the predictions of a method")
 
 
 def named_folders(

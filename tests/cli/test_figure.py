@@ -88,7 +88,7 @@ def gather(corpus: Path, *more: str) -> Material:
     """What the command finds by its options."""
     words = [str(corpus.parent / "ours"), str(corpus), "-o", "a.png", *more]
     given = arguments_of(load("figure heatmap"), "facediff figure heatmap", words)
-    material: Material = given["files"].gather(given["predictions"], given["truth"])
+    material: Material = given["files"].gather(given["predictions"], given["truth"], given["page"], given["output"])[1]
     return material
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from facediff.cli.app import COMMANDS, main
+from facediff.cli.app import COMMANDS, GROUPS, main
+from facediff.registry import KINDS
 
 SPY = (
     "import sys; from facediff.cli.app import main; status = main(sys.argv[1:]); "
@@ -23,23 +25,58 @@ def test_the_top_level_imports_nothing_heavy(words: list[str], status: int) -> N
     assert done.stdout.splitlines()[-1] == "[]"
 
 
-@pytest.mark.parametrize("words", [["animate", "--help"], ["demo", "--help"], ["animate"], ["animate", "--bad"]])
-def test_our_own_subcommands_answer_without_torch(words: list[str]) -> None:
+MISTAKES = [
+    "animate",
+    "animate --bad",
+    "animate missing.wav --checkpoint x.ckpt -o y.mp4",
+    "animate - -o y.npy --checkpoint x.ckpt",
+    "adapt --checkpoint missing.ckpt --person a -o b.ckpt",
+    "style extract a --checkpoint missing.ckpt -o a.npy",
+    "view missing.npz -o a.html",
+    "export --sise 3",
+    "export missing.npz -o a.glb",
+    "blendshapes missing.npz -o a.csv --shapes missing",
+    "retarget missing.npz --target-mesh missing.obj -o a.npz",
+    "evaluate missing truth",
+    "figure lips missing truth -o a.png",
+    "figure training missing -o a.png",
+    "data check missing",
+    "data regions missing",
+    "data import-person missing --audio a --name b --corpus c -o d --frame-rate 25",
+    "components samplr",
+    "demo --epoch 3",
+]
+
+
+@pytest.mark.parametrize("words", ["animate --help", "demo --help", *MISTAKES])
+def test_help_and_mistakes_import_nothing_heavy(words: str, tmp_path: Path) -> None:
     spy = SPY.replace(
         "status = main(sys.argv[1:])",
         "import atexit; atexit.register(lambda: print([m for m in "
-        "('torch', 'lightning') if m in sys.modules])); status = main(sys.argv[1:])",
+        "('torch', 'lightning', 'numpy') if m in sys.modules])); status = main(sys.argv[1:])",
     )
-    done = subprocess.run([sys.executable, "-c", spy, *words], capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", spy, *words.split()]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == (0 if "--help" in words else 2)
     assert done.stdout.splitlines()[-1] == "[]"
+    assert len(done.stderr.splitlines()) == (0 if "--help" in words else 1)
 
 
 def test_a_wrong_command_names_the_nearest_and_all(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["anmate"]) == 2
     message = capsys.readouterr().err
     assert 'did you mean "animate"?' in message
-    assert all(name in message for name in COMMANDS)
+    assert all(name.split()[0] in message for name in COMMANDS)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_groups_list_their_commands(group: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([group]) == 2
+    assert main([group, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  {name.split()[1]} " in text for name in COMMANDS if name.startswith(f"{group} "))
+    assert main([group, "nothing"]) == 2
+    assert f'"{group} nothing"' in capsys.readouterr().err
 
 
 def test_components_lists_what_can_be_chosen(capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,7 +87,15 @@ def test_components_lists_what_can_be_chosen(capsys: pytest.CaptureFixture[str])
     assert main(["components", "decoder"]) == 0
     text = capsys.readouterr().out
     assert "gru" in text
+    assert "num_layers = " in text
     assert "ddim" not in text
+
+
+def test_components_lists_every_kind(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["components"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"\n{kind.kind}: {kind.title}\n" in f"\n{text}" for kind in KINDS.values())
+    assert all(f"  {entry.name} " in text for kind in KINDS.values() for entry in kind)
 
 
 def test_a_reader_that_has_had_enough_is_no_error() -> None:

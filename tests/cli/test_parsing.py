@@ -1,0 +1,261 @@
+"""Command functions become parsers: every kind of parameter, every error, the help of every command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+
+from facediff.cli.app import COMMANDS, load
+from facediff.cli.data import CORPORA, options_of
+from facediff.cli.parsing import (
+    RENAMED,
+    Group,
+    Option,
+    Parameters,
+    arguments_of,
+    flat,
+    make_parser,
+    parameters_of,
+    with_more_help,
+)
+from facediff.errors import FaceDiffError
+
+FUNCTIONS = sorted(name for name in COMMANDS if not COMMANDS[name].target.endswith(":run"))
+
+
+@dataclass(frozen=True)
+class LookOptions:
+    """How it looks.
+
+    Only where there is a picture.
+
+    Attributes:
+        colour: of the face, 100 % sure
+        blinks: blinks a minute
+        share: between 0 and 1
+    """
+
+    colour: str = "grey"
+    blinks: Annotated[float | None, Option(metavar="RATE", bare=17.0)] = None
+    share: Annotated[float, Option(above=0, below=1)] = 0.5
+
+
+def command(
+    recording: Path,
+    others: Annotated[list[Path], Option(metavar="OTHER")],
+    *,
+    output: Annotated[Path, Option(also="-o", metavar="OUT")],
+    name: str | None = None,
+    frame_rate: Annotated[float | None, Option(above=0)] = None,
+    seed: Annotated[int, Option(least=0, most=10)] = 0,
+    precision: Literal["32", "bf16"] = "32",
+    span: Annotated[tuple[float, float], Option(metavar=("FROM", "TO"))] = (0.0, 1.0),
+    times: Annotated[list[float] | None, Option(many=True)] = None,
+    method: list[str] | None = None,
+    sound: bool = True,
+    quiet: bool = False,
+    look: LookOptions,
+) -> None:
+    """Do something.
+
+    This is ``literal`` text.
+
+    Args:
+        recording: a :func:`print` of ``speech``
+        others: more
+        output: what to write
+        name: of it
+        frame_rate: frames a second
+        seed: of the noise
+        precision: bits
+        span: seconds
+        times: columns
+        method: repeatable
+        sound: without sound
+        quiet: no bars
+        look: the group.
+    """
+
+
+def parsed(*words: str) -> dict[str, Any]:
+    return arguments_of(command, "facediff command", ["a.wav", "b.wav", "-o", "out.mp4", *words])
+
+
+def refused(*words: str) -> str:
+    with pytest.raises(FaceDiffError) as caught:
+        arguments_of(command, "facediff command", words)
+    assert len(str(caught.value).splitlines()) == 1
+    return str(caught.value)
+
+
+def test_defaults() -> None:
+    assert parsed() == {
+        "recording": Path("a.wav"),
+        "others": [Path("b.wav")],
+        "output": Path("out.mp4"),
+        "name": None,
+        "frame_rate": None,
+        "seed": 0,
+        "precision": "32",
+        "span": (0.0, 1.0),
+        "times": None,
+        "method": None,
+        "sound": True,
+        "quiet": False,
+        "look": LookOptions(),
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["--name", "007"], "name", "007"),
+        (["--name", "null"], "name", "null"),
+        (["--name", "[1, 2]"], "name", "[1, 2]"),
+        (["--name=a=b"], "name", "a=b"),
+        (["--frame-rate", "25"], "frame_rate", 25.0),
+        (["--frame_rate", "25"], "frame_rate", 25.0),
+        (["--precision", "bf16"], "precision", "bf16"),
+        (["--span", "2", "3.5"], "span", (2.0, 3.5)),
+        (["--times", "1", "2"], "times", [1.0, 2.0]),
+        (["--method", "a=x", "--method", "b=y"], "method", ["a=x", "b=y"]),
+        (["--no-sound"], "sound", False),
+        (["--quiet"], "quiet", True),
+        (["--seed", "10"], "seed", 10),
+        (["--blinks"], "look", LookOptions(blinks=17.0)),
+        (["--blinks", "3", "--colour", "red"], "look", LookOptions("red", 3.0)),
+    ],
+)
+def test_values_have_the_type_of_their_hint(words: list[str], name: str, value: object) -> None:
+    found = parsed(*words)[name]
+    assert found == value
+    assert type(found) is type(value)
+
+
+FILES = ["a.wav", "b.wav", "-o", "out.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ([], "recording"),
+        (["a.wav", "b.wav"], "--output"),
+        ([*FILES, "--sed", "1"], 'did you mean "--seed"'),
+        ([*FILES, "--zzz"], "--zzz"),
+        ([*FILES, "--seed"], "--seed"),
+        ([*FILES, "--seed", "1.5"], "--seed 1.5"),
+        ([*FILES, "--seed", "11"], "at most 10"),
+        ([*FILES, "--seed", "-1"], "--seed -1"),
+        ([*FILES, "--frame-rate", "nan"], "--frame-rate nan"),
+        ([*FILES, "--frame-rate", "inf"], "--frame-rate inf"),
+        ([*FILES, "--frame-rate", "0"], "--frame-rate 0"),
+        ([*FILES, "--share", "1"], "below 1"),
+        ([*FILES, "--precision", "16"], "one of 32, bf16"),
+        ([*FILES, "--span", "1"], "--span"),
+        ([*FILES, "--span", "1", "x"], "--span"),
+        ([*FILES, "--blinks", "c.wav"], "goes to the end"),
+    ],
+)
+def test_mistakes_name_the_option(words: list[str], named: str) -> None:
+    assert named in refused(*words)
+
+
+def test_renamed_options_name_the_new_one() -> None:
+    def renamed(*, samples: int = 1, controls_seed: int = 0) -> None:
+        """Nothing."""
+
+    for old, new in RENAMED.items():
+        with pytest.raises(FaceDiffError, match=new):
+            arguments_of(renamed, "x", [old, "3"])
+
+
+def test_a_sequence_is_one_word_with_commas() -> None:
+    from collections.abc import Sequence
+
+    def listed(*, subjects: Sequence[str] | None = None) -> None:
+        """Nothing."""
+
+    listed.__annotations__ = {"subjects": Sequence[str] | None}
+    assert arguments_of(listed, "x", ["--subjects", "F2, F3"]) == {"subjects": ["F2", "F3"]}
+    assert arguments_of(listed, "x", []) == {"subjects": None}
+
+
+def test_a_positional_argument_with_a_default_may_be_missing() -> None:
+    def optional(kind: str | None = None, *, json: bool = False) -> None:
+        """Nothing."""
+
+    assert arguments_of(optional, "x", []) == {"kind": None, "json": False}
+    assert arguments_of(optional, "x", ["a", "--json"]) == {"kind": "a", "json": True}
+    with pytest.raises(FaceDiffError, match="b: one argument too many"):
+        arguments_of(optional, "x", ["a", "b"])
+
+
+def test_help_shows_groups_defaults_and_plain_text(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        parsed("--help")
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert "usage: facediff command" in text
+    assert "How it looks:\n  Only where there is a picture." in text
+    assert "a print of speech" in text
+    assert "This is literal text." in text
+    assert "of the face, 100 % sure (default: grey)" in " ".join(text.split())
+    assert "--no-sound" in text
+    assert "--frame_rate" not in text
+
+
+def test_costly_help_is_made_when_it_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    made: list[str] = []
+
+    @with_more_help(lambda: made.append("made") or "formats: many")  # type: ignore[func-returns-value]
+    def lazy(*, quiet: bool = False) -> None:
+        """Nothing."""
+
+    arguments_of(lazy, "x", [])
+    assert not made
+    with pytest.raises(SystemExit):
+        arguments_of(lazy, "x", ["--help"])
+    assert "formats: many" in capsys.readouterr().out
+
+
+def all_parameters() -> dict[str, Parameters]:
+    import importlib
+
+    found: dict[str, Parameters] = {name: parameters_of(load(name)) for name in FUNCTIONS}
+    for corpus in CORPORA:
+        plan = importlib.import_module(f"facediff.data.prepare.{corpus}").plan
+        found[f"data prepare {corpus}"] = options_of(plan)
+    return found
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_option_of_every_command_is_explained(name: str) -> None:
+    function = load(name)
+    parameters = parameters_of(function)
+    text = make_parser(parameters, f"facediff {name}", "").format_help()
+    for parameter in flat(parameters):
+        assert parameter.help, f"{name}: {parameter.flag} has no help"
+        assert parameter.positional or parameter.flag in text
+    assert all(entry.title for entry in parameters.values() if isinstance(entry, Group))
+    assert COMMANDS[name].help
+
+
+# Options that have one name and two types, and why.
+DIFFERENT = {
+    "corpus": "the folder of a corpus where a video is imported; the name of one elsewhere",
+    "frame_rate": "30 or 60 where VOCASET is prepared",
+    "json": "`evaluate` writes a file; the others print",
+}
+
+
+def test_one_option_has_one_type_everywhere() -> None:
+    found: dict[str, dict[Any, str]] = {}
+    for command_name, parameters in all_parameters().items():
+        for parameter in flat(parameters):
+            if not parameter.positional and parameter.name not in DIFFERENT:
+                kind = (str(parameter.value_type), parameter.is_list)
+                found.setdefault(parameter.name, {}).setdefault(kind, command_name)
+    assert {name: kinds for name, kinds in found.items() if len(kinds) > 1} == {}
