@@ -219,6 +219,7 @@ def _moving(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> _M
     area = area / max(float(area.sum()), np.finfo(float).tiny)
     deltas = shapes.deltas[:, used].reshape(len(shapes.names), -1).astype(np.float64)
     energy = np.square(deltas) @ np.repeat(area, 3)
+    # A shape that moves nothing among the vertices that count has no energy to be scaled by.
     still = np.array([name in shapes.still for name in shapes.names])
     places = np.flatnonzero(~still & (energy > 1e-12 * energy.max(initial=0.0)))
     if not len(places):
@@ -341,6 +342,8 @@ def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[A
         if (left <= tolerance).all():
             return x, True
         slope = problem.gradient(x)
+        # A set of held variables that changed with every step would keep the steps short: near a bound counts as on it.
+        # The distance that counts as near shrinks with the residual, so that the solution is not affected.
         near = min(NEAR * width, float(left.max()))
         held = ((x <= problem.lower + near) & (slope > 0)) | ((x >= problem.upper - near) & (slope < 0))
         direction = np.where(held, -slope, _newton(problem, -slope, ~held))

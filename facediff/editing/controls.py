@@ -119,6 +119,8 @@ class AnimationControls:
             )
         seed = seed if self.seed is None else self.seed
         eyes = self._needed_eyes(animation.template, animation.faces)
+        # Expressiveness must not scale procedural motion, a blink must be able to shut eyes that gaze has opened, and
+        # all of them need the head in the pose of the neutral face, which sway leaves.
         if self.expressiveness is not None:
             animation = scale_regions(animation, self.factors, eyes)
         if self.gaze is not None and eyes is not None:

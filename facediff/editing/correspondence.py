@@ -125,6 +125,8 @@ def correspond(
     places = partners(source, laid)
     bent = _bent(source, laid, places, pairs)
     found = places.nearest(bent.vertices, bent.normals)
+    # Bending tells which place belongs to a vertex; how far the meshes lie apart is measured before bending, and how
+    # well the place is known by what bending left.
     away = np.linalg.norm(laid.vertices - found.points, axis=1) / source.size
     left = found.distances / source.size
     trust = np.clip((FAR - left) / (FAR - EXACT), 0.0, 1.0) * np.clip((found.cosines + 0.3) / 0.6, 0.0, 1.0)
@@ -296,6 +298,7 @@ def _start(moved: Surface, goal: Surface) -> Similarity:
         for _ in range(5):
             trial, apart = _by_vertices(source, target, trial)
         trials.append((apart, trial))
+    # Five rounds from every start tell good ones from bad ones; only the winner is worth more of them.
     own, (least, best) = trials[0], min(trials, key=lambda pair: pair[0])
     # Faces are nearly symmetric, so that a mirrored start fits almost as well: the meshes' own axes win unless another
     # start is clearly better.
@@ -332,6 +335,8 @@ def _refined(moved: Surface, goal: Surface, start: Similarity) -> Similarity:
     for _ in range(FINE_ROUNDS):
         laid = found.apply(points)
         there = nearest(goal, laid, normals @ found.rotation.T, size=0.0)
+        # The weights follow the spread of the distances, so that parts that one mesh lacks lose their influence as the
+        # rest comes closer.
         spread = max(1.4826 * float(np.median(there.distances)), 1e-9 * goal.size)
         weights = np.square(np.clip(1.0 - np.square(there.distances / (TUKEY * spread)), 0.0, None))
         weights *= there.cosines > 0.5
@@ -426,7 +431,7 @@ def pieces(surface: Surface) -> Indices:
 
     extent = max(float(np.ptp(surface.vertices, axis=0).max()), np.finfo(float).tiny)
     _, welded = np.unique(np.rint(surface.vertices / (WELD * extent)), axis=0, return_inverse=True)
-    welded = welded.reshape(-1)
+    welded = welded.reshape(-1)  # NumPy 2.0 returns it with a second axis
     edges, count = welded[edges_of(surface.faces)], int(welded.max()) + 1
     joined = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
     return np.asarray(connected_components(joined, directed=False)[1], np.int64)[welded]
@@ -454,6 +459,8 @@ def _bent(source: Surface, laid: Surface, places: Partners, pairs: Indices) -> S
     edges = edges_of(laid.faces)
     bent = laid
     for stiffness in STIFFNESSES:
+        # Nearest points of a mesh that is still far away are often wrong: they count less the less the surfaces face
+        # the same way, and a stiff target follows them only on average.
         there = places.nearest(bent.vertices, bent.normals)
         trust = np.clip(2.0 * there.cosines - 0.5, 0.0, 1.0)
         trust *= np.clip((FAR - there.distances / source.size) / (FAR - CLOSE), 0.0, 1.0)
@@ -647,6 +654,7 @@ def _best(surface: Surface, points: Array, normals: Array, slack: float) -> tupl
         there = _unit(np.einsum("nc,ncd->nd", shares, surface.normals[surface.faces[face]]))
         cosine = np.einsum("nd,nd->n", there, normals[some][point])
         wrong = np.clip((FACING - cosine) / (FACING - AWAY), 0.0, 1.0)
+        # The distance decides; a sheet that faces away costs the slack, and between equal distances the normal decides.
         cost = np.sqrt(square) + slack * wrong + TIE * surface.balls[1][face] * (1.0 - cosine)
         order = np.lexsort((face, cost, point))
         best = order[np.unique(point[order], return_index=True)[1]]

@@ -124,6 +124,7 @@ def region_factors(
     weights = np.zeros((len(named), len(places)))
     for row, region in zip(weights, named, strict=True):
         row[:] = 1.0 - smooth_step(_distances(places, np.asarray(regions[region]), width) / max(width, 1e-12))
+    # Where regions overlap, their weights are made to sum to one; without it, two factors of 1 would scale by 2.
     total = weights.sum(axis=0)
     weights /= np.maximum(total, 1.0)
     rest = np.clip(1.0 - total, 0.0, None)

@@ -99,6 +99,7 @@ def puppet_eyes(template: Vertices, faces: npt.NDArray[np.integer] | None) -> Ey
     mesh = build_face()  # takes a second or two
     if not np.array_equal(np.asarray(faces), mesh.faces):
         return None
+    # Templates pass through float32, and through files that round them, hence the tolerance.
     distances = {
         name: float(np.abs(speaker.shape(mesh.vertices) - template).max()) for name, speaker in SPEAKERS.items()
     }
@@ -267,6 +268,7 @@ def closing_of_lids(
     closing = np.zeros_like(places)
     for upper, lower in lids:
         top, bottom = places[upper], places[lower]
+        # Edges may be listed from either corner of the eye: the lower one is made to begin where the upper one does.
         if np.linalg.norm(top[0] - bottom[0]) > np.linalg.norm(top[0] - bottom[-1]):
             lower, bottom = lower[::-1], bottom[::-1]
         width = max(float(np.linalg.norm(np.ptp(edge, axis=0))) for edge in (top, bottom))

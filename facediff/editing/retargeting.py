@@ -63,6 +63,7 @@ def retarget(
         if correspondence_path.suffix != ".npz":
             raise FaceDiffError(f"--correspondence {correspondence_path}: expected a name that ends in .npz")
         check_writable(correspondence_path)
+    # Everything that can be wrong with the options is found before the meshes are compared, which takes seconds.
     landmarks = None if landmarks_path is None else read_landmarks(landmarks_path)
     try:
         found = correspond(animation.template, triangles, mesh.vertices, mesh.faces, landmarks=landmarks)
@@ -126,6 +127,7 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
     Each target vertex takes the weighted mean of its triangle's corners, turned and scaled by the similarity. Where
     its place on the source is not well known, neighbours are averaged; where it is far from anything, motion fades.
     """
+    # Displacements are differences of positions: the similarity's translation does not act on them.
     matrix = correspondence.similarity.scale * correspondence.similarity.rotation
     moved = np.asarray(displacements, np.float64)
     made = sum(correspondence.weights[:, k, None] * moved[:, correspondence.corners[:, k]] for k in range(3)) @ matrix.T
@@ -163,6 +165,7 @@ def carried_region(correspondence: Correspondence, indices: npt.NDArray[np.integ
     """A region of the source as that of the target: vertices whose place is more inside than out, and that move."""
     member = np.zeros(len(correspondence.source_vertices))
     member[indices] = 1.0
+    # The barycentric mean of a region's membership says how much of a vertex's place is inside.
     inside = (member[correspondence.corners] * correspondence.weights).sum(axis=1)
     return np.flatnonzero((inside > 0.5) & (correspondence.share > 0))
 

@@ -25,49 +25,16 @@ Array = npt.NDArray[np.float64]
 # The 52 names are Apple's (developer documentation of ``ARFaceAnchor.BlendShapeLocation``). Their order and the further
 # columns are those of the CSV files that Epic's app Live Link Face records, as public readers of such files state them.
 
-_EYE = ("eyeBlink", "eyeLookDown", "eyeLookIn", "eyeLookOut", "eyeLookUp", "eyeSquint", "eyeWide")
-ARKIT: tuple[str, ...] = (
-    *(f"{name}Left" for name in _EYE),
-    *(f"{name}Right" for name in _EYE),
-    "jawForward",
-    "jawRight",
-    "jawLeft",
-    "jawOpen",
-    "mouthClose",
-    "mouthFunnel",
-    "mouthPucker",
-    "mouthRight",
-    "mouthLeft",
-    "mouthSmileLeft",
-    "mouthSmileRight",
-    "mouthFrownLeft",
-    "mouthFrownRight",
-    "mouthDimpleLeft",
-    "mouthDimpleRight",
-    "mouthStretchLeft",
-    "mouthStretchRight",
-    "mouthRollLower",
-    "mouthRollUpper",
-    "mouthShrugLower",
-    "mouthShrugUpper",
-    "mouthPressLeft",
-    "mouthPressRight",
-    "mouthLowerDownLeft",
-    "mouthLowerDownRight",
-    "mouthUpperUpLeft",
-    "mouthUpperUpRight",
-    "browDownLeft",
-    "browDownRight",
-    "browInnerUp",
-    "browOuterUpLeft",
-    "browOuterUpRight",
-    "cheekPuff",
-    "cheekSquintLeft",
-    "cheekSquintRight",
-    "noseSneerLeft",
-    "noseSneerRight",
-    "tongueOut",
-)
+_EYE = "eyeBlink{0} eyeLookDown{0} eyeLookIn{0} eyeLookOut{0} eyeLookUp{0} eyeSquint{0} eyeWide{0}"
+_FACE = """
+    jawForward jawRight jawLeft jawOpen mouthClose mouthFunnel mouthPucker mouthRight mouthLeft
+    mouthSmileLeft mouthSmileRight mouthFrownLeft mouthFrownRight mouthDimpleLeft mouthDimpleRight
+    mouthStretchLeft mouthStretchRight mouthRollLower mouthRollUpper mouthShrugLower mouthShrugUpper
+    mouthPressLeft mouthPressRight mouthLowerDownLeft mouthLowerDownRight mouthUpperUpLeft mouthUpperUpRight
+    browDownLeft browDownRight browInnerUp browOuterUpLeft browOuterUpRight cheekPuff cheekSquintLeft cheekSquintRight
+    noseSneerLeft noseSneerRight tongueOut
+"""
+ARKIT: tuple[str, ...] = (*_EYE.format("Left").split(), *_EYE.format("Right").split(), *_FACE.split())
 """The names in the order of the recordings' columns."""
 
 ROTATIONS: tuple[str, ...] = (
@@ -97,6 +64,7 @@ def mirror_pairs(names: tuple[str, ...] = ARKIT) -> list[tuple[int, int]]:
 
 def arkit_name(name: str) -> str | None:
     """The ARKit name that a spelling stands for: ``EyeBlink_L``, ``jaw_open``, ``17 - browInnerUp``; None if none."""
+    # Leading digits number the shapes; what follows a dot, a colon or a bar is the shape's name within a node.
     known = _spellings()
     for part in (name, re.split(r"[.:|]", name)[-1]):
         key = plain(part)
@@ -221,6 +189,8 @@ def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m
         matrix = lay_onto(files, goal, notes, unit)
         return _named(files, goal, (files.shapes - files.neutral) @ matrix.T, notes)
     deltas = files.shapes / (metres_per_unit(unit) if files.metric else 1.0) - goal
+    # A median that moves is another neutral face, which all shapes were made from: its difference from the template
+    # would be solved for in every frame.
     common = np.median(deltas, axis=0) if len(deltas) >= ENOUGH else np.zeros_like(goal)
     size, least = face_size(goal), np.sqrt(np.square(deltas).sum(-1).mean(-1)).min()
     if np.sqrt(np.square(common).sum(-1).mean()) > ANOTHER_FACE * size or least > ANOTHER_ORDER * size:

@@ -130,6 +130,7 @@ def robust_fit(
     used = base > 0
     if not used.all():
         source, target, base = source[:, used], target[used], base[used]
+    # The scale of the residuals has a floor relative to the target's size: points that fit exactly would divide by zero.
     size = face_size(target)
     if near:
         count = len(source)
@@ -157,6 +158,8 @@ def face_size(vertices: npt.NDArray[np.floating]) -> float:
 
 def _start(source: Array, target: Array, base: Array, scale: bool) -> tuple[Array, Array, Array]:
     """Least squares, or the fit to a random triple of points where its median residual is less."""
+    # A triple without outliers fits all points that did not move, whatever the others do; its median residual is then
+    # small. Some hundred points are enough to compare medians, so that many frames are cheap.
     random = np.random.default_rng(0)
     judges = random.permutation(len(target))[:JUDGES]
     judged, goal = source[:, judges], target[judges]
@@ -190,6 +193,7 @@ def _fit(
             "alignment: the points do not determine a rotation, since fewer than three of them count, or all lie in "
             "one place or on one line; expected at least three that are not on a line"
         )
+    # Where the best orthogonal matrix is a reflection, the axis with the least spread is turned round.
     proper = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
     u[:, :, 2] *= proper[:, None]
     rotation = u @ vt
@@ -330,6 +334,8 @@ def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST
     for _ in range(ROUNDS):
         aligned, median = _aligned_with_median(some, stable)
         restlessness = np.square(aligned - median).sum(axis=-1).mean(axis=0)
+        # The choice and the alignment depend on each other: once the jaw no longer takes part in the alignment, what is
+        # at rest stands out more clearly.
         before, stable = stable, np.sort(np.argsort(restlessness, kind="stable")[:count])
         if len(np.intersect1d(stable, before)) >= AGREED * len(before):
             break
@@ -387,6 +393,7 @@ def _aligned_with_median(some: Array, stable: Indices) -> tuple[Array, Array]:
     anchors = stable[np.linspace(0, len(stable) - 1, min(len(stable), ANCHORS)).round().astype(int)]
     median = some[len(some) // 2]
     aligned = some
+    # The middle frame may be an extreme one; the median of aligned frames is not, and two rounds settle it.
     for near in (False, True, True):
         rotation, translation, _ = robust_fit(aligned[:, anchors], median[anchors], near=near)
         aligned = aligned @ rotation.swapaxes(1, 2) + translation[:, None]

@@ -118,6 +118,7 @@ class Flame:
     def _pose(self, face: Array, expression: Array, jaw: Array, result: Array) -> None:
         turns = rotations(jaw) - np.eye(3)
         count = expression.shape[1]
+        # The pose features of eq. 9 are the rotation without the identity, so that they are zero for a jaw at rest.
         flat = result.reshape(len(result), -1)
         np.matmul(expression, self._basis[:count], out=flat)
         flat += turns.reshape(-1, 9) @ self._basis[EXPRESSIONS:]

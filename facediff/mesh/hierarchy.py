@@ -187,6 +187,7 @@ def mesh_hierarchy(
         )
     chosen = None if vertices is None else _checked_vertices(vertices, len(template))
     key = _key(template, faces, chosen, [levels, factor, spiral_length, dilation, pooling])
+    # Three levels of a dense mesh take some seconds, and every training on its corpus needs the same ones.
     path = (cache or cache_dir() / "topology") / f"{key}.npz"
     cached = _read(path)
     if cached is not None:
@@ -355,6 +356,8 @@ def _clusters(points: Array, faces: Indices, n_vertices: int) -> Indices:
     spare = len(points) - n_vertices
     used = np.unique(faces)
     if len(used) and spare:
+        # Vertices without faces never collapse: they are merged first, the nearest to the surface before the others,
+        # and the simplifier makes up for the rest.
         loose = np.setdiff1d(roots, used)
         near, distance = _nearest(points[loose], points[used])
         loose, near = (part[np.argsort(distance, kind="stable")][:spare] for part in (loose, near))

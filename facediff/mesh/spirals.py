@@ -87,6 +87,8 @@ def ordered_rings(faces: Indices, n_vertices: int) -> list[list[int]]:
     """
     follows: list[dict[int, int]] = [{} for _ in range(n_vertices)]
     loose: dict[int, set[int]] = {}
+    # A face (a, b, c) seen from outside says that around a, the neighbour c follows b. A second follower of the same
+    # neighbour is an edge with more than two faces, or two faces that wind against one another.
     for a, b, c in faces.tolist():
         for vertex, here, there in ((a, b, c), (b, c, a), (c, a, b)):
             if follows[vertex].setdefault(here, there) != there:
@@ -96,9 +98,10 @@ def ordered_rings(faces: Indices, n_vertices: int) -> list[list[int]]:
 
 def _fan(follow: dict[int, int], loose: set[int]) -> list[int]:
     """Neighbours in order, from the neighbour that comes after each; ``loose`` are those that come after no other."""
+    # An open fan starts at the neighbour that follows no other; a closed one has no such neighbour.
     ends = set(follow.values())
     starts = [*sorted(follow.keys() - ends), *sorted(follow.keys() & ends), *sorted(loose)]
-    seen: dict[int, None] = {}
+    seen: dict[int, None] = {}  # a set that keeps its order
     for start in starts:
         step: int | None = start
         while step is not None and step not in seen:

@@ -55,7 +55,7 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
         raise FaceDiffError(f"{name}: is an archive of several arrays; name it .npz")
     if kinds and (array.dtype.kind not in kinds or not array.size):
         wanted = "floating-point numbers" if kinds == "f" else "numbers"
-        raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {wanted}")
+        raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {wanted}, at least one")
     return array
 
 
