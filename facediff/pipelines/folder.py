@@ -25,7 +25,7 @@ TABLE = 40
 Animate = Callable[[Path, Path], None]
 """Animates a recording (first) and writes a file (second), whole or not at all."""
 MakeWorker = Callable[[list[str]], Animate]
-"""Gets the command's words and loads what all recordings have in common."""
+"""Takes the options and loads what all recordings have in common."""
 
 
 def recordings(paths: Sequence[Path]) -> list[Path]:
@@ -106,7 +106,7 @@ def run_folder(
         the exit status: 0 if all outputs are there, 1 if a recording failed.
 
     Raises:
-        FaceDiffError: if nothing can be made at all: the folder, the options or the checkpoint cannot be used.
+        FaceDiffError: if nothing can be animated at all: the folder, the options or the checkpoint cannot be used.
     """
     if workers is not None and workers < 1:
         raise FaceDiffError(f"--workers {workers}: expected 1 or more")

@@ -75,7 +75,7 @@ def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
     Args:
         path: the folder that shall appear.
-        replace: whether it may take the place of a folder with content; an empty one is always replaced.
+        replace: whether a folder with content may be replaced; an empty one always is.
 
     Yields:
         a hidden folder next to ``path``, to be filled. It is renamed to ``path`` at the end and removed if anything
@@ -110,7 +110,7 @@ def scratch_folder(path: Path) -> Iterator[Path]:
     with _writing(path), _new_folders(path.parent):
         _remove_abandoned(path)
         folder = _partial(path)
-        # The folder is locked before it gets its name, so that no other process takes it for an abandoned one.
+        # The folder is locked before it gets its name, so that no other process removes it as abandoned.
         unnamed = folder.with_name(f"{folder.name}.new")
         unnamed.mkdir()
         with _locked_folder(unnamed):
@@ -221,7 +221,7 @@ def _new_folders(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(path: Path, command: str) -> Iterator[None]:
-    """Keep a second process out of a folder while the block runs; a process that was killed keeps nobody out.
+    """Keep a second process out of a folder while the block runs; the lock of a killed process does not count.
 
     Args:
         path: the lock file, in the folder that is to be locked; it is removed at the end.

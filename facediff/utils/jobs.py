@@ -101,8 +101,8 @@ def run_tasks(
 
     No worker gets a task before it is free for it, and at most one result for each worker waits to be taken, so memory
     is bounded and a stop waits only for what is running. Wrap the generator in :func:`contextlib.closing`, so that it
-    stops with the loop that takes the results: what is running is finished then, and nothing else is begun. Ctrl-C is
-    heard by this process only.
+    stops with the loop that takes the results: what is running is finished then, and nothing else is begun. Workers
+    ignore Ctrl-C; only this process reacts to it.
 
     Args:
         work: does a task. For processes: a picklable function or object, which each worker gets once and keeps, such as
@@ -116,7 +116,7 @@ def run_tasks(
 
     Yields:
         task and result, in the order in which they are done. The result of a task that kills its process is
-        :class:`WorkerDied`: what was running then is tried again, each task alone, so that only the guilty one is lost.
+        :class:`WorkerDied`: what was running then is tried again, one at a time, so that no other is lost.
 
     Raises:
         Exception: the first one that ``work`` raises; tasks that have not been begun are dropped.
@@ -219,9 +219,9 @@ def _do(task: Any) -> Any:  # noqa: ANN401
 
 @contextmanager
 def _starting_processes() -> Iterator[None]:
-    """Processes that are started inside compute on one thread each and never hear Ctrl-C, not even while they start.
+    """Processes that are started inside compute on one thread each and ignore Ctrl-C, even while they start.
 
-    A worker that Ctrl-C ended would take all others along, in the middle of their work; this process hears it
+    A worker that Ctrl-C ended would break the pool in the middle of the others' work; this process receives the signal
     afterwards. The libraries read the number of threads when they are imported, which is before a worker's first task.
     """
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}

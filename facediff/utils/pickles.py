@@ -1,4 +1,10 @@
-"""Opening pickles from elsewhere without letting them run code."""
+"""Opening pickles of unknown origin without letting them run code.
+
+A pickle is a program: it names functions and classes and has them called. :func:`load_pickle` resolves a fixed list of
+names only, and puts harmless objects in the place of NumPy's own, because NumPy trusts the state that a pickle gives
+its types: a crafted dtype turns bytes into object pointers. The objects that are called have no attributes, because a
+pickle could set those of a function.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +18,17 @@ import numpy as np
 
 from facediff.errors import FaceDiffError
 
-# What replaces NumPy's own classes when a pickle from elsewhere is opened.
-#
-# NumPy trusts the state that a pickle gives its types: a crafted dtype turns bytes into object pointers. Here a dtype
-# is kept as text until it is known to be a plain number or text, and only then created.
-
 PLAIN = re.compile(r"[<>|=]?(?:[biufc]\d{1,2}|[SU]\d+|\?)")
+"""Types that arrays may have: plain numbers and text."""
 
 
 class PlainType:
-    """In place of ``numpy.dtype``: the words for it, checked when they are used."""
+    """In place of ``numpy.dtype``: its name, from which the type is created once that is known to be plain."""
 
-    __slots__ = ("order", "words")
+    __slots__ = ("name", "order")
 
-    def __init__(self, words: object, *flags: object) -> None:
-        self.words, self.order = words, "="
+    def __init__(self, name: object, *flags: object) -> None:
+        self.name, self.order = name, "="
 
     def __setstate__(self, state: object) -> None:
         """Version, byte order, then what only structured types have."""
@@ -48,29 +50,29 @@ class PlainArray(np.ndarray[Any, Any]):
         super().__setstate__((version, shape, real_type(kind), fortran, data))
 
     def __reduce_ex__(self, protocol: Any) -> Any:  # noqa: ANN401
-        """Written anew it is an array like any other."""
+        """Pickled again, it is an ordinary array."""
         return self.view(np.ndarray).__reduce_ex__(protocol)
 
 
 def real_type(kind: object) -> np.dtype[Any]:
     """The dtype that a :class:`PlainType` stands for."""
-    words = kind.words if isinstance(kind, PlainType) else None
-    if not isinstance(words, str) or not isinstance(kind, PlainType) or not PLAIN.fullmatch(words):
-        raise pickle.UnpicklingError(f"it holds an array of the type {words!r}")
-    made = np.dtype(words)
+    name = kind.name if isinstance(kind, PlainType) else None
+    if not isinstance(name, str) or not isinstance(kind, PlainType) or not PLAIN.fullmatch(name):
+        raise pickle.UnpicklingError(f"it holds an array of the type {name!r}")
+    plain = np.dtype(name)
     if kind.order not in ("<", ">"):
-        return made
-    return np.dtype(made.newbyteorder(">" if kind.order == ">" else "<").str)
+        return plain
+    return np.dtype(plain.newbyteorder(">" if kind.order == ">" else "<").str)
 
 
 class ArrayType:
-    """In place of ``numpy.ndarray``, which pickles name but do not call."""
+    """In place of ``numpy.ndarray``, which pickles name as an argument but do not call."""
 
     __slots__ = ()
 
 
 class Reconstruct:
-    """In place of NumPy's ``_reconstruct``; an object without attributes, since a pickle could set a function's."""
+    """In place of NumPy's ``_reconstruct``."""
 
     __slots__ = ()
 
@@ -80,7 +82,7 @@ class Reconstruct:
 
 
 class FromBuffer:
-    """In place of NumPy's ``_frombuffer``, by which newer pickles make arrays."""
+    """In place of NumPy's ``_frombuffer``, with which newer pickles create arrays."""
 
     __slots__ = ()
 
@@ -107,12 +109,12 @@ class Scalar:
 
 
 class NoBytes:
-    """In place of ``bytes``, by which older pickles make the content of an empty array."""
+    """In place of ``bytes``, with which older pickles create the content of an empty array."""
 
     __slots__ = ()
 
     def __call__(self) -> bytes:
-        """Nothing; a number would ask for so much memory."""
+        """Nothing; an argument could request any amount of memory."""
         return b""
 
 
@@ -125,7 +127,7 @@ SAFE: dict[tuple[str, str], Any] = {
     **{(f"numpy.{core}.multiarray", "scalar"): Scalar() for core in ("core", "_core")},
     **{(f"numpy.{core}.numeric", "_frombuffer"): FromBuffer() for core in ("core", "_core")},
 }
-"""What is given in the place of each name of NumPy's that a pickle may ask for."""
+"""What replaces each of NumPy's names that a pickle may ask for."""
 
 
 ALLOWED = {
@@ -140,7 +142,7 @@ ALLOWED = {
 
 
 class StandIn:
-    """Takes the place of an object of a foreign package: keeps what the pickle says of it, and does nothing.
+    """Takes the place of an object of another package: keeps what the pickle holds of it, and does nothing.
 
     Attributes:
         origin: what the pickle asked for, e.g. ``chumpy.ch.Ch``.
@@ -154,9 +156,9 @@ class StandIn:
 
     def __new__(cls, *arguments: object) -> StandIn:
         """Keep the arguments."""
-        made = super().__new__(cls)
-        made.arguments, made.state = arguments, None
-        return made
+        stand_in = super().__new__(cls)
+        stand_in.arguments, stand_in.state = arguments, None
+        return stand_in
 
     def __setstate__(self, state: object) -> None:
         """Keep the state."""
@@ -169,16 +171,13 @@ def _stand_in(origin: str) -> type[StandIn]:
 
 
 class _Reconstructor:
-    """In place of ``copyreg._reconstructor``, by which old pickles make their objects.
-
-    An object without attributes: a pickle could set attributes of a function.
-    """
+    """In place of ``copyreg._reconstructor``, with which old pickles create their objects."""
 
     __slots__ = ()
 
     def __call__(self, wanted: object, base: object, state: object) -> StandIn:
         if not (isinstance(wanted, type) and issubclass(wanted, StandIn)):
-            raise pickle.UnpicklingError("it makes an object in an unknown way")
+            raise pickle.UnpicklingError("it creates an object in an unknown way")
         return wanted()
 
 
@@ -215,11 +214,11 @@ class PlainUnpickler(pickle.Unpickler):
 def load_pickle(path: Path, *, stand_ins: tuple[str, ...] = ()) -> Any:  # noqa: ANN401
     """Read a pickle that holds NumPy arrays and plain containers.
 
-    Files written by Python 2 are read as Latin-1, as every project of the field does.
+    Files written by Python 2 are read as Latin-1, as all projects of the field do.
 
     Args:
         path: the file.
-        stand_ins: packages (``scipy.sparse``) whose objects are given out as :class:`StandIn`.
+        stand_ins: packages (``scipy.sparse``) whose objects become :class:`StandIn`.
 
     Raises:
         FaceDiffError: if the file is missing, is no pickle, or asks for anything else; nothing of it has been run.

@@ -264,7 +264,7 @@ def _check_subjects(clips: Mapping[str, Clip], with_template: set[str], findings
         findings.error("template_missing", "templates.pkl", message)
 
 
-# Findings that take all clips together: topology, form of the speech, frame rate, copies.
+# Findings about all clips together: topology, form of the speech, frame rate, copies.
 
 
 def _check_vertex_counts(facts: Iterable[ClipFacts], findings: Findings) -> None:
