@@ -1,4 +1,4 @@
-"""The contract of a finished performance."""
+"""The class :class:`Animation`, and units of length."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.utils import SAMPLE_RATE
 
-# How long a corpus's unit of length is.
+MAPPED_BYTES = 1 << 26
+"""How much of a memory map is read before its pages are released."""
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _ABOUT = re.compile(r"about ([0-9.]+) mm\b")
@@ -24,11 +25,15 @@ def metres_per_unit(unit: str) -> float:
     """Metres in one unit of length.
 
     Args:
-        unit: ``m``, ``cm``, ``mm``, ``in``, a number of metres, or a description that says "about … mm", as that of a
+        unit: ``m``, ``cm``, ``mm``, ``in``, a number of metres, or a description with "about … mm", such as that of a
             corpus whose faces were normalised.
 
     Raises:
         FaceDiffError: if it is none of these.
+
+    Example:
+        >>> metres_per_unit("mm"), metres_per_unit("normalised (about 185 mm)")
+        (0.001, 0.185)
     """
     about = _ABOUT.search(unit)
     try:
@@ -40,31 +45,33 @@ def metres_per_unit(unit: str) -> float:
     return value
 
 
-MAPPED_BYTES = 1 << 26
-"""How much of a memory map is read before its pages are let go."""
-
-
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """One performance of one face.
+    """Finished motion of one face, with everything that players, exporters and retargeting need.
 
     Attributes:
-        name: what it is called in messages and in files.
+        name: its name in messages and in files.
         vertices: (T, V, 3) absolute positions; float32, finite, possibly a memory map that is read frame by frame.
             y points up and z towards the viewer.
         template: (V, 3) the neutral face.
         frame_rate: frames a second; frame t is shown from t / frame_rate on.
-        faces: (F, 3) triangles; None where the topology has no mesh, so that it can be neither drawn nor exported.
+        faces: (F, 3) triangles; None if they are not known, so that the face cannot be drawn.
         unit: unit of length, as :func:`facediff.animation.metres_per_unit` takes it.
-        speech: (S,) mono, full scale 1, starting with the first frame; None for a silent take.
+        speech: (S,) mono, full scale 1, starting with the first frame; None for a silent animation.
         sample_rate: of the speech, in Hz.
-        colours: (V, 3) vertex colours (sRGB, 0 to 255); None where there are none.
+        colours: (V, 3) vertex colours (sRGB, 0 to 255); None if there are none.
         regions: vertex indices by region name (``lips``, ``upper_face``).
         inner_lip_pairs: (P, 2) upper and lower vertices of the inner lips, for the mouth's opening; None if unknown.
-        metadata: plain words about how it was made: identity, style, what in it is procedural …
+        metadata: text about how it was made: identity, style, what in it is procedural …
 
     Raises:
         FaceDiffError: if the arrays do not fit one another, or there is no frame.
+
+    Example:
+        >>> template = np.zeros((4, 3), np.float32)
+        >>> animation = Animation("hello", np.stack([template] * 50), template, frame_rate=25)
+        >>> animation.seconds
+        2.0
     """
 
     name: str
@@ -111,7 +118,7 @@ class Animation:
 
     @cached_property
     def triangles(self) -> npt.NDArray[np.int32]:
-        """The triangles, where something cannot do without.
+        """The triangles (F, 3).
 
         Raises:
             FaceDiffError: if there are none.
@@ -124,7 +131,7 @@ class Animation:
         return self.faces
 
     def frames(self) -> Iterator[npt.NDArray[np.float32]]:
-        """Frame after frame (V, 3); what has been read of a memory map is let go, so that memory stays small."""
+        """Frame after frame (V, 3); the pages of a memory map that have been read are released."""
         mapped = self.vertices if isinstance(self.vertices, np.memmap) else None
         step = max(1, MAPPED_BYTES // max(1, self.vertices[0].nbytes))
         for start in range(0, len(self.vertices), step):
@@ -133,17 +140,17 @@ class Animation:
                 mapped._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
     def refuse_not_finite(self) -> None:
-        """Look at every frame.
+        """Check every frame.
 
         Raises:
             FaceDiffError: naming the first frame that holds NaN or infinity.
         """
         for index, frame in enumerate(self.frames()):
             if not np.isfinite(frame).all():
-                raise FaceDiffError(f"{self.name}: frame {index} holds NaN or infinity; make the motion anew")
+                raise FaceDiffError(f"{self.name}: frame {index} holds NaN or infinity; generate the motion again")
 
     def sound(self) -> npt.NDArray[np.float32] | None:
-        """The speech as long as the motion: cut, or followed by silence; None for a silent take."""
+        """The speech (S,) as long as the motion: cut, or padded with silence; None for a silent animation."""
         if self.speech is None:
             return None
         wanted = round(self.seconds * self.sample_rate)

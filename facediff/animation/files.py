@@ -1,62 +1,25 @@
-"""A take from a motion file: an archive, or a bare array with what it lacks given beside it."""
+"""Animations on disk: archives that hold everything, and bare arrays of vertices that options complete."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.animation import Animation
 from facediff.errors import FaceDiffError
-from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import open_vertices, read_arrays
 from facediff.utils.files import atomic
 
-# Motion that is written to a .npy file while it is made, so that memory does not hold it.
-
-
-class MotionWriter:
-    """A .npy file of (frames, V, 3) float32 that grows; its header is right after :meth:`close`.
-
-    Args:
-        path: the file.
-        frame: shape of a frame, (V, 3).
-    """
-
-    def __init__(self, path: Path, frame: tuple[int, ...]) -> None:
-        self.path = path
-        self.frame = frame
-        self.frames = 0
-        self._stream = path.open("wb")
-        self._write_header()
-
-    def write(self, vertices: npt.NDArray[np.float32]) -> None:
-        """Add frames (n, V, 3)."""
-        self._stream.write(np.ascontiguousarray(vertices, "<f4").tobytes())
-        self.frames += len(vertices)
-
-    def close(self) -> None:
-        """Write how many frames there are."""
-        with self._stream:
-            self._stream.seek(0)
-            self._write_header()
-
-    def _write_header(self) -> None:
-        # NumPy leaves room for the first number of a shape to grow, so the header may be written again in its place.
-        facts = {"descr": "<f4", "fortran_order": False, "shape": (self.frames, *self.frame)}
-        np.lib.format.write_array_header_1_0(self._stream, facts)
-
-
-# A take in one file: NumPy's .npz with everything that players and exporters need.
-
 FORMAT = "facediff take 1"
-ARRAYS = ("vertices", "template", "faces", "speech", "colours", "inner_lip_pairs")
-NEEDED = ("vertices", "template", "about")
-SHAPES: dict[str, tuple[str, str, tuple[int | None, ...]]] = {
+"""Marks an archive. The word is older than the class :class:`Animation`; it stays, so that old and new files agree."""
+
+ARRAYS: dict[str, tuple[str, str, tuple[int | None, ...]]] = {
     "vertices": ("f", "floating point (frames, vertices, 3)", (None, None, 3)),
     "template": ("f", "floating point (vertices, 3)", (None, 3)),
     "faces": ("iu", "whole numbers (triangles, 3)", (None, 3)),
@@ -64,14 +27,86 @@ SHAPES: dict[str, tuple[str, str, tuple[int | None, ...]]] = {
     "colours": ("u", "bytes (vertices, 3)", (None, 3)),
     "inner_lip_pairs": ("iu", "whole numbers (pairs, 2)", (None, 2)),
 }
-"""What the arrays are: kinds of number, in words, and lengths of the axes."""
+"""The arrays of an archive: kinds of number, in words, and lengths of the axes."""
+
+OF_TOPOLOGY = ("template", "faces", "colours", "inner_lip_pairs")
+"""Facts that hold for one topology only, as regions do."""
+
+
+class AnimationFacts(TypedDict, total=False):
+    """What a bare array of vertices lacks, as the fields of :class:`Animation`; any of them may be missing."""
+
+    template: npt.NDArray[np.float32]
+    faces: npt.NDArray[np.int32]
+    frame_rate: float
+    unit: str
+    colours: npt.NDArray[np.uint8]
+    regions: Mapping[str, npt.NDArray[np.int64]]
+    inner_lip_pairs: npt.NDArray[np.int64]
+    speech: npt.NDArray[np.float32]
+    sample_rate: int
+
+
+def read_animation(
+    path: Path, overrides: AnimationFacts | None = None, defaults: AnimationFacts | None = None
+) -> Animation:
+    """Read a motion file.
+
+    Args:
+        path: ``.npz`` as :func:`facediff.animation.write_archive` writes it, or ``.npy`` of absolute vertices (T, V, 3)
+            or (T, 3V). Without a template an array's first frame is used as the neutral face.
+        overrides: facts that take precedence over those of an archive.
+        defaults: facts that neither the file nor ``overrides`` have; those of another topology only if they hold for
+            any.
+
+    Raises:
+        FaceDiffError: if the file is unreadable, an array lacks a frame rate, or the parts do not fit one another.
+    """
+    overrides = overrides or {}
+    if path.suffix == ".npz":
+        animation = read_archive(path)
+        facts = complete(complete(overrides, facts_of(animation)), defaults)
+        return replace(animation, **facts)
+    if path.suffix != ".npy":
+        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a motion in .npz or .npy')
+    vertices = open_vertices(path).astype(np.float32, copy=False)
+    facts = complete(overrides, defaults)
+    if "frame_rate" not in facts:
+        raise FaceDiffError(f"{path}: an array has no frame rate; give --frame-rate or --checkpoint")
+    if "template" not in facts:
+        facts = {**facts, "template": np.array(vertices[0], np.float32)}
+    return Animation(name=path.stem, vertices=vertices, **facts)
+
+
+def facts_of(animation: Animation) -> AnimationFacts:
+    """The facts of an animation, other than its motion and its speech."""
+    return {
+        "template": animation.template,
+        "frame_rate": animation.frame_rate,
+        "unit": animation.unit,
+        "regions": animation.regions,
+        **{name: getattr(animation, name) for name in OF_TOPOLOGY if getattr(animation, name) is not None},  # type: ignore[typeddict-item]
+    }
+
+
+def complete(facts: AnimationFacts, defaults: AnimationFacts | None) -> AnimationFacts:
+    """Facts together with those of others that are missing: of another topology, the frame rate and the unit only."""
+    if defaults is None:
+        return facts
+    alike = (
+        "template" not in facts or "template" not in defaults or facts["template"].shape == defaults["template"].shape
+    )
+    names = ("frame_rate", "unit", *(OF_TOPOLOGY if alike else ()))
+    found: dict[str, Any] = {name: defaults[name] for name in names if defaults.get(name) is not None}  # type: ignore[literal-required]
+    regions = {**(defaults.get("regions", {}) if alike else {}), **facts.get("regions", {})}
+    return {**found, **facts, "regions": regions}  # type: ignore[typeddict-item]
 
 
 def write_archive(path: Path, animation: Animation) -> None:
-    """Write a take; ``numpy.load`` opens the file without pickle.
+    """Write an animation to one .npz file, which ``numpy.load`` opens without pickle.
 
-    The entries are the arrays of :class:`Animation` under their own names, ``region_<name>`` for each region, and ``about``:
-    JSON with name, frame rate, unit, sample rate and metadata.
+    The entries are the arrays of :class:`Animation` under their own names, ``region_<name>`` for each region, and
+    ``about``: JSON with name, frame rate, unit, sample rate and metadata.
 
     Raises:
         FaceDiffError: if the file cannot be written, or the motion is not finite.
@@ -93,21 +128,20 @@ def write_archive(path: Path, animation: Animation) -> None:
 
 
 def read_archive(path: Path) -> Animation:
-    """Read what :func:`write_archive` wrote.
+    """Read a file of :func:`write_archive`.
 
     Raises:
-        FaceDiffError: if the file is missing, broken, or no take.
+        FaceDiffError: if the file is missing, damaged, or no archive of an animation.
     """
+    expected = "expected an animation that `facediff animate … -o hello.npz` wrote"
     if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; expected a take that `facediff animate … -o take.npz` wrote")
-    held: dict[str, Any] = {**read_arrays(path)}
-    missing = [name for name in NEEDED if name not in held]
+        raise FaceDiffError(f"{path}: no such file; {expected}")
+    arrays: dict[str, Any] = {**read_arrays(path)}
+    missing = [name for name in ("vertices", "template", "about") if name not in arrays]
     if missing:
-        raise FaceDiffError(
-            f"{path}: has no {', '.join(missing)}; expected a take that `facediff animate … -o take.npz` wrote"
-        )
+        raise FaceDiffError(f"{path}: has no {', '.join(missing)}; {expected}")
     try:
-        about = json.loads(str(held["about"]))
+        about = json.loads(str(arrays["about"]))
         facts: dict[str, Any] = {
             "name": str(about["name"]),
             "frame_rate": float(about["frame_rate"]),
@@ -117,120 +151,61 @@ def read_archive(path: Path) -> Animation:
         }
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FaceDiffError(
-            f"{path}: its entry about is not what facediff writes ({error!r}); write it anew"
+            f"{path}: its entry about is not what facediff writes ({error!r}); write the file again"
         ) from error
-    regions = {name.removeprefix("region_"): held[name] for name in held if name.startswith("region_")}
-    for name, (kinds, words, lengths) in SHAPES.items():
-        if name in held:
-            _refuse_other(path, name, held[name], kinds, words, lengths)
-    for name, indices in {**regions, "inner_lip_pairs": held.get("inner_lip_pairs", np.zeros(0, int))}.items():
-        _refuse_outside(path, name, indices, len(held["template"]))
-    return Animation(**{name: held[name] for name in ARRAYS if name in held}, regions=regions, **facts)
+    regions = {name.removeprefix("region_"): arrays[name] for name in arrays if name.startswith("region_")}
+    for name in ARRAYS.keys() & arrays.keys():
+        _check_array(path, name, arrays[name])
+    indices = regions if "inner_lip_pairs" not in arrays else {**regions, "inner_lip_pairs": arrays["inner_lip_pairs"]}
+    count = len(arrays["template"])
+    for name, array in indices.items():
+        if array.size and (array.dtype.kind not in "iu" or not 0 <= array.min() <= array.max() < count):
+            raise FaceDiffError(f"{path}: its {name} names vertices other than 0 to {count - 1}; write the file again")
+    return Animation(**{name: arrays[name] for name in ARRAYS if name in arrays}, regions=regions, **facts)
 
 
-def _refuse_other(
-    path: Path, name: str, array: npt.NDArray[Any], kinds: str, words: str, lengths: tuple[int | None, ...]
-) -> None:
-    """Refuse an array of another kind or shape; one without any number may have any shape."""
+def _check_array(path: Path, name: str, array: npt.NDArray[Any]) -> None:
+    """Refuse an array of another kind or shape; an empty array may have any shape."""
+    kinds, words, lengths = ARRAYS[name]
     fits = array.ndim == len(lengths) and all(
         wanted in (None, length) for length, wanted in zip(array.shape, lengths, strict=True)
     )
     if array.dtype.kind not in kinds or not (fits or not array.size):
         raise FaceDiffError(
-            f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {words}; write it anew"
+            f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {words}; write the file again"
         )
 
 
-def _refuse_outside(path: Path, name: str, indices: npt.NDArray[Any], count: int) -> None:
-    """Refuse indices of vertices that are not there."""
-    if indices.size and (indices.dtype.kind not in "iu" or not 0 <= indices.min() <= indices.max() < count):
-        raise FaceDiffError(f"{path}: its {name} names vertices other than 0 to {count - 1}; write it anew")
-
-
-SUFFIXES = (".npz", ".npy")
-OF_VERTICES = ("template", "faces", "colours", "inner_lip_pairs")
-"""Facts that hold for one topology only."""
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """What a bare array of vertices does not say; None is "not given".
-
-    Attributes:
-        template: (V, 3) neutral face.
-        faces: (F, 3) triangles.
-        frame_rate: frames a second.
-        unit: unit of length.
-        colours: (V, 3) vertex colours.
-        regions: vertex indices by region name.
-        inner_lip_pairs: (P, 2) upper and lower inner lips.
-        speech: (S,) mono.
-        sample_rate: of the speech.
-    """
-
-    template: npt.NDArray[np.float32] | None = None
-    faces: npt.NDArray[np.int32] | None = None
-    frame_rate: float | None = None
-    unit: str | None = None
-    colours: npt.NDArray[np.uint8] | None = None
-    regions: dict[str, npt.NDArray[np.int64]] = field(default_factory=dict)
-    inner_lip_pairs: npt.NDArray[np.int64] | None = None
-    speech: npt.NDArray[np.float32] | None = None
-    sample_rate: int = SAMPLE_RATE
-
-    @classmethod
-    def of(cls, animation: Animation) -> Surroundings:
-        """What a take knows beside its motion and its speech."""
-        facts: dict[str, Any] = {name: getattr(animation, name) for name in (*OF_VERTICES, "frame_rate", "unit")}
-        return cls(**facts, regions=dict(animation.regions))
-
-    def completed(self, other: Surroundings | None) -> Surroundings:
-        """These facts, and from others what these do not say: of another topology the frame rate and unit only."""
-        if other is None:
-            return self
-        alike = self.template is None or other.template is None or self.template.shape == other.template.shape
-        names = (*(OF_VERTICES if alike else ()), "frame_rate", "unit")
-        missing: dict[str, Any] = {name: getattr(other, name) for name in names if getattr(self, name) is None}
-        return replace(self, **missing, regions={**(other.regions if alike else {}), **self.regions})
-
-
-def read_animation(path: Path, given: Surroundings | None = None, lent: Surroundings | None = None) -> Animation:
-    """Read a motion file.
+class MotionWriter:
+    """A .npy file of (frames, V, 3) float32 that grows, so that memory does not hold a long motion.
 
     Args:
-        path: ``.npz`` as :func:`facediff.animation.write_archive` writes it, or ``.npy`` of absolute vertices (T, V, 3) or
-            (T, 3V).
-        given: goes before what an archive says, and completes an array. Without a template a bare array's first
-            frame is taken for the neutral face.
-        lent: completes what neither the file nor ``given`` says.
+        path: the file; its header is valid after :meth:`close`.
+        frame: shape of a frame, (V, 3).
 
-    Raises:
-        FaceDiffError: if the file is unreadable, an array lacks a frame rate, or the parts do not fit one another.
+    Attributes:
+        frames: number of frames so far.
     """
-    given = given or Surroundings()
-    if path.suffix == ".npz":
-        animation = read_archive(path)
-        said = given.completed(Surroundings.of(animation)).completed(lent)
-        told: dict[str, Any] = {name: getattr(said, name) for name in (*OF_VERTICES, "frame_rate", "unit")}
-        if given.speech is not None:
-            told |= {"speech": given.speech, "sample_rate": given.sample_rate}
-        return replace(animation, **told, regions=said.regions)
-    if path.suffix != ".npy":
-        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a motion in {" or ".join(SUFFIXES)}')
-    vertices = open_vertices(path).astype(np.float32, copy=False)
-    given = given.completed(lent)
-    if given.frame_rate is None:
-        raise FaceDiffError(f"{path}: an array does not say its frame rate; give --frame-rate or --checkpoint")
-    return Animation(
-        name=path.stem,
-        vertices=vertices,
-        template=given.template if given.template is not None else np.array(vertices[0], np.float32),
-        frame_rate=given.frame_rate,
-        faces=given.faces,
-        unit=given.unit or "m",
-        speech=given.speech,
-        sample_rate=given.sample_rate,
-        colours=given.colours,
-        regions=given.regions,
-        inner_lip_pairs=given.inner_lip_pairs,
-    )
+
+    def __init__(self, path: Path, frame: tuple[int, ...]) -> None:
+        self.path = path
+        self.frame = frame
+        self.frames = 0
+        self._stream = path.open("wb")
+        self._write_header()
+
+    def write(self, vertices: npt.NDArray[np.float32]) -> None:
+        """Add frames (n, V, 3)."""
+        self._stream.write(np.ascontiguousarray(vertices, "<f4").tobytes())
+        self.frames += len(vertices)
+
+    def close(self) -> None:
+        """Write the number of frames into the header."""
+        with self._stream:
+            self._stream.seek(0)
+            self._write_header()
+
+    def _write_header(self) -> None:
+        # NumPy leaves room for the first number of a shape to grow, so that the header may be overwritten in its place.
+        facts = {"descr": "<f4", "fortran_order": False, "shape": (self.frames, *self.frame)}
+        np.lib.format.write_array_header_1_0(self._stream, facts)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
-    from facediff.animation.files import Surroundings
+    from facediff.animation.files import AnimationFacts
     from facediff.editing.controls import AnimationControls
     from facediff.export import ExportOptions
 
@@ -66,34 +66,33 @@ class SourceOptions:
         if self.identity is not None and self.checkpoint is None:
             raise FaceDiffError("--identity: names a face of a checkpoint; give --checkpoint as well")
 
-    def surroundings(self) -> tuple[Surroundings, Surroundings | None]:
+    def facts(self) -> tuple[AnimationFacts, AnimationFacts | None]:
         """What the options say, which overrides a file; and what the checkpoint adds where nothing else says it."""
         import numpy as np
 
-        from facediff.animation.files import Surroundings
         from facediff.mesh import read_mesh
 
-        given: dict[str, Any] = {}
-        lent = None
+        overrides: dict[str, Any] = {}
+        defaults = None
         if self.checkpoint is not None:
             from facediff.models.checkpoint import read_assets
             from facediff.pipelines.animate import facts_of
 
-            lent = Surroundings(**facts_of(read_assets(self.checkpoint), self.identity))
+            defaults = facts_of(read_assets(self.checkpoint), self.identity)
             if self.identity is not None:
-                given["template"] = lent.template
+                overrides["template"] = defaults["template"]
         if self.mesh is not None:
             mesh = read_mesh(self.mesh)
-            given |= {"template": mesh.vertices.astype(np.float32), "faces": mesh.faces}
-            given |= {} if mesh.colours is None else {"colours": mesh.colours}
+            overrides |= {"template": mesh.vertices.astype(np.float32), "faces": mesh.faces}
+            overrides |= {} if mesh.colours is None else {"colours": mesh.colours}
         if self.speech is not None:
             from facediff.data.audio import read_speech
             from facediff.utils import SAMPLE_RATE
 
-            given |= {"speech": read_speech(self.speech), "sample_rate": SAMPLE_RATE}
-        given |= {} if self.frame_rate is None else {"frame_rate": self.frame_rate}
-        given |= {} if self.unit is None else {"unit": self.unit}
-        return Surroundings(**given), lent
+            overrides |= {"speech": read_speech(self.speech), "sample_rate": SAMPLE_RATE}
+        overrides |= {} if self.frame_rate is None else {"frame_rate": self.frame_rate}
+        overrides |= {} if self.unit is None else {"unit": self.unit}
+        return cast("AnimationFacts", overrides), cast("AnimationFacts | None", defaults)
 
     def read(self, path: Path) -> Animation:
         """The animation in a file, completed by the options; all of its frames are finite.
@@ -104,7 +103,7 @@ class SourceOptions:
         from facediff.animation import read_animation
 
         self.check([path])
-        animation = read_animation(path, *self.surroundings())
+        animation = read_animation(path, *self.facts())
         animation.refuse_not_finite()
         return animation
 

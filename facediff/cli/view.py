@@ -78,16 +78,16 @@ def read_animations(paths: Sequence[Path], source: SourceOptions) -> list[Animat
         FaceDiffError: if a file is unreadable, or something needed is not said.
     """
     from facediff.animation import read_animation
-    from facediff.animation.files import Surroundings
+    from facediff.animation.files import complete, facts_of
     from facediff.utils.arrays import open_vertices
 
-    given, lent = source.surroundings()
-    whole = {path: read_animation(path, given, lent) for path in paths if path.suffix == ".npz"}
+    overrides, defaults = source.facts()
+    whole = {path: read_animation(path, overrides, defaults) for path in paths if path.suffix == ".npz"}
     lender = next(iter(whole.values()), None)
     found = []
     for path in paths:
-        completing = lent
+        completing = defaults
         if lender is not None and path.suffix == ".npy" and open_vertices(path).shape[1] == len(lender.template):
-            completing = (lent or Surroundings()).completed(Surroundings.of(lender))  # the checkpoint takes precedence
-        found.append(whole[path] if path in whole else read_animation(path, given, completing))
+            completing = complete(defaults or {}, facts_of(lender))  # the checkpoint takes precedence
+        found.append(whole[path] if path in whole else read_animation(path, overrides, completing))
     return found

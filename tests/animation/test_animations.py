@@ -1,4 +1,4 @@
-"""A take survives its file; what does not fit together is refused with one sentence."""
+"""An animation survives its file; what does not fit together is refused with one sentence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation, metres_per_unit, read_animation, read_archive, write_archive
-from facediff.animation.files import Surroundings
+from facediff.animation.files import AnimationFacts
 from facediff.errors import FaceDiffError
 
 
@@ -65,23 +65,23 @@ def test_a_bare_array_needs_a_frame_rate_and_may_be_flat(animation: Animation, t
     np.save(tmp_path / "x.npy", animation.vertices.reshape(5, -1))
     with pytest.raises(FaceDiffError, match="--frame-rate"):
         read_animation(tmp_path / "x.npy")
-    read = read_animation(tmp_path / "x.npy", Surroundings(frame_rate=30, template=animation.template))
+    read = read_animation(tmp_path / "x.npy", AnimationFacts(frame_rate=30, template=animation.template))
     assert np.array_equal(read.vertices, animation.vertices)
     assert np.array_equal(
-        read_animation(tmp_path / "x.npy", Surroundings(frame_rate=30)).template, animation.vertices[0]
+        read_animation(tmp_path / "x.npy", AnimationFacts(frame_rate=30)).template, animation.vertices[0]
     )
 
 
-def test_options_go_before_what_an_archive_says(animation: Animation, tmp_path: Path) -> None:
+def test_overrides_take_precedence_over_an_archive(animation: Animation, tmp_path: Path) -> None:
     write_archive(tmp_path / "a.npz", animation)
-    read = read_animation(tmp_path / "a.npz", Surroundings(frame_rate=60, regions={"jaw": np.array([0])}))
+    read = read_animation(tmp_path / "a.npz", AnimationFacts(frame_rate=60, regions={"jaw": np.array([0])}))
     assert read.frame_rate == 60
     assert set(read.regions) == {"lips", "jaw"}
     assert read.unit == "mm"
 
 
-def test_what_is_lent_never_goes_before_a_file(animation: Animation, tmp_path: Path) -> None:
-    lent = Surroundings(
+def test_defaults_never_override_a_file(animation: Animation, tmp_path: Path) -> None:
+    defaults = AnimationFacts(
         template=animation.template + 1,
         faces=animation.triangles[:1],
         frame_rate=60,
@@ -90,7 +90,7 @@ def test_what_is_lent_never_goes_before_a_file(animation: Animation, tmp_path: P
         inner_lip_pairs=np.array([[3, 4]]),
     )
     write_archive(tmp_path / "a.npz", replace(animation, inner_lip_pairs=None))
-    read = read_animation(tmp_path / "a.npz", None, lent)
+    read = read_animation(tmp_path / "a.npz", None, defaults)
     assert np.array_equal(read.template, animation.template)
     assert np.array_equal(read.triangles, animation.triangles)
     assert (read.frame_rate, read.unit) == (25, "mm")
@@ -98,13 +98,13 @@ def test_what_is_lent_never_goes_before_a_file(animation: Animation, tmp_path: P
     assert read.inner_lip_pairs.tolist() == [[3, 4]]
     assert {name: indices.tolist() for name, indices in read.regions.items()} == {"lips": [1, 2], "jaw": [0]}
     np.save(tmp_path / "x.npy", animation.vertices)
-    bare = read_animation(tmp_path / "x.npy", Surroundings(unit="cm"), lent)
+    bare = read_animation(tmp_path / "x.npy", AnimationFacts(unit="cm"), defaults)
     assert np.array_equal(bare.template, animation.template + 1)
     assert (bare.frame_rate, bare.unit) == (60, "cm")
-    other = replace(lent, template=np.zeros((9, 3), np.float32), inner_lip_pairs=np.array([[7, 8]]))
+    other = AnimationFacts(defaults, template=np.zeros((9, 3), np.float32), inner_lip_pairs=np.array([[7, 8]]))
     assert read_animation(tmp_path / "a.npz", None, other).inner_lip_pairs is None  # of another topology
-    told = read_animation(tmp_path / "x.npy", Surroundings(template=animation.template), other)
-    assert (told.faces, told.frame_rate, told.regions) == (None, 60, {})
+    read = read_animation(tmp_path / "x.npy", AnimationFacts(template=animation.template), other)
+    assert (read.faces, read.frame_rate, read.regions) == (None, 60, {})
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_motion_that_is_not_finite_is_never_written(animation: Animation, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_files_that_are_no_takes(tmp_path: Path) -> None:
+def test_files_that_are_no_animations(tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_text("no")
     with pytest.raises(FaceDiffError, match="not a readable .npz"):
         read_archive(tmp_path / "a.npz")
@@ -191,7 +191,7 @@ def test_files_that_are_no_takes(tmp_path: Path) -> None:
         ("region_lips", np.array([0.5]), "its lips names vertices other than 0 to 5"),
     ],
 )
-def test_an_archive_that_others_made_is_looked_at(
+def test_an_archive_that_others_made_is_checked(
     animation: Animation, tmp_path: Path, name: str, wrong: np.ndarray, sentence: str
 ) -> None:
     write_archive(tmp_path / "a.npz", animation)
@@ -222,10 +222,10 @@ import resource, numpy as np
 from facediff.animation import Animation
 from facediff.utils.arrays import open_vertices
 vertices = open_vertices(__import__("pathlib").Path({str(tmp_path / "large.npy")!r}))
-take = Animation("large", vertices, np.zeros((20_000, 3), np.float32), 25.0)
+animation = Animation("large", vertices, np.zeros((20_000, 3), np.float32), 25.0)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-take.refuse_not_finite()
-assert sum(float(frame[0, 0]) for frame in take.frames()) == 1
+animation.refuse_not_finite()
+assert sum(float(frame[0, 0]) for frame in animation.frames()) == 1
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
