@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, choices
-from facediff.synthetic.face import Shape, build_face
-from facediff.synthetic.rig import CONTROLS, build_rig
+from facediff.synthetic.face import build_face
+from facediff.synthetic.rig import CONTROLS, Shape, build_rig
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.utils.files import atomic
 

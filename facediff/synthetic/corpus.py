@@ -1,35 +1,38 @@
-"""Writing the built-in corpus in the on-disk layout that BIWI's has in circulation."""
+"""Writing the built-in corpus in the layout of BIWI's circulating copies."""
 
 from __future__ import annotations
 
 import csv
-import json
-import os
 import pickle
-import shutil
-import socket
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError
-from facediff.synthetic.face import Array, build_face
+from facediff.synthetic.face import build_face
+from facediff.synthetic.geometry import Array
 from facediff.synthetic.motion import FRAME_RATE, analyse, generate_clips, segments_of, visemes_of
 from facediff.synthetic.rig import Rig, build_rig, lip_pairs
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.synthetic.speech import SENTENCES, Phoneme, speak
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.files import sha256
+from facediff.utils.files import atomic_folder, describe_files, read_json, same_sizes, write_json
 from facediff.utils.jobs import WorkerDied, run_tasks
 
-# Who says what in which mood: the clips of the built-in corpus and its splits.
+FORMAT = 1
+GENERATOR = "1.1"
+MANIFEST = "manifest.json"
+_CORPUS = "facediff-puppet"
+_SAMPLES_PER_FRAME = SAMPLE_RATE // FRAME_RATE
+_QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
+_PEAK = 0.6
+
+# Who speaks what in which mood: the clips and their splits.
 
 SEEN_IDENTITIES = ("F1", "F2", "F3", "M1", "M2", "M3")
 UNSEEN_IDENTITIES = ("F4", "M4")
@@ -83,162 +86,6 @@ def clips() -> tuple[Clip, ...]:
     )
 
 
-# Writing a folder of files as one: complete or not there at all.
-
-_OWNER = ".owner"
-_FORGOTTEN_AFTER = 86_400.0
-
-
-@contextmanager
-def folder_as_a_whole(root: Path) -> Iterator[Path]:
-    """Lend a sibling folder to write into and rename it to ``root`` when the block ends without an error.
-
-    Args:
-        root: The folder that shall appear; a folder that is there already is replaced.
-
-    Yields:
-        The folder ``ROOT.partial-PID`` to fill. It is removed if the block fails; one left behind by a
-        process that was killed is removed by the next writer.
-    """
-    root.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(root)
-    partial = root.with_name(f"{root.name}.partial-{os.getpid()}")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
-    (partial / _OWNER).write_text(socket.gethostname())
-    try:
-        yield partial
-        (partial / _OWNER).unlink()
-        _put_in_place(partial, root)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _put_in_place(partial: Path, root: Path) -> None:
-    """Rename, moving an older folder out of the way first."""
-    old = root.with_name(f"{root.name}.replaced-{os.getpid()}")
-    if root.exists():
-        # Another process may move it away at the same time: then there is nothing left to move.
-        try:
-            root.rename(old)
-        except FileNotFoundError:
-            old = partial
-    try:
-        partial.rename(root)
-    except OSError:
-        # Another process was quicker. Its folder has the same contents, so this one is not needed.
-        if not (root / "manifest.json").is_file():
-            raise
-    finally:
-        if old != partial:
-            shutil.rmtree(old, ignore_errors=True)
-
-
-def _sweep(root: Path) -> None:
-    """Remove what killed processes left behind, on this machine or more than a day ago."""
-    for kind in ("partial", "replaced"):
-        for leftover in root.parent.glob(f"{root.name}.{kind}-*"):
-            pid = leftover.name.rpartition("-")[2]
-            owner = leftover / _OWNER
-            try:
-                age = time.time() - leftover.stat().st_mtime
-                here = owner.is_file() and owner.read_text() == socket.gethostname()
-            except OSError:
-                continue
-            if age > _FORGOTTEN_AFTER or (here and pid.isdigit() and not _is_alive(int(pid))):
-                shutil.rmtree(leftover, ignore_errors=True)
-
-
-def _is_alive(pid: int) -> bool:
-    """Say whether a process runs; where one cannot ask without harm, say yes."""
-    if os.name != "posix":
-        return True
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def write_manifest(folder: Path, facts: dict[str, Any]) -> None:
-    """Write ``manifest.json``: the facts, and size and SHA-256 of every other file in the folder.
-
-    Args:
-        folder: The folder to describe.
-        facts: What else to record; plain JSON data.
-    """
-    files = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path.name not in (_OWNER, "manifest.json"):
-            files[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": sha256(path)}
-    text = json.dumps({**facts, "files": files}, indent=1)
-    (folder / "manifest.json").write_text(text + "\n", encoding="utf-8")
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """A folder's manifest; empty if there is none that can be read."""
-    try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return manifest if isinstance(manifest, dict) else {}
-
-
-def matches_manifest(folder: Path, facts: dict[str, Any]) -> bool:
-    """Say whether a folder has a manifest with these facts and all its files in their sizes.
-
-    Args:
-        folder: The folder to look at.
-        facts: What the manifest must say.
-
-    Returns:
-        False as well if the manifest is missing or cannot be read.
-    """
-    manifest = read_manifest(folder)
-    try:
-        if any(manifest.get(key) != value for key, value in facts.items()):
-            return False
-        return all((folder / name).stat().st_size == file["bytes"] for name, file in manifest["files"].items())
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return False
-
-
-def write_ply(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], colours: NDArray[np.uint8]) -> None:
-    """Write a coloured triangle mesh as binary little-endian PLY.
-
-    Args:
-        path: The file.
-        vertices: Positions, shape (V, 3).
-        faces: Vertex indices, shape (F, 3).
-        colours: Red, green, blue, shape (V, 3).
-    """
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *(f"property float {axis}" for axis in "xyz"),
-        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
-    points = np.empty(len(vertices), dtype=[("place", "<f4", 3), ("colour", "u1", 3)])
-    points["place"], points["colour"] = vertices, colours
-    corners = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    corners["count"], corners["index"] = 3, faces
-    path.write_bytes(("\n".join(header) + "\n").encode("ascii") + points.tobytes() + corners.tobytes())
-
-
-FORMAT = 1
-GENERATOR = "1.1"
-_CORPUS = "facediff-puppet"
-_SAMPLES_PER_FRAME = SAMPLE_RATE // FRAME_RATE
-_QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
-_PEAK = 0.6
-
-
 def generate(
     root: Path,
     *,
@@ -249,14 +96,13 @@ def generate(
 ) -> None:
     """Write the built-in corpus, unless the folder holds it already.
 
-    The corpus is written into a folder beside ``root`` and takes its name when it is whole, so an
-    interruption leaves nothing that could pass for a corpus.
+    The corpus is written into a folder next to ``root`` and takes its name when it is whole, so an interruption leaves
+    nothing that could pass for a corpus.
 
     Args:
         root: The folder to make.
-        seed: Where the random part (blinks, drift, habits of the brows) starts; the same seed gives the
-            same bytes.
-        workers: How many processes share the work; by default this one does it alone.
+        seed: Seed of the random part (blinks, drift, habits of the brows); the same seed gives the same bytes.
+        workers: How many processes share the work; one by default.
         progress: Whether to show a progress bar.
         only: Names of clips to write instead of all, for trials; such a corpus never counts as complete.
 
@@ -268,34 +114,32 @@ def generate(
     if only is None and is_complete(root, seed=seed):
         return
     _refuse_foreign(root)
-    try:
-        with folder_as_a_whole(root) as folder:
-            _write_common(folder, chosen)
-            frames = _write_clips(folder, chosen, seed, workers, progress)
-            counts = {"subjects": len(SPEAKERS), "vertices": len(build_face().vertices), "frames": frames}
-            write_manifest(folder, {**_facts(seed, len(chosen)), **counts})
-    except OSError as error:
-        raise FaceDiffError(
-            f"the built-in corpus could not be written to {root}: {error.strerror or error}; "
-            "choose a folder that can be written and has 200 MB free"
-        ) from error
+    with atomic_folder(root, replace=True) as folder:
+        _write_common(folder, chosen)
+        frames = _write_clips(folder, chosen, seed, workers, progress)
+        counts = {"subjects": len(SPEAKERS), "vertices": len(build_face().vertices), "frames": frames}
+        files = describe_files(folder)
+        write_json(folder / MANIFEST, {**_facts(seed, len(chosen)), **counts, "files": files})
 
 
 def is_complete(root: Path, *, seed: int = 0) -> bool:
-    """Say whether a folder holds the whole corpus of this version and seed; looks at sizes, not at contents.
+    """Whether a folder holds the whole corpus of this version and seed; compares sizes, not contents.
 
     Args:
         root: The folder.
         seed: The seed that it must have been made with.
     """
-    return matches_manifest(Path(root), _facts(seed, len(clips())))
+    manifest = read_json(Path(root) / MANIFEST) or {}
+    facts, files = _facts(seed, len(clips())), manifest.get("files")
+    same = all(manifest.get(key) == value for key, value in facts.items())
+    return same and isinstance(files, dict) and same_sizes(Path(root), files)
 
 
 def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, tuple[Phoneme, ...]]:
     """Make one clip.
 
     Args:
-        clip: Who says what in which mood.
+        clip: Who speaks what in which mood.
         seed: The corpus's seed.
 
     Returns:
@@ -313,16 +157,27 @@ def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, 
     phonemes = _in_quiet(said.phonemes, before / SAMPLE_RATE, end)
     random = np.random.default_rng([seed, list(SPEAKERS).index(clip.identity), clip.number])
     weights = generate_clips(
-        segments_of(phonemes), analyse(samples, SAMPLE_RATE), frames, speaker.manner, clip.mood, random
+        segments_of(phonemes), analyse(samples, SAMPLE_RATE), frames, speaker.style, clip.mood, random
     )
     return np.rint(samples * 32767.0).astype(np.int16), weights, phonemes
+
+
+def _in_quiet(phonemes: tuple[Phoneme, ...], before: float, end: float) -> tuple[Phoneme, ...]:
+    """Shift phonemes by the quiet before speech and fill up with pauses to the end of the clip."""
+    moved = [Phoneme(p.start + before, min(p.end + before, end), p.ipa) for p in phonemes]
+    moved = [p for p in moved if p.end > p.start]
+    if moved[0].start > 0.0:
+        moved.insert(0, Phoneme(0.0, moved[0].start, ""))
+    if moved[-1].end < end:
+        moved.append(Phoneme(moved[-1].end, end, ""))
+    return tuple(moved)
 
 
 @lru_cache(maxsize=8)
 def rig_of(identity: str) -> Rig:
     """Rig of a speaker, by name."""
     speaker = SPEAKERS[identity]
-    return build_rig(speaker.shape, speaker.manner.asymmetry)
+    return build_rig(speaker.shape, speaker.style.asymmetry)
 
 
 def regions() -> dict[str, NDArray[np.int64]]:
@@ -341,13 +196,7 @@ def regions() -> dict[str, NDArray[np.int64]]:
 
 
 def _facts(seed: int, count: int) -> dict[str, int | str]:
-    return {
-        "corpus": _CORPUS,
-        "format": FORMAT,
-        "generator": GENERATOR,
-        "seed": seed,
-        "clips": count,
-    }
+    return {"corpus": _CORPUS, "format": FORMAT, "generator": GENERATOR, "seed": seed, "clips": count}
 
 
 def _chosen(only: Sequence[str] | None) -> tuple[Clip, ...]:
@@ -357,24 +206,20 @@ def _chosen(only: Sequence[str] | None) -> tuple[Clip, ...]:
     known = {clip.name: clip for clip in everything}
     unknown = [name for name in only if name not in known]
     if unknown:
-        raise FaceDiffError(f"the built-in corpus has no clip {unknown[0]!r}: clips are named like 'F1_e01'")
+        raise FaceDiffError(f"the built-in corpus has no clip {unknown[0]!r}; clips are named like 'F1_e01'")
     return tuple(known[name] for name in only)
 
 
 def _refuse_foreign(root: Path) -> None:
     """Never replace a folder that this generator did not write."""
-    if not root.exists():
-        return
-    if not root.is_dir():
-        raise FaceDiffError(f"{root} is a file, but the built-in corpus needs a folder there: choose another place")
-    if any(root.iterdir()) and read_manifest(root).get("corpus") != _CORPUS:
+    if root.is_dir() and any(root.iterdir()) and (read_json(root / MANIFEST) or {}).get("corpus") != _CORPUS:
         raise FaceDiffError(
-            f"{root} is not empty and holds no manifest of the built-in corpus: remove it or choose another folder"
+            f"{root}: is not empty and holds no manifest of the built-in corpus; choose another folder, or remove it"
         )
 
 
 def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
-    """Everything that is not a clip."""
+    """Write everything that is not a clip."""
     for name in ("wav", "vertices_npy", "phonemes", "regions"):
         (folder / name).mkdir()
     mesh = build_face()
@@ -431,12 +276,27 @@ def _write_clip(folder: Path, clip: Clip, seed: int) -> int:
     return len(vertices)
 
 
-def _in_quiet(phonemes: tuple[Phoneme, ...], before: float, end: float) -> tuple[Phoneme, ...]:
-    """Shift phonemes behind the quiet before speech and fill up with pauses to the end of the clip."""
-    moved = [Phoneme(p.start + before, min(p.end + before, end), p.ipa) for p in phonemes]
-    moved = [p for p in moved if p.end > p.start]
-    if moved[0].start > 0.0:
-        moved.insert(0, Phoneme(0.0, moved[0].start, ""))
-    if moved[-1].end < end:
-        moved.append(Phoneme(moved[-1].end, end, ""))
-    return tuple(moved)
+def write_ply(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], colours: NDArray[np.uint8]) -> None:
+    """Write a coloured triangle mesh as binary little-endian PLY.
+
+    Args:
+        path: The file.
+        vertices: Positions, shape (V, 3).
+        faces: Vertex indices, shape (F, 3).
+        colours: Red, green, blue, shape (V, 3).
+    """
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    points = np.empty(len(vertices), dtype=[("place", "<f4", 3), ("colour", "u1", 3)])
+    points["place"], points["colour"] = vertices, colours
+    corners = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    corners["count"], corners["index"] = 3, faces
+    path.write_bytes(("\n".join(header) + "\n").encode("ascii") + points.tobytes() + corners.tobytes())

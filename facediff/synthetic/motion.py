@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from facediff.synthetic.face import Array, rise
+from facediff.synthetic.geometry import Array, rise
 from facediff.synthetic.rig import CONTROLS
 from facediff.synthetic.speech import Phoneme
 
@@ -345,7 +345,7 @@ _CLOSURE_SMOOTHNESS = 0.010
 
 
 @dataclass(frozen=True)
-class Manner:
+class SpeakingStyle:
     """A speaker's way of moving.
 
     Attributes:
@@ -427,7 +427,7 @@ def generate_clips(
     segments: list[Segment],
     prosody: Prosody,
     frames: int,
-    manner: Manner,
+    style: SpeakingStyle,
     mood: str,
     random: np.random.Generator,
 ) -> Array:
@@ -437,7 +437,7 @@ def generate_clips(
         segments: The sentence's mouth shapes in time.
         prosody: Its loudness and melody.
         frames: How many frames to make.
-        manner: The speaker's manner.
+        style: The speaker's style.
         mood: One of `MOOD_EFFECTS`.
         random: Source of blinks and drift.
 
@@ -449,11 +449,11 @@ def generate_clips(
     margin = 0.2
     times = np.arange(-margin, frames / FRAME_RATE + margin, 1.0 / _FINE_RATE)
     tracks = {name: np.zeros_like(times) for name in CONTROLS}
-    _speech(tracks, segments, times, manner, effect, random)
-    _upper_face(tracks, prosody, times, manner, effect, random)
+    _speech(tracks, segments, times, style, effect, random)
+    _upper_face(tracks, prosody, times, style, effect, random)
     # Even a slack speaker shuts the lips in time.
-    blur = {"lip_closure": min(manner.smoothness, _CLOSURE_SMOOTHNESS)}
-    fine = np.stack([_smooth(track, blur.get(name, manner.smoothness)) for name, track in tracks.items()])
+    blur = {"lip_closure": min(style.smoothness, _CLOSURE_SMOOTHNESS)}
+    fine = np.stack([_smooth(track, blur.get(name, style.smoothness)) for name, track in tracks.items()])
     middles = (np.arange(frames) + 0.5) / FRAME_RATE
     return np.stack([np.interp(middles, times, track) for track in fine], axis=1)
 
@@ -462,33 +462,33 @@ def _speech(
     tracks: dict[str, Array],
     segments: list[Segment],
     times: Array,
-    manner: Manner,
+    style: SpeakingStyle,
     effect: Mood,
     random: np.random.Generator,
 ) -> None:
     """What the words ask of jaw and lips."""
-    weights = articulate(segments, times + manner.lead, spread=manner.slack)
+    weights = articulate(segments, times + style.lead, spread=style.slack)
     wander = 1.0 + 0.03 * _drift(times, random)
     for column, control in enumerate(SPEECH_CONTROLS):
-        gain = getattr(manner, _GAINS[control]) if control in _GAINS else 1.0
+        gain = getattr(style, _GAINS[control]) if control in _GAINS else 1.0
         # The lip that finds the teeth and the lips that press do so in every mood; only large shapes grow.
         emphasis = effect.articulation if control in _GAINS else 1.0
         tracks[control] += gain * emphasis * wander * weights[:, column]
-    tracks["lip_closure"] += close_lips(segments, times + np.clip(manner.lead, -0.008, 0.008))
+    tracks["lip_closure"] += close_lips(segments, times + np.clip(style.lead, -0.008, 0.008))
     for control in ("upper_lip_raise", "lower_lip_drop", "lower_lip_tuck"):
         # Lips that meet cannot show the teeth at the same time.
         tracks[control] *= 1.0 - 0.85 * tracks["lip_closure"]
-    smile = manner.smile + effect.smile
+    smile = style.smile + effect.smile
     tracks["corner_up"] += max(smile, 0.0) + 0.03 * _drift(times, random)
     tracks["corner_down"] += max(-smile, 0.0)
-    tracks["cheek_raise"] += manner.cheeks * (tracks["stretch"] + 0.8 * tracks["corner_up"])
+    tracks["cheek_raise"] += style.cheeks * (tracks["stretch"] + 0.8 * tracks["corner_up"])
 
 
 def _upper_face(
     tracks: dict[str, Array],
     prosody: Prosody,
     times: Array,
-    manner: Manner,
+    style: SpeakingStyle,
     effect: Mood,
     random: np.random.Generator,
 ) -> None:
@@ -496,29 +496,29 @@ def _upper_face(
     accent = np.interp(times, prosody.times, 0.55 * prosody.pitch + 0.45 * prosody.loudness)
     accent = effect.brows * np.maximum(accent, -0.3)
     habit = 1.0 + 0.25 * float(random.standard_normal())
-    tracks["inner_brow_up"] += effect.raised + manner.inner_brow * habit * accent + 0.06 * _drift(times, random)
-    tracks["outer_brow_up"] += effect.raised + manner.outer_brow * habit * accent + 0.06 * _drift(times, random)
-    tracks["brow_frown"] += manner.frown + effect.frown - 0.25 * np.minimum(accent, 0.0) + 0.04 * _drift(times, random)
-    tracks["squint"] += manner.squint + 0.5 * tracks["cheek_raise"] + 0.04 * _drift(times, random)
+    tracks["inner_brow_up"] += effect.raised + style.inner_brow * habit * accent + 0.06 * _drift(times, random)
+    tracks["outer_brow_up"] += effect.raised + style.outer_brow * habit * accent + 0.06 * _drift(times, random)
+    tracks["brow_frown"] += style.frown + effect.frown - 0.25 * np.minimum(accent, 0.0) + 0.04 * _drift(times, random)
+    tracks["squint"] += style.squint + 0.5 * tracks["cheek_raise"] + 0.04 * _drift(times, random)
     tracks["nose_wrinkle"] += 0.3 * tracks["upper_lip_raise"]
     tracks["lids_wide"] += np.maximum(0.35 * tracks["inner_brow_up"], 0.0)
-    blink = _blinks(times, manner, random)
+    blink = _blinks(times, style, random)
     droop = effect.droop + 0.04 * _drift(times, random)
     tracks["lids_close"] += np.clip(droop + (1.0 - droop) * blink, 0.0, 1.0)
     tracks["lids_wide"] *= 1.0 - blink
     tracks["squint"] *= 1.0 - blink
 
 
-def _blinks(times: Array, manner: Manner, random: np.random.Generator) -> Array:
+def _blinks(times: Array, style: SpeakingStyle, random: np.random.Generator) -> Array:
     """Closings of the lids at random times, quicker to shut than to open, shape of ``times``."""
     shut = np.zeros_like(times)
-    place = float(times[0] + random.exponential(1.0 / manner.blinks))
+    place = float(times[0] + random.exponential(1.0 / style.blinks))
     while place < times[-1]:
-        length = manner.blink_length * float(random.uniform(0.85, 1.2))
+        length = style.blink_length * float(random.uniform(0.85, 1.2))
         down, hold = 0.36 * length, 0.12 * length
         pulse = rise(times, place, place + down) * rise(times, place + length, place + down + hold)
         shut = np.maximum(shut, pulse)
-        place += length + 0.5 + float(random.exponential(1.0 / manner.blinks))
+        place += length + 0.5 + float(random.exponential(1.0 / style.blinks))
     return shut
 
 

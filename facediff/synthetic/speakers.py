@@ -1,308 +1,42 @@
-"""The cast: eight speakers with a face, a voice and a manner each."""
+"""The eight speakers: a face, a voice and a speaking style each. Their numbers are in ``speakers.toml``."""
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
+from importlib import resources
+from typing import Any
 
-from facediff.synthetic.face import Shape
-from facediff.synthetic.motion import Manner
+from facediff.synthetic.motion import SpeakingStyle
+from facediff.synthetic.rig import Shape
 from facediff.synthetic.speech import Voice
 
 
 @dataclass(frozen=True)
 class Speaker:
-    """One of the corpus's people.
+    """One of the corpus's speakers.
 
     Attributes:
-        name: Subject name, such as ``"F1"``.
+        name: Identity, such as ``"F1"``.
         voice: How espeak-ng speaks for them.
         shape: How their head differs from the neutral one.
-        manner: How their face moves.
+        style: How their face moves.
     """
 
     name: str
     voice: Voice
     shape: Shape
-    manner: Manner
+    style: SpeakingStyle
 
 
-_CAST = (
-    Speaker(
-        "F1",
-        Voice("en-us+f2", 158, 55, 55),
-        Shape(
-            width=-0.4,
-            lips=0.5,
-            eye_size=0.5,
-            brow_height=0.4,
-            brow_tilt=0.5,
-            nose_up=0.6,
-            nose_width=-0.5,
-            jaw=-0.2,
-            neck=-0.7,
-            cheekbones=0.4,
-            mouth_width=0.2,
-        ),
-        Manner(jaw=1.0, rounding=1.05, lead=0.02, inner_brow=0.5, outer_brow=0.55, blinks=0.4, smile=0.08),
-    ),
-    Speaker(
-        "F2",
-        Voice("en-gb-x-rp+f3", 150, 60, 70),
-        Shape(
-            width=0.5,
-            length=-0.7,
-            cheeks=0.9,
-            nose_length=-0.6,
-            nose_width=0.4,
-            lips=0.7,
-            eye_gap=0.4,
-            chin=-0.3,
-            chin_width=-0.4,
-            neck=-0.4,
-            forehead=0.5,
-            eye_size=0.4,
-            brow_height=0.5,
-            nose_tip=-0.4,
-        ),
-        Manner(
-            jaw=0.85,
-            rounding=1.25,
-            spreading=0.8,
-            lips=0.9,
-            lead=0.04,
-            slack=1.2,
-            smoothness=0.020,
-            asymmetry=0.10,
-            inner_brow=0.85,
-            outer_brow=0.25,
-            blinks=0.55,
-            blink_length=0.22,
-            squint=0.1,
-        ),
-    ),
-    Speaker(
-        "F3",
-        Voice("en-us+f4", 168, 42, 45),
-        Shape(
-            width=-0.7,
-            length=0.6,
-            cheeks=-0.5,
-            cheekbones=0.9,
-            nose_bridge=0.6,
-            nose_length=0.5,
-            lips=-0.3,
-            mouth_width=0.5,
-            eye_tilt=0.7,
-            eye_gap=-0.3,
-            chin=0.5,
-            chin_width=-0.6,
-            neck=-0.8,
-            brow_tilt=0.8,
-        ),
-        Manner(
-            jaw=1.05,
-            rounding=0.8,
-            spreading=1.3,
-            lips=1.2,
-            lead=0.0,
-            slack=0.85,
-            smoothness=0.011,
-            asymmetry=-0.08,
-            smile=0.2,
-            inner_brow=0.25,
-            outer_brow=0.8,
-            blinks=0.25,
-            cheeks=0.7,
-        ),
-    ),
-    Speaker(
-        "M1",
-        Voice("en-us", 160, 38, 50),
-        Shape(
-            width=0.3,
-            length=0.4,
-            jaw=0.8,
-            chin=0.6,
-            chin_width=0.8,
-            neck=0.7,
-            brow_ridge=0.6,
-            brow_height=-0.5,
-            nose_bridge=0.5,
-            nose_width=0.3,
-            lips=-0.4,
-            eye_size=-0.3,
-            cheeks=-0.2,
-            ears=0.4,
-        ),
-        Manner(
-            jaw=1.05,
-            rounding=0.95,
-            spreading=0.9,
-            lips=0.85,
-            lead=0.015,
-            asymmetry=0.06,
-            frown=0.12,
-            inner_brow=0.35,
-            outer_brow=0.45,
-            blinks=0.3,
-            blink_length=0.3,
-        ),
-    ),
-    Speaker(
-        "M2",
-        Voice("en-gb-scotland+m3", 152, 45, 60),
-        Shape(
-            width=0.8,
-            length=-0.3,
-            depth=0.4,
-            cheeks=1.0,
-            jaw=0.4,
-            chin=-0.4,
-            neck=1.0,
-            nose_width=1.0,
-            nose_tip=0.3,
-            nose_bridge=-0.5,
-            lips=0.8,
-            mouth_width=0.6,
-            brow_ridge=0.3,
-            eye_size=-0.4,
-            eye_gap=0.5,
-            ears=0.8,
-            forehead=-0.5,
-        ),
-        Manner(
-            jaw=0.8,
-            rounding=1.1,
-            spreading=0.75,
-            lips=1.0,
-            lead=0.035,
-            slack=1.25,
-            smoothness=0.022,
-            asymmetry=-0.12,
-            squint=0.22,
-            inner_brow=0.6,
-            outer_brow=0.6,
-            blinks=0.6,
-            cheeks=0.2,
-        ),
-    ),
-    Speaker(
-        "M3",
-        Voice("en+m7", 162, 48, 40),
-        Shape(
-            width=-0.6,
-            length=0.9,
-            depth=0.5,
-            jaw=-0.2,
-            chin=0.9,
-            chin_width=0.2,
-            neck=0.1,
-            nose_length=0.9,
-            nose_tip=0.8,
-            nose_bridge=0.8,
-            nose_width=-0.3,
-            lips=-0.7,
-            mouth_width=-0.3,
-            cheeks=-0.9,
-            brow_ridge=0.8,
-            brow_tilt=-0.4,
-            eye_gap=-0.5,
-            ears=0.9,
-            forehead=0.7,
-        ),
-        Manner(
-            jaw=1.08,
-            rounding=0.9,
-            spreading=1.15,
-            lips=1.15,
-            lead=-0.005,
-            slack=0.85,
-            smoothness=0.012,
-            inner_brow=0.8,
-            outer_brow=0.9,
-            blinks=0.35,
-            smile=-0.08,
-        ),
-    ),
-    Speaker(
-        "F4",
-        Voice("en-us+f5", 162, 50, 60),
-        Shape(
-            width=0.6,
-            length=-0.2,
-            jaw=0.3,
-            lips=1.2,
-            mouth_width=0.9,
-            mouth_forward=0.6,
-            nose_width=0.9,
-            nose_bridge=-0.9,
-            nose_length=-0.3,
-            eye_size=0.8,
-            eye_gap=0.6,
-            eye_tilt=0.4,
-            brow_height=-0.2,
-            cheekbones=0.9,
-            neck=-0.4,
-            forehead=0.4,
-            ears=-0.4,
-        ),
-        Manner(
-            jaw=0.96,
-            rounding=1.15,
-            spreading=1.1,
-            lips=1.05,
-            lead=0.025,
-            slack=0.95,
-            asymmetry=0.05,
-            smile=0.12,
-            inner_brow=0.4,
-            outer_brow=0.75,
-            blinks=0.45,
-            cheeks=0.6,
-        ),
-    ),
-    Speaker(
-        "M4",
-        Voice("en-gb-x-rp+m1", 155, 42, 55),
-        Shape(
-            width=-0.8,
-            length=0.3,
-            depth=-0.5,
-            jaw=0.5,
-            chin=-0.6,
-            chin_width=-0.5,
-            neck=0.0,
-            nose_length=0.7,
-            nose_up=-1.0,
-            nose_bridge=1.0,
-            nose_width=0.5,
-            brow_ridge=1.0,
-            brow_height=-0.9,
-            brow_tilt=0.5,
-            eye_tilt=-0.9,
-            eye_gap=-0.8,
-            lips=0.2,
-            mouth_width=-0.7,
-            cheekbones=0.5,
-            cheeks=-0.7,
-            forehead=-0.8,
-            ears=0.3,
-        ),
-        Manner(
-            jaw=0.9,
-            rounding=1.0,
-            spreading=0.95,
-            lips=0.9,
-            lead=0.03,
-            slack=1.1,
-            smoothness=0.017,
-            asymmetry=-0.06,
-            frown=0.2,
-            inner_brow=0.55,
-            outer_brow=0.3,
-            blinks=0.4,
-            squint=0.12,
-        ),
-    ),
-)
-SPEAKERS = {speaker.name: speaker for speaker in _CAST}
+def _read_speakers() -> dict[str, Speaker]:
+    text = resources.files(__package__).joinpath("speakers.toml").read_text(encoding="utf-8")
+    tables: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(text)
+    # The constructors refuse a number that they do not know, so a misspelt name cannot go unnoticed.
+    return {
+        name: Speaker(name, Voice(**table["voice"]), Shape(**table["shape"]), SpeakingStyle(**table["style"]))
+        for name, table in tables.items()
+    }
+
+
+SPEAKERS = _read_speakers()

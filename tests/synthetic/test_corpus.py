@@ -3,7 +3,6 @@
 import csv
 import hashlib
 import json
-import os
 import pickle
 import subprocess
 import sys
@@ -16,7 +15,7 @@ import soundfile
 from facediff import synthetic as puppet
 from facediff.errors import FaceDiffError
 from facediff.synthetic import corpus as corpus_module
-from facediff.synthetic.corpus import clips, folder_as_a_whole, generate, is_complete
+from facediff.synthetic.corpus import clips, generate, is_complete
 
 pytest.importorskip("espeakng_loader")
 
@@ -136,40 +135,13 @@ def test_an_interruption_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monk
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
-    root = tmp_path / "corpus"
-    script = (
-        "import os, sys, pathlib; from facediff.synthetic.corpus import folder_as_a_whole\n"
-        "with folder_as_a_whole(pathlib.Path(sys.argv[1])) as folder: (folder / 'half').touch(); os._exit(9)"
-    )
-    done = subprocess.run([sys.executable, "-c", script, str(root)], check=False)
-    assert done.returncode == 9
-    (left,) = tmp_path.iterdir()
-    assert left.name.startswith("corpus.partial-")
-    living = tmp_path / f"corpus.partial-{os.getppid()}"
-    living.mkdir()
-    with folder_as_a_whole(root) as folder:
-        (folder / "manifest.json").write_text("{}")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["corpus", living.name]
-
-
-def test_the_slower_of_two_writers_gives_way(tmp_path: Path) -> None:
-    root = tmp_path / "corpus"
-    with folder_as_a_whole(root) as folder:
-        (folder / "manifest.json").write_text("mine")
-        root.mkdir()
-        (root / "manifest.json").write_text("quicker")
-    assert (root / "manifest.json").is_file()
-    assert [path.name for path in tmp_path.iterdir()] == ["corpus"]
-
-
 def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(FaceDiffError, match="not empty"):
         generate(tmp_path, progress=False)
     with pytest.raises(FaceDiffError, match="is a file"):
         generate(tmp_path / "thesis.tex", progress=False)
-    with pytest.raises(FaceDiffError, match="could not be written"):
+    with pytest.raises(FaceDiffError, match="thesis.tex/below: cannot be written"):
         generate(tmp_path / "thesis.tex" / "below", progress=False)
     with pytest.raises(FaceDiffError, match="no clip 'F1_e99'"):
         generate(tmp_path / "new", only=["F1_e99"], progress=False)

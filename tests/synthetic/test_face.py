@@ -7,7 +7,8 @@ import pytest
 
 from facediff import synthetic as puppet
 from facediff.synthetic.corpus import regions, rig_of
-from facediff.synthetic.face import build_face, delaunay
+from facediff.synthetic.face import build_face
+from facediff.synthetic.geometry import delaunay
 from facediff.synthetic.rig import lip_pairs
 from facediff.synthetic.speakers import SPEAKERS
 

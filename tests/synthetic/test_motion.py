@@ -1,4 +1,4 @@
-"""Faces follow the speech: lips meet on p, b, m, open on vowels, nothing jitters, moods and manners show."""
+"""Faces follow the speech: lips meet on p, b, m, open on vowels, nothing jitters, moods and speaking styles show."""
 
 import csv
 from pathlib import Path

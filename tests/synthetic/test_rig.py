@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from facediff.synthetic.corpus import regions, rig_of
-from facediff.synthetic.face import Shape, build_face
-from facediff.synthetic.rig import CONTROLS, LINEAR_FIELDS, build_rig
+from facediff.synthetic.face import build_face
+from facediff.synthetic.rig import CONTROLS, LINEAR_FIELDS, Shape, build_rig
 from facediff.synthetic.speakers import SPEAKERS
 
 

@@ -13,8 +13,8 @@ from facediff.editing.correspondence import Correspondence, correspond
 from facediff.editing.retargeting import carried_region, carry, carry_displacements, unit_of
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh
-from facediff.synthetic.face import Shape, build_face
-from facediff.synthetic.rig import CONTROLS, Rig, build_rig, lip_pairs
+from facediff.synthetic.face import build_face
+from facediff.synthetic.rig import CONTROLS, Rig, Shape, build_rig, lip_pairs
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 LIMIT = 0.02
