@@ -53,7 +53,9 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
     if not isinstance(array, np.ndarray):
         array.close()
         raise FaceDiffError(f"{name}: is an archive of several arrays; name it .npz")
-    if kinds and (array.dtype.kind not in kinds or not array.size):
+    if kinds and not array.size:
+        raise FaceDiffError(f"{name}: holds no numbers, its shape is {array.shape}; write it again")
+    if kinds and array.dtype.kind not in kinds:
         wanted = "floating-point numbers" if kinds == "f" else "numbers"
         raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {wanted}, at least one")
     return array

@@ -163,7 +163,7 @@ def test_files_that_are_no_animations(tmp_path: Path) -> None:
         read_animation(tmp_path / "b.npy")
     for name, shape in (("flat", (4, 0)), ("deep", (4, 0, 3))):
         np.save(tmp_path / f"{name}.npy", np.zeros(shape, np.float32))
-        with pytest.raises(FaceDiffError, match=rf"{name}\.npy: holds float32 "):
+        with pytest.raises(FaceDiffError, match=rf"{name}\.npy: holds no numbers"):
             read_animation(tmp_path / f"{name}.npy")
     with zipfile.ZipFile(tmp_path / "words.npz", "w") as archive:
         archive.writestr("vertices", "no numbers")

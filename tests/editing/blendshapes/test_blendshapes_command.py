@@ -131,7 +131,7 @@ def test_shapes_of_another_topology_are_carried(
         (["take.npz", "-o", "w.csv", "--shapes", "absent"], "absent: no such folder"),
         (["absent.npz", "-o", "w.csv", "--shapes", "shapes"], "absent.npz: no such file"),
         (["nan.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "frame 1 holds NaN"),
-        (["empty.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "empty.npy: holds float32 (0, 1008, 3)"),
+        (["empty.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "holds no numbers"),
         (["small.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "1008 vertices and the"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--bounds", "1", "0"], "bounds 1 to 0"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--show", "a.jpg"], "expected a picture .png"),
