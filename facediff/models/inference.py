@@ -428,9 +428,19 @@ class Window:
     frames: int
 
     @property
+    def start(self) -> int:
+        """Its first frame, counted from the start of the speech."""
+        return self.index * self.plan.hop
+
+    @property
+    def end(self) -> int:
+        """The frame after its last one."""
+        return self.start + self.frames
+
+    @property
     def context(self) -> int:
         """Frames before the window whose speech the model hears, but which it does not animate."""
-        return min(self.plan.before, self.index * self.plan.hop)
+        return min(self.plan.before, self.start)
 
     @property
     def shared(self) -> int:
@@ -485,7 +495,7 @@ class SpeechStream:
         self._speech = clip.audio.new_zeros(0)
         self._dropped = 0  # samples before these, which no window will hear again
         self._level = Level()
-        self._index = 0
+        self._window = Window(self.plan, 0, self.plan.frames)  # the next one to generate, if the speech lasts
         self._tail: list[Tensor] | None = None  # what the latest window hands over to the next
         self._held: Tensor | None = None  # the latest window's frames that the next one shares
         self._finished = False
@@ -502,8 +512,8 @@ class SpeechStream:
         parts = []
         # A window is generated once the speech after it has been heard too. Its last frames are held back: the next
         # window blends into them.
-        while self._heard >= self._sample(self._end + self.plan.after):
-            parts.append(self._next_window(self._end + self.plan.after))
+        while self._heard >= self._sample(self._window.end + self.plan.after):
+            parts.append(self._next_window(self._window.end + self.plan.after))
         return self._joined(parts)
 
     @torch.inference_mode()
@@ -526,15 +536,15 @@ class SpeechStream:
             raise FaceDiffError(f"frames: {total} are fewer than the {self.frames} that have been given out already")
         self._speech = torch.nn.functional.pad(self._speech, (0, max(0, self._sample(total) - self._heard)))
         parts = []
-        while self._end < total:
-            parts.append(self._next_window(min(total, self._end + self.plan.after)))
+        while self._window.end < total:
+            parts.append(self._next_window(min(total, self._window.end + self.plan.after)))
         # The rest lies within the last window. If it is no longer than what the window before has animated already, its
         # frames are certain now, since no later window will blend into them.
-        left = total - self._start
+        left = total - self._window.start
         if self._held is not None and left <= self.plan.overlap:
             parts.append(self._held[:, :left])
         else:
-            parts.append(self._generate(total, total))
+            parts.append(self._generate(replace(self._window, frames=left), total))
         return self._joined(parts)
 
     def parts(
@@ -556,14 +566,6 @@ class SpeechStream:
             yield from (part for part in parts if part.shape[1])
 
     @property
-    def _start(self) -> int:
-        return self._index * self.plan.hop
-
-    @property
-    def _end(self) -> int:
-        return self._start + self.plan.frames
-
-    @property
     def _heard(self) -> int:
         return self._dropped + len(self._speech)
 
@@ -571,25 +573,25 @@ class SpeechStream:
         return samples_for(frame, self.model.frame_rate)
 
     def _next_window(self, heard: int) -> Tensor:
-        """The present window's frames before the overlap, with speech up to frame ``heard``; go on to the next one."""
-        motion = self._generate(self._end, heard)
-        self._index += 1
+        """The window's frames before its overlap with the next, given speech up to frame ``heard``; then advance."""
+        motion = self._generate(self._window, heard)
+        self._window = Window(self.plan, self._window.index + 1, self.plan.frames)
         # Speech before the next window's context will not be heard again, unless the level has not counted it yet.
-        needed = self._sample(self._start - min(self.plan.before, self._start))
+        needed = self._sample(self._window.start - self._window.context)
         drop = max(0, min(needed, self._level.count) - self._dropped)
         self._speech = self._speech[drop:]
         self._dropped += drop
         return motion[:, : self.plan.hop]
 
-    def _generate(self, end: int, heard: int) -> Tensor:
-        """The present window up to frame ``end``, with speech up to frame ``heard``."""
-        window = Window(self.plan, self._index, end - self._start)
+    def _generate(self, window: Window, heard: int) -> Tensor:
+        """Motion of a window, with speech up to frame ``heard``."""
         # Places in the whole recording; the kept speech starts at sample ``_dropped`` of it. Windows overlap, so the
         # level counts only what it has not counted yet.
-        first, last = self._sample(self._start - window.context), self._sample(heard)
+        start = window.start - window.context
+        first, last = self._sample(start), self._sample(heard)
         self._level.hear(self._speech[max(0, self._level.count - self._dropped) : last - self._dropped])
         speech = self._speech[first - self._dropped : last - self._dropped]
-        clip = with_speech(self.clip, speech, heard - self._start + window.context)
+        clip = with_speech(self.clip, speech, heard - start)
         # A window that is mostly a pause, standardised by itself, would turn its noise into loud speech.
         with self.model.speech_encoder.at_level(self._level.mean, max(self._level.deviation, QUIETEST)):
             motion, self._tail = self.model.generate_window(clip, window, self.seeds, self._tail)

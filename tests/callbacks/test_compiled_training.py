@@ -67,7 +67,7 @@ print(json.dumps([plain, found, calls, late]))
 """
 
 
-def test_losses_weights_and_names_are_those_without(tiny_root: Path) -> None:
+def test_compiled_training_gives_the_same_losses_weights_and_names(tiny_root: Path) -> None:
     # In a process of its own, without the checks of shapes, which cannot be traced.
     command = [sys.executable, "-c", PROGRAM, tiny_root]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200, cwd=ROOT)
@@ -82,7 +82,9 @@ def test_losses_weights_and_names_are_those_without(tiny_root: Path) -> None:
     assert late == [[]]
 
 
-def test_a_machine_that_cannot_compile_is_told(make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny) -> None:
+def test_compiled_training_on_a_machine_that_cannot_compile_is_an_error(
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny
+) -> None:
     def backend(*_: object) -> Callable[..., object]:
         raise RuntimeError("No working C++ compiler found")
 
@@ -91,12 +93,14 @@ def test_a_machine_that_cannot_compile_is_told(make_model: MakeModel, make_train
         trainer.fit(make_model(), datamodule=tiny)
 
 
-def test_a_system_without_a_network_is_told(make_trainer: MakeTrainer) -> None:
+def test_compiled_training_of_a_model_without_a_network_is_an_error(make_trainer: MakeTrainer) -> None:
     with pytest.raises(FaceDiffError, match="LightningModule has no network whose parts could be compiled"):
         CompiledTraining().on_fit_start(make_trainer(), pl.LightningModule())
 
 
-def test_a_part_that_is_not_there_is_named(make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny) -> None:
+def test_compiled_training_names_a_part_that_does_not_exist(
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny
+) -> None:
     trainer = make_trainer(callbacks=[CompiledTraining(parts=["decoders"])])
     with pytest.raises(FaceDiffError, match=r'no part "decoders"; choose among .*fusion, .*decoder'):
         trainer.fit(make_model(), datamodule=tiny)

@@ -70,7 +70,7 @@ def train_scaled(make_trainer: MakeTrainer, folder: Path, values: list[float], *
     return module
 
 
-def test_norms_are_those_before_clipping(make_trainer: MakeTrainer, tmp_path: Path) -> None:
+def test_gradient_norm_is_that_before_clipping(make_trainer: MakeTrainer, tmp_path: Path) -> None:
     module = train_scaled(make_trainer, tmp_path, [1.0, 2.0, 0.5], gradient_clip_val=0.25)
     expected = [(13 * x, 5 * x, 12 * x) for x in (1.0, 2.0, 0.5)]
     found = columns(tmp_path, "gradient/norm", "gradient/a", "gradient/b")
@@ -78,14 +78,14 @@ def test_norms_are_those_before_clipping(make_trainer: MakeTrainer, tmp_path: Pa
     assert module.size() == pytest.approx(3 * 0.25, rel=1e-4)  # clipped nevertheless: three steps of this length
 
 
-def test_accumulated_batches_count_once(make_trainer: MakeTrainer, tmp_path: Path) -> None:
+def test_gradient_norm_counts_accumulated_batches_once(make_trainer: MakeTrainer, tmp_path: Path) -> None:
     train_scaled(make_trainer, tmp_path, [1.0, 2.0, 4.0, 6.0], accumulate_grad_batches=2)
     # Lightning averages over the accumulated batches: (1 + 2) / 2 and (4 + 6) / 2. The loss is logged as often.
     assert columns(tmp_path, "gradient/norm") == [(pytest.approx(13 * 1.5),), (pytest.approx(13 * 5.0),)]
     assert len(columns(tmp_path, "train/loss")) == 2
 
 
-def test_mixed_precision_leaves_no_scale(make_trainer: MakeTrainer, tmp_path: Path) -> None:
+def test_gradient_norm_is_without_the_scale_of_mixed_precision(make_trainer: MakeTrainer, tmp_path: Path) -> None:
     scaler = torch.amp.GradScaler("cpu", init_scale=1024.0)
     train_scaled(make_trainer, tmp_path, [0.5], plugins=[MixedPrecision("16-mixed", "cpu", scaler)])
     assert columns(tmp_path, "gradient/norm") == [(pytest.approx(6.5, rel=1e-3),)]
@@ -93,7 +93,7 @@ def test_mixed_precision_leaves_no_scale(make_trainer: MakeTrainer, tmp_path: Pa
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs processes that fork")
-def test_two_processes_log_the_norm_of_the_mean(make_trainer: MakeTrainer, tmp_path: Path) -> None:
+def test_gradient_norm_of_two_processes_is_that_of_the_mean(make_trainer: MakeTrainer, tmp_path: Path) -> None:
     # The first step sees 1 and 3 on the two processes, the second 2 and 8.
     options = {"devices": 2, "strategy": "ddp_fork", "use_distributed_sampler": True}
     module, trainer = Scaled(), make_trainer(logger=CSVLogger(tmp_path), callbacks=[GradientNorm()], **options)
@@ -126,7 +126,7 @@ def test_training_is_the_same_with_and_without(
         assert sum(float(row[part] or 0) ** 2 for part in parts) == pytest.approx(float(row["gradient/norm"]) ** 2)
 
 
-def test_a_run_says_what_it_is(make_model: MakeModel, make_trainer: MakeTrainer, tmp_path: Path) -> None:
+def test_run_description_is_logged(make_model: MakeModel, make_trainer: MakeTrainer, tmp_path: Path) -> None:
     from facediff import registry
 
     root = write_tiny(tmp_path / "corpus")
@@ -176,7 +176,7 @@ def tested(
     return OfflineRun(folder), trainer, model
 
 
-def test_the_worst_clips_have_sound_and_picture(
+def test_sequence_table_has_sound_and_picture_of_the_worst_clips(
     tested: tuple[OfflineRun, pl.Trainer, DualPathDiffusion], tiny_root: Path
 ) -> None:
     run, trainer, model = tested
@@ -206,7 +206,7 @@ def test_the_worst_clips_have_sound_and_picture(
         np.testing.assert_array_equal(np.asarray(Image.open(run.media[row["error"]["path"]])), picture)
 
 
-def test_a_corpus_without_faces_has_sound_only(tested: tuple[OfflineRun, pl.Trainer, DualPathDiffusion]) -> None:
+def test_sequence_table_without_faces_has_sound_only(tested: tuple[OfflineRun, pl.Trainer, DualPathDiffusion]) -> None:
     from dataclasses import replace
 
     run, trainer, model = tested

@@ -96,7 +96,7 @@ def model_of(checkpoint: Path, *, averaged: bool) -> DualPathDiffusion:
     return model
 
 
-def test_averaged_weights_are_shown(
+def test_preview_shows_averaged_weights(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     """After epoch 2 from validation; after epoch 3, which has none, at the end of training.
@@ -121,7 +121,7 @@ class Broken(SamplingPreview):
         raise RuntimeError("the disk is full")
 
 
-def test_two_processes(tiny: Tiny, tiny_root: Path, tmp_path: Path) -> None:
+def test_preview_with_two_processes(tiny: Tiny, tiny_root: Path, tmp_path: Path) -> None:
     """One process draws, and fails where it must; the other neither draws nor waits for ever."""
     here = "tests.callbacks.test_sampling_preview"
     callbacks: list[dict[str, Any]] = [
@@ -160,7 +160,7 @@ def test_two_processes(tiny: Tiny, tiny_root: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("preview", [SamplingPreview, Broken])
 @pytest.mark.filterwarnings("ignore:the preview of:UserWarning")
-def test_training_is_the_same_digit_for_digit(
+def test_preview_leaves_training_the_same_digit_for_digit(
     preview: type[SamplingPreview], make_model: MakeModel, make_trainer: MakeTrainer, tiny_root: Path
 ) -> None:
     found = []
@@ -176,7 +176,7 @@ def test_training_is_the_same_digit_for_digit(
     assert found[0] == found[1]
 
 
-def test_clips_and_noise_are_the_same_in_every_epoch(
+def test_preview_clips_and_noise_are_the_same_in_every_epoch(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     """With weights that stand still, so do the pictures; another seed gives others."""
@@ -200,7 +200,7 @@ def test_clips_and_noise_are_the_same_in_every_epoch(
     assert not np.array_equal(panels[4], panels[0])
 
 
-def test_it_is_drawn_when_it_is_due(
+def test_preview_is_drawn_when_it_is_due(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     def epochs(folder: str, trainer_options: dict[str, Any], **options: object) -> list[int]:
@@ -218,7 +218,7 @@ def test_it_is_drawn_when_it_is_due(
     assert epochs("f", {"max_epochs": 0, "num_sanity_val_steps": 2}) == []
 
 
-def test_a_resumed_run_goes_on_alike() -> None:
+def test_preview_state_is_resumed() -> None:
     before, after, chosen = SamplingPreview(), SamplingPreview(), SamplingPreview(error_scale=2.0)
     before.load_state_dict({"error_scale": 0.5, "drawn_epochs": 4, "drawn_step": 9})
     after.load_state_dict(before.state_dict())
@@ -227,7 +227,7 @@ def test_a_resumed_run_goes_on_alike() -> None:
     assert chosen.state_dict()["error_scale"] == 2.0
 
 
-def test_a_failing_preview_warns_and_leaves_nothing_half_written(
+def test_preview_that_fails_warns_and_leaves_nothing_half_written(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(self: Renderer, *arguments: object, **options: object) -> None:
@@ -241,7 +241,7 @@ def test_a_failing_preview_warns_and_leaves_nothing_half_written(
     assert not [path for path in tmp_path.rglob("*") if "previews" in str(path)]
 
 
-def test_a_logger_that_fails_does_not_keep_the_others_from_showing(
+def test_preview_logger_that_fails_does_not_stop_the_others(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     board, table = TensorBoardLogger(tmp_path / "board"), CSVLogger(tmp_path / "csv")
@@ -253,7 +253,7 @@ def test_a_logger_that_fails_does_not_keep_the_others_from_showing(
     assert len(list(Path(board.log_dir).glob("previews/epoch_0001/*"))) == 4
 
 
-def test_a_missing_package_is_told_once(
+def test_preview_warns_once_of_a_missing_package(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
@@ -263,7 +263,7 @@ def test_a_missing_package_is_told_once(
     assert sum("no previews" in str(warning.message) for warning in told) == 1
 
 
-def test_a_corpus_without_a_mesh_is_told_once(
+def test_preview_without_a_mesh_is_reported_once(
     make_model: MakeModel,
     make_trainer: MakeTrainer,
     tiny: Tiny,
@@ -279,7 +279,7 @@ def test_a_corpus_without_a_mesh_is_told_once(
     assert not (tmp_path / "previews").exists()
 
 
-def test_bad_options_are_refused_at_once(make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny) -> None:
+def test_preview_refuses_bad_options(make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny) -> None:
     with pytest.raises(FaceDiffError, match="seconds is 0, expected a number above zero"):
         SamplingPreview(seconds=0)
     with pytest.raises(FaceDiffError, match='no view "side_wise": did you mean "side"'):
@@ -291,7 +291,7 @@ def test_bad_options_are_refused_at_once(make_model: MakeModel, make_trainer: Ma
         trainer.fit(make_model(), datamodule=tiny)
 
 
-def test_tensorboard_holds_pictures_and_sound(
+def test_preview_in_tensorboard_has_pictures_and_sound(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -309,7 +309,7 @@ def test_tensorboard_holds_pictures_and_sound(
     assert events.Scalars("preview/seconds")[0].value > 0
 
 
-def test_wandb_holds_videos_and_a_growing_table(
+def test_preview_in_wandb_has_videos_and_a_growing_table(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wandb = pytest.importorskip("wandb")
@@ -336,7 +336,7 @@ def test_wandb_holds_videos_and_a_growing_table(
     assert all(row[2]["_type"] == "video-file" and row[4] > 0 for row in rows)
 
 
-def test_the_shipped_configs_draw_and_the_last_one_counts(tiny_root: Path, tmp_path: Path) -> None:
+def test_preview_of_the_last_bundled_config_counts(tiny_root: Path, tmp_path: Path) -> None:
     words = ["--config", "configs/experiment/puppet.yaml", "--config", "configs/callbacks/preview.yaml"]
     words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--model.dim=16", "--trainer.max_steps=1"]
     words += ["--model.diffusion_steps=20", "--model.sampler.steps=2", "--trainer.log_every_n_steps=1"]
@@ -348,7 +348,7 @@ def test_the_shipped_configs_draw_and_the_last_one_counts(tiny_root: Path, tmp_p
         assert image.size[0] == 2 * 3 * 288 + 6
 
 
-def test_a_system_is_given_back_as_it_was_lent(make_model: MakeModel) -> None:
+def test_borrowed_model_is_restored(make_model: MakeModel) -> None:
     model = make_model().train()
     next(model.children()).eval()  # as a frozen part is
     modes, sampler = [module.training for module in model.modules()], model.sampler
@@ -365,12 +365,12 @@ def test_a_system_is_given_back_as_it_was_lent(make_model: MakeModel) -> None:
     assert model.sampler is sampler
 
 
-def test_each_persons_first_clip_comes_before_any_second() -> None:
+def test_first_of_each_identity_comes_before_any_second() -> None:
     clips = [Clip(name, *name.split("_")) for name in ("A_e1", "A_e2", "A_e3", "B_e1", "C_e1", "C_e2")]  # type: ignore[call-arg]
     assert first_of_each_identity(clips, 2) == ["A_e1", "B_e1"]
     assert first_of_each_identity(clips, 5) == ["A_e1", "B_e1", "C_e1", "A_e2", "C_e2"]
     assert first_of_each_identity(clips[:2], 9) == ["A_e1", "A_e2"]
 
 
-def test_lengths_are_for_people() -> None:
+def test_length_has_a_readable_unit() -> None:
     assert [length(0.0051, "m"), length(0.0051, "mm"), length(2, "unit")] == ["5.1 mm", "0.0051 mm", "2 unit"]

@@ -60,7 +60,7 @@ def losses(
 
 
 @pytest.mark.parametrize("frozen", [0, 2, -1])
-def test_losses_are_the_same_with_and_without(
+def test_speech_feature_cache_gives_the_same_losses(
     losses: Callable[..., tuple[list[float], int]], tmp_path: Path, frozen: int
 ) -> None:
     without, _ = losses(frozen=frozen)
@@ -74,7 +74,7 @@ def test_losses_are_the_same_with_and_without(
     assert (encoded, encoded_again) == (10, 0)
 
 
-def test_a_schedule_that_asks_for_the_number_of_steps_reads_the_cache_too(
+def test_speech_feature_cache_works_with_a_schedule(
     losses: Callable[..., tuple[list[float], int]], tmp_path: Path
 ) -> None:
     """It has the loaders made before the features are there."""
@@ -82,7 +82,7 @@ def test_a_schedule_that_asks_for_the_number_of_steps_reads_the_cache_too(
     assert encoded == 10
 
 
-def test_windows_take_their_part_of_the_whole_clips_features(
+def test_speech_feature_cache_gives_windows_their_part(
     losses: Callable[..., tuple[list[float], int]], tmp_path: Path
 ) -> None:
     found, encoded = losses(SpeechFeatureCache(str(tmp_path)), window=7)
@@ -90,7 +90,7 @@ def test_windows_take_their_part_of_the_whole_clips_features(
     assert encoded == 10
 
 
-def test_a_window_of_features_lies_where_the_window_of_motion_lies(tiny_root: Path) -> None:
+def test_speech_feature_window_is_where_the_motion_window_is(tiny_root: Path) -> None:
     data = Tiny(root=str(tiny_root), window=5)
     # Features that count frames in half steps, as an encoder with two steps a frame would give.
     data.features.reader = lambda clip: torch.arange(2.0 * data.corpus.frames(clip))[:, None]
@@ -103,7 +103,9 @@ def test_a_window_of_features_lies_where_the_window_of_motion_lies(tiny_root: Pa
         assert sample.features.flatten().tolist() == list(range(2 * start, 2 * start + 10))
 
 
-def test_a_damaged_cache_file_is_made_anew(losses: Callable[..., tuple[list[float], int]], tmp_path: Path) -> None:
+def test_speech_feature_cache_replaces_a_damaged_file(
+    losses: Callable[..., tuple[list[float], int]], tmp_path: Path
+) -> None:
     first, _ = losses(SpeechFeatureCache(str(tmp_path)))
     files = sorted(tmp_path.rglob("*.npy"))
     assert len(files) == 10
@@ -114,7 +116,7 @@ def test_a_damaged_cache_file_is_made_anew(losses: Callable[..., tuple[list[floa
     assert encoded == 1
 
 
-def test_an_encoder_without_a_frozen_part_is_refused(
+def test_speech_feature_cache_refuses_an_encoder_without_a_frozen_part(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     trainer = make_trainer(callbacks=[SpeechFeatureCache(str(tmp_path))])
@@ -122,7 +124,7 @@ def test_an_encoder_without_a_frozen_part_is_refused(
         trainer.fit(make_model(), datamodule=tiny)
 
 
-def test_from_the_command_line(
+def test_speech_feature_cache_from_the_command_line(
     tiny_root: Path, hubert_source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))

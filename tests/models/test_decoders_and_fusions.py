@@ -34,32 +34,32 @@ MASK = torch.ones(1, FRAMES, dtype=torch.bool)
 STYLE = torch.randn(1, 3, 6, generator=torch.Generator().manual_seed(0))
 
 
-def test_every_frame_sees_past_and_future(decoder: nn.Module) -> None:
+def test_decoder_frame_sees_past_and_future(decoder: nn.Module) -> None:
     assert reach(lambda x: decoder(x, STYLE, MASK)).all()
 
 
-def test_a_one_way_gru_sees_the_past_only() -> None:
+def test_gru_of_one_direction_sees_the_past_only() -> None:
     one_way = GruDecoder(dim=DIM, style_dim=6, num_layers=1, bidirectional=False).eval()
     seen = reach(lambda x: one_way(x, STYLE, MASK))
     assert torch.equal(seen, torch.ones(FRAMES, FRAMES).tril().bool())
 
 
-def test_padding_is_never_seen(decoder: nn.Module) -> None:
+def test_decoder_does_not_see_padding(decoder: nn.Module) -> None:
     mask = torch.arange(FRAMES)[None] < 8
     assert not reach(lambda x: decoder(x, STYLE, mask))[:8, 8:].any()
 
 
-def test_style_changes_every_frame(decoder: nn.Module) -> None:
+def test_decoder_style_changes_every_frame(decoder: nn.Module) -> None:
     x = torch.randn(1, FRAMES, DIM)
     changed = (decoder(x, STYLE, MASK) - decoder(x, 1 - STYLE, MASK)).abs().amax(-1)
     assert (changed > 1e-4).all()
 
 
-def test_one_style_token_is_enough(decoder: nn.Module) -> None:
+def test_decoder_works_with_one_style_token(decoder: nn.Module) -> None:
     assert torch.isfinite(decoder(torch.randn(1, FRAMES, DIM), STYLE[:, :1], MASK)).all()
 
 
-def test_the_order_of_style_tokens_does_not_matter(decoder: nn.Module) -> None:
+def test_decoder_does_not_depend_on_the_order_of_style_tokens(decoder: nn.Module) -> None:
     x = torch.randn(1, FRAMES, DIM)
     torch.testing.assert_close(decoder(x, STYLE.flip(1), MASK), decoder(x, STYLE, MASK), rtol=0, atol=1e-5)
 
@@ -93,7 +93,7 @@ def test_cross_attention_follows_equation_12() -> None:
     torch.testing.assert_close(fusion(audio, motion, MASK), rich + moved, rtol=0, atol=1e-5)
 
 
-def test_motion_of_a_frame_can_hear_any_other_frame() -> None:
+def test_cross_attention_reaches_every_frame() -> None:
     torch.manual_seed(0)
     fusion = BidirectionalCrossAttention(dim=DIM).eval()
     other = torch.randn(1, FRAMES, DIM)
@@ -103,7 +103,7 @@ def test_motion_of_a_frame_can_hear_any_other_frame() -> None:
 
 @pytest.mark.parametrize("part", [(kind, n) for kind in ("fusion", "decoder") for n in registry.KINDS[kind].names()])
 @pytest.mark.parametrize("clips", [(0, 1, 2, 3), (3,)], ids=["padded", "whole"])
-def test_what_is_prepared_changes_nothing(
+def test_prepare_changes_nothing(
     part: tuple[str, str],
     clips: tuple[int, ...],
     make: Callable[..., nn.Module],

@@ -11,7 +11,7 @@ from facediff.models.samplers import unit_noise
 CPU = torch.device("cpu")
 
 
-def test_noise_is_that_of_its_seed_whatever_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unit_noise_does_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(draws, "PART", 100)
     found = []
     for threads in (1, 3):
@@ -24,7 +24,7 @@ def test_noise_is_that_of_its_seed_whatever_the_number_of_threads(monkeypatch: p
         assert torch.equal(found[0], unit_noise((3, 7, 50), CPU, torch.Generator().manual_seed(5)))
 
 
-def test_noise_follows_the_global_seed_and_goes_on() -> None:
+def test_unit_noise_follows_the_global_seed() -> None:
     torch.manual_seed(1)
     first, second = unit_noise((20,), CPU), unit_noise((20,), CPU)
     torch.manual_seed(1)
@@ -32,7 +32,7 @@ def test_noise_follows_the_global_seed_and_goes_on() -> None:
     assert not torch.equal(first, second)
 
 
-def test_noise_is_unit_gaussian_and_its_parts_are_independent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unit_noise_is_unit_gaussian_with_independent_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(draws, "PART", 10_000)
     noise = unit_noise((20, 10_000), CPU, torch.Generator().manual_seed(0)).double()
     # Standard errors: 1 / √200 000 for the mean, √(2 / 200 000) for the variance, 1 / √10 000 between rows.

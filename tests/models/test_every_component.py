@@ -79,7 +79,7 @@ def test_state_dict_round_trip(kind: str, name: str, make: Make, call: Call) -> 
     assert torch.equal(other(*inputs), expected)
 
 
-def test_the_modules_inputs_are_left_alone(kind: str, name: str, make: Make, call: Call) -> None:
+def test_inputs_are_not_changed(kind: str, name: str, make: Make, call: Call) -> None:
     inputs = call(kind, ALL, extra=2)
     before = [tensor.clone() for tensor in inputs]
     make(kind, name).eval()(*inputs)

@@ -79,7 +79,7 @@ def choose(model: DualPathDiffusion, batch: Batch) -> Space:
 
 @pytest.mark.parametrize(("name", "options"), SAMPLERS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
-def test_the_same_noise_gives_the_same_motion(
+def test_folded_sampling_gives_the_same_motion_for_the_same_noise(
     ready: Make, batch: Batch, name: str, options: dict[str, Any], dtype: torch.dtype, tolerance: float
 ) -> None:
     model = ready(sampler=partial(registry.sampler.get(name), **options)).to(dtype)
@@ -104,7 +104,7 @@ def test_the_same_noise_gives_the_same_motion(
     assert (other - plain)[batch.mask].abs().max() > 1e-2  # the noise matters
 
 
-def test_fresh_noise_gives_the_same_mean_and_covariance(ready: Make, tiny: Tiny) -> None:
+def test_folded_sampling_gives_the_same_mean_and_covariance_for_new_noise(ready: Make, tiny: Tiny) -> None:
     """Over 3000 clips with noise of their own, in few directions of motion."""
     model = ready(sampler=partial(registry.sampler.ddim, steps=4, eta=1.0))
     with torch.no_grad():  # a network in which the noise is heard
@@ -137,7 +137,7 @@ def test_fresh_noise_gives_the_same_mean_and_covariance(ready: Make, tiny: Tiny)
     assert ((first - second).abs() / error).max() < 4.5
 
 
-def test_folded_is_the_default_and_vertices_an_option(ready: Make, batch: Batch) -> None:
+def test_sampling_space_is_folded_by_default(ready: Make, batch: Batch) -> None:
     folded, plain = ready(), ready(sampling_space="vertices")
     assert folded.hparams["sampling_space"] == "folded"
     assert isinstance(choose(folded, batch), FoldedSpace)
@@ -145,7 +145,7 @@ def test_folded_is_the_default_and_vertices_an_option(ready: Make, batch: Batch)
     assert plain.generate(batch).shape == folded.generate(batch).shape == batch.motion.shape
 
 
-def test_ends_that_are_not_linear_sample_on_vertices(ready: Make, batch: Batch) -> None:
+def test_sampling_space_is_vertices_without_linear_ends(ready: Make, batch: Batch) -> None:
     model, same = ready(), ready(sampling_space="vertices")
     for one in (model, same):
         torch.manual_seed(1)
@@ -154,7 +154,7 @@ def test_ends_that_are_not_linear_sample_on_vertices(ready: Make, batch: Batch) 
     assert torch.equal(model.generate(batch), same.generate(batch))
 
 
-def test_ends_without_biases_fold(ready: Make, batch: Batch) -> None:
+def test_folded_sampling_works_without_biases(ready: Make, batch: Batch) -> None:
     model = ready().double()
     model.network.embed.bias = model.network.unembed.bias = None
     network, batch = model.network, cast(batch, torch.float64)
@@ -165,7 +165,7 @@ def test_ends_without_biases_fold(ready: Make, batch: Batch) -> None:
     torch.testing.assert_close(folded, plain, rtol=0, atol=1e-10)
 
 
-def test_a_sampler_that_is_not_linear_runs_on_vertices(
+def test_sampling_space_is_vertices_for_a_sampler_that_is_not_linear(
     ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = ready()
@@ -174,7 +174,7 @@ def test_a_sampler_that_is_not_linear_runs_on_vertices(
     assert model.generate(batch).shape == batch.motion.shape
 
 
-def test_a_sampler_that_only_claims_to_end_at_its_prediction_is_named(
+def test_sampler_that_is_wrongly_declared_linear_is_an_error(
     ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = ready()
@@ -185,7 +185,7 @@ def test_a_sampler_that_only_claims_to_end_at_its_prediction_is_named(
 
 
 @pytest.mark.parametrize("sampler", [registry.sampler.ddim, registry.sampler.ddpm])
-def test_a_clip_does_not_depend_on_the_clips_beside_it(ready: Make, tiny: Tiny, sampler: Any) -> None:  # noqa: ANN401
+def test_generate_does_not_depend_on_the_other_clips_of_a_batch(ready: Make, tiny: Tiny, sampler: Any) -> None:  # noqa: ANN401
     model = ready(sampler=sampler)
     dataset = tiny.dataset("train")
     short, long = dataset[0], dataset[7]
@@ -195,7 +195,7 @@ def test_a_clip_does_not_depend_on_the_clips_beside_it(ready: Make, tiny: Tiny, 
         torch.testing.assert_close(together * model.scale, alone * model.scale, rtol=0, atol=1e-4)
 
 
-def test_noise_is_independent_over_frames_and_zero_on_padding(ready: Make, batch: Batch) -> None:
+def test_folded_noise_is_independent_over_frames_and_zero_on_padding(ready: Make, batch: Batch) -> None:
     space = choose(ready(), batch)
     unit = torch.randn(*batch.motion.shape[:2], space.width) * batch.mask[..., None]
     noise = space.noise(unit)
@@ -205,7 +205,7 @@ def test_noise_is_independent_over_frames_and_zero_on_padding(ready: Make, batch
     assert torch.equal((space.noise(other) != noise).any(-1).any(0).nonzero()[:, 0], torch.tensor([3]))
 
 
-def test_changed_weights_are_seen(ready: Make, batch: Batch) -> None:
+def test_folded_sampling_follows_changed_weights(ready: Make, batch: Batch) -> None:
     """Written as weight averaging writes them."""
     model, fresh = ready(), ready()
     model.generate(batch)
@@ -216,7 +216,7 @@ def test_changed_weights_are_seen(ready: Make, batch: Batch) -> None:
     assert torch.equal(model.generate(batch), fresh.generate(batch))
 
 
-def test_weights_are_multiplied_once(ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fold_is_computed_once(ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
     real = dual_path.fold
     monkeypatch.setattr(dual_path, "fold", lambda *maps: (calls.append(1), real(*maps))[1])
@@ -226,7 +226,7 @@ def test_weights_are_multiplied_once(ready: Make, batch: Batch, monkeypatch: pyt
     assert len(calls) == 1
 
 
-def test_a_frame_costs_nothing_per_vertex_until_the_end(ready: Make, batch: Batch) -> None:
+def test_folded_sampling_touches_vertices_once(ready: Make, batch: Batch) -> None:
     model = ready(sampler=partial(registry.sampler.ddpm, steps=9))
     calls = {"embed": 0, "unembed": 0}
     for name in calls:
@@ -239,7 +239,7 @@ def test_a_frame_costs_nothing_per_vertex_until_the_end(ready: Make, batch: Batc
     assert calls == {"embed": 0, "unembed": 1}
 
 
-def test_in_mixed_precision_motion_is_float32_and_near(ready: Make, batch: Batch) -> None:
+def test_mixed_precision_motion_is_float32_and_near(ready: Make, batch: Batch) -> None:
     model = ready()
     exact = model.generate(batch)
     with torch.autocast("cpu", torch.bfloat16):

@@ -19,7 +19,7 @@ def ends(dim: int, coordinates: int, dtype: torch.dtype = torch.float64) -> tupl
 
 @pytest.mark.parametrize(("dim", "coordinates"), [(6, 30), (6, 4), (5, 5), (1, 7)])
 @pytest.mark.parametrize("chunk", [3, 1000])
-def test_the_products(dim: int, coordinates: int, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fold_products(dim: int, coordinates: int, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(folding, "CHUNK", chunk)
     first, last = ends(dim, coordinates)
     made = fold(first.weight.detach(), last.weight.detach(), last.bias.detach())
@@ -32,7 +32,7 @@ def test_the_products(dim: int, coordinates: int, chunk: int, monkeypatch: pytes
     assert torch.linalg.eigvalsh(made.root).min() > -1e-7
 
 
-def test_float32_weights_are_multiplied_in_float64() -> None:
+def test_fold_multiplies_float32_weights_in_float64() -> None:
     first, last = ends(4, 20_000, torch.float32)
     made = fold(first.weight.detach(), last.weight.detach(), last.bias.detach())
     exact = (first.weight.double() @ last.weight.double()).float()
@@ -40,7 +40,7 @@ def test_float32_weights_are_multiplied_in_float64() -> None:
     torch.testing.assert_close(made.product, exact, rtol=1e-6, atol=1e-9)
 
 
-def test_no_bias_is_a_bias_of_zero() -> None:
+def test_fold_without_bias_has_offset_zero() -> None:
     first, last = ends(3, 8)
     assert not fold(first.weight.detach(), last.weight.detach(), None).offset.any()
 
@@ -59,7 +59,7 @@ CHANGES: dict[str, Callable[[nn.Linear, nn.Linear], object]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_the_cache_sees_every_change_of_the_weights(change: str) -> None:
+def test_weight_cache_sees_every_change(change: str) -> None:
     calls: list[int] = []
     first, last = ends(4, 12)
     cache: WeightCache[Fold] = WeightCache()
@@ -79,7 +79,7 @@ def test_the_cache_sees_every_change_of_the_weights(change: str) -> None:
         assert torch.equal(getattr(found, name), getattr(expected, name))
 
 
-def test_what_is_made_in_inference_mode_serves_outside_of_it() -> None:
+def test_weight_cache_filled_in_inference_mode_serves_outside_of_it() -> None:
     first, last = ends(4, 12)
     cache: WeightCache[Fold] = WeightCache()
     with torch.inference_mode():
@@ -89,13 +89,13 @@ def test_what_is_made_in_inference_mode_serves_outside_of_it() -> None:
     (made.product @ weight).sum().backward()
 
 
-def test_the_cache_keeps_the_value_of_one_key() -> None:
+def test_weight_cache_keeps_the_value_of_one_key() -> None:
     cache: WeightCache[int] = WeightCache()
     weights = [torch.ones(2, 2)]
     assert [cache.get(weights, key, lambda key=key: key) for key in (1, 1, 2)] == [1, 1, 2]
 
 
-def test_equal_weights_give_the_same_root_whatever_the_signs_of_eigenvectors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fold_root_does_not_depend_on_the_signs_of_eigenvectors(monkeypatch: pytest.MonkeyPatch) -> None:
     first, last = ends(4, 12)
     maps = first.weight.detach(), last.weight.detach(), None
     once = fold(*maps).root

@@ -35,7 +35,7 @@ def clip(frames: int, batch: int = 1) -> tuple[Tensor, Tensor, Tensor]:
 @pytest.mark.parametrize(
     ("frozen", "trained"), [(0, {"layers.0", "layers.1", "layers.2", "encoder"}), (2, {"layers.2"}), (-1, set())]
 )
-def test_frozen_weights_stay_and_the_others_learn(hubert_source: Path, frozen: int, trained: set[str]) -> None:
+def test_hubert_keeps_frozen_weights_and_trains_the_others(hubert_source: Path, frozen: int, trained: set[str]) -> None:
     encoder = HubertEncoder(dim=8, source=str(hubert_source), frozen_layers=frozen).train()
     before = {name: value.clone() for name, value in encoder.named_parameters()}
     optimizer = torch.optim.AdamW(encoder.parameters(), lr=0.01, weight_decay=0.05)
@@ -55,12 +55,12 @@ def test_frozen_weights_stay_and_the_others_learn(hubert_source: Path, frozen: i
     assert not any("feature_extractor" in name or "feature_projection" in name for name in learning)
 
 
-def test_training_does_not_go_back_through_the_frozen_convolutions(hubert_source: Path) -> None:
+def test_hubert_computes_no_gradient_for_the_frozen_convolutions(hubert_source: Path) -> None:
     encoder = HubertEncoder(dim=8, source=str(hubert_source)).train()
     assert not encoder.hubert.feature_extractor(torch.randn(1, 4000)).requires_grad
 
 
-def test_nothing_is_random_in_training_unless_asked(
+def test_hubert_training_is_not_random_by_default(
     hubert_source: Path, without_dropout: Callable[[nn.Module], nn.Module]
 ) -> None:
     """Long enough for SpecAugment to find something to mask."""
@@ -82,7 +82,7 @@ def test_nothing_is_random_in_training_unless_asked(
 
 
 @pytest.mark.parametrize("frames", [1, 2, 13, 50])
-def test_two_steps_for_every_frame(hubert_source: Path, frames: int) -> None:
+def test_hubert_has_two_steps_for_every_frame(hubert_source: Path, frames: int) -> None:
     encoder = HubertEncoder(dim=8, source=str(hubert_source)).eval()
     steps: list[int] = []
     encoder.hubert.feature_projection.register_forward_pre_hook(lambda _, args: steps.append(args[0].shape[1]))
@@ -90,7 +90,7 @@ def test_two_steps_for_every_frame(hubert_source: Path, frames: int) -> None:
     assert steps == [2 * frames]
 
 
-def test_clips_of_equal_length_are_encoded_together(hubert_source: Path) -> None:
+def test_hubert_encodes_clips_of_equal_length_together(hubert_source: Path) -> None:
     encoder = HubertEncoder(dim=8, source=str(hubert_source)).eval()
     sizes: list[tuple[int, ...]] = []
     encoder.hubert.feature_extractor.register_forward_pre_hook(lambda _, args: sizes.append(tuple(args[0].shape)))
@@ -99,7 +99,7 @@ def test_clips_of_equal_length_are_encoded_together(hubert_source: Path) -> None
     assert sorted(sizes) == [(1, 5 * 640 + 80), (2, 3 * 640 + 80)]
 
 
-def test_convolutions_keep_time(hubert_source: Path) -> None:
+def test_hubert_convolutions_keep_time(hubert_source: Path) -> None:
     """The centre of what a step hears is the centre of its own 320 samples."""
     encoder = HubertEncoder(dim=8, source=str(hubert_source)).eval()
     # Group normalisation over time, in the first block, lets every step hear a little of everything.
@@ -116,7 +116,7 @@ def test_convolutions_keep_time(hubert_source: Path) -> None:
         assert float(places[0] + places[-1]) / 2 == pytest.approx(320 * step + 160, abs=2)
 
 
-def test_a_checkpoint_needs_no_source(hubert_source: Path, copy: Path, tmp_path: Path) -> None:
+def test_hubert_checkpoint_needs_no_source(hubert_source: Path, copy: Path, tmp_path: Path) -> None:
     factory = partial(registry.audio_encoder.hubert, source=str(copy), frozen_layers=1)
     encoder = factory(dim=8).eval()
     saved = {"hparams": describe(factory, encoder), "state": encoder.state_dict()}
@@ -131,7 +131,7 @@ def test_a_checkpoint_needs_no_source(hubert_source: Path, copy: Path, tmp_path:
     assert [p.requires_grad for p in again.parameters()] == [p.requires_grad for p in encoder.parameters()]
 
 
-def test_pretrained_weights_are_really_read(hubert_source: Path) -> None:
+def test_hubert_reads_pretrained_weights(hubert_source: Path) -> None:
     from safetensors.torch import load_file
 
     stored = load_file(hubert_source / "model.safetensors")
@@ -139,7 +139,7 @@ def test_pretrained_weights_are_really_read(hubert_source: Path) -> None:
     assert all(torch.equal(state[name], value) for name, value in stored.items())
 
 
-def test_a_missing_directory_is_named(tmp_path: Path) -> None:
+def test_hubert_missing_directory_is_named(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match=r"no directory .*/absent; expected one with config.json"):
         HubertEncoder(dim=8, source=str(tmp_path / "absent"))
 
@@ -169,14 +169,14 @@ CORRUPTIONS: dict[str, Change] = {
 
 
 @pytest.mark.parametrize("case", CORRUPTIONS)
-def test_a_corrupt_directory_is_one_sentence(copy: Path, case: str) -> None:
+def test_hubert_corrupt_directory_is_named(copy: Path, case: str) -> None:
     CORRUPTIONS[case](copy)
     with pytest.raises(FaceDiffError, match="audio_encoder.source: .*copy") as caught:
         HubertEncoder(dim=8, source=str(copy))
     assert "\n" not in str(caught.value)
 
 
-def test_all_but_the_frozen_part_trains_in_training_mode_and_in_full_precision(hubert_source: Path) -> None:
+def test_hubert_trains_all_but_the_frozen_part_in_full_precision(hubert_source: Path) -> None:
     # from_pretrained hands a model over in evaluation mode, and Lightning leaves modes as they are.
     encoder = HubertEncoder(dim=8, source=str(hubert_source), frozen_layers=1)
     layers = encoder.hubert.encoder.layers
@@ -203,7 +203,7 @@ def either_source(request: pytest.FixtureRequest, hubert_source: Path, tmp_path:
 
 
 @pytest.mark.parametrize("frozen", [0, 1, 2, 3, -1])
-def test_the_two_parts_together_are_the_published_model(either_source: Path, frozen: int) -> None:
+def test_hubert_parts_together_are_the_published_model(either_source: Path, frozen: int) -> None:
     encoder = HubertEncoder(dim=8, source=str(either_source), frozen_layers=frozen).eval()
     audio, lengths, frames = clip(9, batch=2)
     features, steps = encoder.frozen_features(audio, lengths)
@@ -214,7 +214,7 @@ def test_the_two_parts_together_are_the_published_model(either_source: Path, fro
     assert torch.equal(encoder(audio, lengths, frames, features, steps), encoder(audio, lengths, frames))
 
 
-def test_features_of_clips_of_several_lengths_do_not_mix(hubert_source: Path) -> None:
+def test_hubert_features_of_clips_do_not_mix(hubert_source: Path) -> None:
     encoder = HubertEncoder(dim=8, source=str(hubert_source), frozen_layers=1).eval()
     audio, frames = torch.randn(2, 9 * 640), torch.tensor([9, 4])
     audio[1, 4 * 640 :] = 0
@@ -225,7 +225,7 @@ def test_features_of_clips_of_several_lengths_do_not_mix(hubert_source: Path) ->
     torch.testing.assert_close(encoder(audio, frames * 640, frames, features, steps), whole, rtol=0, atol=0)
 
 
-def test_the_key_changes_with_what_decides_the_frozen_features(hubert_source: Path) -> None:
+def test_hubert_frozen_key_changes_with_the_features(hubert_source: Path) -> None:
     def key(change: Callable[[HubertEncoder], object] = lambda encoder: None, **options: object) -> str | None:
         torch.manual_seed(0)
         encoder = HubertEncoder(dim=8, source=str(hubert_source), **options)

@@ -34,7 +34,7 @@ def test_against_numpy(encoder: HierarchicalIdentity) -> None:
         np.testing.assert_allclose(result[row], expected(encoder, identity), atol=1e-10)
 
 
-def test_an_unknown_person_gets_the_mean(encoder: HierarchicalIdentity) -> None:
+def test_unseen_speaker_gets_the_mean(encoder: HierarchicalIdentity) -> None:
     result = encoder(torch.tensor([-1, 1])).detach().numpy()
     np.testing.assert_allclose(result[0], np.mean([expected(encoder, i) for i in range(4)], axis=0), atol=1e-10)
     np.testing.assert_allclose(result[1], expected(encoder, 1), atol=1e-10)
@@ -52,6 +52,6 @@ def test_width_follows_the_level() -> None:
     assert HierarchicalIdentity(dim=8, n_identities=2, level_dim=5)(torch.tensor([0])).shape == (1, 15)
 
 
-def test_an_identity_that_does_not_exist_is_an_error(encoder: HierarchicalIdentity) -> None:
+def test_identity_that_does_not_exist_is_an_error(encoder: HierarchicalIdentity) -> None:
     with pytest.raises(IndexError):
         encoder(torch.tensor([4]))

@@ -84,7 +84,7 @@ def test_rotary_attention_notices_order_and_plain_attention_does_not() -> None:
         assert same != rotary
 
 
-def test_impossible_heads_are_refused() -> None:
+def test_attention_refuses_impossible_heads() -> None:
     with pytest.raises(ValueError, match="dim 10 is not a multiple of num_heads 4"):
         Attention(10, 10, 4)
     with pytest.raises(ValueError, match="even number of channels per head, got 3"):

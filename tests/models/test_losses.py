@@ -74,7 +74,7 @@ def pad(motions: Clips, extra: int = 0) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("name", REFERENCES)
 @pytest.mark.parametrize("lengths", [(9,), LENGTHS, (2,), (1,), (2, 1)], ids=str)
 @pytest.mark.parametrize("extra", [0, 4])
-def test_against_numpy(name: str, lengths: tuple[int, ...], extra: int) -> None:
+def test_loss_against_numpy(name: str, lengths: tuple[int, ...], extra: int) -> None:
     truths, predictions = clips(lengths, 0), clips(lengths, 1)
     (truth, mask), (prediction, _) = pad(truths, extra), pad(predictions, extra)
     prediction[~mask] *= -1
@@ -83,7 +83,7 @@ def test_against_numpy(name: str, lengths: tuple[int, ...], extra: int) -> None:
 
 
 @pytest.mark.parametrize("name", REFERENCES)
-def test_padding_changes_nothing_in_float32(name: str) -> None:
+def test_loss_in_float32_does_not_depend_on_padding(name: str) -> None:
     truths, predictions = clips((6,), 2), clips((6,), 3)
     values = []
     for extra in (0, 1, 5):
@@ -94,7 +94,7 @@ def test_padding_changes_nothing_in_float32(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", REFERENCES)
-def test_gradient_is_that_of_the_formula_and_zero_on_padding(name: str) -> None:
+def test_loss_gradient_is_that_of_the_formula_and_zero_on_padding(name: str) -> None:
     truths, predictions = clips((5, 3), 4), clips((5, 3), 5)
     (truth, mask), (prediction, _) = pad(truths, 2), pad(predictions, 2)
     loss(name, prediction.requires_grad_(), truth, mask).backward()
@@ -113,7 +113,7 @@ def test_gradient_is_that_of_the_formula_and_zero_on_padding(name: str) -> None:
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_short_clips_have_no_acceleration_and_single_frames_no_velocity(frames: int) -> None:
+def test_loss_of_short_clips_has_no_acceleration_or_velocity(frames: int) -> None:
     (truth, mask), (prediction, _) = pad(clips((frames,), 6)), pad(clips((frames,), 7))
     prediction.requires_grad_()
     acceleration = losses.acceleration_loss(prediction, truth, mask)
@@ -126,7 +126,7 @@ def test_short_clips_have_no_acceleration_and_single_frames_no_velocity(frames: 
 
 @pytest.mark.parametrize("name", REFERENCES)
 @pytest.mark.parametrize("value", [0.0, 0.3])
-def test_gradient_is_finite_without_any_motion(name: str, value: float) -> None:
+def test_loss_gradient_is_finite_without_any_motion(name: str, value: float) -> None:
     prediction = torch.full((2, 5, VERTICES, 3), value, requires_grad=True)
     mask = torch.ones(2, 5, dtype=torch.bool)
     loss(name, prediction, torch.zeros_like(prediction), mask).backward()

@@ -24,7 +24,7 @@ def encoder() -> LstmStyle:
     return LstmStyle(dim=DIM, style_dim=STYLE)
 
 
-def test_the_style_is_the_state_after_the_last_frame(encoder: LstmStyle) -> None:
+def test_lstm_style_is_the_state_after_the_last_frame(encoder: LstmStyle) -> None:
     reference, mask = torch.randn(3, 9, DIM), torch.arange(9)[None] < torch.tensor([[9], [4], [1]])
     style = encoder(reference, mask)
     assert style.shape == (3, STYLE) == (3, sum(encoder.token_dims))
@@ -35,7 +35,7 @@ def test_the_style_is_the_state_after_the_last_frame(encoder: LstmStyle) -> None
         torch.testing.assert_close(style[row], hidden, rtol=0, atol=1e-6)
 
 
-def test_no_frame_sees_the_future(encoder: LstmStyle) -> None:
+def test_lstm_states_do_not_depend_on_later_frames(encoder: LstmStyle) -> None:
     reference = torch.randn(1, 10, DIM, requires_grad=True)
     states = encoder.states(reference, torch.ones(1, 10, dtype=torch.bool))
     [gradient] = torch.autograd.grad(states[0, 6].sum(), reference)
@@ -43,7 +43,7 @@ def test_no_frame_sees_the_future(encoder: LstmStyle) -> None:
     assert not gradient[0, 7:].any()
 
 
-def test_padding_that_is_not_finite_reaches_neither_style_nor_gradient(encoder: LstmStyle) -> None:
+def test_lstm_padding_that_is_not_finite_changes_nothing(encoder: LstmStyle) -> None:
     reference, mask = torch.randn(2, 8, DIM), torch.arange(8)[None] < torch.tensor([[8], [5]])
     expected = encoder(reference, mask)
     spoilt = reference.masked_fill(~mask[..., None], torch.nan)
@@ -53,7 +53,7 @@ def test_padding_that_is_not_finite_reaches_neither_style_nor_gradient(encoder: 
     assert all(torch.isfinite(p.grad).all() and p.grad.any() for p in encoder.parameters())
 
 
-def test_the_mean_of_the_states_leaves_padding_out() -> None:
+def test_lstm_mean_pooling_omits_padding() -> None:
     torch.manual_seed(0)
     encoder = LstmStyle(dim=DIM, style_dim=STYLE, pooling="mean")
     reference, mask = torch.randn(2, 8, DIM), torch.arange(8)[None] < torch.tensor([[8], [5]])

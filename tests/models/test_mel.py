@@ -26,7 +26,7 @@ def burst(frame: int, frames: int, hertz: float = 1000.0) -> Tensor:
     return (gate * torch.sin(2 * math.pi * hertz * time))[None]
 
 
-def test_filters_are_triangles_on_the_mel_scale() -> None:
+def test_mel_filters_are_triangles_on_the_mel_scale() -> None:
     filters = mel_filters(40, 4096, 60.0, 7600.0)
     hertz = torch.arange(2049) * RATE / 4096
     assert filters.shape == (40, 2049)
@@ -42,12 +42,12 @@ def test_filters_are_triangles_on_the_mel_scale() -> None:
     assert all(rising)
 
 
-def test_no_filter_of_the_encoder_is_empty(encoder: MelEncoder) -> None:
+def test_mel_filters_are_not_empty(encoder: MelEncoder) -> None:
     """At 31 Hz between bins the lowest triangles could fall between two of them."""
     assert (encoder.filters.sum(1) > 0).all()
 
 
-def test_a_tone_shows_in_its_own_band(encoder: MelEncoder) -> None:
+def test_mel_spectrum_of_a_tone_is_in_its_band(encoder: MelEncoder) -> None:
     for hertz in (200.0, 1000.0, 5000.0):
         audio = torch.sin(2 * math.pi * hertz * torch.arange(RATE) / RATE)[None]
         spectrum, _ = encoder._log_mel(audio, torch.tensor([RATE]))
@@ -57,7 +57,7 @@ def test_a_tone_shows_in_its_own_band(encoder: MelEncoder) -> None:
 
 
 @pytest.mark.parametrize("frame", [3, 10, 18])
-def test_a_burst_shows_at_its_time(encoder: MelEncoder, frame: int) -> None:
+def test_mel_spectrum_of_a_burst_is_at_its_time(encoder: MelEncoder, frame: int) -> None:
     spectrum, steps = encoder._log_mel(burst(frame, 20), torch.tensor([20 * 640]))
     assert steps.tolist() == [80]
     power = (4 * spectrum[0, :80]).exp().sum(1)
@@ -66,7 +66,7 @@ def test_a_burst_shows_at_its_time(encoder: MelEncoder, frame: int) -> None:
 
 
 @pytest.mark.parametrize("frames", [20, 25])
-def test_a_frame_listens_to_its_own_time(encoder: MelEncoder, frames: int) -> None:
+def test_mel_feature_of_a_frame_is_of_its_own_time(encoder: MelEncoder, frames: int) -> None:
     """Where in the sound the gradient of a frame's feature lies, also at another frame rate."""
     torch.manual_seed(1)
     audio = torch.randn(1, RATE, requires_grad=True)
@@ -78,14 +78,14 @@ def test_a_frame_listens_to_its_own_time(encoder: MelEncoder, frames: int) -> No
         assert centre == pytest.approx((frame + 0.5) / frames, abs=0.012)
 
 
-def test_loudness_and_offset_do_not_matter(encoder: MelEncoder) -> None:
+def test_mel_feature_does_not_depend_on_loudness_and_offset(encoder: MelEncoder) -> None:
     audio, lengths, frames = torch.randn(1, 9600), torch.tensor([9600]), torch.tensor([15])
     expected = encoder(audio, lengths, frames)
     for other in (30 * audio, 0.02 * audio, audio + 2):
         torch.testing.assert_close(encoder(other, lengths, frames), expected, rtol=0, atol=2e-4)
 
 
-def test_silence_and_a_tenth_of_a_second_are_fine(encoder: MelEncoder) -> None:
+def test_mel_feature_of_silence_and_short_speech_is_finite(encoder: MelEncoder) -> None:
     for samples in (1600, 100, 1):
         out = encoder(torch.zeros(1, samples), torch.tensor([samples]), torch.tensor([3]))
         assert out.shape == (1, 3, 8)

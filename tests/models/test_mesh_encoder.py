@@ -51,7 +51,7 @@ def motion(batch: int = 2, frames: int = 3, seed: int = 5) -> Tensor:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shape_and_independence_of_frames(name: str, make: Callable[..., MeshEncoder]) -> None:
+def test_mesh_encoder_shape_and_independence_of_frames(name: str, make: Callable[..., MeshEncoder]) -> None:
     encoder, inputs = make(name).eval(), motion()
     before = inputs.clone()
     out = encoder(inputs)
@@ -69,7 +69,7 @@ def test_shape_and_independence_of_frames(name: str, make: Callable[..., MeshEnc
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_gradient_reaches_parameters_and_motion(name: str, make: Callable[..., MeshEncoder]) -> None:
+def test_mesh_encoder_gradient_reaches_parameters_and_motion(name: str, make: Callable[..., MeshEncoder]) -> None:
     encoder, inputs = make(name), motion().requires_grad_()
     encoder(inputs).square().sum().backward()
     assert [key for key, p in encoder.named_parameters() if p.grad is None or not p.grad.any()] == []
@@ -78,7 +78,7 @@ def test_gradient_reaches_parameters_and_motion(name: str, make: Callable[..., M
     assert (inputs.grad.abs().sum((0, 1, 3)) > 0).float().mean() > 0.9
 
 
-def test_the_mean_sees_every_vertex(make: Callable[..., MeshEncoder]) -> None:
+def test_mean_pooling_sees_every_vertex(make: Callable[..., MeshEncoder]) -> None:
     inputs = motion().requires_grad_()
     make("spiral", pooling="mean")(inputs).square().sum().backward()
     assert inputs.grad is not None
@@ -86,7 +86,7 @@ def test_the_mean_sees_every_vertex(make: Callable[..., MeshEncoder]) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_state_dict_needs_no_mesh(name: str, make: Callable[..., MeshEncoder]) -> None:
+def test_mesh_encoder_state_dict_needs_no_mesh(name: str, make: Callable[..., MeshEncoder]) -> None:
     expected = make(name)(motion())
     file = io.BytesIO()
     torch.save(make(name).state_dict(), file)
@@ -99,7 +99,7 @@ def test_a_state_dict_needs_no_mesh(name: str, make: Callable[..., MeshEncoder])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_wrong_motion_is_refused(name: str, make: Callable[..., MeshEncoder]) -> None:
+def test_mesh_encoder_refuses_motion_of_another_mesh(name: str, make: Callable[..., MeshEncoder]) -> None:
     encoder = make(name)
     for vertices in (VERTICES + 1, VERTICES - 1):
         with pytest.raises(ValueError, match=f"made for {VERTICES}"):
@@ -153,7 +153,7 @@ def test_spiral_against_its_definition(
             np.testing.assert_allclose(out[clip, frame], naive(encoder, mesh, inputs[clip, frame].numpy()), atol=1e-6)
 
 
-def test_published_widths() -> None:
+def test_spiral_widths_are_the_published_ones() -> None:
     """Chai et al.: 3 → 16 → 32 → 32 channels, spirals of 12, four times fewer vertices each time."""
     encoder = SpiralMeshEncoder(dim=64, n_vertices=5023)
     assert [tuple(step.map.weight.shape) for step in encoder.steps] == [(16, 36), (32, 192), (32, 384)]
@@ -168,7 +168,7 @@ def test_published_widths() -> None:
 
 
 @pytest.mark.parametrize("frames", [1, 2, 6, 100])
-def test_few_frames_at_a_time_change_nothing(frames: int, make: Callable[..., MeshEncoder]) -> None:
+def test_max_frames_changes_nothing(frames: int, make: Callable[..., MeshEncoder]) -> None:
     results = []
     for options in ({}, {"max_frames": frames}):
         encoder, inputs = make("spiral", **options), motion().requires_grad_()
@@ -180,7 +180,7 @@ def test_few_frames_at_a_time_change_nothing(frames: int, make: Callable[..., Me
 
 
 @pytest.mark.parametrize("pooling", ["select", "mean"])
-def test_without_a_mesh_it_says_so(hierarchy: Hierarchy, pooling: Literal["select", "mean"]) -> None:
+def test_spiral_without_a_mesh_is_an_error(hierarchy: Hierarchy, pooling: Literal["select", "mean"]) -> None:
     encoder = SpiralMeshEncoder(dim=DIM, n_vertices=VERTICES, pooling=pooling)
     assert not encoder.attached
     with pytest.raises(FaceDiffError, match="mesh is not known yet"):
@@ -206,7 +206,7 @@ def test_without_a_mesh_it_says_so(hierarchy: Hierarchy, pooling: Literal["selec
         ({"vertices": tuple(range(100))}, r"\[100, 25, 7, 2\]"),
     ],
 )
-def test_another_mesh_is_refused_and_changes_nothing(
+def test_attach_refuses_another_mesh_and_changes_nothing(
     options: dict[str, Any], message: str, hierarchy: Hierarchy
 ) -> None:
     encoder = SpiralMeshEncoder(dim=DIM, n_vertices=VERTICES)

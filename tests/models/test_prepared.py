@@ -52,9 +52,7 @@ def conditions(dim: int, frames: int = FRAMES, padded: int = 0) -> Conditions:
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=str)
 @pytest.mark.parametrize("padded", [0, 5])
-def test_the_core_gives_the_same_with_prepared_conditions(
-    make_model: Make, variant: dict[str, Any], padded: int
-) -> None:
+def test_prepared_conditions_give_the_same_features(make_model: Make, variant: dict[str, Any], padded: int) -> None:
     model = make_model(**variant).double().eval()
     network, dim = model.network, variant.get("dim", DIM)
     given = conditions(dim, padded=padded)
@@ -67,7 +65,7 @@ def test_the_core_gives_the_same_with_prepared_conditions(
             torch.testing.assert_close(out[known.mask], expected[known.mask], rtol=0, atol=1e-12)
 
 
-def test_the_table_of_steps_is_kept_until_the_weights_change(make_model: Make) -> None:
+def test_step_table_is_kept_until_the_weights_change(make_model: Make) -> None:
     network = make_model().eval().network
     given = Conditions(torch.randn(1, FRAMES, DIM), torch.randn(1, 3, DIM), torch.ones(1, FRAMES, dtype=torch.bool))
 
@@ -90,7 +88,7 @@ def test_the_table_of_steps_is_kept_until_the_weights_change(make_model: Make) -
     (first * torch.ones(DIM, requires_grad=True)).sum().backward()
 
 
-def test_nothing_constant_is_computed_in_a_step(make_model: Make, tiny: Tiny) -> None:
+def test_prepared_conditions_leave_nothing_constant_to_a_step(make_model: Make, tiny: Tiny) -> None:
     """Ten steps call as many maps of what is constant as one step does."""
     calls: dict[str, int] = {}
     sampler = partial(registry.sampler.ddim, steps=10)
@@ -119,7 +117,7 @@ def test_nothing_constant_is_computed_in_a_step(make_model: Make, tiny: Tiny) ->
     assert calls.get("step", 0) == 0  # the table of the steps belongs to the model
 
 
-def test_generating_leaves_nothing_that_training_stumbles_over(make_model: Make, tiny: Tiny) -> None:
+def test_training_works_after_inference_mode(make_model: Make, tiny: Tiny) -> None:
     model = make_model()
     model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
     batch = collate([tiny.dataset("val")[0]])

@@ -11,7 +11,7 @@ from facediff.models.samplers import SCHEDULES, NoiseProcess
 
 
 @pytest.mark.parametrize("steps", [10, 1000])
-def test_cosine_schedule(steps: int) -> None:
+def test_cosine_schedule_is_the_published_one(steps: int) -> None:
     """Nichol and Dhariwal 2021, eq. 17, with their s = 0.008 and their cap of 0.999."""
 
     def curve(t: np.ndarray) -> np.ndarray:
@@ -49,7 +49,7 @@ def test_unknown_schedule_is_refused() -> None:
 
 
 @pytest.mark.parametrize("schedule", SCHEDULES)
-def test_closed_form_is_the_product_of_single_steps(schedule: str) -> None:
+def test_add_noise_is_the_product_of_single_steps(schedule: str) -> None:
     process = NoiseProcess(60, schedule)
     step = torch.arange(60)
     ones, zeros = torch.ones(60, 1), torch.zeros(60, 1)
@@ -62,7 +62,7 @@ def test_closed_form_is_the_product_of_single_steps(schedule: str) -> None:
         assert noise[n] ** 2 == pytest.approx(variance, rel=2e-3)
 
 
-def test_simulated_noising_has_the_closed_forms_statistics() -> None:
+def test_add_noise_has_the_statistics_of_simulated_noising() -> None:
     process, samples, last = NoiseProcess(25), 40_000, 14
     generator = torch.Generator().manual_seed(0)
     clean = torch.tensor([1.5, -0.5]).expand(samples, 2)
@@ -75,7 +75,7 @@ def test_simulated_noising_has_the_closed_forms_statistics() -> None:
     torch.testing.assert_close(closed.std(0), noisy.std(0), rtol=0.015, atol=0)
 
 
-def test_every_clip_is_noised_by_its_own_step() -> None:
+def test_add_noise_takes_each_clips_own_step() -> None:
     process = NoiseProcess(30)
     clean, noise, step = torch.randn(3, 4, 6), torch.randn(3, 4, 6), torch.tensor([29, 0, 11])
     together = process.add_noise(clean, noise, step)
@@ -84,7 +84,7 @@ def test_every_clip_is_noised_by_its_own_step() -> None:
         torch.testing.assert_close(together[i], kept.sqrt() * clean[i] + (1 - kept).sqrt() * noise[i])
 
 
-def test_drawn_steps_cover_the_process_evenly() -> None:
+def test_draw_steps_covers_the_process_evenly() -> None:
     torch.manual_seed(0)
     counts = torch.bincount(NoiseProcess(10).draw_steps(20_000, torch.device("cpu")), minlength=10)
     assert len(counts) == 10

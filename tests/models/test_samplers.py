@@ -45,7 +45,7 @@ def trace(
 
 @every_sampler
 @pytest.mark.parametrize(("total", "steps"), [(10, n) for n in range(1, 11)] + [(1000, 7), (1000, 15), (50, 33)])
-def test_a_perfect_denoiser_gives_the_truth(name: str, total: int, steps: int) -> None:
+def test_sampler_with_a_perfect_denoiser_gives_the_truth(name: str, total: int, steps: int) -> None:
     truth = torch.randn(2, 5, 12)
     seen, motions = trace(make(name, NoiseProcess(total), steps=steps), lambda *_: truth, torch.randn(2, 5, 12))
     torch.testing.assert_close(motions[-1], truth, rtol=0, atol=1e-6)
@@ -55,7 +55,7 @@ def test_a_perfect_denoiser_gives_the_truth(name: str, total: int, steps: int) -
 
 
 @every_sampler
-def test_gaussian_data_come_out_with_their_mean_and_deviation(name: str) -> None:
+def test_sampler_of_gaussian_data_keeps_mean_and_deviation(name: str) -> None:
     """For data N(m, s²) the best denoiser E[M⁰ | Mⁿ] is known, so the samples' distribution is too."""
     process = NoiseProcess(1000)
     mean, deviation = torch.tensor([0.7, -1.5]), torch.tensor([0.3, 1.4])
@@ -73,7 +73,7 @@ def test_gaussian_data_come_out_with_their_mean_and_deviation(name: str) -> None
 
 
 @every_sampler
-def test_a_seed_repeats_bit_for_bit_whatever_the_global_state(name: str) -> None:
+def test_sampler_repeats_a_seed_bit_for_bit_whatever_the_global_state(name: str) -> None:
     start = torch.randn(2, 3, 4)
     runs = []
     for state in (1, 2):
@@ -84,13 +84,13 @@ def test_a_seed_repeats_bit_for_bit_whatever_the_global_state(name: str) -> None
 
 @every_sampler
 @pytest.mark.parametrize("steps", [0, -1, 21])
-def test_impossible_numbers_of_steps_are_refused(name: str, steps: int) -> None:
+def test_sampler_refuses_impossible_numbers_of_steps(name: str, steps: int) -> None:
     with pytest.raises(FaceDiffError, match=rf"steps: {steps} .* 1 to 20"):
         make(name, NoiseProcess(20), steps=steps)
 
 
 @every_sampler
-def test_progress_wraps_the_steps(name: str) -> None:
+def test_sampler_progress_wraps_the_steps(name: str) -> None:
     seen: list[int] = []
 
     def progress(steps: Any) -> Any:  # noqa: ANN401
@@ -159,7 +159,7 @@ def test_ddpm_adds_no_noise_in_the_last_step(steps: int) -> None:
 
 @pytest.mark.parametrize("steps", [20, 7, 15])
 @pytest.mark.parametrize("eta", [0.0, 0.4, 1.0])
-def test_ddim_step(steps: int, eta: float) -> None:
+def test_ddim_step_is_the_published_update(steps: int, eta: float) -> None:
     """Song et al. 2021, eq. 12 with the σ of eq. 16; at η = 1 it is ddpm's posterior."""
     process, shape = NoiseProcess(20), (400, 100)
     truth = torch.randn(shape, generator=torch.Generator().manual_seed(9))
@@ -179,7 +179,7 @@ def test_ddim_step(steps: int, eta: float) -> None:
 
 
 @pytest.mark.parametrize(("name", "deterministic"), [("ddim", True), ("dpm_solver", True), ("ddpm", False)])
-def test_which_samplers_depend_on_their_start_alone(name: str, deterministic: bool) -> None:
+def test_sampler_depends_on_its_start_alone_if_deterministic(name: str, deterministic: bool) -> None:
     start = torch.randn(2, 3, 4)
     ends = [
         trace(make(name, NoiseProcess(20), steps=10), lambda x, _: 0.5 * x.tanh(), start, seed=seed)[1][-1]
@@ -222,13 +222,13 @@ VARIANTS = [(name, {}) for name in LINEAR] + [("ddim", {"eta": 0.6}), ("dpm_solv
 VARIANTS += [("dpm_solver", {"order": 3})]
 
 
-def test_the_samplers_that_can_be_folded() -> None:
+def test_linear_samplers_are_all_bundled_ones() -> None:
     assert {"ddim", "ddpm", "dpm_solver"} <= set(LINEAR)
 
 
 @pytest.mark.parametrize(("name", "options"), VARIANTS)
 @pytest.mark.parametrize("steps", [1, 2, 7, 14, 15, 20])
-def test_a_linear_sampler_ends_at_its_last_prediction(name: str, options: dict[str, float], steps: int) -> None:
+def test_linear_sampler_ends_at_its_last_prediction(name: str, options: dict[str, float], steps: int) -> None:
     predictions: list[Tensor] = []
 
     def predict(noisy: Tensor, step: int) -> Tensor:
@@ -241,7 +241,7 @@ def test_a_linear_sampler_ends_at_its_last_prediction(name: str, options: dict[s
 
 @pytest.mark.parametrize(("name", "options"), VARIANTS)
 @pytest.mark.parametrize("steps", [2, 7, 20])
-def test_a_linear_sampler_commutes_with_linear_maps(name: str, options: dict[str, float], steps: int) -> None:
+def test_linear_sampler_commutes_with_linear_maps(name: str, options: dict[str, float], steps: int) -> None:
     """Run on A x, with predictions A x̂₀ and noise A z, it gives A times what it gives on x."""
     sampler = make(name, NoiseProcess(20), steps=steps, **options)
     generator = torch.Generator().manual_seed(0)
@@ -264,7 +264,7 @@ def test_a_linear_sampler_commutes_with_linear_maps(name: str, options: dict[str
 
 @pytest.mark.parametrize("name", registry.sampler.names())
 @pytest.mark.parametrize("steps", [1, 7, 61, 103, 121, 122, 201, 206, 217, 999, 1000])
-def test_every_number_of_steps_visits_as_many_places_downwards(name: str, steps: int) -> None:
+def test_timesteps_are_as_many_as_steps_and_descend(name: str, steps: int) -> None:
     # 61, 103, 121 … are numbers for which spacing by N // steps has one step too many, the last at -1.
     places = registry.sampler.get(name)(process=NoiseProcess(1000), steps=steps).timesteps
     assert len(places) == steps

@@ -37,7 +37,7 @@ def branch(block: TemporalBlock, x: Array, dilation: int, *, causal: bool) -> Ar
 
 
 @pytest.mark.parametrize("causal", [True, False])
-def test_the_branches_mean_against_numpy(causal: bool) -> None:
+def test_tcn_branches_mean_against_numpy(causal: bool) -> None:
     torch.manual_seed(0)
     encoder = TcnGruTransformer(dim=DIM, num_heads=2, causal=causal).eval()
     entering: list[torch.Tensor] = []

@@ -10,7 +10,7 @@ from facediff.models.layers import Attention
 
 
 @pytest.mark.parametrize("tokens", [1, 2, 3, 4, 9])
-def test_the_order_of_the_products_changes_nothing(tokens: int) -> None:
+def test_token_attention_products_are_the_attention(tokens: int) -> None:
     torch.manual_seed(0)
     plain, narrow = Attention(16, 6, 4).double(), TokenAttention(16, 6, 4).double()
     narrow.load_state_dict(plain.state_dict())

@@ -22,7 +22,7 @@ def model(make_model: Make, tiny: Tiny) -> DualPathDiffusion:
     return made.eval()
 
 
-def test_a_step_takes_the_four_losses_of_noise_added_and_taken_away(model: DualPathDiffusion, tiny: Tiny) -> None:
+def test_losses_are_those_of_added_and_removed_noise(model: DualPathDiffusion, tiny: Tiny) -> None:
     dataset = tiny.dataset("train")
     batch = collate([dataset[0], dataset[3], dataset[7]])
     before, noise, step = batch.motion.clone(), torch.randn(3, batch.motion.shape[1], 72), torch.tensor([3, 20, 39])
@@ -42,7 +42,7 @@ def test_a_step_takes_the_four_losses_of_noise_added_and_taken_away(model: DualP
             torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
 
 
-def test_the_loss_of_a_batch_is_that_of_its_clips(model: DualPathDiffusion, tiny: Tiny) -> None:
+def test_losses_of_a_batch_are_those_of_its_clips(model: DualPathDiffusion, tiny: Tiny) -> None:
     dataset = tiny.dataset("train")
     clips = [dataset[place] for place in (0, 3, 7)]
     batch = collate(clips)
