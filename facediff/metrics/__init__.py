@@ -32,7 +32,7 @@ Sums are float64 whatever comes in, and processes with unequal numbers of sequen
 A new metric is a `SequenceMetric` that defines `clip_value`, registered with ``@facediff.registry.metric.register``.
 """
 
-from facediff.metrics.base import Clip, Coverage, ExactMetric, SequenceMetric, align, functional
+from facediff.metrics.base import Clip, Coverage, ExactMetric, LipMetric, SequenceMetric, align, functional
 from facediff.metrics.by_name import NEEDS, Context, Request, feed, parse
 from facediff.metrics.mouth import (
     BilabialClosureRate,
@@ -103,6 +103,7 @@ __all__ = [
     "FaceDynamicsDeviation",
     "FrameSpeechLipCorrelation",
     "IdentityDiversity",
+    "LipMetric",
     "LipOpeningCorrelation",
     "LipPairs",
     "LipSpeedCorrelation",

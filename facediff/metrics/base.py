@@ -425,8 +425,7 @@ class SequenceMetric(ExactMetric):
     has no sequence (in Lightning from an ``on_…_epoch_end`` hook, not by logging from a step).
 
     Args:
-        definition: The metric in plain words, with all its options. ``{region}`` in it becomes the region's name,
-            count and hash, ``{pooling}`` the pooling in words.
+        definition: The metric in plain words, with all its options; `words` if None.
         pooling: All frames alike, or the mean of sequence means.
         region: Vertices that are looked at, None for all; motion of another mesh is refused.
         length_rule: What to do where prediction and truth differ in length.
@@ -437,13 +436,18 @@ class SequenceMetric(ExactMetric):
         ValueError: If an option is unknown.
 
     >>> class LastFrameError(SequenceMetric):
+    ...     words = "mean distance in the last frame; mean over sequences [unit]"
     ...     def clip_value(self, clip):
     ...         return (clip.prediction[-1] - clip.truth[-1]).double().norm(dim=-1).mean()
-    >>> metric = LastFrameError(definition="mean distance in the last frame [unit]")
+    >>> metric = LastFrameError()
     >>> metric.update(torch.ones(2, 5, 7, 3), torch.zeros(2, 5, 7, 3), lengths=[5, 4])
     >>> round(metric.compute().item(), 6)
     1.732051
     """
+
+    words: ClassVar[str] = ""
+    """The definition, where it does not depend on options. ``{region}`` becomes the region's name, count and hash,
+    ``{pooling}`` the pooling in words."""
 
     leaves_out = ""
     """Which sequences have no value, in words; empty if every sequence has one. `clip_value` gives NaN there."""
@@ -457,7 +461,7 @@ class SequenceMetric(ExactMetric):
     def __init__(
         self,
         *,
-        definition: str,
+        definition: str | None = None,
         pooling: Pooling = "sequences",
         region: RegionLike | None = None,
         length_rule: LengthRule = "min",
@@ -466,16 +470,16 @@ class SequenceMetric(ExactMetric):
     ) -> None:
         check_option("pooling", pooling, Pooling)
         check_option("length rule", length_rule, LengthRule)
-        self_region = None if region is None else as_region(region, "vertices")
-        where = "all vertices" if self_region is None else str(self_region)
-        words = definition.replace("{pooling}", POOLING_WORDS[pooling]).replace("{region}", where)
+        named = None if region is None else as_region(region, "vertices")
+        words = (definition or self.words).replace("{pooling}", POOLING_WORDS[pooling])
+        words = words.replace("{region}", "all vertices" if named is None else str(named))
         super().__init__(definition=words, settings=length_rule, **kwargs)
         self.pooling: Pooling = pooling
         self.length_rule: LengthRule = length_rule
         self.check_finite = check_finite
-        self.region: Region | None = self_region
+        self.region: Region | None = named
         self.latest = None
-        self.register_buffer("indices", None if self_region is None else self_region.tensor(), persistent=False)
+        self.register_buffer("indices", None if named is None else named.tensor(), persistent=False)
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(5, dtype=torch.int64), dist_reduce_fx="sum")
 
@@ -591,10 +595,25 @@ class SequenceMetric(ExactMetric):
         return Coverage(*self.counts.tolist())
 
 
+class LipMetric(SequenceMetric):
+    """Base of metrics over the lip vertices that are pooled by sequence and have no options of their own.
+
+    Args:
+        lips: Lip vertices, a `Region` or indices.
+        **options: Those of `SequenceOptions`.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ("lips",)
+    indices: Tensor
+
+    def __init__(self, lips: RegionLike, **options: Unpack[SequenceOptions]) -> None:
+        super().__init__(region=as_region(lips, "lips"), **options)
+
+
 # The functional form.
 
 
-_NOT_IN_FUNCTIONS = {"check_finite", "sync_on_compute", "process_group", "kwargs"}
+_NOT_IN_FUNCTIONS = {"definition", "check_finite", "sync_on_compute", "process_group", "kwargs"}
 
 
 def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> Callable[..., Tensor]:

@@ -39,7 +39,7 @@ The first three come as the constructor's ``lips``, ``upper`` and ``pairs``; ``s
 several styles), ``embeddings`` with ``labels``, and ``computing`` with ``speech``, both in seconds.
 """
 
-_NOT_CHOSEN = {"check_finite", "sync_on_compute", "process_group", "n_identities", "sample_rate"}
+_NOT_CHOSEN = {"definition", "check_finite", "sync_on_compute", "process_group", "n_identities", "sample_rate"}
 
 
 @dataclass(frozen=True)

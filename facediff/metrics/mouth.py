@@ -19,6 +19,7 @@ from facediff.metrics.base import (
     BatchOptions,
     Clip,
     Clips,
+    LipMetric,
     Pooling,
     SequenceMetric,
     SequenceOptions,
@@ -27,7 +28,7 @@ from facediff.metrics.base import (
     functional,
 )
 from facediff.metrics.one_pass import frames_per_step, squared_norm
-from facediff.metrics.regions import LipPairs, LipPairsLike, RegionLike, as_lip_pairs, as_region
+from facediff.metrics.regions import LipPairs, LipPairsLike, as_lip_pairs
 from facediff.registry import metric
 
 
@@ -101,7 +102,7 @@ class OpeningMetric(SequenceMetric):
 
     Args:
         pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
-        definition: The metric in words; ``{pairs}`` in it becomes the pairs' name, number and hash.
+        definition: The metric in words, `words` if None; ``{pairs}`` becomes the pairs' name, number and hash.
         pooling: ``"frames"`` or ``"sequences"``.
         **options: Those of `SequenceOptions`.
     """
@@ -112,12 +113,13 @@ class OpeningMetric(SequenceMetric):
         self,
         pairs: LipPairsLike,
         *,
-        definition: str,
+        definition: str | None = None,
         pooling: Pooling = "sequences",
         **options: Unpack[SequenceOptions],
     ) -> None:
         named = as_lip_pairs(pairs)
-        super().__init__(definition=definition.replace("{pairs}", str(named)), pooling=pooling, **options)
+        words = (definition or self.words).replace("{pairs}", str(named))
+        super().__init__(definition=words, pooling=pooling, **options)
         self.pairs = named
         self.pair_indices: Tensor
         self.register_buffer("pair_indices", named.tensor(), persistent=False)
@@ -220,13 +222,13 @@ class LipOpeningCorrelation(OpeningMetric):
 
     higher_is_better = True
     leaves_out = "the opening of the truth does not vary"
+    words = (
+        "in each sequence the Pearson correlation over frames between the openings of the mouth, an opening being the "
+        f"mean distance of {{pairs}}; mean over sequences; {_RULE} [1]"
+    )
 
     def __init__(self, pairs: LipPairsLike, **options: Unpack[SequenceOptions]) -> None:
-        words = (
-            "in each sequence the Pearson correlation over frames between the openings of the mouth, an "
-            f"opening being the mean distance of {{pairs}}; mean over sequences; {_RULE} [1]"
-        )
-        super().__init__(pairs, definition=words, **options)
+        super().__init__(pairs, **options)
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The correlation of one sequence, NaN if the truth does not vary."""
@@ -235,7 +237,7 @@ class LipOpeningCorrelation(OpeningMetric):
 
 
 @metric.register("lip_speed_correlation")
-class LipSpeedCorrelation(SequenceMetric):
+class LipSpeedCorrelation(LipMetric):
     """Lip PCC of the speed: do the lips move fast when the truth's do?
 
     With m[t] = mean_{v∈M} ‖x[t, v] − x[t − 1, v]‖₂, t from the second frame on, Pearson's correlation
@@ -250,15 +252,10 @@ class LipSpeedCorrelation(SequenceMetric):
 
     higher_is_better = True
     leaves_out = "the speed of the truth's lips does not vary"
-    needs = ("lips",)
-    indices: Tensor
-
-    def __init__(self, lips: RegionLike, **options: Unpack[SequenceOptions]) -> None:
-        words = (
-            "in each sequence the Pearson correlation over frames between the mean speeds of {region}; "
-            f"mean over sequences; {_RULE} [1]"
-        )
-        super().__init__(definition=words, region=as_region(lips, "lips"), **options)
+    words = (
+        "in each sequence the Pearson correlation over frames between the mean speeds of {region}; mean over "
+        f"sequences; {_RULE} [1]"
+    )
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The correlation of one sequence, NaN if the truth's speed does not vary."""

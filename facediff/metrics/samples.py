@@ -88,8 +88,7 @@ class SamplesMetric(SequenceMetric):
 
     Args:
         lips: Lip vertices, a `Region` or indices.
-        definition: Of what the lip vertex error is taken, in words.
-        n_samples: How many samples there are of each sequence; other numbers are refused.
+        n_samples: N, how many samples there are of each sequence; other numbers are refused.
         squared: Whether distances are squared; the score is then in the vertices' unit squared.
         pooling: ``"frames"`` or ``"sequences"``.
         **options: Those of `SequenceOptions`.
@@ -104,16 +103,16 @@ class SamplesMetric(SequenceMetric):
         self,
         lips: RegionLike,
         *,
-        definition: str,
-        n_samples: int,
-        squared: bool,
-        pooling: Pooling,
+        n_samples: int = 10,
+        squared: bool = True,
+        pooling: Pooling = "frames",
         **options: Unpack[SequenceOptions],
     ) -> None:
         if n_samples < 1:
             raise ValueError(f"n_samples is {n_samples}; expected at least 1")
         distance, unit = ("squared distance", "unit²") if squared else ("distance", "unit")
-        words = f"{definition}, in each frame the largest {distance} over {{region}}; {{pooling}} [{unit}]"
+        words = f"{self.words}, in each frame the largest {distance} over {{region}}; {{pooling}} [{unit}]"
+        words = words.replace("{samples}", f"{n_samples} samples")
         super().__init__(definition=words, pooling=pooling, region=as_region(lips, "lips"), **options)
         self.n_samples = n_samples
         self.squared = squared
@@ -155,17 +154,7 @@ class MeanEstimateError(SamplesMetric):
     0.0
     """
 
-    def __init__(
-        self,
-        lips: RegionLike,
-        *,
-        n_samples: int = 10,
-        squared: bool = True,
-        pooling: Pooling = "frames",
-        **options: Unpack[SequenceOptions],
-    ) -> None:
-        words = f"of the mean of {n_samples} samples"
-        super().__init__(lips, definition=words, n_samples=n_samples, squared=squared, pooling=pooling, **options)
+    words = "of the mean of {samples}"
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The error of the mean of one sequence's samples."""
@@ -198,17 +187,7 @@ class CoverageError(SamplesMetric):
     3.0
     """
 
-    def __init__(
-        self,
-        lips: RegionLike,
-        *,
-        n_samples: int = 10,
-        squared: bool = True,
-        pooling: Pooling = "frames",
-        **options: Unpack[SequenceOptions],
-    ) -> None:
-        words = f"of the best of {n_samples} samples of each sequence"
-        super().__init__(lips, definition=words, n_samples=n_samples, squared=squared, pooling=pooling, **options)
+    words = "of the best of {samples} of each sequence"
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The error of the best of one sequence's samples."""

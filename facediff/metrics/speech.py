@@ -70,7 +70,6 @@ class SpeechLipMetric(SequenceMetric):
 
     Args:
         lips: Lip vertices, a `Region` or indices.
-        definition: The metric in words.
         of: Whose lips: ``"prediction"``, ``"truth"`` or ``"gap"``, the prediction's minus the truth's.
         sample_rate: Samples of the speech per second; needed for waveforms, not for intensities.
         frames_per_second: Of the motion; likewise.
@@ -87,10 +86,10 @@ class SpeechLipMetric(SequenceMetric):
         self,
         lips: RegionLike,
         *,
-        definition: str,
-        of: Side,
-        sample_rate: int | None,
-        frames_per_second: float | None,
+        definition: str | None = None,
+        of: Side = "prediction",
+        sample_rate: int | None = None,
+        frames_per_second: float | None = None,
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("of", of, Side)
@@ -98,7 +97,8 @@ class SpeechLipMetric(SequenceMetric):
             raise ValueError("sample_rate and frames_per_second belong together; give both, or none with intensities")
         if sample_rate is not None and frames_per_second is not None and not 0 < frames_per_second <= sample_rate:
             raise ValueError(f"{frames_per_second} frames a second do not fit {sample_rate} samples a second")
-        super().__init__(definition=definition, region=as_region(lips, "lips"), **options)
+        words = (definition or self.words).replace("{side}", SIDE_WORDS[of])
+        super().__init__(definition=words, region=as_region(lips, "lips"), **options)
         self.of: Side = of
         self.sample_rate = sample_rate
         self.frames_per_second = frames_per_second
@@ -203,25 +203,11 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
     """
 
     leaves_out = "the intensity of the speech does not vary"
-
-    def __init__(
-        self,
-        lips: RegionLike,
-        *,
-        of: Side = "prediction",
-        sample_rate: int | None = None,
-        frames_per_second: float | None = None,
-        **options: Unpack[SequenceOptions],
-    ) -> None:
-        check_option("of", of, Side)
-        words = (
-            "in each sequence the Pearson correlation over frames between the intensity of the speech (root "
-            f"mean square of a frame) and the mean speed of {{region}}, {SIDE_WORDS[of]}; mean over sequences; lips "
-            "that do not vary count 0, a sequence whose speech does not vary is left out [1]"
-        )
-        super().__init__(
-            lips, definition=words, of=of, sample_rate=sample_rate, frames_per_second=frames_per_second, **options
-        )
+    words = (
+        "in each sequence the Pearson correlation over frames between the intensity of the speech (root mean square of "
+        "a frame) and the mean speed of {region}, {side}; mean over sequences; lips that do not vary count 0, a sequence "
+        "whose speech does not vary is left out [1]"
+    )
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The correlation of one sequence, NaN if its speech does not vary."""
@@ -295,13 +281,12 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         frames_per_second: float | None = None,
         **options: Unpack[SequenceOptions],
     ) -> None:
-        check_option("of", of, Side)
         if n_identities < 1:
             raise ValueError(f"n_identities is {n_identities}; expected at least 1")
         words = (
             "Pearson correlation over clips between the intensity of the speech and the root mean square "
             f"over frames of the mean speed of {{region}}, each standardised within {n_identities} identities, "
-            f"{SIDE_WORDS[of]} [1]"
+            "{side} [1]"
         )
         super().__init__(
             lips, definition=words, of=of, sample_rate=sample_rate, frames_per_second=frames_per_second, **options

@@ -7,9 +7,9 @@ from typing import Literal, Unpack
 import torch
 from torch import Tensor
 
-from facediff.metrics.base import Clip, SequenceMetric, SequenceOptions, check_option, functional
+from facediff.metrics.base import Clip, LipMetric, SequenceOptions, check_option, functional
 from facediff.metrics.mouth import OpeningMetric
-from facediff.metrics.regions import LipPairsLike, RegionLike, as_region
+from facediff.metrics.regions import LipPairsLike
 from facediff.registry import metric
 
 # Dynamic time warping: the cheapest way to align two series without going back in time.
@@ -74,7 +74,7 @@ def _trace(costs: Tensor, rows: int, columns: int) -> Path:
 
 
 @metric.register("lip_warping_distance")
-class LipWarpingDistance(SequenceMetric):
+class LipWarpingDistance(LipMetric):
     """Lip DTW: distance between the lips of truth and prediction after time is warped to fit them best.
 
     With d(i, j) = √(mean_{v∈M} ‖g[i, v] − p[j, v]‖²), the root mean square distance between the lips of frame
@@ -104,15 +104,10 @@ class LipWarpingDistance(SequenceMetric):
     """
 
     higher_is_better = False
-    needs = ("lips",)
-    indices: Tensor
-
-    def __init__(self, lips: RegionLike, **options: Unpack[SequenceOptions]) -> None:
-        words = (
-            "in each sequence the root mean square distance over {region} between frames that dynamic "
-            "time warping pairs, mean along the path of smallest sum; mean over sequences [unit]"
-        )
-        super().__init__(definition=words, region=as_region(lips, "lips"), **options)
+    words = (
+        "in each sequence the root mean square distance over {region} between frames that dynamic time warping pairs, "
+        "mean along the path of smallest sum; mean over sequences [unit]"
+    )
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The distance of one sequence."""

@@ -1,29 +1,19 @@
 """A metric of another package, chosen by name in `facediff evaluate` and `facediff test`."""
 
-from __future__ import annotations
-
-from typing import Unpack
-
 import torch
 from torch import Tensor
 
-from facediff.metrics import Clip, Region, SequenceMetric
-from facediff.metrics.base import SequenceOptions
+from facediff.metrics import Clip, LipMetric
 
 
-class LipRange(SequenceMetric):
+class LipRange(LipMetric):
     """Lip range: how much further the lips of the truth move from their first frame than those of the prediction.
 
-    Per sequence the mean over lip vertices of max_t ‖g[t] − g[0]‖ − max_t ‖p[t] − p[0]‖, in the vertices' unit; then the
-    mean over sequences.
+    Per sequence the mean over lip vertices of max_t ‖g[t] − g[0]‖ − max_t ‖p[t] − p[0]‖, in the vertices' unit; then
+    the mean over sequences.
     """
 
-    needs = ("lips",)
-    indices: Tensor
-
-    def __init__(self, lips: Region, **options: Unpack[SequenceOptions]) -> None:
-        words = "in each sequence how much further {region} move in the truth; mean over sequences [unit]"
-        super().__init__(definition=words, region=lips, **options)
+    words = "in each sequence how much further {region} move in the truth; mean over sequences [unit]"
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The difference of one sequence."""
