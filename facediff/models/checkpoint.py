@@ -1,7 +1,7 @@
 """Opening checkpoints: an untrusted file becomes a model that is ready for inference.
 
-A checkpoint is read as plain data (``weights_only=True``). The classes that it names (model, components, corpus) must be
-registered ones, or be imported already; nothing is imported because a file asks for it.
+A checkpoint is read as plain data (``weights_only=True``). The classes that it names (model, components, corpus) must
+be registered, or be imported already; nothing is imported because a file asks for it.
 """
 
 from __future__ import annotations

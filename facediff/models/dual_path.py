@@ -1,10 +1,15 @@
-"""Dual-path style diffusion as a LightningModule."""
+"""Dual-path style diffusion: personalised speech-driven animation by a diffusion model with two style paths.
+
+Li, Song, Liu, An: "Personalised speech-driven 3D facial animation" (2026), called "the paper" in these files. From top
+to bottom: the model (options, loss, sampling), its network, and the network's own layers. The components that are
+chosen by name have files of their own; docs/method.md says where each equation is.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -36,246 +41,7 @@ from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoder, MeshEn
 from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, SamplerFactory, unit_noise
 from facediff.models.style_encoders import StyleEncoder, StyleEncoderFactory, TcnGruTransformer
 
-# Embedding of the diffusion step, computed step by step or as a table of all steps.
-
-
-class StepEmbedding(nn.Module):
-    """t_emb: sinusoids of the diffusion step, then an MLP.
-
-    Args:
-        dim: channels C.
-    """
-
-    frequencies: Tensor
-
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        half = dim // 2
-        frequencies = torch.exp(-math.log(10_000.0) * torch.arange(half) / half)
-        self.register_buffer("frequencies", frequencies, persistent=False)
-        self.mlp = nn.Sequential(nn.Linear(2 * half, dim), nn.SiLU(), nn.Linear(dim, dim))
-
-    def forward(self, step: Int[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
-        """Embed step numbers counted from 0."""
-        angle = step[:, None].float() * self.frequencies
-        return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))
-
-
-# The network of dual-path style diffusion: conditions once per clip, one denoising pass per step.
-
 TokenForm = Literal["levels", "single"]
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """What does not change over the denoising steps of a clip.
-
-    Attributes:
-        audio: speech features F_a.
-        style: style tokens, the condition F_s.
-        mask: True on valid frames.
-        fusion: what the fusion prepared for inference.
-        decoder: what the decoder prepared for inference.
-        step_table: the embedding of each step; None if steps are embedded as they come.
-    """
-
-    audio: Float[Tensor, "batch frames dim"]
-    style: Float[Tensor, "batch tokens dim"]
-    mask: Bool[Tensor, "batch frames"]
-    fusion: object = None
-    decoder: object = None
-    step_table: Float[Tensor, "steps dim"] | None = None
-
-    def frames(self, start: int, end: int) -> Conditions:
-        """Those of some of the frames, with nothing prepared."""
-        return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end])
-
-    def repeated(self, times: int) -> Conditions:
-        """One clip's conditions for several samples of it, with nothing prepared; nothing is copied."""
-        audio, style = (value.expand(times, -1, -1) for value in (self.audio, self.style))
-        return Conditions(audio, style, self.mask.expand(times, -1))
-
-
-class StyleTokens(nn.Module):
-    """F_s = Concat(F_id, F_dyn) (eq. 14), presented to the decoder as tokens.
-
-    Attention over a single key is constant, so by default each part of F_s (coarse, mid, fine, dynamic) becomes a
-    token with a projection of its own.
-
-    Args:
-        token_dims: widths of the parts; may be empty, then one learnt token stands for "no condition".
-        dim: channels of a token.
-        form: a token per part (``levels``) or one token for all (``single``).
-    """
-
-    def __init__(self, token_dims: tuple[int, ...], dim: int, form: TokenForm) -> None:
-        super().__init__()
-        if form == "single" and token_dims:
-            token_dims = (sum(token_dims),)
-        self.token_dims = token_dims
-        self.projections = nn.ModuleList(nn.Linear(width, dim) for width in token_dims)
-        self.null = None if token_dims else nn.Parameter(torch.zeros(1, 1, dim))
-
-    def forward(self, style: Float[Tensor, "batch style_dim"]) -> Float[Tensor, "batch tokens dim"]:
-        """Split F_s and project each part."""
-        if self.null is not None:
-            return self.null.expand(len(style), -1, -1)
-        parts = torch.split(style, list(self.token_dims), dim=-1)
-        return torch.stack([p(part) for p, part in zip(self.projections, parts, strict=True)], dim=1)
-
-
-class DualPathNetwork(nn.Module):
-    """Predicts clean motion from noisy motion under speech, identity and style.
-
-    In the denoising loop vertices appear in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V). Outside it
-    ``mesh_encoder`` stands in front of the style encoder (X = Linear(M_ref) in the paper).
-
-    Args:
-        n_vertices: vertices V of the topology.
-        dim: channels C.
-        audio_encoder: speech to F_a.
-        identity_encoder: identity to F_id.
-        mesh_encoder: reference motion to one feature per frame; None without a dynamic style.
-        style_encoder: these features to F_dyn.
-        fusion: F_a and F_m to F_am.
-        decoder: F_fused and style tokens to F_dec.
-        token_form: how F_s is presented to the decoder.
-    """
-
-    def __init__(
-        self,
-        *,
-        n_vertices: int,
-        dim: int,
-        audio_encoder: AudioEncoder,
-        identity_encoder: IdentityEncoder,
-        mesh_encoder: MeshEncoder | None,
-        style_encoder: StyleEncoder,
-        fusion: Fusion,
-        decoder: Decoder,
-        token_form: TokenForm,
-    ) -> None:
-        super().__init__()
-        self.coordinates = 3 * n_vertices
-        self.audio_encoder = audio_encoder
-        self.identity_encoder = identity_encoder
-        self.style_encoder = style_encoder
-        self.style_tokens = StyleTokens(identity_encoder.token_dims + style_encoder.token_dims, dim, token_form)
-        self.embed = nn.Linear(3 * n_vertices, dim)
-        self.mesh_encoder = mesh_encoder
-        self.step_embedding = StepEmbedding(dim)
-        self.fusion = fusion
-        self.fused_norm = nn.LayerNorm(dim)
-        self.decoder = decoder
-        self.unembed = nn.Linear(dim, 3 * n_vertices)
-        self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
-
-    def conditions(
-        self,
-        audio: Float[Tensor, "batch samples"],
-        audio_lengths: Int[Tensor, " batch"],
-        frame_lengths: Int[Tensor, " batch"],
-        identity: Int[Tensor, " batch"],
-        dynamic_style: Float[Tensor, "batch dynamic_dim"],
-        features: tuple[Float[Tensor, "batch steps channels"], Int[Tensor, " batch"]] | None = None,
-    ) -> Conditions:
-        """Everything that is computed once per clip.
-
-        Args:
-            audio: waveforms at 16 kHz.
-            audio_lengths: valid samples.
-            frame_lengths: motion frames wanted.
-            identity: identity indices, −1 for unknown.
-            dynamic_style: F_dyn, as :meth:`dynamic_style` gives it.
-            features: cached result of the audio encoder's frozen part, and its lengths.
-        """
-        encoded = self.audio_encoder(audio, audio_lengths, frame_lengths, *(features or ()))
-        style = torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1)
-        return Conditions(encoded, self.style_tokens(style), frame_mask(frame_lengths, encoded.shape[1]))
-
-    def prepare_for_inference(
-        self, conditions: Conditions, steps: int, *, folded: bool, blend: Blend = unchanged
-    ) -> Space:
-        """Everything that is constant over the denoising steps of a clip or window, as the space a sampler runs in.
-
-        It holds for the weights and the precision in which it was made, so it is made again for every run; what follows
-        from the weights alone is kept until they change.
-
-        Args:
-            conditions: as :meth:`conditions` gives them, or those of some frames.
-            steps: the process's steps N.
-            folded: run in the width of the model where both ends are linear, else on the vertices.
-            blend: changes the features that the network gives in every step.
-        """
-        first, last = self.embed, self.unembed
-        folded = folded and isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
-        ends = [weight for weight in (first.weight, last.weight, last.bias) if weight is not None] if folded else []
-
-        def of_weights() -> tuple[Tensor, Fold | None]:
-            table = self.step_embedding(torch.arange(steps, device=conditions.audio.device))
-            return table, fold(first.weight, last.weight, last.bias) if folded else None
-
-        weights = [self.step_embedding.frequencies, *self.step_embedding.parameters(), *ends]
-        table, product = self._of_weights.get(weights, (steps, folded), of_weights)
-        audio, style, mask = conditions.audio, conditions.style, conditions.mask
-        ready = Conditions(
-            audio,
-            style,
-            mask,
-            fusion=self.fusion.prepare(audio, mask),
-            decoder=self.decoder.prepare(style, mask),
-            step_table=table,
-        )
-        return VertexSpace(self, ready, blend) if product is None else FoldedSpace(self, ready, product, blend)
-
-    def dynamic_style(
-        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch dynamic_dim"]:
-        """F_dyn of scaled reference motion; of width 0 without a dynamic style.
-
-        Args:
-            reference: scaled reference motion.
-            mask: True on valid frames.
-        """
-        if self.mesh_encoder is None:
-            return reference.new_zeros((len(reference), 0))
-        return self.style_encoder(self.mesh_encoder(reference), mask)
-
-    def forward(
-        self,
-        noisy: Float[Tensor, "batch frames coordinates"],
-        step: Int[Tensor, " batch"],
-        conditions: Conditions,
-    ) -> Float[Tensor, "batch frames coordinates"]:
-        """Predict the clean scaled motion M̂⁰ from Mⁿ."""
-        return self.leave(self.core(self.embed(noisy), step, conditions))
-
-    def leave(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames coordinates"]:
-        """F_dec to the clean scaled motion.
-
-        In mixed precision this map stays in the weights' own type: differences over time of half-precision motion are
-        noise.
-        """
-        with torch.autocast(features.device.type, enabled=False):
-            return self.unembed(features.to(next(self.unembed.parameters()).dtype))
-
-    def core(
-        self, motion: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions
-    ) -> Float[Tensor, "batch frames dim"]:
-        """F_m to F_dec: everything between the two vertex-space maps.
-
-        Args:
-            motion: F_m.
-            step: step numbers counted from 0.
-            conditions: as they are, or prepared for inference.
-        """
-        # A component that prepares nothing need not know that others do.
-        fusion, decoder = ([] if made is None else [made] for made in (conditions.fusion, conditions.decoder))
-        fused = self.fusion(conditions.audio, motion, conditions.mask, *fusion)
-        table = conditions.step_table
-        embedded = self.step_embedding(step) if table is None else table[step]
-        fused = self.fused_norm(fused + embedded[:, None])  # eq. 13
-        return self.decoder(fused, conditions.style, conditions.mask, *decoder)
 
 
 @registry.model.register("DualPathDiffusion")
@@ -289,11 +55,11 @@ class DualPathDiffusion(AnimationModel):
     Args:
         dim: model width C.
         audio_encoder: speech to features.
-        identity_encoder: who the face is.
+        identity_encoder: a speaker's label to the static identity.
         mesh_encoder: reference motion to one feature per frame, in front of the style encoder.
-        style_encoder: how the person moves.
-        fusion: where speech meets noisy motion.
-        decoder: to clean motion.
+        style_encoder: these features to the dynamic style.
+        fusion: speech features and noisy motion to one sequence.
+        decoder: this sequence and the style to clean motion.
         sampler: runs the reverse process in validation, test, prediction and animation.
         sampling_space: where it runs: ``folded`` into ``dim`` dimensions, with the same distribution of motion at a
             cost per step that does not depend on the vertices, or on the ``vertices`` themselves, for comparison. A
@@ -301,7 +67,7 @@ class DualPathDiffusion(AnimationModel):
         diffusion_steps: noising steps N.
         noise_schedule: ``squaredcos_cap_v2`` (the cosine schedule), ``linear`` or ``scaled_linear``.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
-        identity_dropout: share of training clips whose identity is hidden, so that unknown people can be animated.
+        identity_dropout: share of training clips whose identity is hidden, so that unseen speakers can be animated.
         velocity_weight: λ_vel.
         acceleration_weight: λ_acc.
         face_weight: λ_face.
@@ -371,7 +137,7 @@ class DualPathDiffusion(AnimationModel):
         self.sampler = chosen(process=self.process, **options)
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """One draw of step and noise per clip (algorithm 1), then the four losses (eq. 15 to 19)."""
+        """Noise each clip to a random step (algorithm 1, lines 3 and 4), then take the four losses (eq. 15 to 19)."""
         motion = batch.motion.flatten(2)
         step = self.process.draw_steps(len(batch), motion.device, generator)
         return self.losses_at(batch, step, unit_noise(motion.shape, motion.device, generator))
@@ -387,11 +153,11 @@ class DualPathDiffusion(AnimationModel):
             noise: unit noise.
         """
         network = self.network
-        # As NoiseProcess.add_noise, without further tensors of the motion's size: on a processor, having a new one
-        # takes longer than what is done to it.
+        # √ᾱ M⁰ + √(1 − ᾱ) ε, as NoiseProcess.add_noise, but in place: on a processor, allocating tensors of the motion's
+        # size takes longer than the arithmetic.
         signal = self.process.signal.to(noise.device)[step][:, None, None]
         noisy = noise.mul_((1 - signal).sqrt()).addcmul_(batch.motion.flatten(2), signal.sqrt() * self.scale)
-        decoded = network.core(network.embed(noisy), step, self._conditions(batch))
+        decoded = network.core(network.embed(noisy), step, self.conditions(batch))
         return fused_losses(
             decoded,
             network.unembed.weight,
@@ -403,19 +169,13 @@ class DualPathDiffusion(AnimationModel):
             scale=self.scale,
         )
 
-    def _conditions(self, batch: Batch) -> Conditions:
+    def conditions(self, batch: Batch) -> Conditions:
+        """Everything that is computed once per clip; in training, identities are hidden now and then."""
         identity = batch.identity
         if self.training and self.identity_dropout:
             hidden = torch.rand(identity.shape, device=identity.device) < self.identity_dropout
             identity = identity.masked_fill(hidden, -1)
-        return self.network.conditions(
-            batch.audio,
-            batch.audio_lengths,
-            batch.frame_lengths,
-            identity,
-            self.style_of(batch),
-            batch.cached_features,
-        )
+        return self.network.conditions(batch, identity, self.style_of(batch))
 
     def encode_style(
         self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
@@ -429,34 +189,41 @@ class DualPathDiffusion(AnimationModel):
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Algorithm 2 with the model's sampler, in its sampling space; conditions are computed once.
 
-        All noise of a clip follows from the seed and its name: its motion does not depend on the clips beside it.
+        All noise of a clip follows from the seed and its name: its motion does not depend on the rest of the batch.
         """
         noise = ClipNoise(batch.names, batch.frame_lengths.tolist(), [seed] * len(batch), self.device)
-        return self._sample(self._conditions(batch), noise, progress=progress)
+        return self.sample(self.conditions(batch), noise, progress=progress)
 
     @torch.no_grad()
     def generate_samples(
         self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None
-    ) -> Float[Tensor, "takes frames vertices 3"]:
+    ) -> Float[Tensor, "samples frames vertices 3"]:
         """The same for several seeds: speech and style are encoded once."""
         lengths = clip.frame_lengths.tolist() * len(seeds)
         noise = ClipNoise(clip.names * len(seeds), lengths, seeds, self.device)
-        return self._sample(self._conditions(clip).repeated(len(seeds)), noise, progress=progress)
+        return self.sample(self.conditions(clip).repeated(len(seeds)), noise, progress=progress)
 
     @torch.no_grad()
     def generate_window(
         self, clip: Batch, window: Window, seeds: Sequence[int], before: list[Tensor] | None
-    ) -> tuple[Float[Tensor, "takes frames vertices 3"], list[Tensor]]:
-        """The same for a window, joined in every denoising step to the window before it."""
-        conditions = self._conditions(clip).frames(window.context, window.context + window.frames)
+    ) -> tuple[Float[Tensor, "samples frames vertices 3"], list[Tensor]]:
+        """The same for a window of long speech, blended in every denoising step with the window before it."""
+        conditions = self.conditions(clip).frames(window.context, window.context + window.frames)
         overlap_blend = WindowOverlap(before, window.kept)
         noise = WindowNoise(clip.names[0], window, seeds, self.device)
-        return self._sample(conditions.repeated(len(seeds)), noise, blend=overlap_blend), overlap_blend.features
+        return self.sample(conditions.repeated(len(seeds)), noise, blend=overlap_blend), overlap_blend.features
 
-    def _sample(
+    def sample(
         self, conditions: Conditions, unit: NoiseSource, *, blend: Blend = unchanged, progress: Progress | None = None
     ) -> Float[Tensor, "batch frames vertices 3"]:
-        """Run the sampler; ``unit`` gives unit noise, ``blend`` changes the features of every step."""
+        """Run the sampler from noise to motion, in offsets from the template.
+
+        Args:
+            conditions: of the clips, the samples of one clip, or a window.
+            unit: gives unit noise.
+            blend: changes the features of every step.
+            progress: wraps the iteration over steps.
+        """
         folded = self.sampling_space == "folded" and self.sampler.linear
         space = self.network.prepare_for_inference(conditions, self.process.steps, folded=folded, blend=blend)
         rows, frames = conditions.mask.shape
@@ -467,3 +234,216 @@ class DualPathDiffusion(AnimationModel):
         start = noise(torch.empty(rows, frames, space.width, device=self.device, dtype=next(self.parameters()).dtype))
         sample = self.sampler.run(space.denoise, start, noise=noise, progress=progress)
         return (space.motion(sample) / self.scale).view(rows, frames, self.n_vertices, 3)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What does not change over the denoising steps of a clip.
+
+    Attributes:
+        audio: speech features F_a.
+        style: style tokens, the condition F_s.
+        mask: True on valid frames.
+        fusion: what the fusion prepared for inference.
+        decoder: what the decoder prepared for inference.
+        step_table: the embedding of each step; None if steps are embedded as they come.
+    """
+
+    audio: Float[Tensor, "batch frames dim"]
+    style: Float[Tensor, "batch tokens dim"]
+    mask: Bool[Tensor, "batch frames"]
+    fusion: object = None
+    decoder: object = None
+    step_table: Float[Tensor, "steps dim"] | None = None
+
+    def frames(self, start: int, end: int) -> Conditions:
+        """The conditions of some of the frames, with nothing prepared."""
+        return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end])
+
+    def repeated(self, times: int) -> Conditions:
+        """One clip's conditions for several samples of it, with nothing prepared; nothing is copied."""
+        audio, style = (value.expand(times, -1, -1) for value in (self.audio, self.style))
+        return Conditions(audio, style, self.mask.expand(times, -1))
+
+
+class DualPathNetwork(nn.Module):
+    """Predicts clean motion from noisy motion under speech, identity and style.
+
+    In the denoising loop vertices appear in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V). Outside it
+    ``mesh_encoder`` stands in front of the style encoder (X = Linear(M_ref) in the paper).
+
+    Args:
+        n_vertices: vertices V of the topology.
+        dim: channels C.
+        audio_encoder: speech to F_a.
+        identity_encoder: identity to F_id.
+        mesh_encoder: reference motion to one feature per frame; None without a dynamic style.
+        style_encoder: these features to F_dyn.
+        fusion: F_a and F_m to F_am.
+        decoder: F_fused and style tokens to F_dec.
+        token_form: how F_s is presented to the decoder.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_vertices: int,
+        dim: int,
+        audio_encoder: AudioEncoder,
+        identity_encoder: IdentityEncoder,
+        mesh_encoder: MeshEncoder | None,
+        style_encoder: StyleEncoder,
+        fusion: Fusion,
+        decoder: Decoder,
+        token_form: TokenForm,
+    ) -> None:
+        super().__init__()
+        self.coordinates = 3 * n_vertices
+        self.audio_encoder = audio_encoder
+        self.identity_encoder = identity_encoder
+        self.style_encoder = style_encoder
+        self.style_tokens = StyleTokens(identity_encoder.token_dims + style_encoder.token_dims, dim, token_form)
+        self.embed = nn.Linear(3 * n_vertices, dim)
+        self.mesh_encoder = mesh_encoder
+        self.step_embedding = StepEmbedding(dim)
+        self.fusion = fusion
+        self.fused_norm = nn.LayerNorm(dim)
+        self.decoder = decoder
+        self.unembed = nn.Linear(dim, 3 * n_vertices)
+        self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
+
+    def conditions(
+        self, batch: Batch, identity: Int[Tensor, " batch"], dynamic_style: Float[Tensor, "batch dynamic_dim"]
+    ) -> Conditions:
+        """Everything that is computed once per clip.
+
+        Args:
+            batch: its speech, or cached features of it, and its lengths.
+            identity: identity indices, −1 for unknown.
+            dynamic_style: F_dyn, as :meth:`dynamic_style` gives it.
+        """
+        cached = batch.cached_features or ()
+        audio = self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached)
+        style = torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1)  # eq. 14
+        return Conditions(audio, self.style_tokens(style), frame_mask(batch.frame_lengths, audio.shape[1]))
+
+    def dynamic_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch dynamic_dim"]:
+        """F_dyn of scaled reference motion (eq. 2 to 9); of width 0 without a dynamic style."""
+        if self.mesh_encoder is None:
+            return reference.new_zeros((len(reference), 0))
+        return self.style_encoder(self.mesh_encoder(reference), mask)
+
+    def forward(
+        self,
+        noisy: Float[Tensor, "batch frames coordinates"],
+        step: Int[Tensor, " batch"],
+        conditions: Conditions,
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Predict the clean scaled motion M̂⁰ from Mⁿ."""
+        return self.clean_motion(self.core(self.embed(noisy), step, conditions))
+
+    def core(
+        self, motion: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions
+    ) -> Float[Tensor, "batch frames dim"]:
+        """F_m to F_dec: everything between the two vertex-space maps.
+
+        Args:
+            motion: F_m.
+            step: step numbers counted from 0.
+            conditions: as they are, or prepared for inference.
+        """
+        # A component that prepares nothing need not know that others do.
+        fusion, decoder = ([] if made is None else [made] for made in (conditions.fusion, conditions.decoder))
+        fused = self.fusion(conditions.audio, motion, conditions.mask, *fusion)  # eq. 12
+        table = conditions.step_table
+        embedded = self.step_embedding(step) if table is None else table[step]
+        fused = self.fused_norm(fused + embedded[:, None])  # eq. 13
+        return self.decoder(fused, conditions.style, conditions.mask, *decoder)
+
+    def clean_motion(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames coordinates"]:
+        """The last map, from F_dec to clean scaled motion."""
+        # In mixed precision this map stays in the weights' own type: differences over time of half-precision motion
+        # are noise.
+        with torch.autocast(features.device.type, enabled=False):
+            return self.unembed(features.to(next(self.unembed.parameters()).dtype))
+
+    def prepare_for_inference(
+        self, conditions: Conditions, steps: int, *, folded: bool, blend: Blend = unchanged
+    ) -> Space:
+        """Everything that is constant over the denoising steps of a clip or window, as the space a sampler runs in.
+
+        It holds for the weights and the precision in which it was made, so it is made again for every run; what follows
+        from the weights alone is kept until they change.
+
+        Args:
+            conditions: as :meth:`conditions` gives them, or those of some frames.
+            steps: the process's steps N.
+            folded: run in the width of the model where both ends are linear, else on the vertices.
+            blend: changes the features that the network gives in every step.
+        """
+        first, last = self.embed, self.unembed
+        folded = folded and isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
+        ends = [weight for weight in (first.weight, last.weight, last.bias) if weight is not None] if folded else []
+
+        def of_weights() -> tuple[Tensor, Fold | None]:
+            table = self.step_embedding(torch.arange(steps, device=conditions.audio.device))
+            return table, fold(first.weight, last.weight, last.bias) if folded else None
+
+        weights = [self.step_embedding.frequencies, *self.step_embedding.parameters(), *ends]
+        table, product = self._of_weights.get(weights, (steps, folded), of_weights)
+        audio, style, mask = conditions.audio, conditions.style, conditions.mask
+        fusion, decoder = self.fusion.prepare(audio, mask), self.decoder.prepare(style, mask)
+        ready = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
+        return VertexSpace(self, ready, blend) if product is None else FoldedSpace(self, ready, product, blend)
+
+
+class StyleTokens(nn.Module):
+    """F_s = Concat(F_id, F_dyn) (eq. 14), presented to the decoder as tokens.
+
+    Attention over a single key is constant, so by default each part of F_s (coarse, mid, fine, dynamic) becomes a
+    token with a projection of its own.
+
+    Args:
+        token_dims: widths of the parts; may be empty, then one learnt token stands for "no condition".
+        dim: channels of a token.
+        form: a token per part (``levels``) or one token for all (``single``).
+    """
+
+    def __init__(self, token_dims: tuple[int, ...], dim: int, form: TokenForm) -> None:
+        super().__init__()
+        if form == "single" and token_dims:
+            token_dims = (sum(token_dims),)
+        self.token_dims = token_dims
+        self.projections = nn.ModuleList(nn.Linear(width, dim) for width in token_dims)
+        self.null = None if token_dims else nn.Parameter(torch.zeros(1, 1, dim))
+
+    def forward(self, style: Float[Tensor, "batch style_dim"]) -> Float[Tensor, "batch tokens dim"]:
+        """Split F_s and project each part."""
+        if self.null is not None:
+            return self.null.expand(len(style), -1, -1)
+        parts = torch.split(style, list(self.token_dims), dim=-1)
+        return torch.stack([p(part) for p, part in zip(self.projections, parts, strict=True)], dim=1)
+
+
+class StepEmbedding(nn.Module):
+    """t_emb: sinusoids of the diffusion step, then an MLP.
+
+    Args:
+        dim: channels C.
+    """
+
+    frequencies: Tensor
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        half = dim // 2
+        frequencies = torch.exp(-math.log(10_000.0) * torch.arange(half) / half)
+        self.register_buffer("frequencies", frequencies, persistent=False)
+        self.mlp = nn.Sequential(nn.Linear(2 * half, dim), nn.SiLU(), nn.Linear(dim, dim))
+
+    def forward(self, step: Int[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
+        """Embed step numbers counted from 0."""
+        angle = step[:, None].float() * self.frequencies
+        return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))

@@ -65,7 +65,7 @@ class Network(Protocol):
         """Everything between the two maps."""
         ...
 
-    def leave(self, features: Frames) -> ScaledMotion:
+    def clean_motion(self, features: Frames) -> ScaledMotion:
         """The last map in the weights' own precision."""
         ...
 
@@ -116,7 +116,7 @@ class VertexSpace(Space):
 
     def denoise(self, state: State, step: int) -> State:
         """M̂⁰."""
-        return self.network.leave(self.features(self.network.embed(state), step))
+        return self.network.clean_motion(self.features(self.network.embed(state), step))
 
     def motion(self, sample: State) -> ScaledMotion:
         """The sample as it is."""
@@ -167,7 +167,7 @@ class FoldedSpace(Space):
                 "sampler: it is declared linear, but its last step does not return the last prediction; "
                 "choose --model.sampling_space=vertices"
             )
-        return self.network.leave(self._last[0])
+        return self.network.clean_motion(self._last[0])
 
 
 CHUNK = 8192

@@ -43,8 +43,8 @@ def test_the_loss_of_a_clip_does_not_depend_on_its_padding(model: DualPathDiffus
     noisy = model.process.add_noise(clean, noise, step)
     padded = torch.randn(2, together.motion.shape[1], 72)
     padded[:1, :frames] = noisy
-    first = model.network(noisy, step, model._conditions(alone))
-    second = model.network(padded, step.expand(2), model._conditions(together))
+    first = model.network(noisy, step, model.conditions(alone))
+    second = model.network(padded, step.expand(2), model.conditions(together))
     torch.testing.assert_close(second[:1, :frames], first, atol=1e-4, rtol=1e-4)
     for loss in (losses.reconstruction_loss, losses.velocity_loss, losses.acceleration_loss):
         truth = clean.view(1, frames, 24, 3)

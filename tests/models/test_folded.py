@@ -59,7 +59,7 @@ def run(model: DualPathDiffusion, space: Space, noise: Callable[[], Tensor]) -> 
 
 def vertices(model: DualPathDiffusion, batch: Batch) -> Space:
     """On vertices, with everything computed again in every step."""
-    return VertexSpace(model.network, model._conditions(batch))
+    return VertexSpace(model.network, model.conditions(batch))
 
 
 def choose(model: DualPathDiffusion, batch: Batch) -> Space:

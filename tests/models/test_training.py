@@ -143,7 +143,7 @@ def test_mixed_precision_trains_with_clipped_gradients(make_model: Make, tiny: T
     batch = collate([tiny.dataset("val")[0]])
     with torch.autocast("cpu", dtype=torch.bfloat16):
         noisy = torch.randn(batch.motion.flatten(2).shape)
-        assert model.network(noisy, torch.tensor([3]), model._conditions(batch)).dtype == torch.float32
+        assert model.network(noisy, torch.tensor([3]), model.conditions(batch)).dtype == torch.float32
     after = model.network.unembed.weight
     assert after.dtype == torch.float32
     assert torch.isfinite(after).all()

@@ -30,7 +30,7 @@ def test_losses_are_those_of_added_and_removed_noise(model: DualPathDiffusion, t
     assert torch.equal(batch.motion, before)
     clean = batch.motion.flatten(2) * model.scale
     noisy = model.process.add_noise(clean, noise, step)
-    predicted = model.network(noisy, step, model._conditions(batch)).view(batch.motion.shape)
+    predicted = model.network(noisy, step, model.conditions(batch)).view(batch.motion.shape)
     truth, upper = clean.view(batch.motion.shape), model.assets.regions["upper_face"]
     expected = losses.training_losses(predicted, truth, batch.mask, upper, model.loss_weights)
     torch.testing.assert_close(terms, expected, rtol=1e-5, atol=1e-6)

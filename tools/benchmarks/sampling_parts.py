@@ -110,7 +110,7 @@ class Bench:
         """What is computed once a clip."""
         batch, network = self.batch, self.model.network
         style = self.model.encode_style(batch.reference, batch.reference_mask)
-        return network.conditions(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.identity, style)
+        return network.conditions(batch, batch.identity, style)
 
     def once_a_clip(self) -> tuple[float, float]:
         """Seconds of the audio encoder, and of all other conditions."""
@@ -172,7 +172,7 @@ class Bench:
         step = torch.full((len(batch),), number, device=self.model.device)
         entered = torch.randn(*batch.motion.shape[:2], network.embed.out_features, device=self.model.device)
         decoded = network.core(entered, step, conditions)
-        vertices = network.leave(decoded)
+        vertices = network.clean_motion(decoded)
         maps = network.embed.weight.detach(), network.unembed.weight.detach(), network.unembed.bias.detach()
         cores = self.in_turn(
             {
@@ -188,7 +188,7 @@ class Bench:
             look=self.quickest(lambda: self.space("folded", conditions)),
             core=cores["kept"],
             core_unprepared=cores["anew"],
-            leave=self.quickest(lambda: network.leave(decoded)),
+            leave=self.quickest(lambda: network.clean_motion(decoded)),
             rest=self.quickest(lambda: vertices / self.model.scale),
         )
         costs.step = {space: {} for space in SPACES}

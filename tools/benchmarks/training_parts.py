@@ -210,7 +210,7 @@ class Bench:
         model = self.model
         clean = batch.motion.flatten(2) * model.scale
         noisy = model.process.add_noise(clean, noise, step)
-        predicted = model.network(noisy, step, model._conditions(batch)).view(batch.motion.shape)
+        predicted = model.network(noisy, step, model.conditions(batch)).view(batch.motion.shape)
         truth, mask = clean.view(batch.motion.shape), batch.mask
         return training_losses(predicted, truth, mask, model.assets.regions["upper_face"], model.loss_weights)
 
