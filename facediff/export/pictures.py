@@ -1,4 +1,4 @@
-"""Check pictures: faces next to each other, with numbers at vertices as colours, by which a result is judged."""
+"""Pictures for checking a result: faces next to each other, with numbers at vertices as colours."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Panel:
 
 
 def draw_worst_frame(path: Path, animation: Animation, shapes: ShapeSet, weights: Weights) -> None:
-    """Draw the frame that blendshapes fit worst: as it was, as the weights make it, and their difference.
+    """Draw the frame that blendshapes fit worst: the original, the sum of the weighted shapes, and their difference.
 
     Args:
         path: the picture (.png).
@@ -58,7 +58,7 @@ def draw_worst_frame(path: Path, animation: Animation, shapes: ShapeSet, weights
 
 
 def draw_correspondence(path: Path, animation: Animation, made: Animation, found: Correspondence) -> None:
-    """Draw both meshes at the most open mouth, how far each target vertex moves, and how far the meshes lie apart.
+    """Draw both meshes with the mouth most open, how far each target vertex moves, and the distance of the meshes.
 
     Args:
         path: the picture (.png).
@@ -91,7 +91,7 @@ def heat(values_mm: npt.NDArray[np.floating], label: str) -> tuple[str, npt.NDAr
 
 
 def widest_frame(animation: Animation) -> int:
-    """The frame in which the mouth is most open; without known lips, that which is furthest from the neutral face."""
+    """The frame in which the mouth is most open; without known lips, the frame furthest from the neutral face."""
     pairs = animation.inner_lip_pairs
 
     def opening(frame: npt.NDArray[np.floating]) -> float:

@@ -140,8 +140,8 @@ def draw_frames(
         headings = [moment.heading for moment in moments]
         grid = Grid(paper, material.names, headings, aspect=painter.aspect, highest=HIGHEST, remark=material.remark)
         painter.set_size(*grid.pixels)
-        page = grid.page()
+        figure = grid.draw_labels()
         for row, shown in enumerate(picked.values()):
             for column, face in enumerate(shown):
-                page.picture(painter.paint(face), *grid.place(row, column))
-        save(page.figure, output)
+                grid.picture(painter.paint(face), row, column)
+        save(figure, output)

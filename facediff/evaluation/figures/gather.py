@@ -1,4 +1,4 @@
-"""What figures need in addition to the files of vertices: templates, mesh, frame rate, sound, phonemes."""
+"""Finding what figures need in addition to the files of vertices: templates, mesh, frame rate, sound, phonemes."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module
     folder = list_folder(root, MOTION_FOLDERS)
     if name is not None:
         if "." in name:
-            sys.path.append(os.getcwd())  # a data module of one's own may lie in the working folder
+            sys.path.append(os.getcwd())  # a data module of the user's own may be in the working folder
         return by_name(name, folder.n_vertices())
     if not folder.motions or isinstance(manifest.get("person"), str):
         return None
@@ -133,14 +133,14 @@ def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module
 
 
 def _count_vertices(templates_file: Path | None, truth: Path) -> int:
-    """Vertices of the mesh where no data module tells: as the templates have it, else the first readable truth."""
+    """Vertices of the mesh where no data module is known: those of the templates, else of the first readable truth."""
     if templates_file is None and not any(truth.glob("**/*.npy")):
         raise FaceDiffError(f"{truth}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
     return count_vertices(None, templates_file, truth)
 
 
 def _find_mesh(given: Path | None, root: Path, module: Module | None, n_vertices: int) -> Mesh | None:
-    """The mesh given, else the one that lies in the corpus folder, else the built-in corpus's own; None without one."""
+    """The mesh given, else the one in the corpus folder, else that of the built-in corpus; None without one."""
     if given is not None:
         mesh = read_mesh(given)
         if len(mesh.vertices) != n_vertices:
@@ -160,9 +160,9 @@ def _find_mesh(given: Path | None, root: Path, module: Module | None, n_vertices
 def _rates(
     frame_rate: float | None, truth_stride: int | None, manifest: dict[str, Any], module: Module | None
 ) -> tuple[float | None, int]:
-    """Frames a second of the predictions, and every how many-th frame of the truth belongs to them."""
-    said = manifest.get("frame_rate") or (module and (module.stored_frame_rate or module.frame_rate))
-    stored = float(said) if isinstance(said, int | float) else None
+    """Frames a second of the predictions, and the step between the frames of the truth that belong to them."""
+    stated = manifest.get("frame_rate") or (module and (module.stored_frame_rate or module.frame_rate))
+    stored = float(stated) if isinstance(stated, int | float) else None
     rate = frame_rate if frame_rate is not None else module.frame_rate if module else stored
     if rate is not None and not 0 < rate < 10_000:
         raise FaceDiffError(f"--frame-rate {rate:g}: expected frames a second, e.g. 25")
@@ -175,7 +175,7 @@ def _rates(
     stride = round(stored / rate)
     if stride < 1 or abs(stride * rate - stored) > 1e-6:
         raise FaceDiffError(
-            f"the truth has {stored:g} frames a second, no whole multiple of the predictions' {rate:g}; say what is "
-            f"so with --frame-rate and --truth-stride"
+            f"the truth has {stored:g} frames a second, no whole multiple of the predictions' {rate:g}; give "
+            f"--frame-rate and --truth-stride"
         )
     return rate, stride

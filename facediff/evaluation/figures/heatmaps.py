@@ -17,7 +17,6 @@ from facediff.evaluation.figures.page import (
     SMALLEST_TEXT,
     Grid,
     Heading,
-    Page,
     Paper,
     check_output,
     plain,
@@ -33,6 +32,9 @@ BAR, BAR_SPACE = 2.5, 16.0
 """Width of a colour bar, and of the bar with its numbers and label, in mm."""
 
 Statistic = Literal["mean", "max", "both"]
+Row = tuple[str, dict[str, Array], float | None]
+"""A row of pictures with one colour scale: the bar's label without the unit, numbers (V,) by column in the vertices'
+unit, and the value of the last colour in the unit shown, or None for the largest value."""
 
 
 @dataclass(frozen=True)
@@ -122,21 +124,6 @@ def _vertex_maps(
     return maps, notes
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of pictures with one colour scale.
-
-    Attributes:
-        label: text at the colour bar, without the unit.
-        values: numbers (V,) by column, in the vertices' unit.
-        highest: value of the last colour, in the unit shown; the largest value of the row if None.
-    """
-
-    label: str
-    values: dict[str, Array]
-    highest: float | None = None
-
-
 def draw_heatmap(
     material: Material,
     clips: Sequence[str],
@@ -165,9 +152,9 @@ def draw_heatmap(
     check_output(output)
     material.mesh(clips)  # refuses before the work
     maps, notes = motion_maps(material, clips)
-    rows = [
-        Row("mean of motion", {name: each.mean for name, each in maps.items()}, highest[0]),
-        Row("std of motion", {name: each.deviation for name, each in maps.items()}, highest[1]),
+    rows: list[Row] = [
+        ("mean of motion", {name: each.mean for name, each in maps.items()}, highest[0]),
+        ("std of motion", {name: each.deviation for name, each in maps.items()}, highest[1]),
     ]
     _draw(material, clips, rows, output, paper or Paper(), view)
     return notes
@@ -203,9 +190,9 @@ def draw_error(
     check_output(output)
     material.mesh(clips)  # refuses before the work
     maps, notes = error_maps(material, clips)
-    rows = {
-        "mean": Row("mean error", {name: each.mean for name, each in maps.items()}, highest[0]),
-        "max": Row("maximum error", {name: each.maximum for name, each in maps.items()}, highest[1]),
+    rows: dict[str, Row] = {
+        "mean": ("mean error", {name: each.mean for name, each in maps.items()}, highest[0]),
+        "max": ("maximum error", {name: each.maximum for name, each in maps.items()}, highest[1]),
     }
     chosen = list(rows.values()) if statistic == "both" else [rows[statistic]]
     _draw(material, clips, chosen, output, paper or Paper(), view)
@@ -216,10 +203,10 @@ def _draw(material: Material, clips: Sequence[str], rows: Sequence[Row], output:
     from facediff.render.panels import heat_colours
 
     factor, unit = material.scale
-    ends = [scale_end(row.values, factor, row.highest) for row in rows]
+    ends = [scale_end(values, factor, highest) for _, values, highest in rows]
     faces, shape = material.mesh(clips)
     painter = Painter(faces, shape, view=view, look=FLAT)
-    names = list(rows[0].values)
+    names = list(rows[0][1])
     with style(paper):
         grid = Grid(
             paper,
@@ -231,14 +218,14 @@ def _draw(material: Material, clips: Sequence[str], rows: Sequence[Row], output:
             remark=material.remark,
         )
         painter.set_size(*grid.pixels)
-        page = grid.page()
-        for number, (row, end) in enumerate(zip(rows, ends, strict=True)):
+        figure = grid.draw_labels()
+        for number, ((label, values, _), end) in enumerate(zip(rows, ends, strict=True)):
             for column, name in enumerate(names):
-                colours = heat_colours(row.values[name] * factor, end)
-                page.picture(painter.paint(shape, colours), *grid.place(number, column))
-            beyond = max(float(values.max()) for values in row.values.values()) * factor > end * (1 + 1e-9)
-            _draw_bar(page, grid, number, end, f"{row.label} [{unit}]", beyond=beyond)
-        save(page.figure, output)
+                colours = heat_colours(values[name] * factor, end)
+                grid.picture(painter.paint(shape, colours), number, column)
+            beyond = max(float(each.max()) for each in values.values()) * factor > end * (1 + 1e-9)
+            _draw_bar(grid, number, end, f"{label} [{unit}]", beyond=beyond)
+        save(figure, output)
 
 
 def scale_end(values: Mapping[str, Array], factor: float, highest: float | None) -> float:
@@ -255,7 +242,7 @@ def scale_end(values: Mapping[str, Array], factor: float, highest: float | None)
     return largest if largest > 0 else 1.0  # nothing moves: any scale is right
 
 
-def _draw_bar(page: Page, grid: Grid, row: int, end: float, label: str, *, beyond: bool) -> None:
+def _draw_bar(grid: Grid, row: int, end: float, label: str, *, beyond: bool) -> None:
     """A colour bar at the right of a row, with exactly the colours that the meshes have."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
@@ -265,10 +252,10 @@ def _draw_bar(page: Page, grid: Grid, row: int, end: float, label: str, *, beyon
 
     _, top = grid.place(row, 0)
     height = min(grid.height * 0.9, 45.0)
-    axes = page.axes(grid.end + 2 * GAP, top + (grid.height - height) / 2, BAR, height)
+    axes = grid.axes(grid.end + 2 * GAP, top + (grid.height - height) / 2, BAR, height)
     mappable = ScalarMappable(Normalize(0, end), ListedColormap(heat_ramp() / 255))
-    bar = page.figure.colorbar(mappable, cax=axes, extend="max" if beyond else "neither")
-    lines = wrapped(label, grid.height, SMALLEST_TEXT, page.paper.font)  # must not overlap the next row's
+    bar = grid.figure.colorbar(mappable, cax=axes, extend="max" if beyond else "neither")
+    lines = wrapped(label, grid.height, SMALLEST_TEXT, grid.paper.font)  # must not overlap the next row's
     bar.set_label(plain("\n".join(lines)), size=SMALLEST_TEXT)
     bar.outline.set_linewidth(0.4)
     bar.locator = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])

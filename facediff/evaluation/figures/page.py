@@ -154,40 +154,6 @@ def style(paper: Paper) -> Iterator[None]:
             raise FaceDiffError(f"the font {paper.font} lacks a letter ({letter}); choose one with --font") from warning
 
 
-class Page:
-    """A figure whose parts are placed in millimetres from its upper left corner.
-
-    Args:
-        paper: width, resolution and font.
-        height: in mm.
-    """
-
-    def __init__(self, paper: Paper, height: float) -> None:
-        self.paper, self.height = paper, height
-        self.figure = new_figure(paper, height)
-        self._size = (paper.pixels(paper.width), paper.pixels(height))
-
-    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
-        """Axes in a rectangle whose edges lie on whole pixels."""
-        return self._axes(*(self.paper.pixels(mm) for mm in (left, top, width, height)))
-
-    def picture(self, picture: npt.NDArray[np.uint8], left: float, top: float) -> None:
-        """A picture (height, width, 3), pixel for pixel."""
-        size = picture.shape[1], picture.shape[0]
-        axes = self._axes(self.paper.pixels(left), self.paper.pixels(top), *size)
-        axes.set_axis_off()
-        axes.imshow(picture, interpolation="none", aspect="auto", extent=(0, size[0], 0, size[1]))
-
-    def text(self, text: str, x: float, y: float, **options: object) -> None:
-        """Text at a place; options are those of matplotlib's ``Figure.text``."""
-        settings: dict[str, Any] = {"va": "center", "ha": "center", "size": TEXT, **options}
-        self.figure.text(x / self.paper.width, 1 - y / self.height, plain(text), **settings)
-
-    def _axes(self, left: int, top: int, width: int, height: int) -> Axes:
-        across, down = self._size
-        return self.figure.add_axes((left / across, 1 - (top + height) / down, width / across, height / down))
-
-
 def new_figure(paper: Paper, height: float, **options: object) -> Figure:
     """An empty figure of whole pixels, without any of pyplot's state; options are those of matplotlib's ``Figure``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -276,7 +242,7 @@ class Heading:
 
 
 class Grid:
-    """Places of pictures of one size; row names stand upright at the left, headings above the columns.
+    """A figure of pictures of one size, laid out in mm: row names upright at the left, headings above the columns.
 
     Args:
         paper: width, resolution and font.
@@ -334,23 +300,43 @@ class Grid:
         """Left and top of a picture, in mm."""
         return self.left + column * (self.width + GAP), self.header + row * (self.height + GAP)
 
-    def page(self) -> Page:
-        """A page with all labels on it."""
-        page = Page(self.paper, self.total)
+    def draw_labels(self) -> Figure:
+        """Make the figure with all labels on it; call it inside :func:`style`."""
+        self.figure = new_figure(self.paper, self.total)
+        line, small_line = line_height(TEXT), line_height(SMALLEST_TEXT)
         for row, lines in enumerate(self.names):
-            _, top = self.place(row, 0)
+            middle = self.place(row, 0)[1] + self.height / 2
             shown = lines if len(lines) <= NAME_LINES else [*lines[: NAME_LINES - 1], lines[NAME_LINES - 1][:-1] + "…"]
             for number, text in enumerate(reversed(shown)):
-                x = self.left - GAP - (number + 0.5) * line_height(TEXT)
-                page.text(text, x, top + self.height / 2, rotation=90)
-        small = line_height(SMALLEST_TEXT) * any(heading.small for heading in self.columns)
+                self._text(text, self.left - GAP - (number + 0.5) * line, middle, rotation=90)
+        small = small_line * any(heading.small for heading in self.columns)
         for column, heading in enumerate(self.columns):
             x = self.place(0, column)[0] + self.width / 2
             if heading.small:
-                page.text(heading.small, x, self.header - GAP / 2 - small / 2, size=SMALLEST_TEXT, color=GREY)
+                self._text(heading.small, x, self.header - GAP / 2 - small / 2, size=SMALLEST_TEXT, color=GREY)
             for number, text in enumerate(reversed(self.headings[column])):
-                page.text(text, x, self.header - GAP / 2 - small - (number + 0.5) * line_height(TEXT))
+                self._text(text, x, self.header - GAP / 2 - small - (number + 0.5) * line)
         if self.remark:
-            y = self.bottom + GAP / 2 + line_height(SMALLEST_TEXT) / 2
-            page.text(self.remark, self.end, y, ha="right", size=SMALLEST_TEXT, color=GREY)
-        return page
+            y = self.bottom + GAP / 2 + small_line / 2
+            self._text(self.remark, self.end, y, ha="right", size=SMALLEST_TEXT, color=GREY)
+        return self.figure
+
+    def picture(self, picture: npt.NDArray[np.uint8], row: int, column: int) -> None:
+        """Show a picture (height, width, 3) at its place, pixel for pixel."""
+        height, width = picture.shape[:2]
+        left, top = (self.paper.pixels(mm) for mm in self.place(row, column))
+        axes = self._axes(left, top, width, height)
+        axes.set_axis_off()
+        axes.imshow(picture, interpolation="none", aspect="auto", extent=(0, width, 0, height))
+
+    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
+        """Axes in a rectangle in mm, whose edges lie on whole pixels."""
+        return self._axes(*(self.paper.pixels(mm) for mm in (left, top, width, height)))
+
+    def _axes(self, left: int, top: int, width: int, height: int) -> Axes:
+        across, down = self.paper.pixels(self.paper.width), self.paper.pixels(self.total)
+        return self.figure.add_axes((left / across, 1 - (top + height) / down, width / across, height / down))
+
+    def _text(self, text: str, x: float, y: float, **options: object) -> None:
+        settings: dict[str, Any] = {"va": "center", "ha": "center", "size": TEXT, **options}
+        self.figure.text(x / self.paper.width, 1 - y / self.total, plain(text), **settings)

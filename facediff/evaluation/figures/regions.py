@@ -1,4 +1,4 @@
-"""A picture of the vertices that the scores of a corpus look at: its lips and upper face, drawn on its mesh."""
+"""A picture of the vertices that LVE and FDD use: a corpus's lips and upper face, drawn on its mesh."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from facediff.render import Renderer, save_image, side_by_side
 from facediff.render.panels import draw_text
 
 COLOURS: dict[str, tuple[int, int, int]] = {"lips": (214, 40, 57), "upper_face": (38, 102, 207)}
-"""Colour (sRGB) of each region; vertices of both take the last."""
+"""Colour (sRGB) of each region; vertices of both have the last."""
 
 REST = (219, 209, 200)
 """Colour (sRGB) of all other vertices."""
 
 VIEWS = {"front": "front", "three_quarter": "three-quarter"}
-"""Views from left to right, with what is written above them."""
+"""Views from left to right, with the text above them."""
 
 
 def draw_regions(
@@ -36,14 +36,14 @@ def draw_regions(
     upper_face: str | None = None,
     size: int = 640,
 ) -> list[str]:
-    """Draw a corpus's lips and upper face, the vertices that LVE and FDD look at, on its mesh.
+    """Draw a corpus's lips and upper face, the vertices that LVE and FDD use, on its mesh.
 
     Args:
         root: the corpus folder; its mesh and region files are needed, no clips.
         output: the picture (.png).
         corpus: what the folder is: a corpus's name, or the import path of its data module; recognised if None.
         lips: source of the lips; the corpus's own if None.
-        upper_face: likewise.
+        upper_face: source of the upper face; the corpus's own if None.
         size: height of each view in pixels.
 
     Returns:
@@ -88,7 +88,7 @@ def find_mesh(root: Path, view: View) -> Mesh:
     """The corpus's mesh: its neutral vertices and its faces.
 
     Raises:
-        FaceDiffError: if there is no mesh file, or it is none of this corpus.
+        FaceDiffError: if there is no mesh file, or it does not belong to this corpus.
     """
     mesh = Corpus(root, view.n_vertices, view.frame_rate, stored_frame_rate=view.frame_rate).read_mesh(view.mesh_files)
     if mesh is None and not view.mesh_files:
@@ -101,7 +101,7 @@ def find_mesh(root: Path, view: View) -> Mesh:
 
 
 def legend(root: Path, sources: Sequence[str], region: Region) -> str:
-    """A region in one line: name, vertex count, hash, source, and how often its source repeats itself."""
+    """A region in one line: name, vertex count, hash, source, and how many indices its source repeats."""
     used = next((source for source in sources if (root / source.partition(":")[0]).is_file()), sources[0])
     repeated = f", {region.duplicates} repeated indices counted once" if region.duplicates else ""
     return f"{region} from {used}{repeated}"
