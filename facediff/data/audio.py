@@ -1,4 +1,4 @@
-"""Reading speech: any common file, any rate, mono or not, to 16 kHz mono."""
+"""Reading speech: files of any common format, rate and number of channels become 16 kHz mono."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from facediff.utils.arrays import ArrayStore
 
 SUFFIXES = (".wav", ".flac", ".ogg", ".mp3", ".opus", ".aiff")
 CONTAINERS = (".flv", ".m4a", ".mp4", ".mov", ".mkv", ".webm", ".avi", ".aac")
-"""Videos and their like, whose sound PyAV takes out."""
+"""Videos and similar containers, whose sound PyAV extracts."""
 
 
 def read_speech(path: Path) -> npt.NDArray[np.float32]:
@@ -48,7 +48,7 @@ def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.
     except ImportError as error:
         raise MissingExtraError("soxr", "audio", "resampling speech") from error
     if not np.isfinite(samples).all():
-        raise FaceDiffError(f"{name}: holds samples that are not finite numbers; convert it anew")
+        raise FaceDiffError(f"{name}: holds samples that are not finite numbers; convert it again")
     mono = samples if samples.ndim == 1 else samples.mean(axis=1)
     if rate != SAMPLE_RATE:
         mono = soxr.resample(mono, rate, SAMPLE_RATE, quality="HQ")
@@ -56,7 +56,7 @@ def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.
 
 
 def resampler(rate: int) -> Callable[[npt.NDArray[np.float32], bool], npt.NDArray[np.float32]]:
-    """Converts pieces of a stream (n,) at any rate to 16 kHz; the second argument says that no more will come.
+    """Converts pieces of a stream (n,) at any rate to 16 kHz; the second argument marks the last piece.
 
     Raises:
         MissingExtraError: if soxr is not installed.
@@ -89,7 +89,7 @@ def _decode_container(path: Path) -> tuple[npt.NDArray[np.float32], int]:
         import av
         from av.audio.resampler import AudioResampler
     except ImportError as error:
-        raise MissingExtraError("av", "prepare", f"taking the sound out of {path.suffix} files") from error
+        raise MissingExtraError("av", "prepare", f"extracting the sound of {path.suffix} files") from error
     try:
         with av.open(str(path)) as container:
             if not container.streams.audio:
@@ -107,7 +107,7 @@ def _decode_container(path: Path) -> tuple[npt.NDArray[np.float32], int]:
 def read_stretch(path: Path, first: int, length: int, store: ArrayStore | None) -> npt.NDArray[np.float32]:
     """Samples ``first`` to ``first + length`` at 16 kHz, (length,) float32, filled with zeros past the end.
 
-    Of a 16 kHz mono file nothing else is read. Any other file is decoded as a whole once and kept in ``store``.
+    Of a 16 kHz mono file only these samples are read. Any other file is decoded as a whole once and kept in ``store``.
 
     Raises:
         FaceDiffError: as :func:`read_speech`.
@@ -120,10 +120,10 @@ def read_stretch(path: Path, first: int, length: int, store: ArrayStore | None) 
                 file.seek(min(first, file.frames))
                 samples = file.read(length, dtype="float32")
                 if not np.isfinite(samples).all():
-                    raise FaceDiffError(f"{path}: holds samples that are not finite numbers; convert it anew")
+                    raise FaceDiffError(f"{path}: holds samples that are not finite numbers; convert it again")
                 return fit_length(samples, length)
     except (soundfile.LibsndfileError, RuntimeError):
-        pass  # told in detail below
+        pass  # read_speech reports below what is wrong
     if store is None or not path.is_file():
         return fit_length(read_speech(path)[first:], length)
     facts = path.stat()

@@ -1,7 +1,7 @@
-"""THE data contract: what one clip and one batch of clips are, for every corpus and every model.
+"""The data contract: one clip, one batch of clips, and what a checkpoint keeps of a corpus.
 
 Audio is 16 kHz mono float32 and spans exactly the time of the motion. Motion is offsets from the speaker's neutral
-template, in the corpus's unit of length. Tensors are padded with zeros; lengths say what is valid.
+template, in the corpus's unit of length. Tensors are padded with zeros; lengths tell which part is valid.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ class Sample:
         audio: waveform at 16 kHz.
         motion: offsets from the template.
         template: neutral face.
-        identity: index into the training identities, −1 for anybody else.
+        identity: index into the training identities, −1 for any other.
         reference: motion that carries the speaking style.
         name: the clip's name, ``<identity>_<sentence>``.
-        identity_name: whose face it is.
+        identity_name: the speaker's name.
         sentence: which sentence is spoken.
-        reference_name: the clip that the reference was taken from.
+        reference_name: the clip that the reference comes from.
         decoy_audio: speech of another sentence, as long as ``audio``; only for evaluation against shuffled audio.
-        features: what the frozen part of the audio encoder makes of the clip's speech; None where it is not cached.
-        repeated: whether another process scores the same clip.
-        style: a style vector that a model made, in place of what it would make of ``reference``.
+        features: the clip's speech, encoded by the frozen part of the audio encoder; None where it is not cached.
+        repeated: whether another process scores the same clip, so that this one must not.
+        style: a style vector to be used instead of encoding ``reference``.
     """
 
     audio: Float[Tensor, " samples"]
@@ -57,7 +57,9 @@ class Sample:
 
 @dataclass
 class Batch:
-    """Several clips, padded to the longest; the fields are those of :class:`Sample` with a batch dimension.
+    """Several clips, padded to the longest.
+
+    The fields are those of :class:`Sample`, where they are explained, with a batch dimension.
 
     Attributes:
         audio: padded waveforms.
@@ -65,18 +67,18 @@ class Batch:
         motion: padded offsets from the template.
         frame_lengths: valid frames of each clip.
         template: neutral faces.
-        identity: indices into the training identities, −1 for anybody else.
+        identity: indices into the training identities, −1 for any other.
         reference: padded reference motions.
         reference_lengths: valid frames of each reference.
         names: clip names.
-        identity_names: whose faces.
-        sentences: which sentences.
-        reference_names: the clips that the references were taken from.
+        identity_names: the speakers' names.
+        sentences: what is spoken.
+        reference_names: the clips that the references come from.
         decoy_audio: padded speech of other sentences, with the lengths of ``audio``; evaluation only.
         features: padded features of the frozen part of the audio encoder; None unless all clips have them.
         feature_lengths: valid steps of the features.
-        repeated: whether other processes score these clips, so that this one must not.
-        style: style vectors in place of what a model would make of the references; None unless all clips have one.
+        repeated: whether other processes score these clips.
+        style: style vectors; None unless all clips have one.
     """
 
     audio: Float[Tensor, "batch samples"]
@@ -196,7 +198,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
     )
 
 
-# What a checkpoint must hold about its corpus to animate a face without the corpus.
+# What a checkpoint keeps of its corpus, so that it animates a face without the corpus.
 
 FORMAT_KEY = "facediff_format"
 """Where a checkpoint keeps :data:`FORMAT`."""
@@ -213,10 +215,10 @@ DATA_SOURCE_KEY = "facediff_data"
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference motion that carries a person's style.
+    """A reference motion that carries a speaking style.
 
     Attributes:
-        clip: the clip it was taken from.
+        clip: the clip that it comes from.
         motion: offsets from the template, half precision to keep checkpoints small.
     """
 
@@ -232,7 +234,7 @@ class Assets:
         corpus: name of the corpus.
         synthetic: whether the corpus was made by a program rather than captured from people.
         unit: unit of length of templates and motion.
-        frame_rate: motion frames a second.
+        frame_rate: motion frames per second.
         identities: the training identities, in the order of the identity index.
         templates: neutral face of every identity.
         faces: triangles; None where the corpus has no mesh file.
@@ -274,8 +276,8 @@ class Assets:
         return self.templates[identity]
 
     def identity_index(self, identity: str) -> int:
-        """Index of a training identity, −1 for anybody else."""
-        return self.identities.index(identity) if identity in self.identities else -1
+        """Index of a training identity, −1 for any other."""
+        return self.identities.index(identity) if identity in self.identities else UNKNOWN_IDENTITY
 
     def with_motion_scale(self, scale: float | None) -> Assets:
         """The same with another motion scale."""

@@ -1,4 +1,4 @@
-"""Clips of one split as samples: windows, style references, decoy speech."""
+"""The clips of one split as samples: cached features, windows, style references, and how clips make batches."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import ArrayStore
 
-# Features of an audio encoder's frozen part, kept on disk, one array a clip.
+# Features of an audio encoder's frozen part, kept on disk, one array for each clip.
 
 
 class FeatureSlot:
-    """Where cached features are looked for when a sample is read; may be filled after the loaders were made."""
+    """Where a data set looks for cached features; its reader may be set after the loaders were made."""
 
     def __init__(self) -> None:
         self.reader: Callable[[Clip], Tensor | None] | None = None
@@ -38,8 +38,8 @@ class CachedFeatures:
     """Reads the features of clips whose speech has been encoded before.
 
     Args:
-        store: where they lie.
-        encoder_key: what decides the features beside the speech: weights, layer, precision.
+        store: the folder that holds them.
+        encoder_key: what decides the features in addition to the speech: weights, layer, precision.
     """
 
     def __init__(self, store: ArrayStore, encoder_key: str) -> None:
@@ -48,24 +48,24 @@ class CachedFeatures:
         self._keys: dict[str, str] = {}
 
     def add(self, corpus: Corpus, clip: Clip) -> Tensor | None:
-        """Take a clip up; its whole speech (samples,) if that has yet to be encoded, None if its features are there."""
+        """Register a clip; returns its whole speech (samples,) if it must be encoded, None if it is cached."""
         audio = corpus.read_audio(clip, 0, corpus.frames(clip))
         key = self.store.key(self.encoder_key, hashlib.sha256(audio.numpy().tobytes()).hexdigest())
         self._keys[clip.name] = key
         return audio if self.store.get(key) is None else None
 
     def put(self, clip: Clip, features: Tensor) -> None:
-        """Keep the features (steps, channels) of a clip that was taken up."""
+        """Store the features (steps, channels) of a registered clip."""
         self.store.put(self._keys[clip.name], features.detach().float().cpu().numpy())
 
     def __call__(self, clip: Clip) -> Tensor | None:
-        """The features (steps, channels) of a clip's whole speech; None for a clip that was not taken up."""
+        """The features (steps, channels) of a clip's whole speech; None for a clip that was not registered."""
         key = self._keys.get(clip.name)
         stored = None if key is None else self.store.get(key)
         return None if stored is None else torch.from_numpy(np.array(stored, np.float32))
 
 
-# Which clips make a batch, on which process, with which random draws.
+# Which clips make a batch, on which process, with which random numbers.
 
 BUCKETS = 32
 """Into how many lengths a frame budget is divided for bucketing."""
@@ -77,7 +77,7 @@ class Pick:
 
     Attributes:
         index: which clip.
-        seed: seed of its random draws (window, style reference).
+        seed: seed of its random choices (window, style reference).
         repeated: whether another process has the same clip, so that it must not be scored here.
     """
 
@@ -87,30 +87,30 @@ class Pick:
 
 
 class ClipBatches(DistributedSampler[list[Pick]]):
-    """Batches of clips, the same for a seed and an epoch however many workers read them.
+    """Batches of clips, which depend on seed and epoch but not on the number of loader processes.
 
-    Either ``batch_size`` clips a batch, or, with ``max_frames``, as many clips of like length as fit into that many
-    frames once they are padded to the longest. The draws of a clip follow from seed, epoch and clip alone.
+    A batch has ``batch_size`` clips or, with ``max_frames``, as many clips of similar length as fit into that many
+    frames once they are padded to the longest. Window and style reference of a clip follow from seed, epoch and clip.
 
-    It is a ``DistributedSampler`` in the sense that each process iterates over its own share of the same batches, so
-    Lightning leaves it as it is. All processes get equally many batches, for they wait for one another at each. In
-    training that may repeat some batches of an epoch's last step. In evaluation every clip is scored once: batches are
-    split until their number goes up in the processes; where all are single clips, a process that would be idle in the
-    last step gets a clip that is marked as repeated.
+    It is a ``DistributedSampler``, so that Lightning does not replace it: each process iterates over its own share of
+    the same batches. All processes get equally many batches, since they wait for one another at each. In training this
+    may repeat some batches in an epoch's last step. In evaluation every clip is scored once: batches are split until
+    their number is a multiple of the number of processes; where all batches are single clips, a process that would be
+    idle in the last step gets a clip that is marked as repeated.
 
     With ``groups``, training batches are made of pairs of neighbours: clips 2k and 2k + 1 of a batch are of one group
-    (one sentence, say) as far as there are such clips. A clip that is left over is paired with one that already has a
-    partner.
+    (for example one sentence) as far as there are such clips. A clip that is left over is paired with one that already
+    has a partner.
 
     Args:
-        lengths: frames of every clip; looked at with ``max_frames`` only.
+        lengths: frames of every clip; used with ``max_frames`` only.
         batch_size: clips a batch.
         max_frames: padded frames a batch; a longer clip is a batch of its own.
-        training: shuffle, and let every process have equally many batches.
-        seed: of order and draws.
+        training: shuffle, and repeat batches where processes would get unequally many.
+        seed: seed of the order and of the clips' random choices.
         rank: this process.
         world_size: number of processes.
-        groups: per clip what pairs have in common; None for no pairs.
+        groups: for each clip what pairs have in common; None for no pairs.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         world_size: int = 1,
         groups: Sequence[str] | None = None,
     ) -> None:
-        clips: Any = range(len(lengths))  # only its length is looked at
+        clips: Any = range(len(lengths))  # only its length is used
         super().__init__(clips, num_replicas=world_size, rank=rank, shuffle=training, seed=seed)
         self.lengths = list(lengths)
         self.batch_size = batch_size
@@ -138,10 +138,10 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         return -(-len(self._all(torch.Generator())) // self.num_replicas)
 
     def __iter__(self) -> Iterator[list[Pick]]:
-        """This process's batches of the present epoch."""
+        """This process's batches of the current epoch."""
         batches = self._all(torch.Generator().manual_seed(self._hash("order")))
         for place in range(self.rank, len(batches), self.num_replicas):
-            # Where clips are repeated every batch is one clip, and those behind the last clip are the repeated ones.
+            # Clips are repeated only where every batch is a single clip, so places past the last clip are repeated ones.
             repeated = not self.training and place >= len(self.lengths)
             yield [Pick(i, self._hash(i) if self.training else 0, repeated) for i in batches[place]]
 
@@ -155,7 +155,9 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         if self.max_frames is None:
             each = max(1, self.batch_size // (1 if self.groups is None else 2))
             return [sum(units[i : i + each], []) for i in range(0, len(units), each)]
-        # Rounded up to a bucket, lengths give equally many batches in every epoch, whoever shares a bucket.
+        # Lengths are rounded up to buckets. Otherwise the number of batches would depend on which clips the shuffle
+        # puts together, and the length of an epoch would change.
+
         width = max(1, self.max_frames // BUCKETS)
         rounded = [-(-max(self.lengths[i] for i in unit) // width) * width for unit in units]
         batches: list[list[int]] = []
@@ -169,7 +171,8 @@ class ClipBatches(DistributedSampler[list[Pick]]):
     def _all(self, generator: torch.Generator) -> list[list[int]]:
         """The batches of all processes, in turn.
 
-        In training, batches of one step are neighbours in length, and steps are shuffled.
+        In training, the batches of one step are neighbours in length, so that no process waits long for another; the
+        steps are shuffled.
         """
         world, batches = self.num_replicas, self._batches(generator)
         if not self.training:
@@ -193,7 +196,7 @@ def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generat
     members: dict[str, list[int]] = {}
     for index in order:
         members.setdefault(groups[index], []).append(index)
-    # Those that are alone in their group are paired with one another.
+    # Clips that are alone in their group are paired with one another.
     alone = [clips[0] for clips in members.values() if len(clips) == 1]
     pools = [clips for clips in members.values() if len(clips) > 1] + ([alone] if alone else [])
     pairs = []
@@ -231,7 +234,7 @@ class ReferencePolicy:
     """Which clip gives a target its style reference.
 
     Attributes:
-        candidates: clips that may serve, by identity; never a clip of an evaluated split.
+        candidates: clips that may serve, by identity; never a clip of an evaluated split where there are others.
         same: clip attributes that target and reference share where possible, e.g. the mood.
         choice: another clip of the same speaker, or (in training only) the target itself.
         max_frames: longest reference; longer clips are cut to a window.
@@ -243,7 +246,7 @@ class ReferencePolicy:
     max_frames: int
 
     def check(self, targets: Sequence[Clip]) -> None:
-        """Find out before training that a clip has nothing to take a style from.
+        """Find out before training that a clip has no style reference.
 
         Raises:
             FaceDiffError: as :meth:`eligible`.
@@ -261,32 +264,32 @@ class ReferencePolicy:
         others = [clip for clip in self.candidates.get(target.identity, []) if clip.name != target.name]
         if not others:
             raise FaceDiffError(
-                f"clip {target.name}: speaker {target.identity} has no other clip to take a style reference from; "
-                f"add clips outside the test sentences, or train with data.reference=self"
+                f"clip {target.name}: {target.identity} has no other clip that could be its style reference; add clips "
+                f"outside the test sentences, or train with data.reference=self"
             )
         alike = [c for c in others if all(c.attributes.get(k) == target.attributes.get(k) for k in self.same)]
         return alike or others
 
 
 FeatureReader = Callable[[Clip], Tensor | None]
-"""Gives the cached features (steps, channels) of a whole clip's speech, or None."""
+"""Returns the cached features (steps, channels) of a whole clip's speech, or None."""
 
 
 class MotionDataset(Dataset[Sample]):
     """Samples of one split.
 
-    Training samples draw their window and their reference at random; evaluation samples are whole clips with a
-    reference fixed by the clip's name.
+    Training samples have a random window and a random reference; evaluation samples are whole clips whose reference
+    follows from the clip's name.
 
     Args:
-        corpus: where the clips are.
+        corpus: the corpus that holds the clips.
         clips: the clips of the split, in order.
         identities: training identities in the order of the identity index.
         policy: how style references are chosen.
         training: random windows and references.
         window: longest training window in frames; whole clips if None.
-        decoys: give every clip the speech of another sentence beside its own.
-        features: gives cached features of the speech, if there are any.
+        decoys: give every clip the speech of another sentence in addition to its own.
+        features: returns cached features of the speech, if there are any.
     """
 
     def __init__(
@@ -315,16 +318,16 @@ class MotionDataset(Dataset[Sample]):
         return len(self.clips)
 
     def __getitem__(self, index: int) -> Sample:
-        """Read one clip from disk; training samples are drawn with torch's global generator."""
+        """Read one clip from disk; in training, window and reference depend on torch's global generator."""
         return self.sample(Pick(index, int(torch.randint(2**31, ())) if self.training else 0))
 
     def sample(self, pick: Pick) -> Sample:
-        """Read one clip from disk, with the draws of a seed."""
-        index, draw = pick.index, torch.Generator().manual_seed(pick.seed)
+        """Read one clip from disk, with a window and a reference that follow from a seed."""
+        index, random = pick.index, torch.Generator().manual_seed(pick.seed)
         clip = self.clips[index]
         frames = self.corpus.frames(clip)
-        start, stop = self._window(frames, self.window, draw)
-        reference, reference_name = self._reference(clip, draw)
+        start, stop = self._window(frames, self.window, random)
+        reference, reference_name = self._reference(clip, random)
         return Sample(
             audio=self.corpus.read_audio(clip, start, stop),
             motion=self.corpus.read_motion(clip, start, stop),
@@ -345,24 +348,24 @@ class MotionDataset(Dataset[Sample]):
         counts = [self.corpus.frames(clip) for clip in self.clips]
         return counts if self.window is None else [min(count, self.window) for count in counts]
 
-    def _window(self, frames: int, longest: int | None, draw: torch.Generator) -> tuple[int, int]:
+    def _window(self, frames: int, longest: int | None, random: torch.Generator) -> tuple[int, int]:
         if longest is None or frames <= longest:
             return 0, frames
-        start = int(torch.randint(frames - longest + 1, (), generator=draw)) if self.training else 0
+        start = int(torch.randint(frames - longest + 1, (), generator=random)) if self.training else 0
         return start, start + longest
 
-    def _reference(self, clip: Clip, draw: torch.Generator) -> tuple[Tensor, str]:
+    def _reference(self, clip: Clip, random: torch.Generator) -> tuple[Tensor, str]:
         if self.training and self.policy.choice == "self":
             source = clip
         else:
             eligible = self.policy.eligible(clip)
             pick = (
-                int(torch.randint(len(eligible), (), generator=draw))
+                int(torch.randint(len(eligible), (), generator=random))
                 if self.training
                 else zlib.crc32(clip.name.encode()) % len(eligible)
             )
             source = eligible[pick]
-        start, stop = self._window(self.corpus.frames(source), self.policy.max_frames, draw)
+        start, stop = self._window(self.corpus.frames(source), self.policy.max_frames, random)
         return self.corpus.read_motion(source, start, stop), source.name
 
     def _features(self, clip: Clip, start: int, stop: int, frames: int) -> Tensor | None:
@@ -375,7 +378,7 @@ class MotionDataset(Dataset[Sample]):
         return whole[first : max(first + 1, math.ceil(stop * per_frame))].float()
 
     def _decoy(self, index: int, frames: int) -> Tensor | None:
-        """The next clip of the split that says something else, repeated or cut to ``frames``; None if there is none."""
+        """Speech of the next clip with another sentence, repeated or cut to ``frames``; None if there is none."""
         own = self.clips[index]
         order = self.clips[index + 1 :] + self.clips[:index]
         others = [clip for clip in order if clip.sentence != own.sentence]
@@ -387,7 +390,7 @@ class MotionDataset(Dataset[Sample]):
 
 
 class BatchDataset(Dataset[list[Sample]]):
-    """What :class:`~facediff.data.dataset.ClipBatches` picks from a dataset, a batch at a time."""
+    """The batches that :class:`~facediff.data.dataset.ClipBatches` picks from a data set."""
 
     def __init__(self, samples: MotionDataset) -> None:
         self.samples = samples
