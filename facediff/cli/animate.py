@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from facediff.cli.options import Checkpoint, ControlOptions, File, Identity, Output, OutputOptions, Seed, Workers
 from facediff.cli.parsing import Option
-from facediff.errors import FaceDiffError, choices
-
-if TYPE_CHECKING:
-    from facediff.pipelines.animate import AnimationOptions
+from facediff.errors import FaceDiffError
 
 
 @dataclass(frozen=True)
@@ -147,7 +142,18 @@ def animate(
         animate_stream(options, output, rate=windows.rate, seed=seed)
         return 0
     if len(speech) > 1 or speech[0].is_dir():
-        return animate_batch(options, speech, output, batch, seed=seed, max_seconds=windows.max_seconds)
+        from facediff.pipelines.folder import animate_folder
+
+        return animate_folder(
+            options,
+            speech,
+            output,
+            batch.suffix,
+            seed=seed,
+            max_seconds=windows.max_seconds,
+            workers=batch.workers,
+            retry_failed=batch.retry_failed,
+        )
     options.check(output)
     refuse_replacing(speech, [output])
     samples_of_speech = read_recording(speech[0], windows.max_seconds)  # before the model, which takes longer to load
@@ -159,99 +165,3 @@ def animate(
         print(f"{path}: {line}")
         line = "next to it"
     return 0
-
-
-def animate_batch(
-    options: AnimationOptions,
-    speech: list[Path],
-    output: Path,
-    batch: BatchOptions,
-    *,
-    seed: int,
-    max_seconds: float | None,
-) -> int:
-    """Animate many recordings into a folder.
-
-    Raises:
-        FaceDiffError: if nothing can be made at all.
-    """
-    from facediff.export import FORMATS
-    from facediff.models.styles import style_paths
-    from facediff.pipelines.folder import recordings, run_folder
-
-    suffix = batch.suffix
-    if suffix not in FORMATS:
-        raise FaceDiffError(f"--suffix {suffix}: there is no such format: {choices(suffix, FORMATS)}")
-    if output.suffix in FORMATS and not output.is_dir():
-        raise FaceDiffError(
-            f"--output {output}: several recordings go into a folder; give its name, and --suffix {output.suffix}"
-        )
-    options.check(output / f"recording{suffix}")
-    if FORMATS[suffix].is_folder or (options.samples > 1 and not FORMATS[suffix].holds_several):
-        fit = ".html or .mp4, which show several" if options.samples > 1 else "a format of one file, such as .glb"
-        raise FaceDiffError(f"--suffix {suffix}: a batch writes one file for each recording; choose {fit}")
-    found = recordings(speech)
-    if options.correspondence is not None and not options.correspondence.exists():
-        write_correspondence(options)
-    template = None if options.style_template is None else Path(options.style_template)
-    files = [options.checkpoint, *style_paths(options.style)]
-    optional = (options.target_mesh, options.controls.eyes, options.correspondence, template)
-    files += [path for path in optional if path is not None and path.is_file()]
-    shapes = options.export.shapes
-    if shapes is not None:
-        inside = sorted(shapes.iterdir()) if shapes.is_dir() else [shapes]
-        files += [path for path in inside if path.is_file()]
-    quiet = replace(options, quiet=True, export=replace(options.export, quiet=True))
-    decides = {**asdict(quiet), "seed": seed, "max_seconds": max_seconds}
-    return run_folder(
-        found,
-        output,
-        suffix,
-        [f"{name}={json.dumps(value, default=str)}" for name, value in decides.items()],
-        make_worker=BatchWorker(quiet, seed, max_seconds),
-        files=files,
-        workers=batch.workers or (None if options.device == "cpu" else 1),  # one accelerator holds one model
-        retry_failed=batch.retry_failed,
-    )
-
-
-@dataclass(frozen=True)
-class BatchWorker:
-    """Makes the function by which a process of a batch animates a recording; the model is loaded once."""
-
-    options: AnimationOptions
-    seed: int
-    max_seconds: float | None
-
-    def __call__(self, command: list[str]) -> Callable[[Path, Path], None]:
-        """The function of a recording and an output."""
-        from facediff.pipelines.animate import AnimationPipeline, read_recording
-        from facediff.pipelines.folder import seed_of_recording
-
-        pipeline = AnimationPipeline(self.options)
-
-        def animate(recording: Path, output: Path) -> None:
-            speech = read_recording(recording, self.max_seconds)
-            pipeline.write(speech, recording.stem, output, seed=seed_of_recording(recording, self.seed))
-
-        return animate
-
-
-def write_correspondence(options: AnimationOptions) -> None:
-    """Fit the target mesh, once and before a batch.
-
-    Otherwise every process would fit it, and a second run would find a file that decides the outputs and that the
-    records of the first one do not know.
-
-    Raises:
-        FaceDiffError: if a file is unreadable, or the meshes do not fit.
-    """
-    from facediff.animation import Animation
-    from facediff.editing.retargeting import retarget
-    from facediff.models.checkpoint import read_assets
-    from facediff.pipelines.animate import facts_of
-
-    facts = facts_of(read_assets(options.checkpoint), options.identity)
-    neutral = Animation(name=str(options.checkpoint), vertices=facts["template"][None], **facts)
-    if options.target_mesh is not None:
-        retarget(neutral, options.target_mesh, options.correspondence)

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
-from facediff.errors import FaceDiffError
-from facediff.pipelines.animate import refuse_replacing
+from facediff.animation import Animation
+from facediff.editing.retargeting import retarget
+from facediff.errors import FaceDiffError, choices
+from facediff.export import FORMATS
+from facediff.models.checkpoint import read_assets
+from facediff.models.styles import style_paths
+from facediff.pipelines.animate import (
+    AnimationOptions,
+    AnimationPipeline,
+    facts_of,
+    read_recording,
+    refuse_replacing,
+)
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.files import check_writable, locked, remove_partial
 from facediff.utils.jobs import PerWorker
@@ -26,6 +39,90 @@ Animate = Callable[[Path, Path], None]
 """Animates a recording (first) and writes a file (second), whole or not at all."""
 MakeWorker = Callable[[list[str]], Animate]
 """Takes the options and loads what all recordings have in common."""
+
+
+def animate_folder(
+    options: AnimationOptions,
+    speech: Sequence[Path],
+    output: Path,
+    suffix: str = ".mp4",
+    *,
+    seed: int = 0,
+    max_seconds: float | None = None,
+    workers: int | None = None,
+    retry_failed: bool = False,
+) -> int:
+    """Animate many recordings into a folder.
+
+    Args:
+        options: how each recording is animated.
+        speech: recordings, and folders of them.
+        output: folder for the animations.
+        suffix: format of the animations.
+        seed: from which each recording's own seed follows, together with the name of its file.
+        max_seconds: recordings that last longer fail.
+        workers: processes; as many as processors if None, one on an accelerator, which holds one model.
+        retry_failed: try recordings again that failed before.
+
+    Returns:
+        the exit status: 0 if all animations are there, 1 if a recording failed.
+
+    Raises:
+        FaceDiffError: if nothing can be made at all: the folder, the options or the checkpoint cannot be used.
+    """
+    if suffix not in FORMATS:
+        raise FaceDiffError(f"--suffix {suffix}: there is no such format: {choices(suffix, FORMATS)}")
+    if output.suffix in FORMATS and not output.is_dir():
+        raise FaceDiffError(
+            f"--output {output}: several recordings go into a folder; give its name, and --suffix {output.suffix}"
+        )
+    options.check(output / f"recording{suffix}")
+    if FORMATS[suffix].is_folder or (options.samples > 1 and not FORMATS[suffix].holds_several):
+        fit = ".html or .mp4, which show several" if options.samples > 1 else "a format of one file, such as .glb"
+        raise FaceDiffError(f"--suffix {suffix}: a batch writes one file for each recording; choose {fit}")
+    found = recordings(speech)
+    if options.target_mesh is not None and options.correspondence is not None and not options.correspondence.exists():
+        # Otherwise every process would fit the mesh, and a second run would find a file that decides the outputs and
+        # that the records of the first one do not know.
+        facts = facts_of(read_assets(options.checkpoint), options.identity)
+        neutral = Animation(name=str(options.checkpoint), vertices=facts["template"][None], **facts)
+        retarget(neutral, options.target_mesh, options.correspondence)
+    quiet = replace(options, quiet=True, export=replace(options.export, quiet=True))
+    decides = {**asdict(quiet), "seed": seed, "max_seconds": max_seconds}
+    return run_folder(
+        found,
+        output,
+        suffix,
+        [f"{name}={json.dumps(value, default=str)}" for name, value in decides.items()],
+        make_worker=partial(_load_pipeline, quiet, seed, max_seconds),
+        files=_deciding_files(options),
+        workers=workers or (None if options.device == "cpu" else 1),
+        retry_failed=retry_failed,
+    )
+
+
+def _deciding_files(options: AnimationOptions) -> list[Path]:
+    """The files whose content decides the animations."""
+    files = [options.checkpoint, *style_paths(options.style)]
+    template = None if options.style_template is None else Path(options.style_template)
+    optional = (options.target_mesh, options.controls.eyes, options.correspondence, template)
+    files += [path for path in optional if path is not None and path.is_file()]
+    shapes = options.export.shapes
+    if shapes is not None:
+        inside = sorted(shapes.iterdir()) if shapes.is_dir() else [shapes]
+        files += [path for path in inside if path.is_file()]
+    return files
+
+
+def _load_pipeline(options: AnimationOptions, seed: int, max_seconds: float | None, _command: list[str]) -> Animate:
+    """Load what all recordings have in common, once in each process."""
+    pipeline = AnimationPipeline(options)
+
+    def animate(recording: Path, output: Path) -> None:
+        speech = read_recording(recording, max_seconds)
+        pipeline.write(speech, recording.stem, output, seed=seed_of_recording(recording, seed))
+
+    return animate
 
 
 def recordings(paths: Sequence[Path]) -> list[Path]:
