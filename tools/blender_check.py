@@ -1,12 +1,13 @@
-"""Imports exported files into Blender and measures how far its vertices are from the take's.
+"""Imports exported files into Blender and measures how far their vertices are from the animation's.
 
 Needs Blender as a module, in an environment of its own (tried with 5.0.1 on Python 3.11; 940 MB)::
 
     python -m venv blender && blender/bin/pip install bpy==5.0.1
     blender/bin/python tools/blender_check.py hello.npz hello.glb hello.usdc hello.pc2 hello.mdd hello_obj hello_ply
 
-Prints the largest distance of a vertex over all frames, in millimetres, of a take in metres. A .glb is carried over to
-.fbx and .abc as well, and measured there. ``--picture FILE`` draws frames of the first file by Cycles on the processor.
+Prints the largest distance of a vertex over all frames, in millimetres, of an animation in metres. A .glb is also
+converted to .fbx and .abc, and measured there. ``--picture FILE`` renders frames of the first file with Cycles on the
+CPU.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ IMPORTERS: dict[str, Callable[[Path], Any]] = {
 
 
 def load(path: Path, frame_rate: float) -> bpy.types.Object:
-    """Import into an empty scene; gives the mesh."""
+    """Import into an empty scene and return the mesh."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.fps, scene.render.fps_base = round(frame_rate), round(frame_rate) / frame_rate
@@ -50,7 +51,7 @@ def load(path: Path, frame_rate: float) -> bpy.types.Object:
 
 
 def positions(thing: bpy.types.Object) -> np.ndarray[Any, Any]:
-    """Vertices (V, 3) of the scene's present frame in the world, z up."""
+    """Vertices (V, 3) of the scene's current frame in world coordinates, z up."""
     mesh = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
     flat = np.empty(3 * len(mesh.vertices), np.float32)
     mesh.vertices.foreach_get("co", flat)
@@ -65,7 +66,7 @@ def worst(path: Path, truth: np.ndarray[Any, Any], frame_rate: float, first: int
         files = sorted(file for file in path.iterdir() if file.suffix in (".obj", ".ply"))
         for file, frame in zip(files, truth, strict=True):
             made = positions(load(file, frame_rate))
-            # .ply says nothing about axes: its numbers stay as they are.
+            # .ply does not define axes: its numbers stay as they are.
             turned = made if file.suffix == ".obj" else made @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
             distances.append(np.linalg.norm(turned - frame, axis=-1).max())
         return float(max(distances))
@@ -77,7 +78,7 @@ def worst(path: Path, truth: np.ndarray[Any, Any], frame_rate: float, first: int
 
 
 def convert(glb: Path, folder: Path, frames: int, frame_rate: float) -> dict[str, Path]:
-    """Carry a .glb over to .fbx and .abc."""
+    """Convert a .glb to .fbx and .abc."""
     load(glb, frame_rate)
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 0, frames - 1
     fbx, alembic = folder / "a.fbx", folder / "a.abc"
@@ -93,7 +94,7 @@ def convert(glb: Path, folder: Path, frames: int, frame_rate: float) -> dict[str
 
 
 def picture(path: Path, frame_rate: float, frames: list[int], png: Path) -> None:
-    """Draw frames next to each other."""
+    """Render frames next to each other."""
     mesh, scene = load(path, frame_rate), bpy.context.scene
     corners = [mesh.matrix_world @ mathutils.Vector(corner) for corner in mesh.bound_box]
     middle = sum(corners, mathutils.Vector()) / 8
@@ -128,9 +129,9 @@ def picture(path: Path, frame_rate: float, frames: list[int], png: Path) -> None
 
 
 def main() -> None:
-    """Measure and draw."""
+    """Measure and render."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("take", type=Path, help=".npz that the files were exported from")
+    parser.add_argument("animation", type=Path, help=".npz that the files were exported from")
     parser.add_argument("files", type=Path, nargs="+")
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--frames", type=int, nargs="+", default=[0, 15, 23, 31], help="of the picture")
@@ -146,7 +147,7 @@ def main() -> None:
             lines.append(f"{file.name}: {1000 * worst(file, truth, rate):.5f} mm")
             for name, made in convert(file, Path(folder), len(truth), rate).items() if file.suffix == ".glb" else ():
                 first = 1 if name == "fbx" else 0  # Blender's frames of an .fbx start at 1
-                lines.append(f"{file.name} by way of {name}: {1000 * worst(made, truth, rate, first):.5f} mm")
+                lines.append(f"{file.name} through {name}: {1000 * worst(made, truth, rate, first):.5f} mm")
     if args.picture is not None:
         picture(args.files[0], rate, args.frames, args.picture)
     print(f"Blender {bpy.app.version_string}, {len(truth)} frames of {truth.shape[1]} vertices", *lines, sep="\n")

@@ -1,8 +1,8 @@
 """A picture of an animated .glb, read as any other program would read it.
 
 Run ``python tools/glb_sheet.py hello.glb docs/images/export_glb.png``: pygltflib reads the file, the weights of the
-morph targets are interpolated as glTF 2.0 has it and clamped to 0 … 1 as Blender does, and :mod:`facediff.render` draws
-the faces at a few times.
+morph targets are interpolated as glTF 2.0 requires and clamped to 0 … 1 as Blender does, and :mod:`facediff.render`
+draws the faces at a few times.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def values(gltf: pygltflib.GLTF2, index: int) -> NDArray[Any]:
 
 
 def main() -> None:
-    """Read, morph, draw."""
+    """Read, interpolate and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("glb", type=Path)
     parser.add_argument("png", type=Path)

@@ -1,1 +1,1 @@
-"""Changes to finished animations: retargeting, blendshapes, procedural motion, expressiveness."""
+"""Changes to finished animations: retargeting, blendshapes, expressiveness, procedural eyes and head motion."""

@@ -1,4 +1,4 @@
-"""What depends on the mesh alone: faces of a template, coarser ones, and laying faces onto one another."""
+"""Meshes: reading and coarsening them, alignment of faces, and the FLAME head model."""
 
 from facediff.mesh.alignment import (
     RigidMotion,

@@ -130,7 +130,7 @@ def robust_fit(
     used = base > 0
     if not used.all():
         source, target, base = source[:, used], target[used], base[used]
-    # The scale of the residuals has a floor relative to the target's size: points that fit exactly would divide by zero.
+    # The scale of the residuals has a floor, relative to the target's size, so that an exact fit divides by no zero.
     size = face_size(target)
     if near:
         count = len(source)

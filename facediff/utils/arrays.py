@@ -57,7 +57,7 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
         raise FaceDiffError(f"{name}: holds no numbers, its shape is {array.shape}; write it again")
     if kinds and array.dtype.kind not in kinds:
         wanted = "floating-point numbers" if kinds == "f" else "numbers"
-        raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {wanted}, at least one")
+        raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {wanted}")
     return array
 
 

@@ -1,4 +1,4 @@
-"""Laying faces onto one another, with and without vertices that move, and taking out the head's motion."""
+"""Alignment of faces, with and without vertices that move, and removal of the head's motion."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_face_size_is_the_distance_from_the_mean() -> None:
     assert face_size(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 2, 0], [0, -2, 0]]) + 7) == pytest.approx(np.sqrt(2.5))
 
 
-def test_head_motion_is_taken_out_and_told() -> None:
+def test_head_motion_is_removed_and_returned() -> None:
     known = person(frames=40)
     rest = 1000 * face()
     laid = remove_rigid_motion(known.seen, rest, np.flatnonzero(~lower_face()))
@@ -164,7 +164,7 @@ def test_head_motion_is_taken_out_and_told() -> None:
     np.testing.assert_allclose(laid.residuals, left, atol=1e-6)
 
 
-def test_all_vertices_serve_where_no_stable_ones_are_told() -> None:
+def test_all_vertices_are_used_where_no_stable_ones_are_given() -> None:
     known = person(frames=12)
     laid = remove_rigid_motion(known.seen, 1000 * face())
     np.testing.assert_allclose(laid.frames, 1000 * known.truth, atol=1e-6)

@@ -192,7 +192,7 @@ def test_broken_templates_are_refused() -> None:
         coarsen(points[:10], faces, 8)
 
 
-def test_a_missing_simplifier_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_simplifier_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     with pytest.raises(MissingExtraError, match=r"facediff\[mesh\]"):
         coarsen(*flat(), 16)

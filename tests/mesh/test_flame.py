@@ -205,7 +205,7 @@ def test_coefficients_that_are_left_out_are_zero() -> None:
         ((300,), (2, 100), (2, 6), r"jaw coefficients have shape \(2, 6\)"),
     ],
 )
-def test_wrong_parameters_are_told(
+def test_wrong_parameters_are_refused(
     shape: tuple[int, ...], expression: tuple[int, ...], jaw: tuple[int, ...], message: str
 ) -> None:
     with pytest.raises(FaceDiffError, match=message):
@@ -334,7 +334,7 @@ REGRESSOR = "scipy.sparse.csc", "csc_matrix"
         ({"v_template": self_containing()}, "chumpy.ch.Ch, which is not understood"),
     ],
 )
-def test_what_is_no_model_is_told_in_a_sentence(change: dict[str, object], message: str, tmp_path: Path) -> None:
+def test_what_is_no_model_is_refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
     content = {key: value for key, value in {**BAD, **change}.items() if value is not None}
     (tmp_path / "m.pkl").write_bytes(model_pickle(content))
     with pytest.raises(FaceDiffError, match=rf"m\.pkl: .*{message}"):

@@ -82,7 +82,7 @@ def test_the_second_call_reads_the_file(tmp_path: Path, count: list[int]) -> Non
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "bit", "text", "member", "pickle"])
-def test_a_damaged_file_is_made_anew(tmp_path: Path, count: list[int], damage: str) -> None:
+def test_a_damaged_file_is_computed_again(tmp_path: Path, count: list[int], damage: str) -> None:
     first = mesh_hierarchy(*MESH, cache=tmp_path)
     [file] = tmp_path.iterdir()
     whole = file.read_bytes()
@@ -141,7 +141,7 @@ def test_the_usual_folder_and_none_to_write_to(
     assert len(count) == 6
 
 
-def test_two_processes_at_once(tmp_path: Path) -> None:
+def test_two_processes_write_one_file(tmp_path: Path) -> None:
     program = (
         "import sys; from pathlib import Path\n"
         "from facediff.mesh.hierarchy import mesh_hierarchy\n"
@@ -156,7 +156,7 @@ def test_two_processes_at_once(tmp_path: Path) -> None:
     for run in runs:
         _, error = run.communicate(timeout=100)
         assert run.returncode == 0, error
-    [file] = tmp_path.iterdir()  # one file, nothing half-written beside it
+    [file] = tmp_path.iterdir()  # one file, nothing half-written next to it
     here = mesh_hierarchy(*MESH, cache=tmp_path / "here")
     assert file.read_bytes() == next((tmp_path / "here").iterdir()).read_bytes()
     with np.load(file, allow_pickle=False) as stored:

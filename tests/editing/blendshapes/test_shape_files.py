@@ -1,4 +1,4 @@
-"""Shapes from folders and glb files: names, units, axes and everything that may be wrong with them."""
+"""Shapes from folders and .glb files: names, units, axes and everything that may be wrong with them."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_shapes_in_another_unit_and_with_z_up_are_laid_onto_the_template(folder:
     assert any("scaled by 0.01" in note for note in made.notes)
 
 
-def test_another_persons_shapes_of_the_same_topology_are_taken_as_they_are(folder: Path) -> None:
+def test_another_speakers_shapes_of_the_same_topology_are_used_as_they_are(folder: Path) -> None:
     """A head that is a tenth larger does not scale the movements."""
     check(read_shapes(folder, 1.1 * GRID))
 
@@ -97,7 +97,7 @@ def test_without_a_neutral_face_the_template_is_it(tmp_path: Path) -> None:
         read_shapes(tmp_path, GRID + 0.005 * np.sin(100 * GRID[:, :1]))
 
 
-def test_wrong_folders_are_one_sentence(folder: Path, tmp_path: Path) -> None:
+def test_wrong_folders_are_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="no such folder"):
         read_shapes(tmp_path / "absent", GRID)
     with pytest.raises(FaceDiffError, match=r"Neutral.obj: has 36 vertices .* 35; .*--carry"):
@@ -186,7 +186,7 @@ def edited(change: dict[tuple[str | int, ...], Any]) -> bytes:
         {("accessors",): None},
     ],
 )
-def test_damaged_glbs_are_one_sentence(tmp_path: Path, change: dict[tuple[str | int, ...], Any]) -> None:
+def test_damaged_glbs_are_refused(tmp_path: Path, change: dict[tuple[str | int, ...], Any]) -> None:
     (tmp_path / "a.glb").write_bytes(edited(change))
     with pytest.raises(FaceDiffError, match=r"a\.glb: .*(export|not a readable glb)"):
         read_shapes(tmp_path / "a.glb", GRID)

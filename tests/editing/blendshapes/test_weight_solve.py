@@ -156,7 +156,7 @@ def test_the_residual_is_what_the_shapes_do_not_span() -> None:
     assert found.residual_share == pytest.approx(found.residual_rms_mm / (1000 * np.sqrt(moved)))
 
 
-def test_smoothness_is_over_the_whole_take_and_shifts_nothing() -> None:
+def test_smoothness_is_over_the_whole_animation_and_shifts_nothing() -> None:
     """Inside the bounds the answer is one linear model's; read backwards, it is the same."""
     made = shapes()
     known = 0.5 + 0.3 * np.sin(np.arange(20)[:, None] / 3 + np.arange(5))
@@ -183,7 +183,7 @@ def test_symmetry_draws_left_and_right_together() -> None:
     assert gaps[2] < 1e-3
 
 
-def test_lengths_have_no_say_in_weights() -> None:
+def test_weights_do_not_depend_on_the_unit() -> None:
     made = shapes()
     animation = animation_of(made, wild(), off=0.003)
     mm = ShapeSet(made.names, 1000 * made.neutral, 1000 * made.deltas)
@@ -253,7 +253,7 @@ def test_a_motion_that_stands_still_has_no_share() -> None:
     assert found.extra == ("mine",)
 
 
-def test_bad_motion_is_one_sentence() -> None:
+def test_bad_motion_is_refused() -> None:
     made = shapes()
     animation = animation_of(made, np.zeros((3, 5)))
     animation.vertices[1, 4, 2] = np.nan

@@ -1,4 +1,4 @@
-"""Tables as Live Link's importers read them, and what stands beside them."""
+"""Tables as Live Link's importers read them, and the files next to them."""
 
 from __future__ import annotations
 

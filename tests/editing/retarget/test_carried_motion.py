@@ -163,8 +163,8 @@ def test_a_coarser_copy_with_vertices_of_its_own(rig: Rig, faces: np.ndarray) ->
     assert error(carry_displacements(found, field(source)), field(coarse)) < LIMIT
 
 
-def test_another_persons_face_moves_its_own_lips(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> None:
-    """Without being told that the topology is one, each vertex moves about as its own counterpart does."""
+def test_another_speakers_face_moves_its_own_lips(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> None:
+    """Without knowing that the topology is the same, each vertex moves about as its own counterpart does."""
     other = build_rig(Shape(width=0.5, lips=0.7, nose_width=0.6, jaw=0.5, mouth_width=0.5, cheeks=0.5)).neutral
     known = carry_displacements(correspond(rig.neutral, faces, other, faces), motion)
     vertices, triangles, truth = reordered(other, faces, known)
@@ -207,7 +207,9 @@ def test_landmarks_lay_a_part_of_a_face_onto_the_whole(rig: Rig, faces: np.ndarr
         correspond(rig.neutral, faces, mask, cut, landmarks=np.array([[5000, 0]]))
 
 
-def test_a_carried_take_says_what_it_is(animation: Animation, far_copy: Arrays, found: Correspondence) -> None:
+def test_carried_animation_has_unit_regions_and_metadata(
+    animation: Animation, far_copy: Arrays, found: Correspondence
+) -> None:
     colours = np.zeros((len(far_copy[0]), 3), np.uint8)
     made = carry(animation, found, Mesh(far_copy[0], far_copy[1].astype(np.int32), colours))
     assert made.unit == "mm"
@@ -216,7 +218,7 @@ def test_a_carried_take_says_what_it_is(animation: Animation, far_copy: Arrays, 
     assert made.colours is colours
     assert made.metadata["identity"] == "X"
     assert "1008 vertices" in made.metadata["carried"]
-    # The map serves another identity's take as well.
+    # The correspondence can be used for another identity's animation as well.
     wide = replace(animation, template=animation.template * [1.1, 1, 1], vertices=animation.vertices * [1.1, 1, 1])
     assert carry(wide, found, Mesh(far_copy[0], far_copy[1].astype(np.int32))).unit == "mm"
     # Lips open as far as those of the source do.
@@ -239,7 +241,7 @@ def test_regions_need_more_than_half(found: Correspondence) -> None:
     assert not len(carried_region(found, np.arange(0)))
 
 
-def test_wrong_meshes_are_one_sentence(animation: Animation, far_copy: Arrays, found: Correspondence) -> None:
+def test_wrong_meshes_are_refused(animation: Animation, far_copy: Arrays, found: Correspondence) -> None:
     vertices, faces, motion = far_copy
     order = np.random.default_rng(5).permutation(len(vertices))
     with pytest.raises(FaceDiffError, match=r"target mesh: \d+ of its \d+ vertices are where others were.*reordered"):

@@ -32,7 +32,7 @@ def test_what_is_saved_comes_back(found: Correspondence, tmp_path: Path) -> None
         assert "corners" in archive.files
 
 
-def test_damaged_files_are_one_sentence(found: Correspondence, tmp_path: Path) -> None:
+def test_damaged_correspondences_are_refused(found: Correspondence, tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     with pytest.raises(FaceDiffError, match="no such file"):
         load_correspondence(path)

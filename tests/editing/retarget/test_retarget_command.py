@@ -1,4 +1,4 @@
-"""``facediff retarget``: a take on another mesh, the map kept and used again, and what is refused."""
+"""``facediff retarget``: an animation on another mesh, correspondences that are used again, and what is refused."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def face(tmp_path: Path, animation: Animation) -> Path:
     return tmp_path / "face.obj"
 
 
-def test_a_take_on_another_mesh(
+def test_retarget_writes_an_animation_on_another_mesh(
     animation: Animation,
     face: Path,
     tmp_path: Path,
@@ -72,7 +72,7 @@ def test_a_take_on_another_mesh(
     assert np.array_equal(retarget(animation, face)[0].vertices, made.vertices)
 
 
-def test_a_reordered_mesh_is_told(
+def test_retarget_names_a_reordered_mesh(
     animation: Animation,
     face: Path,
     tmp_path: Path,

@@ -23,7 +23,7 @@ def eyes() -> Eyes:
 
 @pytest.fixture(scope="session")
 def make_animation() -> Callable[..., Animation]:
-    """A take of puppet F1 with given weights of the rig, constant or (T,)."""
+    """An animation of puppet F1 with given weights of the rig, constant or (T,)."""
 
     def make(frames: int = 250, frame_rate: float = 25.0, **weights: object) -> Animation:
         rig, named = rig_of("F1"), regions()

@@ -82,7 +82,7 @@ def test_lids_meet_in_a_still_and_in_a_widened_eye_and_nothing_else_moves(
         assert made.metadata["procedural"] == "blinks (30 a minute, seed 0)"
 
 
-def test_an_eye_that_is_shut_already_stays_just_so(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
+def test_an_eye_that_is_shut_already_stays_as_it_is(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
     shut = make_animation(250, lids_close=1.0)
     made = add_blinks(shut, eyes, rate=40)
     np.testing.assert_allclose(made.vertices, shut.vertices, atol=1e-6)
@@ -94,7 +94,7 @@ def test_an_eye_that_is_shut_already_stays_just_so(make_animation: Callable[...,
 
 
 @pytest.mark.parametrize("frames", [0, 1, 5])
-def test_takes_too_short_for_a_blink_have_none(frames: int) -> None:
+def test_animations_too_short_for_a_blink_have_none(frames: int) -> None:
     assert not blink_curve(frames, 25.0, rate=40).any()
 
 

@@ -1,4 +1,4 @@
-"""From the command line's words to a directed take; where a topology's eyes are, from any of the files."""
+"""Animation controls from the command line to the changed animation; where a topology's eyes are, from any file."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_words_are_checked_before_anything_is_made(words: list[str], sentence: s
     assert sentence in str(caught.value)
 
 
-def test_a_topology_without_known_eyes_says_what_to_give(make_animation: Callable[..., Animation]) -> None:
+def test_a_topology_without_known_eyes_names_the_option(make_animation: Callable[..., Animation]) -> None:
     animation = replace(make_animation(2), faces=None)
     for option in ("--blinks", "--gaze"):
         with pytest.raises(
@@ -108,7 +108,9 @@ def lid_gap(vertices: np.ndarray) -> float:
     return float((vertices[ring[1:8], 1] - vertices[ring[9:][::-1], 1]).max())
 
 
-def test_lids_of_anybody_else_on_the_puppets_mesh_shut_by_their_edges(make_animation: Callable[..., Animation]) -> None:
+def test_lids_of_other_speakers_on_the_puppets_mesh_shut_by_their_edges(
+    make_animation: Callable[..., Animation],
+) -> None:
     animation = make_animation(1)
     face = animation.template * np.array([1.3, 1.15, 1.1], np.float32)
     found = puppet_eyes(face, animation.faces)
@@ -208,7 +210,7 @@ def test_eyes_from_the_lids_edges_alone(eyes_folder: Path, make_animation: Calla
         ('{"lids": [[1, 2], [3]]}', 'expected "lids" as a list'),
     ],
 )
-def test_files_that_say_nothing_useful(
+def test_wrong_eyes_files_are_refused(
     content: str, sentence: str, eyes_folder: Path, make_animation: Callable[..., Animation]
 ) -> None:
     path = eyes_folder / "bad.json"

@@ -122,9 +122,7 @@ def test_sway_is_slow() -> None:
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 10])
-def test_short_takes_sway_and_gaze_without_a_fuss(
-    frames: int, make_animation: Callable[..., Animation], eyes: Eyes
-) -> None:
+def test_short_animations_can_sway_and_gaze(frames: int, make_animation: Callable[..., Animation], eyes: Eyes) -> None:
     animation = make_animation(frames)
     made = add_sway(add_gaze(animation, eyes))
     assert np.isfinite(made.vertices).all()
@@ -152,7 +150,7 @@ def test_impossible_angles(degrees: float) -> None:
         sway_curve(9, 25.0, degrees=degrees)
 
 
-def test_a_take_on_disk_is_directed_on_disk_and_leaves_no_file(
+def test_an_animation_on_disk_is_changed_on_disk_and_leaves_no_file(
     make_animation: Callable[..., Animation], eyes: Eyes, tmp_path: Path
 ) -> None:
     animation = make_animation(300, jaw_open=0.5)
