@@ -35,7 +35,7 @@ def animation() -> Animation:
     )
 
 
-def test_an_archive_gives_back_every_field_without_pickle(animation: Animation, tmp_path: Path) -> None:
+def test_archive_gives_back_every_field_without_pickle(animation: Animation, tmp_path: Path) -> None:
     write_archive(tmp_path / "a.npz", animation)
     back = read_archive(tmp_path / "a.npz")
     for name, value in vars(animation).items():
@@ -50,7 +50,7 @@ def test_an_archive_gives_back_every_field_without_pickle(animation: Animation, 
         assert set(archive.files) >= {"vertices", "template", "faces", "speech", "about", "region_lips"}
 
 
-def test_the_sound_is_as_long_as_the_picture(animation: Animation) -> None:
+def test_sound_is_as_long_as_the_picture(animation: Animation) -> None:
     sound = animation.sound()
     assert sound is not None
     assert len(sound) == 3200
@@ -61,7 +61,7 @@ def test_the_sound_is_as_long_as_the_picture(animation: Animation) -> None:
     assert not longer[100:].any()
 
 
-def test_a_bare_array_needs_a_frame_rate_and_may_be_flat(animation: Animation, tmp_path: Path) -> None:
+def test_bare_array_needs_a_frame_rate_and_may_be_flat(animation: Animation, tmp_path: Path) -> None:
     np.save(tmp_path / "x.npy", animation.vertices.reshape(5, -1))
     with pytest.raises(FaceDiffError, match="--frame-rate"):
         read_animation(tmp_path / "x.npy")
@@ -121,14 +121,16 @@ def test_defaults_never_override_a_file(animation: Animation, tmp_path: Path) ->
         ({"sample_rate": 0}, "sample rate 0 is impossible"),
     ],
 )
-def test_parts_that_do_not_fit_are_refused(animation: Animation, change: dict[str, object], sentence: str) -> None:
+def test_animation_refuses_parts_that_do_not_fit(
+    animation: Animation, change: dict[str, object], sentence: str
+) -> None:
     with pytest.raises(FaceDiffError) as caught:
         replace(animation, **change)  # type: ignore[arg-type]
     assert sentence in str(caught.value)
     assert "hello" in str(caught.value) or "unit" in change
 
 
-def test_motion_that_is_not_finite_is_never_written(animation: Animation, tmp_path: Path) -> None:
+def test_archive_is_never_written_with_motion_that_is_not_finite(animation: Animation, tmp_path: Path) -> None:
     vertices = animation.vertices.copy()
     vertices[3, 2, 1] = np.nan
     with pytest.raises(FaceDiffError, match="frame 3 holds NaN"):
@@ -136,7 +138,7 @@ def test_motion_that_is_not_finite_is_never_written(animation: Animation, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_files_that_are_no_animations(tmp_path: Path) -> None:
+def test_archive_refuses_files_that_are_no_animations(tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_text("no")
     with pytest.raises(FaceDiffError, match="not a readable .npz"):
         read_archive(tmp_path / "a.npz")
@@ -191,7 +193,7 @@ def test_files_that_are_no_animations(tmp_path: Path) -> None:
         ("region_lips", np.array([0.5]), "its lips names vertices other than 0 to 5"),
     ],
 )
-def test_an_archive_that_others_made_is_checked(
+def test_archive_by_others_is_checked(
     animation: Animation, tmp_path: Path, name: str, wrong: np.ndarray, sentence: str
 ) -> None:
     write_archive(tmp_path / "a.npz", animation)
@@ -208,11 +210,11 @@ def test_an_archive_that_others_made_is_checked(
     ("unit", "metres"),
     [("m", 1.0), ("mm", 0.001), ("0.5", 0.5), ("normalised (the root of its area is 1, about 185 mm)", 0.185)],
 )
-def test_units(unit: str, metres: float) -> None:
+def test_metres_per_unit(unit: str, metres: float) -> None:
     assert metres_per_unit(unit) == pytest.approx(metres)
 
 
-def test_a_motion_larger_than_memory_is_read_without_holding_it(tmp_path: Path) -> None:
+def test_frames_larger_than_memory_are_read_without_holding_them(tmp_path: Path) -> None:
     """In a process of its own, since memory is counted per process: 600 MB are looked at twice."""
     made = np.lib.format.open_memmap(tmp_path / "large.npy", "w+", np.float32, (2500, 20_000, 3))
     made[2499, 0, 0] = 1

@@ -21,7 +21,7 @@ def ball() -> trimesh.Trimesh:
 
 @pytest.fixture
 def make_animation(ball: trimesh.Trimesh) -> Callable[..., Animation]:
-    """A take of 162 vertices in which five shapes move up and down; keyword arguments override."""
+    """An animation of 162 vertices in which five shapes move up and down; keyword arguments override."""
 
     def make(**changes: object) -> Animation:
         rng = np.random.default_rng(0)

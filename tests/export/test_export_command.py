@@ -14,7 +14,7 @@ from facediff.cli.app import main
 from facediff.export import FORMATS
 
 
-def test_an_archive_needs_no_further_options(
+def test_archive_needs_no_further_options(
     animation: Animation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_archive(tmp_path / "in.npz", animation)
@@ -27,7 +27,7 @@ def test_an_archive_needs_no_further_options(
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"a.glb", "a.wav"}
 
 
-def test_a_bare_array_is_completed_by_options(
+def test_bare_array_is_completed_by_options(
     animation: Animation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     np.save(tmp_path / "x.npy", animation.vertices.reshape(40, -1))
@@ -45,7 +45,7 @@ def test_a_bare_array_is_completed_by_options(
     assert not (tmp_path / "out_obj" / "out.wav").exists()
 
 
-def test_takes_of_one_recording_are_told_apart_by_their_files(animation: Animation, tmp_path: Path) -> None:
+def test_animations_of_one_recording_are_named_after_their_files(animation: Animation, tmp_path: Path) -> None:
     for name in ("mine", "theirs"):
         write_archive(tmp_path / f"{name}.npz", animation)
     page = tmp_path / "page.html"

@@ -41,7 +41,7 @@ def read_mdd(path: Path) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float3
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply"])
-def test_a_sequence_is_a_folder_with_a_mesh_for_every_frame(animation: Animation, tmp_path: Path, suffix: str) -> None:
+def test_sequence_is_a_folder_with_a_mesh_for_every_frame(animation: Animation, tmp_path: Path, suffix: str) -> None:
     folder = tmp_path / f"hello_{suffix[1:]}"
     assert write_animations(tmp_path / f"hello{suffix}", [animation]) == [folder]
     names = [f"hello_{index:04d}{suffix}" for index in range(40)]
@@ -51,15 +51,15 @@ def test_a_sequence_is_a_folder_with_a_mesh_for_every_frame(animation: Animation
         np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), animation.vertices[index])
         np.testing.assert_array_equal(mesh.faces, animation.triangles)
         np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], animation.colours, atol=0)
-    told = json.loads((folder / "sequence.json").read_text())
-    assert told["format"] == "facediff sequence 1"
-    assert (told["frame_rate"], told["frames"], told["files"]) == (30.0, 40, f"hello_####{suffix}")
-    assert (told["unit"], told["metres_per_unit"], told["up"], told["speech"]) == ("m", 1.0, "y", "hello.wav")
-    assert told["metadata"] == {"identity": "Zoë", "style": "F1_e01"}
+    found = json.loads((folder / "sequence.json").read_text())
+    assert found["format"] == "facediff sequence 1"
+    assert (found["frame_rate"], found["frames"], found["files"]) == (30.0, 40, f"hello_####{suffix}")
+    assert (found["unit"], found["metres_per_unit"], found["up"], found["speech"]) == ("m", 1.0, "y", "hello.wav")
+    assert found["metadata"] == {"identity": "Zoë", "style": "F1_e01"}
     assert soundfile.info(folder / "hello.wav").frames == round(40 / 30 * 16_000)
 
 
-def test_meshes_without_colours(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+def test_sequence_without_colours(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     animation = make_animation(colours=None, speech=None)
     for suffix in (".obj", ".ply"):
         (folder,) = write_animations(tmp_path / f"hello{suffix}", [animation])
@@ -68,7 +68,7 @@ def test_meshes_without_colours(make_animation: Callable[..., Animation], tmp_pa
         assert not (folder / "hello.wav").exists()
 
 
-def test_point_caches_and_the_mesh_beside_them(animation: Animation, tmp_path: Path) -> None:
+def test_point_caches_and_the_mesh_next_to_them(animation: Animation, tmp_path: Path) -> None:
     for suffix in (".pc2", ".mdd"):
         path = tmp_path / suffix[1:] / f"hello{suffix}"
         assert write_animations(path, [animation]) == [path, path.with_suffix(".obj"), path.with_suffix(".wav")]
@@ -105,8 +105,8 @@ def test_unit_and_axis(make_animation: Callable[..., Animation], tmp_path: Path)
         folder = tmp_path / suffix / f"a_{suffix}"
         mesh = trimesh.load(folder / f"a_0007.{suffix}", process=False, maintain_order=True)
         np.testing.assert_allclose(mesh.vertices, want[7], rtol=1e-6)
-        told = json.loads((folder / "sequence.json").read_text())
-        assert (told["unit"], told["metres_per_unit"], told["up"]) == ("cm", 0.01, "z")
+        found = json.loads((folder / "sequence.json").read_text())
+        assert (found["unit"], found["metres_per_unit"], found["up"]) == ("cm", 0.01, "z")
     assert not list(tmp_path.rglob("*.wav"))
 
 
@@ -124,7 +124,7 @@ def test_numpy_files(animation: Animation, tmp_path: Path) -> None:
     assert (scaled.unit, scaled.speech) == ("mm", None)
 
 
-def test_a_memory_map_may_be_replaced_by_what_is_made_of_it(animation: Animation, tmp_path: Path) -> None:
+def test_memory_map_may_be_replaced_by_its_own_export(animation: Animation, tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", animation.vertices)
     mapped = np.load(tmp_path / "a.npy", mmap_mode="r")
     write_animations(tmp_path / "a.npy", [replace(animation, vertices=mapped)], ExportOptions(unit="mm"))

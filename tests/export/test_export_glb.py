@@ -70,7 +70,7 @@ class Reader:
 
 
 @pytest.mark.parametrize("unit", ["m", "mm", "normalised (about 185 mm)"])
-def test_every_vertex_of_every_frame_comes_back_at_its_time(
+def test_glb_gives_back_every_vertex_at_its_time(
     make_animation: Callable[..., Animation], tmp_path: Path, unit: str
 ) -> None:
     animation = make_animation(unit=unit)
@@ -87,7 +87,7 @@ def test_every_vertex_of_every_frame_comes_back_at_its_time(
     assert np.linalg.norm(reader.at(6.5 / 30) - between, axis=-1).max() <= 0.05e-3
 
 
-def test_few_shapes_are_enough_for_a_motion_of_few_shapes(animation: Animation, tmp_path: Path) -> None:
+def test_glb_has_few_targets_for_a_motion_of_few_shapes(animation: Animation, tmp_path: Path) -> None:
     write_animations(tmp_path / "a.glb", [animation], ExportOptions(tolerance_mm=0.001))
     reader = Reader(tmp_path / "a.glb")
     assert len(reader.primitive.targets) == 10  # two halves of each of five components
@@ -95,7 +95,7 @@ def test_few_shapes_are_enough_for_a_motion_of_few_shapes(animation: Animation, 
     np.testing.assert_allclose(reader.values(reader.primitive.attributes.POSITION), animation.template)
 
 
-def test_a_motion_that_cannot_be_compressed_gets_a_target_for_every_frame(
+def test_glb_has_a_target_for_every_frame_that_cannot_be_compressed(
     make_animation: Callable[..., Animation], tmp_path: Path
 ) -> None:
     noise = np.random.default_rng(1).normal(0, 0.01, (9, 162, 3))
@@ -110,7 +110,9 @@ def test_a_motion_that_cannot_be_compressed_gets_a_target_for_every_frame(
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_short_and_still_takes(make_animation: Callable[..., Animation], tmp_path: Path, frames: int) -> None:
+def test_glb_of_short_and_still_animations(
+    make_animation: Callable[..., Animation], tmp_path: Path, frames: int
+) -> None:
     moving, still = make_animation(), make_animation().template
     for name, vertices in {"moving": moving.vertices[:frames], "still": np.stack([still] * frames)}.items():
         write_animations(tmp_path / f"{name}.glb", [make_animation(vertices=vertices)])
@@ -119,7 +121,7 @@ def test_short_and_still_takes(make_animation: Callable[..., Animation], tmp_pat
             np.testing.assert_allclose(reader.at(index / 30), vertices[index], atol=1e-7)
 
 
-def test_the_file_keeps_the_rules_of_the_specification(animation: Animation, tmp_path: Path) -> None:
+def test_glb_follows_the_specification(animation: Animation, tmp_path: Path) -> None:
     write_animations(tmp_path / "a.glb", [animation])
     data = (tmp_path / "a.glb").read_bytes()
     magic, version, length, json_length, json_kind = struct.unpack_from("<4sIII4s", data)
@@ -168,7 +170,7 @@ def test_the_file_keeps_the_rules_of_the_specification(animation: Animation, tmp
     }
 
 
-def test_the_face_is_whole_and_its_colours_are_linear(animation: Animation, tmp_path: Path) -> None:
+def test_glb_face_is_whole_and_its_colours_are_linear(animation: Animation, tmp_path: Path) -> None:
     write_animations(tmp_path / "a.glb", [animation])
     mesh = trimesh.load(tmp_path / "a.glb", process=False, maintain_order=True, force="mesh")
     np.testing.assert_allclose(mesh.vertices, animation.template, atol=1e-8)
@@ -180,7 +182,7 @@ def test_the_face_is_whole_and_its_colours_are_linear(animation: Animation, tmp_
 
 
 @pytest.mark.parametrize("inside_out", [False, True])
-def test_faces_and_normals_look_outward(
+def test_glb_faces_and_normals_look_outward(
     make_animation: Callable[..., Animation], tmp_path: Path, inside_out: bool
 ) -> None:
     faces = make_animation().triangles
@@ -210,7 +212,9 @@ def test_faces_and_normals_look_outward(
     tolerance=st.sampled_from([1e-5, 1e-4]),
     seed=st.integers(0, 99),
 )
-def test_any_motion_is_within_the_tolerance(frames: int, rank: int, noise: float, tolerance: float, seed: int) -> None:
+def test_compress_keeps_any_motion_within_the_tolerance(
+    frames: int, rank: int, noise: float, tolerance: float, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     motion = rng.normal(0, 1, (frames, rank)) @ rng.normal(0, 5e-3, (rank, 60)) + rng.normal(0, noise, (frames, 60))
     offsets = motion.reshape(frames, 20, 3).astype(np.float32)
@@ -222,7 +226,9 @@ def test_any_motion_is_within_the_tolerance(frames: int, rank: int, noise: float
     assert len(morphs.shapes) <= max(frames, 1)
 
 
-def test_more_vertices_than_short_indices_can_count(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+def test_glb_of_more_vertices_than_short_indices_can_count(
+    make_animation: Callable[..., Animation], tmp_path: Path
+) -> None:
     template = np.random.default_rng(0).normal(0, 0.1, (65_600, 3)).astype(np.float32)
     faces = np.array([[65_599, 0, 65_535]], np.int32)
     animation = make_animation(vertices=template[None], template=template, faces=faces, colours=None, speech=None)
@@ -232,13 +238,13 @@ def test_more_vertices_than_short_indices_can_count(make_animation: Callable[...
     assert reader.primitive.attributes.COLOR_0 is None
 
 
-def test_a_mesh_without_faces_is_refused(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+def test_glb_of_a_mesh_without_faces_is_refused(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="comes without a mesh"):
         write_animations(tmp_path / "a.glb", [make_animation(faces=None)])
     assert not list(tmp_path.iterdir())
 
 
-def test_the_same_animation_gives_the_same_bytes(animation: Animation, tmp_path: Path) -> None:
+def test_glb_of_the_same_animation_has_the_same_bytes(animation: Animation, tmp_path: Path) -> None:
     for folder in ("one", "two"):
         write_animations(tmp_path / folder / "a.glb", [animation])
     assert (tmp_path / "one" / "a.glb").read_bytes() == (tmp_path / "two" / "a.glb").read_bytes()

@@ -17,7 +17,7 @@ from facediff.export import ExportOptions, write_animations
 
 
 @pytest.mark.parametrize("suffix", [".usdc", ".usda"])
-def test_every_vertex_of_every_frame_comes_back(animation: Animation, tmp_path: Path, suffix: str) -> None:
+def test_usd_gives_back_every_vertex_of_every_frame(animation: Animation, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     assert write_animations(path, [animation]) == [path, tmp_path / "a.wav"]
     stage = Usd.Stage.Open(str(path))
@@ -42,12 +42,12 @@ def test_every_vertex_of_every_frame_comes_back(animation: Animation, tmp_path: 
     np.testing.assert_allclose(points.Get(6.5), (animation.vertices[6] + animation.vertices[7]) / 2, atol=1e-7)
 
 
-def test_words_colours_and_sound(animation: Animation, tmp_path: Path) -> None:
+def test_usd_metadata_colours_and_sound(animation: Animation, tmp_path: Path) -> None:
     write_animations(tmp_path / "a.usdc", [animation])
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
-    told = stage.GetRootLayer().customLayerData["facediff"]
-    assert told["metadata"] == {"identity": "Zoë", "style": "F1_e01"}
-    assert (told["name"], told["frame_rate"], told["unit"]) == ("Hello Zoë", 30.0, "m")
+    data = stage.GetRootLayer().customLayerData["facediff"]
+    assert data["metadata"] == {"identity": "Zoë", "style": "F1_e01"}
+    assert (data["name"], data["frame_rate"], data["unit"]) == ("Hello Zoë", 30.0, "m")
     colour = UsdGeom.PrimvarsAPI(stage.GetDefaultPrim().GetChild("face")).GetPrimvar("displayColor")
     share = animation.colours / 255  # type: ignore[operator]
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
@@ -64,17 +64,17 @@ def test_words_colours_and_sound(animation: Animation, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".usdc", ".usda"])
-def test_words_of_any_kind(make_animation: Callable[..., Animation], tmp_path: Path, suffix: str) -> None:
+def test_usd_metadata_may_hold_any_text(make_animation: Callable[..., Animation], tmp_path: Path, suffix: str) -> None:
     words = {"a b:c": 'say "ü"\n\\ twice', "": "", "1": "{}"}
     write_animations(tmp_path / f"a{suffix}", [make_animation(name='1 "q" / é', metadata=words)])
     stage = Usd.Stage.Open(str(tmp_path / f"a{suffix}"))
-    told = stage.GetRootLayer().customLayerData["facediff"]
-    assert told["metadata"] == words
-    assert told["name"] == '1 "q" / é'
+    data = stage.GetRootLayer().customLayerData["facediff"]
+    assert data["metadata"] == words
+    assert data["name"] == '1 "q" / é'
     assert len(UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("face")).GetPointsAttr().Get(0)) == 162
 
 
-def test_the_layer_complies_with_usd(animation: Animation, tmp_path: Path) -> None:
+def test_usd_layer_is_valid(animation: Animation, tmp_path: Path) -> None:
     write_animations(tmp_path / "a.usdc", [animation])
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) > 10
@@ -83,7 +83,7 @@ def test_the_layer_complies_with_usd(animation: Animation, tmp_path: Path) -> No
     assert [error.GetErrorAsString() for error in found] == []
 
 
-def test_another_unit_and_z_up(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+def test_usd_in_another_unit_with_z_up(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     animation = make_animation(unit="mm", speech=None)
     options = ExportOptions(unit="cm", up="z")
     assert write_animations(tmp_path / "a.usda", [animation], options) == [tmp_path / "a.usda"]
@@ -95,7 +95,7 @@ def test_another_unit_and_z_up(make_animation: Callable[..., Animation], tmp_pat
     assert not stage.GetDefaultPrim().GetChild("speech")
 
 
-def test_without_usd_core_one_sentence_says_what_to_install(
+def test_usd_without_usd_core_names_the_extra(
     animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     find = importlib.util.find_spec

@@ -1,4 +1,4 @@
-"""Videos read back by PyAV: what is seen and heard, of one take and of several."""
+"""Videos read back by PyAV: what is seen and heard, of one animation and of several."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_no_speech_is_a_silent_video(animation: Animation, tmp_path: Path) -> No
         assert not container.streams.audio
 
 
-def test_the_corpus_is_named_below(make_animation: Callable[..., Animation]) -> None:
+def test_corpus_is_named_below_the_video(make_animation: Callable[..., Animation]) -> None:
     def height(animation: Animation, footer: str = "") -> int:
         return len(next(drawn_frames([animation], ExportOptions(size=64, footer=footer))))
 
@@ -52,7 +52,7 @@ def test_the_corpus_is_named_below(make_animation: Callable[..., Animation]) -> 
     assert height(make_animation(metadata={}), "synthetic corpus") > bare
 
 
-def test_several_takes_stand_side_by_side_and_wait_for_the_longest(
+def test_several_animations_are_shown_side_by_side_and_wait_for_the_longest(
     make_animation: Callable[..., Animation], tmp_path: Path
 ) -> None:
     long, short = make_animation(), make_animation(vertices=make_animation().vertices[:5], name="short")
@@ -61,7 +61,7 @@ def test_several_takes_stand_side_by_side_and_wait_for_the_longest(
     assert len(seen) == 40
     assert seen.shape[2] == 128
     left, right = seen[:, -64:, :64], seen[:, -64:, 64:]
-    assert np.abs(left[20:] - left[6]).mean() < 1, "the short take stays on its last frame"
+    assert np.abs(left[20:] - left[6]).mean() < 1, "the short animation stays on its last frame"
     assert np.abs(right[20:] - right[6]).mean() > np.abs(left[20:] - left[6]).mean()
 
 
@@ -74,16 +74,21 @@ def test_faces_of_one_unit_compare_in_size(make_animation: Callable[..., Animati
     assert covered[1] < 0.5 * covered[0]
 
 
-def test_takes_of_different_frame_rates_are_refused(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+def test_animations_of_different_frame_rates_are_refused(
+    make_animation: Callable[..., Animation], tmp_path: Path
+) -> None:
     with pytest.raises(FaceDiffError, match=r"differ in frame rate \(Hello Zoë 30, b 25\)"):
         write_animations(tmp_path / "a.mp4", [make_animation(), make_animation(name="b", frame_rate=25.0)], SMALL)
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_procedural_is_told_under_the_video(animation: Animation) -> None:
-    told = {"corpus": "puppet (synthetic)", "procedural": "blinks (17 a minute, seed 0); head sway (2 degrees, seed 0)"}
-    assert video.procedural([replace(animation, metadata=told), animation]) == "procedural: blinks, head sway"
+def test_procedural_motion_is_named_below_the_video(animation: Animation) -> None:
+    found = {
+        "corpus": "puppet (synthetic)",
+        "procedural": "blinks (17 a minute, seed 0); head sway (2 degrees, seed 0)",
+    }
+    assert video.procedural([replace(animation, metadata=found), animation]) == "procedural: blinks, head sway"
     assert video.procedural([animation]) == ""
     plain = next(drawn_frames([replace(animation, metadata={"corpus": "puppet (synthetic)"})], ExportOptions(size=128)))
-    marked = next(drawn_frames([replace(animation, metadata=told)], ExportOptions(size=128)))
+    marked = next(drawn_frames([replace(animation, metadata=found)], ExportOptions(size=128)))
     assert not np.array_equal(plain, marked)

@@ -23,7 +23,7 @@ OWN = [".glb", ".usdc", ".usda", ".obj", ".ply", ".pc2", ".mdd", ".mp4", ".npz",
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_formats_are_as_promised() -> None:
+def test_formats_are_as_promised() -> None:
     assert {*OWN, ".html", ".csv"} == set(FORMATS)
     assert {suffix for suffix, made in FORMATS.items() if made.holds_several} == {".mp4", ".html"}
     assert {suffix for suffix, made in FORMATS.items() if made.speech == "in the file"} == {".mp4", ".html", ".npz"}
@@ -57,7 +57,9 @@ def test_the_formats_are_as_promised() -> None:
         ("foreign.obj", {}, ["foreign_obj: is a folder with files"]),
     ],
 )
-def test_refused_before_any_work(tmp_path: Path, name: str, options: dict[str, object], words: list[str]) -> None:
+def test_export_is_refused_before_any_work(
+    tmp_path: Path, name: str, options: dict[str, object], words: list[str]
+) -> None:
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "folder.glb").mkdir()
     (tmp_path / "foreign_obj").mkdir()
@@ -70,7 +72,7 @@ def test_refused_before_any_work(tmp_path: Path, name: str, options: dict[str, o
 
 
 @pytest.mark.parametrize("unit", ["m", "1", None])
-def test_what_a_format_prescribes_may_be_said(tmp_path: Path, unit: str | None) -> None:
+def test_export_accepts_the_unit_that_the_format_prescribes(tmp_path: Path, unit: str | None) -> None:
     check_export(tmp_path / "a.glb", ExportOptions(unit=unit, up="y"))
 
 
@@ -85,7 +87,7 @@ def test_what_a_format_prescribes_may_be_said(tmp_path: Path, unit: str | None) 
     ],
 )
 @pytest.mark.parametrize("suffix", [".glb", ".usdc", ".obj", ".ply"])
-def test_animations_that_would_make_broken_files(
+def test_export_refuses_animations_that_would_make_broken_files(
     make_animation: Callable[..., Animation], tmp_path: Path, change: dict[str, object], sentence: str, suffix: str
 ) -> None:
     for name in [name for name, value in change.items() if isinstance(value, str)]:
@@ -99,7 +101,9 @@ def test_animations_that_would_make_broken_files(
     assert not list(tmp_path.iterdir())
 
 
-def test_several_animations_get_a_file_each(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+def test_export_of_several_animations_writes_a_file_each(
+    make_animation: Callable[..., Animation], tmp_path: Path
+) -> None:
     first, second = make_animation(), make_animation(speech=None)
     second = replace(second, vertices=second.vertices[:7])
     written = write_animations(tmp_path / "a.npy", [first, second])
@@ -113,12 +117,12 @@ def test_several_animations_get_a_file_each(make_animation: Callable[..., Animat
     assert not (written[1] / "a_sample2_0007.ply").exists()
 
 
-def test_no_animation_is_refused(tmp_path: Path) -> None:
+def test_export_of_no_animation_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="no animation"):
         write_animations(tmp_path / "a.glb", [])
 
 
-def test_a_full_disk_leaves_nothing(animation: Animation, tmp_path: Path) -> None:
+def test_export_to_a_full_disk_leaves_nothing(animation: Animation, tmp_path: Path) -> None:
     """A process that may not write files beyond a few kB, with the speech (which fails early) and without."""
     write_archive(tmp_path / "in.npz", animation)
     program = """
@@ -151,7 +155,7 @@ def test_a_full_disk_leaves_nothing(animation: Animation, tmp_path: Path) -> Non
     assert sorted(file.name for file in tmp_path.rglob("*")) == ["in.npz"]
 
 
-def test_if_the_last_of_several_fails_none_appears(
+def test_export_whose_last_file_fails_writes_none(
     animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "a_sample1.pc2").write_text("from before")
@@ -169,7 +173,7 @@ def test_if_the_last_of_several_fails_none_appears(
     assert (tmp_path / "a_sample1.pc2").read_text() == "from before"
 
 
-def test_files_beside_never_replace_the_users_own(animation: Animation, tmp_path: Path) -> None:
+def test_files_next_to_an_export_never_replace_the_users_own(animation: Animation, tmp_path: Path) -> None:
     with wave.open(str(tmp_path / "hello.wav"), "wb") as own:
         own.setparams((2, 2, 48_000, 0, "NONE", ""))
         own.writeframes(bytes(4000))
@@ -197,7 +201,7 @@ def test_files_beside_never_replace_the_users_own(animation: Animation, tmp_path
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "hello.wav", "hello_0003.ply"])
-def test_a_folder_with_something_of_the_users_is_not_replaced(animation: Animation, tmp_path: Path, name: str) -> None:
+def test_sequence_never_replaces_a_folder_with_the_users_files(animation: Animation, tmp_path: Path, name: str) -> None:
     (folder,) = write_animations(tmp_path / "hello.ply", [animation])
     (folder / name).write_text("mine")
     with pytest.raises(FaceDiffError, match="hello_ply: is a folder with files that facediff did not write"):
@@ -206,7 +210,7 @@ def test_a_folder_with_something_of_the_users_is_not_replaced(animation: Animati
 
 
 @pytest.mark.parametrize("suffix", OWN)
-def test_an_export_may_be_repeated(make_animation: Callable[..., Animation], tmp_path: Path, suffix: str) -> None:
+def test_export_may_be_repeated(make_animation: Callable[..., Animation], tmp_path: Path, suffix: str) -> None:
     options = ExportOptions(size=64)
     first = write_animations(tmp_path / f"a{suffix}", [make_animation()], options)
     shorter = make_animation(vertices=make_animation().vertices[:9])
@@ -216,7 +220,7 @@ def test_an_export_may_be_repeated(make_animation: Callable[..., Animation], tmp
         assert len(list(first[0].glob(f"*{suffix}"))) == 9
 
 
-def test_the_speech_beside_is_readable_everywhere(animation: Animation, tmp_path: Path) -> None:
+def test_speech_next_to_an_export_is_readable_everywhere(animation: Animation, tmp_path: Path) -> None:
     write_animations(tmp_path / "a.glb", [animation])
     with wave.open(str(tmp_path / "a.wav")) as sound:
         assert (sound.getnchannels(), sound.getsampwidth(), sound.getframerate()) == (1, 2, 16_000)
@@ -225,7 +229,7 @@ def test_the_speech_beside_is_readable_everywhere(animation: Animation, tmp_path
     np.testing.assert_array_equal(values / np.float32(32768), animation.speech)
 
 
-def test_the_page_gets_all_animations(animation: Animation, tmp_path: Path) -> None:
+def test_page_holds_all_animations(animation: Animation, tmp_path: Path) -> None:
     path = tmp_path / "a.html"
     assert write_animations(path, [animation, animation]) == [path]
     assert path.read_text(encoding="utf-8").lstrip().lower().startswith("<!doctype html>")
@@ -234,7 +238,7 @@ def test_the_page_gets_all_animations(animation: Animation, tmp_path: Path) -> N
     assert silent.stat().st_size < path.stat().st_size
 
 
-def test_weights_are_solved_for_the_shapes(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+def test_csv_holds_weights_solved_for_the_shapes(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     rest = make_animation().template
     rng = np.random.default_rng(3)
     shapes = {name: rng.normal(0, 3e-3, rest.shape) for name in ("jawOpen", "mouthFunnel")}
@@ -252,7 +256,7 @@ def test_weights_are_solved_for_the_shapes(make_animation: Callable[..., Animati
     assert np.abs(table["MouthFunnel"]).max() < 0.03
 
 
-def test_missing_packages_are_named_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_names_missing_packages_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r'writing \.mp4 needs the package "av"'):
         check_export(tmp_path / "a.mp4", ExportOptions())
@@ -275,7 +279,7 @@ class Bounds(Format):
 """
 
 
-def test_a_format_of_an_installed_package_is_reached_by_its_suffix(animation: Animation, tmp_path: Path) -> None:
+def test_format_of_an_installed_package_is_reached_by_its_suffix(animation: Animation, tmp_path: Path) -> None:
     info = tmp_path / "site" / "bounds-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: bounds\nVersion: 1.0\n")

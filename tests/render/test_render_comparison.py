@@ -24,7 +24,7 @@ def renderer() -> Renderer:
     return Renderer(FACES, template=VERTICES, size=(96, 80))
 
 
-def test_panels_are_truth_prediction_and_coloured_prediction(renderer: Renderer) -> None:
+def test_comparison_shows_truth_prediction_and_coloured_prediction(renderer: Renderer) -> None:
     frames = list(comparison(renderer, TRUTH, OFF, highest=0.5, scale_label="5 mm", footer="clip"))
     assert len(frames) == 3
     top = next(row for row in range(96) if (frames[0][row : row + 96, :80] == renderer.render(VERTICES)).all())
@@ -39,7 +39,7 @@ def test_panels_are_truth_prediction_and_coloured_prediction(renderer: Renderer)
         np.testing.assert_allclose(panels[:, 160:].astype(int), renderer.render(OFF[index], colours=colours), atol=4)
 
 
-def test_the_key_shows_the_scale_and_stays_the_same(renderer: Renderer) -> None:
+def test_comparison_key_shows_the_scale_and_stays_the_same(renderer: Renderer) -> None:
     one, two = (
         list(comparison(renderer, TRUTH, OFF, highest=highest, scale_label=label, footer="a clip"))
         for highest, label in ((0.5, "5 mm"), (0.1, "1 mm"))
@@ -56,7 +56,7 @@ def test_the_key_shows_the_scale_and_stays_the_same(renderer: Renderer) -> None:
     assert cv2.absdiff(one[0][foot, :216], two[0][foot, :216]).max() == 0  # only the last number differs
 
 
-def test_motions_that_do_not_fit_are_refused_before_the_first_frame(renderer: Renderer) -> None:
+def test_comparison_refuses_motions_before_the_first_frame(renderer: Renderer) -> None:
     broken = OFF.copy()
     broken[2, 0, 0] = np.nan
     for truth, prediction, highest, message in (

@@ -24,7 +24,7 @@ def renderer() -> Renderer:
     return Renderer(FACES, template=VERTICES, size=(96, 80))
 
 
-def test_panels_are_the_renderers_pictures_under_their_labels(renderer: Renderer) -> None:
+def test_side_by_side_shows_the_renderers_pictures_under_their_labels(renderer: Renderer) -> None:
     frames = list(side_by_side(renderer, [MOTION, MOTION[::-1]], ["truth", "facediff"], footer="synthetic corpus"))
     assert len(frames) == 3
     height, width, _ = frames[0].shape
@@ -41,18 +41,18 @@ def test_panels_are_the_renderers_pictures_under_their_labels(renderer: Renderer
     np.testing.assert_allclose(strip.astype(int), frames[2][:top].astype(int), atol=1)
 
 
-def test_strips_continue_the_background_where_the_face_reaches_the_edge(renderer: Renderer) -> None:
+def test_side_by_side_strips_continue_the_background(renderer: Renderer) -> None:
     (frame,) = side_by_side(renderer, [MOTION[:1] - [0, 0.5, 0]], [""], footer="x")
     assert (frame[95] != renderer.backdrop[-1]).any()
     np.testing.assert_array_equal(frame[96], renderer.backdrop[-1])
 
 
-def test_without_labels_and_footer_there_are_no_strips(renderer: Renderer) -> None:
+def test_side_by_side_without_labels_has_no_strips(renderer: Renderer) -> None:
     (frame,) = side_by_side(renderer, [MOTION[:1]], [""])
     np.testing.assert_array_equal(frame, renderer.render(MOTION[0]))
 
 
-def test_topologies_and_colours_mix(renderer: Renderer, sphere: MakeSphere) -> None:
+def test_side_by_side_mixes_topologies_and_colours(renderer: Renderer, sphere: MakeSphere) -> None:
     vertices, faces = sphere(8, 12)
     other = Renderer(faces, template=vertices, size=(96, 64))
     still = np.tile(vertices, (3, 1, 1))
@@ -62,12 +62,12 @@ def test_topologies_and_colours_mix(renderer: Renderer, sphere: MakeSphere) -> N
     np.testing.assert_array_equal(frames[1][-96:, :80], renderer.render(MOTION[1], colours=heat[1]))
 
 
-def test_a_very_long_label_still_fits(renderer: Renderer) -> None:
+def test_side_by_side_fits_a_very_long_label(renderer: Renderer) -> None:
     (frame,) = side_by_side(renderer, [MOTION[:1]], ["a label that is much too long for such a small picture " * 2])
     assert frame.shape[1] == 80
 
 
-def test_bad_motions_are_refused_before_the_first_frame(renderer: Renderer) -> None:
+def test_side_by_side_refuses_motions_before_the_first_frame(renderer: Renderer) -> None:
     broken = MOTION.copy()
     broken[1, 3, 2] = np.inf
     other = Renderer(FACES, template=VERTICES, size=64)

@@ -34,7 +34,7 @@ def _read_sound(path: Path) -> tuple[npt.NDArray[np.float32], int, float]:
 
 @pytest.mark.parametrize("rate", [25, 30, 60, 29.97])
 @pytest.mark.parametrize("count", [1, 2, 37])
-def test_frame_count_and_rate_are_exact(tmp_path: Path, rate: float, count: int) -> None:
+def test_video_frame_count_and_rate_are_exact(tmp_path: Path, rate: float, count: int) -> None:
     path = tmp_path / "a.mp4"
     assert write_video(path, _frames(count), rate, np.zeros(8000, np.float32), SAMPLE_RATE) == count
     with av.open(str(path)) as container:
@@ -55,7 +55,7 @@ def test_frame_count_and_rate_are_exact(tmp_path: Path, rate: float, count: int)
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
 
 
-def test_pictures_come_back_in_order_and_in_colour(tmp_path: Path) -> None:
+def test_video_pictures_come_back_in_order_and_in_colour(tmp_path: Path) -> None:
     colours = np.array([[200, 60, 40], [50, 180, 70], [40, 80, 210], [128, 128, 128]], np.uint8)
     write_video(tmp_path / "a.mp4", (np.full((32, 32, 3), colour, np.uint8) for colour in colours), 25)
     capture = cv2.VideoCapture(str(tmp_path / "a.mp4"))
@@ -67,7 +67,7 @@ def test_pictures_come_back_in_order_and_in_colour(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rate", [16000, 44100, 48000, 11999])
-def test_sound_keeps_its_length(tmp_path: Path, rate: int) -> None:
+def test_video_sound_keeps_its_length(tmp_path: Path, rate: int) -> None:
     seconds = 1.3
     tone = 0.5 * np.sin(2 * np.pi * 440 * np.arange(round(seconds * rate)) / rate)
     write_video(tmp_path / "a.mp4", _frames(33), 25, tone.astype(np.float32), rate)
@@ -78,7 +78,7 @@ def test_sound_keeps_its_length(tmp_path: Path, rate: int) -> None:
     assert np.abs(middle).max() == pytest.approx(0.5, abs=0.05)
 
 
-def test_flash_and_click_agree(tmp_path: Path) -> None:
+def test_video_flash_and_click_agree(tmp_path: Path) -> None:
     moment, frame_rate = 1.5, 30
     click = np.zeros(3 * SAMPLE_RATE, np.float32)
     click[round(moment * SAMPLE_RATE)] = 1
@@ -111,7 +111,7 @@ def _boxes(data: bytes, *path: bytes) -> Iterator[bytes]:
         place += size
 
 
-def test_a_mouth_opens_with_its_clicks(tmp_path: Path) -> None:
+def test_video_mouth_opens_with_its_clicks(tmp_path: Path) -> None:
     """A drawn mesh whose hole opens for one frame at every click: what is seen, what is heard, the file's edits."""
     frame_rate, count, opened = 25, 75, [7, 31, 32, 60]
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), -1).reshape(-1, 2)
@@ -152,7 +152,7 @@ def test_a_mouth_opens_with_its_clicks(tmp_path: Path) -> None:
     assert edits[1][3] == 1024  # AAC's priming, in samples
 
 
-def test_two_writes_are_equal(tmp_path: Path) -> None:
+def test_video_is_equal_when_written_twice(tmp_path: Path) -> None:
     """Silent ones byte by byte, and all pictures; sound but for what the AAC encoder chooses now and then."""
     sound = np.random.default_rng(0).normal(0, 0.1, SAMPLE_RATE).astype(np.float32)
     noise = np.random.default_rng(1).integers(0, 256, (25, 40, 56, 3)).astype(np.uint8)
@@ -170,7 +170,7 @@ def test_two_writes_are_equal(tmp_path: Path) -> None:
     assert float(np.abs(one - two).mean()) < 0.1 * float(np.abs(one).mean())
 
 
-def test_odd_sizes_are_padded(tmp_path: Path) -> None:
+def test_video_of_odd_size_is_padded(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", _frames(3, (33, 47)), 25)
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0]
@@ -178,7 +178,7 @@ def test_odd_sizes_are_padded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [RuntimeError("half-way"), KeyboardInterrupt(), OSError("a reader's own")])
-def test_a_failing_generator_leaves_nothing(tmp_path: Path, error: BaseException) -> None:
+def test_video_of_a_failing_generator_leaves_nothing(tmp_path: Path, error: BaseException) -> None:
     def failing() -> Iterator[Frame]:
         yield from _frames(30)
         raise error
@@ -189,7 +189,7 @@ def test_a_failing_generator_leaves_nothing(tmp_path: Path, error: BaseException
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failure_keeps_the_video_that_was_there(tmp_path: Path) -> None:
+def test_video_that_fails_keeps_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"before")
     frames = [*_frames(5), np.zeros((10, 10, 3), np.uint8)]
@@ -221,7 +221,7 @@ def test_bad_input_is_one_clear_sentence(tmp_path: Path) -> None:
     assert sorted(file.name for file in tmp_path.iterdir()) == ["file", "folder.mp4"]
 
 
-def test_a_folder_that_refuses_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_video_in_a_folder_that_refuses_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 

@@ -1,4 +1,4 @@
-"""The files of figures: sizes, fonts, texts, equal bytes, and colours that say the numbers."""
+"""The files of figures: sizes, fonts, texts, equal bytes, and colours that stand for the numbers."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_colours_of_the_heat_map_are_those_of_the_bar(own_material: Material, tm
 def test_a_known_motion_has_the_colours_of_its_numbers(
     own_material: Material, damaged: Callable[..., Material], tmp_path: Path
 ) -> None:
-    """Vertices that all stay 2 mm beside the template: four fifths up a scale to 2.5 mm, and without deviation."""
+    """Vertices that all stay 2 mm off the template: at four fifths of a scale to 2.5 mm, without deviation."""
     still = np.repeat(own_material.template("A_e06")[None], 24, axis=0) + (0.002, 0, 0)
     material = damaged(still)
     truth = replace(material.truths["A_e06"], path=material.methods["ours"]["A_e06"])

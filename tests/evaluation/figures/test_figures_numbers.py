@@ -47,7 +47,9 @@ def chunk(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.usefixtures("chunk")
-def test_motion_is_the_distance_from_the_subjects_template(own_material: Material, read: Read, tiny_root: Path) -> None:
+def test_motion_maps_are_distances_from_the_identitys_template(
+    own_material: Material, read: Read, tiny_root: Path
+) -> None:
     templates = load_pickle(tiny_root / "templates.pkl")
     maps, notes = motion_maps(own_material, own_material.choose())
     assert own_material.choose() == CLIPS
@@ -64,7 +66,7 @@ def test_motion_is_the_distance_from_the_subjects_template(own_material: Materia
 
 
 @pytest.mark.usefixtures("chunk")
-def test_errors_are_distances_from_the_truth(own_material: Material, read: Read) -> None:
+def test_error_maps_are_distances_from_the_truth(own_material: Material, read: Read) -> None:
     maps, _ = error_maps(own_material, ["A_e07", "B_e06"])
     assert list(maps) == NAMES[1:]
     for name, found in maps.items():
@@ -77,7 +79,7 @@ def test_errors_are_distances_from_the_truth(own_material: Material, read: Read)
 
 
 @pytest.mark.usefixtures("chunk")
-def test_the_opening_is_that_of_the_metrics(own_material: Material, read: Read, tiny_root: Path) -> None:
+def test_opening_curves_are_those_of_the_metrics(own_material: Material, read: Read, tiny_root: Path) -> None:
     pairs = read_pairs(None, tiny_root, VERTICES)
     curves, note = opening_curves(own_material, "A_e06", pairs)
     assert note is None
@@ -177,7 +179,7 @@ def test_times_outside_a_motion(own_material: Material, time: float) -> None:
         pick_frames(own_material, "A_e06", [Moment(time)])
 
 
-def test_a_method_that_ends_early_is_told(damaged: Callable[..., Material], read: Read) -> None:
+def test_a_method_that_ends_early_is_named(damaged: Callable[..., Material], read: Read) -> None:
     with pytest.raises(FaceDiffError, match=r"ours lasts from 0 to 0\.2 s"):
         pick_frames(damaged(read("ours", "A_e06")[:5]), "A_e06", [Moment(0.3)])
 
@@ -198,7 +200,7 @@ def test_choosing_clips(own_material: Material, tiny_root: Path, methods: dict[s
         replace(own_material, methods=parted).choose()
 
 
-def test_what_is_not_known_is_asked_for(own_material: Material) -> None:
+def test_unknown_facts_name_the_option_that_gives_them(own_material: Material) -> None:
     with pytest.raises(FaceDiffError, match="--mesh"):
         replace(own_material, faces=None).mesh(["A_e06"])
     with pytest.raises(FaceDiffError, match="--frame-rate"):
@@ -211,7 +213,7 @@ def test_what_is_not_known_is_asked_for(own_material: Material) -> None:
 
 
 @pytest.mark.parametrize("source", ["0-0", "0-99", "0-1-2", "gone.txt", "-"])
-def test_lip_pairs_that_are_none(source: str, tiny_root: Path) -> None:
+def test_lip_pairs_are_refused(source: str, tiny_root: Path) -> None:
     with pytest.raises(FaceDiffError, match="--lip-pairs"):
         read_pairs(source, tiny_root, VERTICES)
     with pytest.raises(FaceDiffError, match="--lip-pairs"):

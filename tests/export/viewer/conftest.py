@@ -1,4 +1,4 @@
-"""The browser of this folder's tests: found, or said to be missing."""
+"""The browser of this folder's tests, which are skipped without one."""
 
 from __future__ import annotations
 

@@ -100,11 +100,11 @@ def is_open(colour: list[int]) -> bool:
 
 def frame_after(page: Page, script: str) -> int:
     """The frame that is on the screen some pictures after a script has run."""
-    told: int = page.evaluate(
+    found: int = page.evaluate(
         f"(async () => {{ await ({script}); for (let i = 0; i < 4; i++) await new Promise(requestAnimationFrame);"
         f" return facediff.frame; }})()"
     )
-    return told
+    return found
 
 
 def test_while_it_plays_the_picture_follows_the_sound_by_less_than_half_a_frame(show: Show) -> None:
@@ -153,8 +153,8 @@ def test_every_frame_is_unpacked_as_it_was_written(show: Show) -> None:
     animation = Animation("wild", vertices, template, 24, np.arange(30, dtype=np.int32).reshape(-1, 3), unit="mm")
     page = show([animation])
     for frame in (69, 0, 31, 32, 33, 63, 64):
-        told = page.evaluate(f"(async () => {{ await facediff.seek({frame}); return [...facediff.positions(0)]; }})()")
-        off = np.linalg.norm(np.reshape(told, (-1, 3)) - vertices[frame], axis=1)
+        found = page.evaluate(f"(async () => {{ await facediff.seek({frame}); return [...facediff.positions(0)]; }})()")
+        off = np.linalg.norm(np.reshape(found, (-1, 3)) - vertices[frame], axis=1)
         assert off.max() < 0.05
 
 
@@ -223,8 +223,8 @@ def test_the_heat_map_is_the_distance_from_the_truth(show: Show) -> None:
     plain = page.evaluate("[key.hidden, heat.hidden]")
     assert plain == [True, False]
     page.press("h")
-    told = page.evaluate("(async () => { await facediff.seek(10); return [...facediff.distances(1)]; })()")
-    assert np.allclose(told, [0] * 8 + [4] * 4, atol=0.09)
+    found = page.evaluate("(async () => { await facediff.seek(10); return [...facediff.distances(1)]; })()")
+    assert np.allclose(found, [0] * 8 + [4] * 4, atol=0.09)
     assert page.evaluate("[key.hidden, highest.value]") == [False, "4"]
     assert page.evaluate("document.querySelectorAll('.error')[1].textContent") == "mean 1.33 mm\nlargest 4.00 mm"
     page.press("h")
@@ -265,7 +265,7 @@ def test_wide_and_narrow_windows_light_and_dark(show: Show, width: int, height: 
     assert is_open(page.evaluate("(facediff.turn(0, 0), new Promise(requestAnimationFrame).then(pixel))"))
 
 
-def test_names_from_files_cannot_become_scripts_and_nothing_foreign_runs(show: Show) -> None:
+def test_names_from_files_cannot_become_scripts_and_no_other_code_runs(show: Show) -> None:
     page = show([replace(clicks(name=HOSTILE), metadata={"identity": HOSTILE, HOSTILE: HOSTILE})])
     assert page.evaluate("document.querySelector('.name b').textContent") == HOSTILE
     assert page.evaluate("document.title").startswith(HOSTILE)

@@ -27,7 +27,7 @@ HOSTILE = '</script><script>window.hacked = 1</script><img src=x onerror="window
 
 
 class Reader(html.parser.HTMLParser):
-    """Every element, by the rules of HTML: what a browser takes for a script is one here."""
+    """Every element, by the rules of HTML: what a browser treats as a script is one here."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -99,7 +99,7 @@ def random_animation(
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["m", "cm", "0.5"]), st.sampled_from([1, 31, 32, 33, 70]))
-def test_positions_come_back_within_the_bound_that_is_stated(
+def test_page_positions_come_back_within_the_stated_bound(
     tmp_path_factory: pytest.TempPathFactory, seed: int, unit: str, frames: int
 ) -> None:
     scale = {"m": 1000, "cm": 10, "0.5": 500}[unit]
@@ -111,7 +111,7 @@ def test_positions_come_back_within_the_bound_that_is_stated(
     assert off.max() <= 0.05 * 3**0.5 / 2 + 1e-4 < 0.05
 
 
-def test_a_mesh_that_is_wound_inside_out_is_turned(tmp_path: Path) -> None:
+def test_page_turns_a_mesh_that_is_wound_inside_out(tmp_path: Path) -> None:
     """The picture's script treats what is wound clockwise for the dark hollow of the mouth."""
     animation = clicks()
     write_page(tmp_path / "a.html", [animation, replace(animation, faces=animation.triangles[:, ::-1])])
@@ -120,7 +120,7 @@ def test_a_mesh_that_is_wound_inside_out_is_turned(tmp_path: Path) -> None:
         assert np.array_equal(np.frombuffer(page.blob(facts["faces"]), "<u4").reshape(-1, 3), animation.triangles)
 
 
-def test_a_page_of_several_animations_keeps_each_mesh_and_equal_parts_once(tmp_path: Path) -> None:
+def test_page_keeps_each_mesh_and_equal_parts_once(tmp_path: Path) -> None:
     first, second = random_animation(0), random_animation(1, vertices=12)
     write_page(tmp_path / "a.html", [first, second, replace(first, name="again")])
     page = Written(tmp_path / "a.html")
@@ -138,7 +138,7 @@ def test_a_page_of_several_animations_keeps_each_mesh_and_equal_parts_once(tmp_p
     assert page.facts["heat"] is None
 
 
-def test_the_clicks_stand_at_the_samples_of_their_frames_and_the_curve_shows_them(tmp_path: Path) -> None:
+def test_page_sound_and_curve_show_the_clicks_at_their_frames(tmp_path: Path) -> None:
     write_page(tmp_path / "a.html", [clicks(speech=False), clicks()])
     page = Written(tmp_path / "a.html")
     with wave.open(io.BytesIO(page.blob(page.facts["sound"]))) as file:
@@ -153,7 +153,7 @@ def test_the_clicks_stand_at_the_samples_of_their_frames_and_the_curve_shows_the
     assert curve.max() == pytest.approx(OPENING)
 
 
-def test_the_heat_map_has_the_renderers_colours_and_only_where_topologies_agree(tmp_path: Path) -> None:
+def test_page_heat_map_has_the_renderers_colours_where_topologies_agree(tmp_path: Path) -> None:
     truth, other = random_animation(0), random_animation(1, vertices=12)
     near = replace(truth, vertices=truth.vertices + np.float32([0.003, 0, 0]), name="3 mm off")
     write_page(tmp_path / "a.html", [truth, near, other], truth=0)
@@ -166,7 +166,7 @@ def test_the_heat_map_has_the_renderers_colours_and_only_where_topologies_agree(
     assert Written(tmp_path / "b.html").facts["heat"] is None
 
 
-def test_hostile_names_stay_words_and_the_page_refers_to_nothing(tmp_path: Path) -> None:
+def test_page_keeps_hostile_names_as_text_and_refers_to_nothing(tmp_path: Path) -> None:
     write_page(tmp_path / "a.html", [replace(clicks(name=HOSTILE), metadata={HOSTILE: HOSTILE})])
     page = Written(tmp_path / "a.html")
     assert page.facts["animations"][0]["name"] == HOSTILE
@@ -186,7 +186,7 @@ def test_hostile_names_stay_words_and_the_page_refers_to_nothing(tmp_path: Path)
     assert "unsafe" not in policies[0]
 
 
-def test_a_page_is_the_same_every_time(tmp_path: Path) -> None:
+def test_page_is_the_same_every_time(tmp_path: Path) -> None:
     for name in "ab":
         write_page(tmp_path / f"{name}.html", [clicks()])
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
@@ -220,7 +220,7 @@ def nan_at(animation: Animation, frame: int) -> Animation:
         ([random_animation(0, unit="1000")], "away from its template; give the unit"),
     ],
 )
-def test_what_cannot_be_shown_is_one_sentence_and_no_file(
+def test_page_that_cannot_be_shown_is_one_sentence_and_no_file(
     tmp_path: Path, animations: list[Animation], words: str
 ) -> None:
     with pytest.raises(FaceDiffError, match=words) as error:
@@ -229,7 +229,7 @@ def test_what_cannot_be_shown_is_one_sentence_and_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_page_above_the_limit_is_refused_with_its_size_and_the_old_one_stays(tmp_path: Path) -> None:
+def test_page_above_the_limit_is_refused_and_the_old_one_stays(tmp_path: Path) -> None:
     path = tmp_path / "a.html"
     write_page(path, [random_animation(0)])
     before = path.read_bytes()
@@ -239,11 +239,11 @@ def test_a_page_above_the_limit_is_refused_with_its_size_and_the_old_one_stays(t
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
     write_page(tmp_path / "b.html", [random_animation(1, frames=900, vertices=99)], max_mb=30)
-    told = float(str(error.value).split("would have ")[1].split(" MB")[0])
-    assert (tmp_path / "b.html").stat().st_size / 1e6 == pytest.approx(told, abs=0.05)
+    found = float(str(error.value).split("would have ")[1].split(" MB")[0])
+    assert (tmp_path / "b.html").stat().st_size / 1e6 == pytest.approx(found, abs=0.05)
 
 
-def test_a_minute_of_flames_size_stays_below_the_limit(tmp_path: Path) -> None:
+def test_page_of_a_minute_of_flames_size_stays_below_the_limit(tmp_path: Path) -> None:
     animation = minute(
         5023, seconds=6, noise=0.1
     )  # on every coordinate of every frame: more than models and scans have

@@ -33,7 +33,9 @@ def files(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_bare_truth_borrows_the_mesh_and_stands_first(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bare_truth_gets_the_mesh_of_an_archive_and_comes_first(
+    files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     page = files / "page.html"
     assert main(["view", str(files / "guess.npz"), "--truth", str(files / "true.npy"), "-o", str(page)]) == 0
     read = facts(page)
@@ -46,7 +48,7 @@ def test_a_bare_truth_borrows_the_mesh_and_stands_first(files: Path, capsys: pyt
     assert re.search(r"page.html: 75 frames of 2 animations, 0\.\d MB", capsys.readouterr().out)
 
 
-def test_a_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
+def test_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
     files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The checkpoint's first face is not the archive's; whoever names an identity wants that one's."""
@@ -75,7 +77,7 @@ def test_a_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
     assert facts(page)["animations"][0]["centre"] == [100, 100, 97.5]
 
 
-def test_animations_of_one_recording_are_told_apart_by_their_files(files: Path) -> None:
+def test_animations_of_one_recording_are_named_after_their_files(files: Path) -> None:
     write_archive(files / "other.npz", clicks(name="guess", lower=5))
     page = files / "page.html"
     assert main(["view", str(files / "guess.npz"), str(files / "other.npz"), "-o", str(page)]) == 0
@@ -109,7 +111,7 @@ def test_labels_the_shortest_and_the_browser(files: Path, monkeypatch: pytest.Mo
         (["guess.npz", "short.npy", "-o", "page.html"], "short: has 9 frames and guess 75"),
     ],
 )
-def test_what_cannot_be_done_is_one_sentence_and_no_page(
+def test_view_refuses_in_one_sentence_and_writes_no_page(
     files: Path, words: list[str], told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(files)
