@@ -102,8 +102,9 @@ def evaluate(
     requests = parse_all(metrics)
     names, unnamed_truths = list_names(Path(truth), [NamePattern(truth_pattern, templates or ())])
     truths = index_truths(names)
-    if frame_rate is None and corpus is not None and "frame_rate" in (manifest := read_manifest(corpus)):
-        frame_rate = float(manifest["frame_rate"]) / truth_stride
+    if frame_rate is None and requests and corpus is not None:
+        stored = read_manifest(corpus).get("frame_rate")
+        frame_rate = stored / truth_stride if isinstance(stored, int | float) and stored > 0 else None
     needed = {need for request in requests for need in request.needs}
     if lip_pairs is None and "lip_pairs" in needed and corpus is not None and (corpus / PAIRS_FILE).is_file():
         lip_pairs = read_pairs(None, corpus, n_vertices)

@@ -1,4 +1,4 @@
-"""Finding the vertices of the lips and the upper face beside the files that are scored."""
+"""Find the files that are scored, pair them, and find the templates, regions and lip pairs that belong to them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from facediff.errors import FaceDiffError
 from facediff.metrics import TOPOLOGIES, LipPairs, Region
 from facediff.utils.arrays import open_vertices
 
-# What a file's name says: who speaks, what is said, and whose style the prediction was given.
+# File names: who speaks, what is said, and whose style the prediction was given.
 
 DEFAULT_PATTERNS = ("{subject}_{sentence}_condition_{identity}", "{subject}_{sentence}")
-"""How predictions are named unless told otherwise; the first is that of the field's released projects."""
+"""How predictions are named by default; the first is that of the field's released projects."""
 
 TRUTH_PATTERN = "{subject}_{sentence}"
-"""How truths are named unless told otherwise."""
+"""How truths are named by default."""
 
 FIELDS = ("subject", "sentence", "identity")
 
@@ -41,20 +41,20 @@ class Name:
 
     @property
     def clip(self) -> str:
-        """``<subject>_<sentence>``, under which prediction and truth find each other."""
+        """``<subject>_<sentence>``, by which prediction and truth are paired."""
         return f"{self.subject}_{self.sentence}"
 
 
 class NamePattern:
-    """Takes names apart by a pattern such as ``{subject}_{sentence}_condition_{identity}``.
+    """Reads the fields of names by a pattern such as ``{subject}_{sentence}_condition_{identity}``.
 
-    Subjects and sentences may hold underscores themselves. Where a name can be read in several ways, a known subject
-    goes first, then a subject that is also the identity, then the split at the last underscore.
+    Names of speakers and sentences may hold underscores. Where a name can be read in several ways, a known speaker
+    takes precedence, then a speaker that is also the identity, then the split at the last underscore.
 
     Args:
         pattern: the name without ``.npy``, or the path below the folder if it has a ``/``. It has ``{subject}`` and
             ``{sentence}`` and may have ``{identity}``.
-        subjects: known subjects.
+        subjects: known speakers.
 
     Raises:
         FaceDiffError: if the pattern has other fields, or lacks one.
@@ -96,7 +96,7 @@ def _expression(parts: Sequence[str], reading: dict[str, str]) -> str:
 def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path, Name], list[str]]:
     """The ``.npy`` files of a folder by what their names say, sorted, and the names that no pattern fits.
 
-    Files whose names begin with a dot are passed over.
+    Files whose names begin with a dot are ignored.
 
     Raises:
         FaceDiffError: if there is no such folder, or no ``.npy`` file in it.
@@ -119,10 +119,10 @@ def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path
     return found, unnamed
 
 
-# Which prediction belongs to which truth, and what is left over on either side.
+# Pairing: which prediction belongs to which truth, and what has no counterpart.
 
 OWN = "own"
-"""Which conditions are scored: the subject's own identity, or the mean over all."""
+"""Scores the prediction that was conditioned on the speaker's own identity."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], ident
     Args:
         predictions: what the names of a method's files say.
         truths: truths by clip.
-        identity: ``own``: the prediction conditioned on the subject itself, or else the one whose name has no
+        identity: ``own``: the prediction conditioned on the speaker's own identity, or else the one whose name has no
             condition; ``all``: every condition; or a condition's name.
 
     Raises:
@@ -236,7 +236,7 @@ def _choose(there: Mapping[str, Path], wanted: str) -> list[str]:
     return [wanted] if wanted in there else []
 
 
-# What lies beside the files that are scored: templates, and how many vertices the mesh has.
+# What belongs to the files that are scored: the corpus folder, the mesh's size, regions and lip pairs.
 
 
 def find_truths(folder: Path) -> tuple[Path, Path | None]:

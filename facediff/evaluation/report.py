@@ -101,7 +101,7 @@ class Missing:
         without_prediction: clips that have no prediction of the conditions asked for.
         unused: files under conditions that were not asked for.
         unnamed: files whose names no pattern fits.
-        unusable: clip to reason: unreadable files, other meshes, subjects without a template.
+        unusable: clip to reason: unreadable files, other meshes, speakers without a template.
     """
 
     without_truth: list[str] = field(default_factory=list)

@@ -160,7 +160,7 @@ class Scorer:
         self.columns.append(Column(protocol.name, name, pooling, protocol.length_rule, source, absolute, region))
 
     def score(self, pair: Pair) -> ClipScores | str:
-        """The scores of a clip; in words why it has none if a file of it cannot be used.
+        """The scores of a clip, or in words why it has none: a file of it cannot be used.
 
         Raises:
             FaceDiffError: if it holds NaN or infinity, or a protocol refuses its lengths.
@@ -306,8 +306,8 @@ def score_all(
 ) -> dict[str, dict[str, ClipScores | str]]:
     """The scores of every job.
 
-    Threads do it: nearly all of the time goes into torch, which lets other threads run, and a thread starts at once
-    where a process would first take seconds, and a hundred megabytes, to import torch.
+    The workers are threads: nearly all of the time is spent in torch, which lets other threads run, and a thread
+    starts immediately where a process would take seconds, and a hundred megabytes, to import torch.
 
     Args:
         scorer: scores a clip.

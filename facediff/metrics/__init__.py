@@ -27,7 +27,8 @@ class's docstring has the formula, its source, its unit, and what about it is a 
 - speed: `RealTimeFactor`
 
 Lengths or masks say what is padding, which is never read. NaN and infinity are refused with the clip's name.
-Sums are float64 whatever comes in, and processes with unequal numbers of sequences get what one would.
+Sums are float64 whatever comes in, and processes with unequal numbers of sequences get what one would. The options
+that all metrics share are those of `facediff.metrics.base.SequenceOptions` and `BatchOptions`.
 
 A new metric is a `SequenceMetric` that defines `clip_value`, registered with ``@facediff.registry.metric.register``.
 """

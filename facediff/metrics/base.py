@@ -613,7 +613,7 @@ class LipMetric(SequenceMetric):
 # The functional form.
 
 
-_NOT_IN_FUNCTIONS = {"definition", "check_finite", "sync_on_compute", "process_group", "kwargs"}
+_NOT_IN_FUNCTIONS = {"definition", "check_finite", "sync_on_compute", "process_group"}
 
 
 def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> Callable[..., Tensor]:
@@ -636,7 +636,8 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
     order |= {name: p for name, p in made.items() if p.kind is by_place and name not in metric.inferred}
     order |= {name: updated[name].replace(kind=by_place, default=inspect.Parameter.empty) for name in positional}
     for name, parameter in (updated | made).items():
-        if name not in order and name not in metric.inferred and name not in _NOT_IN_FUNCTIONS:
+        internal = parameter.kind is inspect.Parameter.VAR_KEYWORD or name in _NOT_IN_FUNCTIONS
+        if name not in order and name not in metric.inferred and not internal:
             order[name] = parameter
     signature = inspect.Signature(list(order.values()), return_annotation=Tensor)
 

@@ -104,7 +104,6 @@ class OpeningMetric(SequenceMetric):
         pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
         definition: The metric in words, `words` if None; ``{pairs}`` becomes the pairs' name, number and hash.
         pooling: ``"frames"`` or ``"sequences"``.
-        **options: Those of `SequenceOptions`.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lip_pairs",)
@@ -147,7 +146,6 @@ class OpeningMetric(SequenceMetric):
             offsets_from: Neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, that
                 prediction and truth are offsets from. **None means that they are absolute vertices**; offsets
                 without it give another, meaningless number.
-            **batch: Those of `BatchOptions`.
 
         Raises:
             ValueError: As for `SequenceMetric.update`, and if ``offsets_from`` does not fit. Nothing is
@@ -170,7 +168,6 @@ class MouthOpeningDifference(OpeningMetric):
     Args:
         pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
         pooling: ``"frames"`` or ``"sequences"``.
-        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> metric = MouthOpeningDifference([(0, 1)])
@@ -212,7 +209,6 @@ class LipOpeningCorrelation(OpeningMetric):
 
     Args:
         pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
-        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> truth = torch.tensor([0.0, 1.0, 0.0, 2.0])[:, None, None] * torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
@@ -247,7 +243,6 @@ class LipSpeedCorrelation(LipMetric):
 
     Args:
         lips: Lip vertices, a `Region` or indices.
-        **options: Those of `SequenceOptions`.
     """
 
     higher_is_better = True
@@ -304,7 +299,6 @@ class BilabialClosureRate(OpeningMetric):
             closes less.
         pooling: ``"frames"``: the frames (or closures) of all sequences alike; ``"sequences"``: the mean of
             the sequences' rates.
-        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> motion = torch.zeros(4, 2, 3)
@@ -383,7 +377,6 @@ class BilabialClosureRate(OpeningMetric):
                 do not count.
             offsets_from: Neutral vertices that prediction and truth are offsets from; **None means that they
                 are absolute vertices**.
-            **batch: Those of `BatchOptions`.
 
         Raises:
             ValueError: As for `OpeningMetric.update`, and if the closures are missing or do not fit. Nothing is
@@ -396,18 +389,7 @@ class BilabialClosureRate(OpeningMetric):
 
 
 def _attach_closures(clips: Clips, closures: Closures, *, padded: int, single: bool) -> Clips:
-    """The sequences with their closures, as far as these lie in scored frames.
-
-    Args:
-        clips: The sequences.
-        closures: Masks or intervals.
-        padded: Frames of the truth with padding, which a mask must have too.
-        single: Whether the caller gave one sequence without batch axis.
-
-    Raises:
-        ValueError: If a mask has another shape, or intervals are no pairs of whole numbers, empty, negative,
-            out of order or overlapping; the message names the clip.
-    """
+    """The sequences with their closures, as far as these lie in scored frames; a mask has as many as are padded."""
     count = len(clips.clips)
     if isinstance(closures, Tensor):
         shape = (padded,) if single else (count, padded)

@@ -26,13 +26,7 @@ _CHUNK_ELSEWHERE = 2**24
 
 @dataclass(frozen=True)
 class ErrorOf:
-    """Which vertex error to take.
-
-    Args:
-        indices: Vertices to look at, (region,) int64; None for all.
-        reduction: How the vertices of a frame become one number.
-        squared: Whether distances are squared.
-    """
+    """Which vertex error to take: over which vertices (None for all), how reduced in a frame, and whether squared."""
 
     indices: Tensor | None
     reduction: Reduction
@@ -117,16 +111,7 @@ def widened(motion: Tensor, name: str, buffers: Buffers) -> Tensor:
 
 
 def squared_errors(true: Tensor, predicted: Tensor, buffers: Buffers) -> Tensor:
-    """Σ_c (g_c − p_c)² of every vertex.
-
-    Args:
-        true: (frames, vertices, 3), of any floating-point type.
-        predicted: Likewise.
-        buffers: Where the work is done.
-
-    Returns:
-        (frames, vertices), float64, in a buffer.
-    """
+    """Σ_c (g_c − p_c)² of every vertex, (frames, vertices) float64, in a buffer."""
     difference = buffers.get("difference", *true.shape)
     torch.sub(widened(true, "difference", buffers), widened(predicted, "predicted", buffers), out=difference)
     difference.mul_(difference)
@@ -166,8 +151,8 @@ class Variation:
         first: First frame, (vertices, 3).
         template: (vertices, 3); None if frames are offsets from it.
         indices: Vertices to look at, (region,) int64.
-        step: The most frames that are added at a time.
-        buffers: Where the work is done.
+        step: The most frames that are added in one call.
+        buffers: Memory for the work.
     """
 
     def __init__(self, first: Tensor, template: Tensor | None, indices: Tensor, step: int, buffers: Buffers) -> None:

@@ -91,7 +91,6 @@ class SamplesMetric(SequenceMetric):
         n_samples: N, how many samples there are of each sequence; other numbers are refused.
         squared: Whether distances are squared; the score is then in the vertices' unit squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        **options: Those of `SequenceOptions`.
     """
 
     higher_is_better = False
@@ -146,7 +145,6 @@ class MeanEstimateError(SamplesMetric):
         n_samples: N; other numbers of samples are refused.
         squared: Whether distances are squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> samples = torch.stack([torch.ones(4, 2, 3), -torch.ones(4, 2, 3)])
@@ -179,7 +177,6 @@ class CoverageError(SamplesMetric):
         n_samples: N; other numbers of samples are refused.
         squared: Whether distances are squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> samples = torch.stack([torch.ones(4, 2, 3), 2 * torch.ones(4, 2, 3)])
@@ -212,7 +209,6 @@ class Diversity(SequenceMetric):
         definition: Which predictions are compared, in words.
         pooling: ``"frames"`` or ``"sequences"``.
         check_finite: Whether NaN and infinity are refused.
-        **options: Those of `ProcessOptions`.
     """
 
     def __init__(
@@ -263,7 +259,6 @@ class SampleDiversity(Diversity):
         seed: Of the order; not used with ``"all"``.
         pooling: ``"sequences"`` as in the script, or ``"frames"``.
         check_finite: Whether NaN and infinity are refused.
-        **options: Those of `ProcessOptions`.
 
     Raises:
         ValueError: If an option is unknown, or ``n_samples`` cannot be paired.
@@ -338,7 +333,6 @@ class IdentityDiversity(Diversity):
         region: Vertices to look at, a `Region` or indices; None for all.
         pooling: ``"sequences"`` as in the script, or ``"frames"``.
         check_finite: Whether NaN and infinity are refused.
-        **options: Those of `ProcessOptions`.
     """
 
     leaves_out = "each was predicted for one identity only"

@@ -120,7 +120,6 @@ class SpeechLipMetric(SequenceMetric):
             waveform: The sound (batch, samples), or (samples,) of one sequence, at the metric's
                 ``sample_rate``, beginning with the first frame. Samples beyond the scored frames are not read.
             intensity: Instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
-            **batch: Those of `BatchOptions`.
 
         Raises:
             ValueError: As for `SequenceMetric.update`, and if the speech is missing, given twice, too short
@@ -130,17 +129,7 @@ class SpeechLipMetric(SequenceMetric):
         self.add(self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3))
 
     def attach_speech(self, clips: Clips, waveform: Tensor | None, intensity: Tensor | None, *, single: bool) -> Clips:
-        """The sequences with the intensity of their speech.
-
-        Args:
-            clips: The sequences.
-            waveform: As for `update`.
-            intensity: As for `update`.
-            single: Whether the caller gave one sequence without batch axis.
-
-        Raises:
-            ValueError: As `update`.
-        """
+        """The sequences with the intensity of their speech; ``single`` for one sequence without batch axis."""
         given = intensity if waveform is None else waveform
         if given is None or (waveform is not None and intensity is not None):
             raise ValueError("give the speech once: as waveform= or as intensity=")
@@ -205,8 +194,8 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
     leaves_out = "the intensity of the speech does not vary"
     words = (
         "in each sequence the Pearson correlation over frames between the intensity of the speech (root mean square of "
-        "a frame) and the mean speed of {region}, {side}; mean over sequences; lips that do not vary count 0, a sequence "
-        "whose speech does not vary is left out [1]"
+        "a frame) and the mean speed of {region}, {side}; mean over sequences; lips that do not vary count 0, a "
+        "sequence whose speech does not vary is left out [1]"
     )
 
     def clip_value(self, clip: Clip) -> Tensor:
@@ -307,12 +296,11 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         """Add a batch of sequences with their speech.
 
         Args:
-            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
+            prediction: As for `SpeechLipMetric.update`, like all that follow but the identities.
             truth: Likewise.
             identities: Number of each sequence's identity, below ``n_identities``; needed unless there is one.
             waveform: The sound (batch, samples); needs the two rates.
             intensity: Instead: intensity of the speech in each frame, (batch, frames).
-            **batch: Those of `BatchOptions`.
 
         Raises:
             ValueError: As for `SpeechLipMetric.update`, and if the identities are missing or do not fit.

@@ -27,7 +27,6 @@ class RealTimeFactor(ExactMetric):
 
     Args:
         hardware: What it was computed on, for the summary: see `device_name`.
-        **options: Those of `ProcessOptions`.
 
     Raises:
         ValueError: If the hardware is not named.

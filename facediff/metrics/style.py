@@ -35,7 +35,6 @@ class StyleRetrievalAccuracy(ExactMetric):
 
     Args:
         closeness: ``"cosine"`` or ``"euclidean"``.
-        **options: Those of `ProcessOptions`.
 
     Raises:
         ValueError: If the closeness is unknown.

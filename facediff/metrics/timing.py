@@ -92,7 +92,6 @@ class LipWarpingDistance(LipMetric):
 
     Args:
         lips: Lip vertices, a `Region` or indices.
-        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> late = torch.zeros(4, 1, 3)
@@ -230,7 +229,6 @@ class TemporalMisalignment(OpeningMetric):
         smoothing: Standard deviation of the Gaussian in frames; 0 for none. It is cut off at 4 standard
             deviations, and the series is mirrored at its ends.
         frames_per_second: Of the motion, for a result in milliseconds; None for frames.
-        **options: Those of `SequenceOptions`.
 
     Raises:
         ValueError: If an option is unknown or out of range.

@@ -44,10 +44,6 @@ class VertexError(SequenceMetric):
         reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
         squared: Whether distances are squared; the score is then in the vertices' unit squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        **options: Those of `SequenceOptions`.
-
-    Raises:
-        ValueError: If an option is unknown.
     """
 
     higher_is_better = False
@@ -88,7 +84,6 @@ class MeanVertexError(VertexError):
         reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
         squared: Whether e² replaces √e².
         pooling: ``"frames"`` or ``"sequences"``.
-        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> metric = MeanVertexError()
@@ -119,7 +114,6 @@ class LipVertexError(VertexError):
         lips: Lip vertices, a `Region` or indices.
         squared: Whether distances are squared, e² instead of √e².
         pooling: ``"frames"`` or ``"sequences"``.
-        **options: Those of `SequenceOptions`.
 
     >>> import torch
     >>> metric = LipVertexError([1, 2])
@@ -153,7 +147,6 @@ class UpperFaceVertexError(VertexError):
         reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
         squared: Whether distances are squared.
         pooling: ``"frames"`` or ``"sequences"``.
-        **options: Those of `SequenceOptions`.
     """
 
     needs = ("upper_face",)
@@ -192,10 +185,6 @@ class FaceDynamicsDeviation(SequenceMetric):
     Args:
         upper: Upper-face vertices, a `Region` or indices.
         sign: ``"signed"`` or ``"absolute"`` in each sequence.
-        **options: Those of `SequenceOptions`.
-
-    Raises:
-        ValueError: If an option is unknown.
 
     >>> import torch
     >>> truth = torch.zeros(2, 1, 3)
@@ -231,7 +220,6 @@ class FaceDynamicsDeviation(SequenceMetric):
             template: Neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, when
                 prediction and truth are absolute vertices. **None means that they are offsets from the
                 template already**; absolute vertices without a template give another, meaningless number.
-            **batch: Those of `BatchOptions`.
 
         Raises:
             ValueError: As for `SequenceMetric.update`, and if the template does not fit. Nothing is added

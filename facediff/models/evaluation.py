@@ -193,7 +193,7 @@ class Evaluation:
         return {place: references[name] for place, name in enumerate(assets.identities) if name in references}
 
     def score(self, model: Inference, split: str, batch: Batch, identity: str = "") -> None:
-        """Generate a batch's motion, and what metrics need of the model besides, and add it to the model's scores.
+        """Generate a batch's motion, and whatever else metrics need of the model, and add its scores.
 
         Args:
             model: the model.

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 import torch
+from torchmetrics import Metric
 
 import facediff.metrics as fm
 from facediff import registry
@@ -204,3 +205,37 @@ def test_regions_are_options_too(corpus: Files) -> None:
 def test_the_mesh_is_checked(corpus: Files) -> None:
     with pytest.raises(FaceDiffError, match=rf"mouth_opening_difference: .*{VERTICES}"):
         scored(corpus, "mouth_opening_difference", lip_pairs=LipPairs.from_pairs("far", [(0, 99)]))
+
+
+class PlainError(Metric):
+    """A metric of another package that knows nothing of facediff's base classes."""
+
+    full_state_update = False
+    total: torch.Tensor
+    count: torch.Tensor
+
+    def __init__(self, scale: float = 1.0) -> None:
+        super().__init__()
+        self.scale = scale
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("count", torch.zeros(()), dist_reduce_fx="sum")
+
+    def update(self, prediction: torch.Tensor, truth: torch.Tensor) -> None:
+        self.total = self.total + self.scale * (prediction.double() - truth.double()).abs().sum()
+        self.count = self.count + truth.numel()
+
+    def compute(self) -> torch.Tensor:
+        return self.total / self.count
+
+
+def test_any_torchmetrics_class_can_be_registered(corpus: Files, monkeypatch: pytest.MonkeyPatch) -> None:
+    registry.metric.load()
+    entry = registry.Entry("plain_error", PlainError, PlainError)
+    monkeypatch.setitem(registry.metric._entries, "plain_error", entry)
+    report = scored(corpus, "plain_error:scale=2", bootstrap=20)
+    pairs = [(batch["prediction"], batch["truth"]) for batch in batches(corpus)]
+    expected = 2 * sum((p - t).abs().sum().item() for p, t in pairs) / sum(t.numel() for _, t in pairs)
+    (score,) = [score for score in report.methods[0].scores if score.protocol == "metrics"]
+    assert score.value == pytest.approx(expected, rel=1e-9)
+    assert (score.interval, score.sequences) == (None, len(LENGTHS))
+    assert "metrics/plain_error:scale=2" not in report.rows()[0]
