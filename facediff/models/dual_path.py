@@ -153,8 +153,8 @@ class DualPathDiffusion(AnimationModel):
             noise: unit noise.
         """
         network = self.network
-        # √ᾱ M⁰ + √(1 − ᾱ) ε, as NoiseProcess.add_noise, but in place: on a processor, allocating tensors of the motion's
-        # size takes longer than the arithmetic.
+        # √ᾱ M⁰ + √(1 − ᾱ) ε, as NoiseProcess.add_noise, but in place: on a processor, allocating tensors of this size
+        # takes longer than the arithmetic.
         signal = self.process.signal.to(noise.device)[step][:, None, None]
         noisy = noise.mul_((1 - signal).sqrt()).addcmul_(batch.motion.flatten(2), signal.sqrt() * self.scale)
         decoded = network.core(network.embed(noisy), step, self.conditions(batch))

@@ -248,8 +248,8 @@ class Oracle(nn.Module):
     def content(self, motion: Tensor, mask: Tensor) -> Tensor:
         return (motion / self.style(motion, mask)[:, :, None, None]).flatten(2)
 
-    def hear(self, audio: Tensor, *rest: object) -> Tensor:
-        return self.said.flatten(1)[None].expand(len(audio), -1, -1)
+    def content_of_speech(self, batch: Batch) -> Tensor:
+        return self.said.flatten(1)[None].expand(len(batch), -1, -1)
 
     def decoder(self, content: Tensor, style: Tensor, mask: Tensor) -> Tensor:
         return content * style[:, None]
@@ -283,7 +283,7 @@ class TestLosses:
         terms = model.losses(collate(made))
         assert set(terms) >= {"reconstruction", "swap", "cycle", "speech_reconstruction", "speech_swap", "speech_cycle"}
         for name in terms:
-            if name not in ("person_style", "loss"):  # telling two people apart is never done
+            if name not in ("identity_style", "loss"):  # telling two people apart is never done
                 assert float(terms[name]) == 0.0, name
 
     def test_a_network_that_ignores_style_has_a_swap_loss(self, tiny: Tiny) -> None:
@@ -350,7 +350,7 @@ class TestLosses:
             without = gradients(**option)
             torch.testing.assert_close(full["loss"] - without["loss"], term, rtol=1e-4, atol=1e-4)
         apart = gradients(aligned_pairs=False)
-        assert float(apart["reading_content"]) == 0 < float(full["reading_content"])
+        assert float(apart["recording_content"]) == 0 < float(full["recording_content"])
         assert float(apart["swap"]) != float(full["swap"])
 
     def test_every_parameter_gets_a_gradient(self, tiny: Tiny) -> None:

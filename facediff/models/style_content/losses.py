@@ -1,4 +1,8 @@
-"""The terms of style-content disentanglement, on padded batches with a frame mask."""
+"""Distances of motions, contents and styles, and which recording goes with which, on padded batches with a mask.
+
+First the distances that the objectives of style-content disentanglement are made of, then the pairs of clips that they
+compare, and at last how two recordings of one sentence are aligned in time.
+"""
 
 from __future__ import annotations
 
@@ -17,146 +21,16 @@ from facediff.errors import MissingExtraError
 from facediff.models.audio_encoders import mel_filters
 from facediff.models.losses import masked_std
 
-# Which frame of one person's reading of a sentence goes with which of another's.
+Motion = Float[Tensor, "batch frames vertices 3"]
+Mask = Bool[Tensor, "batch frames"]
+EPSILON = 1e-6
+"""Added to denominators and under roots, so that gradients are finite."""
 
 N_MELS = 40
 N_FFT = 512
 N_CEPSTRA = 13
 BAND = 0.25
-"""How far two readings may be apart in time, as a share of the longer one, after both are stretched to one length."""
-
-
-def cepstra(audio: Float[Tensor, " samples"], frames: int, frame_rate: float) -> npt.NDArray[np.float64]:
-    """Speech features (frames, 2 · 13) that depend little on the voice: standardised cepstra and their slopes.
-
-    The mean and the variance over the sentence, which tell voice and microphone rather than sounds, are taken out.
-    """
-    hop = SAMPLE_RATE / frame_rate
-    padded = torch.nn.functional.pad(audio.double(), (N_FFT // 2, N_FFT // 2 + int(hop)))
-    starts = [round(hop * (frame + 0.5)) for frame in range(frames)]
-    stretch = torch.stack([padded[start : start + N_FFT] for start in starts])
-    power = torch.fft.rfft(stretch * torch.hann_window(N_FFT, dtype=torch.float64)).abs().square()
-    energy = torch.log(power @ mel_filters(N_MELS, N_FFT, 60.0, 7600.0).double().T + 1e-6)
-    place = (torch.arange(N_MELS, dtype=torch.float64) + 0.5) * torch.pi / N_MELS
-    features = energy @ torch.cos(place[:, None] * torch.arange(N_CEPSTRA, dtype=torch.float64))
-    features = torch.cat([features, torch.gradient(features, dim=0)[0]], 1) if frames > 1 else features.repeat(1, 2)
-    spread = features.std(0, correction=0).clamp_min(1e-6)
-    return ((features - features.mean(0)) / spread).numpy()
-
-
-def align(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """For each frame of ``first`` the frame of ``second`` that goes with it, by dynamic time warping.
-
-    Args:
-        first: features (T, C).
-        second: features (U, C).
-
-    Returns:
-        indices (T,) into ``second``, never falling; where several frames go with one, the middle one.
-
-    Raises:
-        MissingExtraError: if dtaidistance is not installed.
-    """
-    try:
-        from dtaidistance import dtw_ndim
-        from dtaidistance.dtw import best_path
-    except ImportError as error:
-        raise MissingExtraError("dtaidistance", "mesh", "aligning two readings of one sentence") from error
-    window = round(BAND * max(len(first), len(second))) + abs(len(first) - len(second)) + 1
-    _, costs = dtw_ndim.warping_paths_fast(np.ascontiguousarray(first), np.ascontiguousarray(second), window=window)
-    partners: list[list[int]] = [[] for _ in first]
-    for here, there in best_path(costs):
-        partners[here].append(there)
-    return np.array([there[len(there) // 2] for there in partners], np.int64)
-
-
-class Alignments:
-    """Alignments of pairs of clips, each computed once and kept.
-
-    Args:
-        frame_rate: motion frames a second.
-    """
-
-    def __init__(self, frame_rate: float) -> None:
-        self.frame_rate = frame_rate
-        self._found: dict[tuple[str, str], Tensor] = {}
-
-    def frames(self, batch: Batch, clip: int, other: int) -> Tensor:
-        """For each valid frame of a clip of the batch the frame of another one, indices (frames,)."""
-        names = (batch.names[clip], batch.names[other])
-        if names not in self._found:
-            features = [self._features(batch, each) for each in (clip, other)]
-            self._found[names] = torch.from_numpy(align(*features))
-        return self._found[names]
-
-    def _features(self, batch: Batch, clip: int) -> npt.NDArray[np.float64]:
-        audio = batch.audio[clip, : int(batch.audio_lengths[clip])].float().cpu()
-        return cepstra(audio, int(batch.frame_lengths[clip]), self.frame_rate)
-
-
-Motion = Float[Tensor, "batch frames vertices 3"]
-Mask = Bool[Tensor, "batch frames"]
-EPSILON = 1e-6
-
-
-@dataclass(frozen=True)
-class Pairing:
-    """Each clip's partner, and where its frames lie in the partner's reading.
-
-    Attributes:
-        partner: index of the partner; a clip without one is its own.
-        frames: for each frame the partner's frame of the same sound; 0 where the two are not aligned.
-        aligned: True on valid frames of clips whose partner says the same sentence.
-    """
-
-    partner: Int[Tensor, " batch"]
-    frames: Int[Tensor, "batch frames"]
-    aligned: Mask
-
-    def of_partner(self, values: Tensor) -> Tensor:
-        """Values (batch, frames, …) of the partners, in the timing of the clips themselves."""
-        rows = self.partner[:, None].expand_as(self.frames)
-        return values[rows, self.frames]
-
-    @property
-    def unaligned(self) -> Bool[Tensor, " batch"]:
-        """Clips with a partner who says something else."""
-        alone = self.partner == torch.arange(len(self.partner), device=self.partner.device)
-        return ~alone & ~self.aligned.any(1)
-
-
-def pair_up(batch: Batch, readings: Alignments | None) -> Pairing:
-    """Neighbours 2k and 2k + 1 are partners; those that say the same sentence are aligned in time.
-
-    There is nothing to swap between two sentences of one person: each clip is its own partner then.
-
-    Args:
-        batch: clips; one that is left over is its own partner.
-        readings: aligns; None aligns nobody.
-    """
-    count, frames = batch.mask.shape
-    partner = torch.arange(count)
-    for clip in range(0, count - 1, 2):
-        if (
-            batch.identity_names[clip] != batch.identity_names[clip + 1]
-            or batch.sentences[clip] == batch.sentences[clip + 1]
-        ):
-            partner[clip], partner[clip + 1] = clip + 1, clip
-    places = torch.zeros(count, frames, dtype=torch.long)
-    aligned = torch.zeros(count, frames, dtype=torch.bool)
-    for clip, other in enumerate(partner.tolist()):
-        same = clip != other and batch.sentences[clip] == batch.sentences[other]
-        if readings is not None and same and batch.names[clip] != batch.names[other]:
-            found = readings.frames(batch, clip, other)
-            places[clip, : len(found)] = found
-            aligned[clip, : len(found)] = True
-    device = batch.motion.device
-    return Pairing(partner.to(device), places.to(device), aligned.to(device))
-
-
-def frame_mean(values: Float[Tensor, "batch frames"], mask: Mask) -> Float[Tensor, ""]:
-    """Mean over valid frames; 0 if there is none."""
-    return (values * mask).sum() / mask.sum().clamp_min(1)
+"""How far two recordings may be apart in time, as a share of the longer one, after both are stretched to one length."""
 
 
 class MotionDistance:
@@ -216,16 +90,21 @@ class MotionDistance:
         return total + self.lip_gap * gap + self.upper_face * face
 
 
-def relative_error(motion: Motion, truth: Motion, mask: Mask) -> Float[Tensor, ""]:
-    """Mean squared difference as a share of the truth's mean square."""
-    size = frame_mean(truth.square().mean((2, 3)), mask)
-    return frame_mean((motion - truth).square().mean((2, 3)), mask) / (size + EPSILON)
-
-
 def _gaps(motion: Motion, rest: Tensor, pairs: Tensor) -> Float[Tensor, "batch frames pairs"]:
     """Distances between the paired vertices; its gradient is finite where they touch."""
     upper, lower = (motion[:, :, pairs[:, side]] + rest[:, None, pairs[:, side]] for side in (0, 1))
     return ((upper - lower).square().sum(-1) + EPSILON).sqrt()
+
+
+def frame_mean(values: Float[Tensor, "batch frames"], mask: Mask) -> Float[Tensor, ""]:
+    """Mean over valid frames; 0 if there is none."""
+    return (values * mask).sum() / mask.sum().clamp_min(1)
+
+
+def relative_error(motion: Motion, truth: Motion, mask: Mask) -> Float[Tensor, ""]:
+    """Mean squared difference as a share of the truth's mean square."""
+    size = frame_mean(truth.square().mean((2, 3)), mask)
+    return frame_mean((motion - truth).square().mean((2, 3)), mask) / (size + EPSILON)
 
 
 def relative_distance(
@@ -235,28 +114,21 @@ def relative_distance(
 
     A share, so that it is not made small by making all values small.
     """
-    kept, beside = values[mask], others[mask]
+    kept, other = values[mask], others[mask]
     if len(kept) < 2:
         return values.new_zeros(())
-    spread = kept.var(0, correction=0).mean() + beside.var(0, correction=0).mean()
-    return 2 * (kept - beside).square().mean() / (spread + EPSILON)
-
-
-def relative_style_distance(
-    styles: Float[Tensor, "batch dim"], others: Float[Tensor, "batch dim"], chosen: Bool[Tensor, " batch"]
-) -> Float[Tensor, ""]:
-    """The same for the chosen clips' style vectors."""
-    return relative_distance(styles[:, None], others[:, None], chosen[:, None])
+    spread = kept.var(0, correction=0).mean() + other.var(0, correction=0).mean()
+    return 2 * (kept - other).square().mean() / (spread + EPSILON)
 
 
 def style_contrast(
     styles: Float[Tensor, "clips dim"], identities: Sequence[str], temperature: float = 0.1
 ) -> Float[Tensor, ""]:
-    """Pulls styles of one person together and those of different people apart.
+    """Pulls styles of one identity together and those of different identities apart.
 
-    For every style, the mean negative log-probability of picking another one of the same person among all others, with
-    cosine similarities over the temperature as logits (supervised contrast, Khosla et al. 2020, eq. 2). Pulling alone
-    would be satisfied by one style for everybody. 0 if nobody has two styles.
+    For every style, the mean negative log-probability of picking another one of the same identity among all others,
+    with cosine similarities over the temperature as logits (supervised contrast, Khosla et al. 2020, eq. 2). Pulling
+    alone would be satisfied by one style for everybody. 0 if nobody has two styles.
 
     Args:
         styles: style vectors.
@@ -286,8 +158,8 @@ def dynamics_distance(
 ) -> Float[Tensor, ""]:
     """Mean over vertices of (σ − σ̂)² / σ̄², σ the spread over time of a vertex's squared displacement, as in FDD.
 
-    σ̄ is the mean of σ̂ over vertices and clips. The motions need not be aligned, nor be of one length: two people who
-    say the same do not blink at the same time, but one may blink more.
+    σ̄ is the mean of σ̂ over vertices and clips. The motions need not be aligned, nor be of one length: two speakers
+    who say the same do not blink at the same time, but one may blink more.
 
     Args:
         motion: (B, T, V, 3).
@@ -302,3 +174,126 @@ def dynamics_distance(
     squared = [each[chosen][:, :, vertices].square().sum(-1) for each in (motion, truths)]
     spread, wanted = masked_std(squared[0], mask[chosen]), masked_std(squared[1], truth_mask[chosen])
     return (spread - wanted).square().mean() / (wanted.mean().square() + EPSILON)
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Each clip's partner, and which of the partner's frames goes with each of its frames.
+
+    Attributes:
+        partner: index of the partner; a clip without one is its own.
+        frames: for each frame the partner's frame of the same sound; 0 where the two are not aligned.
+        aligned: True on valid frames of clips whose partner says the same sentence.
+    """
+
+    partner: Int[Tensor, " batch"]
+    frames: Int[Tensor, "batch frames"]
+    aligned: Mask
+
+    def of_partner(self, values: Tensor) -> Tensor:
+        """Values (batch, frames, …) of the partners, in the timing of the clips themselves."""
+        rows = self.partner[:, None].expand_as(self.frames)
+        return values[rows, self.frames]
+
+    @property
+    def unaligned(self) -> Bool[Tensor, " batch"]:
+        """Clips with a partner who says something else."""
+        alone = self.partner == torch.arange(len(self.partner), device=self.partner.device)
+        return ~alone & ~self.aligned.any(1)
+
+
+def pair_up(batch: Batch, alignments: Alignments | None) -> Pairing:
+    """Neighbours 2k and 2k + 1 are partners; those that say the same sentence are aligned in time.
+
+    There is nothing to swap between two sentences of one speaker: each clip is its own partner then.
+
+    Args:
+        batch: clips; one that is left over is its own partner.
+        alignments: aligns recordings of one sentence; None aligns nobody.
+    """
+    count, frames = batch.mask.shape
+    partner = torch.arange(count)
+    for clip in range(0, count - 1, 2):
+        if (
+            batch.identity_names[clip] != batch.identity_names[clip + 1]
+            or batch.sentences[clip] == batch.sentences[clip + 1]
+        ):
+            partner[clip], partner[clip + 1] = clip + 1, clip
+    places = torch.zeros(count, frames, dtype=torch.long)
+    aligned = torch.zeros(count, frames, dtype=torch.bool)
+    for clip, other in enumerate(partner.tolist()):
+        same = clip != other and batch.sentences[clip] == batch.sentences[other]
+        if alignments is not None and same and batch.names[clip] != batch.names[other]:
+            found = alignments.frames(batch, clip, other)
+            places[clip, : len(found)] = found
+            aligned[clip, : len(found)] = True
+    device = batch.motion.device
+    return Pairing(partner.to(device), places.to(device), aligned.to(device))
+
+
+class Alignments:
+    """Alignments of pairs of clips, each computed once and kept.
+
+    Args:
+        frame_rate: motion frames a second.
+    """
+
+    def __init__(self, frame_rate: float) -> None:
+        self.frame_rate = frame_rate
+        self._found: dict[tuple[str, str], Tensor] = {}
+
+    def frames(self, batch: Batch, clip: int, other: int) -> Tensor:
+        """For each valid frame of a clip of the batch the frame of another one, indices (frames,)."""
+        names = (batch.names[clip], batch.names[other])
+        if names not in self._found:
+            features = [self._features(batch, each) for each in (clip, other)]
+            self._found[names] = torch.from_numpy(align(*features))
+        return self._found[names]
+
+    def _features(self, batch: Batch, clip: int) -> npt.NDArray[np.float64]:
+        audio = batch.audio[clip, : int(batch.audio_lengths[clip])].float().cpu()
+        return cepstra(audio, int(batch.frame_lengths[clip]), self.frame_rate)
+
+
+def align(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """For each frame of ``first`` the frame of ``second`` that goes with it, by dynamic time warping.
+
+    Args:
+        first: features (T, C).
+        second: features (U, C).
+
+    Returns:
+        indices (T,) into ``second``, never falling; where several frames go with one, the middle one.
+
+    Raises:
+        MissingExtraError: if dtaidistance is not installed.
+    """
+    try:
+        from dtaidistance import dtw_ndim
+        from dtaidistance.dtw import best_path
+    except ImportError as error:
+        raise MissingExtraError("dtaidistance", "mesh", "aligning two recordings of one sentence") from error
+    window = round(BAND * max(len(first), len(second))) + abs(len(first) - len(second)) + 1
+    _, costs = dtw_ndim.warping_paths_fast(np.ascontiguousarray(first), np.ascontiguousarray(second), window=window)
+    partners: list[list[int]] = [[] for _ in first]
+    for here, there in best_path(costs):
+        partners[here].append(there)
+    return np.array([there[len(there) // 2] for there in partners], np.int64)
+
+
+def cepstra(audio: Float[Tensor, " samples"], frames: int, frame_rate: float) -> npt.NDArray[np.float64]:
+    """Speech features (frames, 2 · 13) that depend little on the voice: standardised cepstra and their slopes.
+
+    The mean and the variance over the sentence, which depend on voice and microphone more than on sounds, are removed.
+    """
+    hop = SAMPLE_RATE / frame_rate
+    padded = torch.nn.functional.pad(audio.double(), (N_FFT // 2, N_FFT // 2 + int(hop)))
+    starts = [round(hop * (frame + 0.5)) for frame in range(frames)]
+    stretch = torch.stack([padded[start : start + N_FFT] for start in starts])
+    power = torch.fft.rfft(stretch * torch.hann_window(N_FFT, dtype=torch.float64)).abs().square()
+    energy = torch.log(power @ mel_filters(N_MELS, N_FFT, 60.0, 7600.0).double().T + 1e-6)
+    place = (torch.arange(N_MELS, dtype=torch.float64) + 0.5) * torch.pi / N_MELS
+    features = energy @ torch.cos(place[:, None] * torch.arange(N_CEPSTRA, dtype=torch.float64))
+    features = torch.cat([features, torch.gradient(features, dim=0)[0]], 1) if frames > 1 else features.repeat(1, 2)
+    spread = features.std(0, correction=0).clamp_min(1e-6)
+    return ((features - features.mean(0)) / spread).numpy()

@@ -1,4 +1,9 @@
-"""Style-content disentanglement as a LightningModule."""
+"""The style-content model: its options, its objectives and inference.
+
+E_C and E_S split motion into content (what is said, per frame) and style (how somebody moves, one vector); the decoder
+D turns both into motion again, whether the content comes from motion or from speech. The networks are in
+``network.py``, the distances and the alignment of two recordings of a sentence in ``losses.py``.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +28,6 @@ from facediff.models.style_content.losses import (
     dynamics_distance,
     pair_up,
     relative_distance,
-    relative_style_distance,
     style_contrast,
 )
 from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
@@ -57,18 +61,18 @@ class StyleContentDisentanglement(AnimationModel):
         decoder_hidden: channels of its fully connected layers before the coefficients.
         basis_size: coefficients of its linear basis.
         basis_start: the basis starts from the principal components of the training motion, or at random.
-        content_scale: ``clip`` takes mean and spread over a clip out of the content of motion, in which a person would
-            be recognised; ``free`` leaves it as it is.
-        aligned_pairs: where two people say the same sentence, supervise a swap of their styles with the other's
-            reading, aligned in time; else, and everywhere if False, by the encoders' consistency.
-        swap_region: where such a reading supervises.
+        content_scale: ``clip`` takes mean and spread over a clip out of the content of motion, by which a speaker
+            would be recognised; ``free`` leaves it as it is.
+        aligned_pairs: where two speakers say the same sentence, supervise a swap of their styles with the other's
+            recording, aligned in time; else, and everywhere if False, by the encoders' consistency.
+        swap_region: the vertices where such a recording supervises.
         reconstruction_weight: of motion from its own content and style.
         swap_weight: of motion from its own content and the partner's style.
         cycle_weight: of swapping twice.
         swap_dynamics_weight: of the swapped upper face's spread over time against the partner's.
         speech_weight: factor of the same terms with content from speech.
-        reading_content_weight: pulls the contents of two aligned readings of a sentence together.
-        person_style_weight: pulls the styles of a person's clips together, and those of different people apart.
+        recording_content_weight: pulls the contents of two aligned recordings of a sentence together.
+        identity_style_weight: pulls the styles of an identity's clips together, and those of different ones apart.
         speech_content_weight: pulls content from speech to content from motion.
         position_weight: of positions within each comparison of motions.
         velocity_weight: of velocities within it.
@@ -102,8 +106,8 @@ class StyleContentDisentanglement(AnimationModel):
         cycle_weight: float = 1.0,
         swap_dynamics_weight: float = 3.0,
         speech_weight: float = 2.0,
-        reading_content_weight: float = 5.0,
-        person_style_weight: float = 10.0,
+        recording_content_weight: float = 5.0,
+        identity_style_weight: float = 10.0,
         speech_content_weight: float = 5.0,
         position_weight: float = 1.0,
         velocity_weight: float = 5.0,
@@ -121,16 +125,16 @@ class StyleContentDisentanglement(AnimationModel):
             "swap": swap_weight,
             "cycle": cycle_weight,
             "swap_dynamics": swap_dynamics_weight,
-            "reading_content": reading_content_weight,
-            "person_style": person_style_weight,
+            "recording_content": recording_content_weight,
+            "identity_style": identity_style_weight,
             "speech_content": speech_content_weight,
         }
         self.weights |= {f"speech_{term}": speech_weight * self.weights[term] for term in SPOKEN}
         self.distance = MotionDistance(position_weight, velocity_weight, lip_gap_weight, upper_face_weight)
-        self.readings = Alignments(self.frame_rate)
+        self.alignments = Alignments(self.frame_rate)
         style = style_encoder(dim=dim)
         if not style.token_dims:
-            raise FaceDiffError("style_encoder: this model cannot be without a style; choose another, such as lstm")
+            raise FaceDiffError("style_encoder: this model needs a style; choose another style encoder, such as lstm")
         self.network = DisentanglementNetwork(
             content_encoder=mesh_encoder(dim=content_dim, n_vertices=self.n_vertices),
             style_frames=mesh_encoder(dim=dim, n_vertices=self.n_vertices),
@@ -157,7 +161,7 @@ class StyleContentDisentanglement(AnimationModel):
         )
 
     def personal_modules(self) -> list[nn.Module]:
-        """The style encoder and the decoder, in whose basis a face's own shapes are."""
+        """The style encoder, and the decoder, whose basis holds the shapes of a face."""
         return [self.network.style_frames, self.network.style_encoder, self.network.decoder]
 
     def setup(self, stage: str) -> None:
@@ -172,60 +176,69 @@ class StyleContentDisentanglement(AnimationModel):
                 self.network.decoder.start_from(mean * self.scale, shapes * self.scale)
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Reconstruction, swap and cycle of both networks, and what pulls contents and styles together."""
+        """Reconstruction, swap and cycle with content of motion and of speech, and distances of contents and styles."""
         network, motion, mask = self.network, batch.motion * self.scale, batch.mask
-        pairing = self._pair(batch)
+        pairing = pair_up(batch, self.alignments if self.aligned_pairs and self.alignment_allowed() else None)
         content, style = network.content(motion, mask), network.style(motion, mask)
+        # Speech is decoded with the style of another clip of the speaker, as it will be in inference.
         usual = network.style(batch.reference * self.scale, batch.reference_mask)
-        heard = network.hear(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.cached_features)
+        spoken = network.content_of_speech(batch)
         terms = {
-            "reading_content": relative_distance(content, pairing.of_partner(content), pairing.aligned),
-            "person_style": style_contrast(torch.cat([style, usual]), batch.identity_names * 2),
-            "speech_content": relative_distance(content, heard, mask),
+            "recording_content": relative_distance(content, pairing.of_partner(content), pairing.aligned),
+            "identity_style": style_contrast(torch.cat([style, usual]), batch.identity_names * 2),
+            "speech_content": relative_distance(content, spoken, mask),
         }
-        for prefix, said, own in (("", content, style), ("speech_", heard, usual)):
-            made = self._branch(batch, motion, pairing, said, own, style)
+        for prefix, said, own in (("", content, style), ("speech_", spoken, usual)):
+            made = self.branch_losses(batch, motion, pairing, said, own, style)
             terms |= {f"{prefix}{name}": term for name, term in made.items()}
         terms["loss"] = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
         return terms
 
-    def _branch(
-        self, batch: Batch, motion: Tensor, pairing: Pairing, said: Tensor, own: Tensor, style: Tensor
+    def branch_losses(
+        self, batch: Batch, motion: Tensor, pairing: Pairing, content: Tensor, own: Tensor, style: Tensor
     ) -> dict[str, Tensor]:
-        """Reconstruction, swap and cycle with content ``said``; ``own`` is the style that must give the motion back."""
-        network, mask = self.network, batch.mask
-        partner = pairing.partner
-        terms = {"reconstruction": self._compare(batch, self._decode(said, own, mask), motion, mask)}
+        """Reconstruction, swap and cycle of clips i with partners j.
+
+        Args:
+            batch: the clips.
+            motion: M_i, scaled (B, T, V, 3).
+            pairing: the partners.
+            content: C_i (B, T, content_dim), from motion or from speech.
+            own: the style (B, style_dim) with which C_i must give M_i.
+            style: S_i of the motion (B, style_dim); S_j is that of the partner.
+        """
+        network, mask, partner = self.network, batch.mask, pairing.partner
+        # D(C_i, S_i) ≈ M_i
+        terms = {"reconstruction": self.distance_to(batch, self.decode_scaled(content, own, mask), motion, mask)}
         apart = partner != torch.arange(len(partner), device=partner.device)
-        if not apart.any():  # nobody to swap with: two thirds of the work saved where one person alone is learnt
+        if not apart.any():  # nobody to swap with: it saves two thirds of the work while one speaker alone is learnt
             return {**terms, **dict.fromkeys(("swap", "swap_dynamics", "cycle"), motion.new_zeros(()))}
-        swapped = self._decode(said, style[partner], mask)
+        # D(C_i, S_j) is the partner's motion where both say the same sentence, in the timing of i. Where they do not,
+        # no true motion exists, and content and style that are encoded again must be those that went in.
+        swapped = self.decode_scaled(content, style[partner], mask)
         again, style_again = network.content(swapped, mask), network.style(swapped, mask)
-        terms["swap"] = self._compare(
-            batch, swapped, pairing.of_partner(motion), pairing.aligned, self._supervised_vertices()
-        )
+        lower = self.lower_face() if self.swap_region == "lower_face" else None
+        terms["swap"] = self.distance_to(batch, swapped, pairing.of_partner(motion), pairing.aligned, lower)
         free = pairing.unaligned
-        terms["swap"] = terms["swap"] + relative_distance(again, said.detach(), mask & free[:, None])
-        terms["swap"] = terms["swap"] + relative_style_distance(style_again, style[partner].detach(), free)
+        terms["swap"] = terms["swap"] + relative_distance(again, content.detach(), mask & free[:, None])
+        wanted = style[partner].detach()
+        terms["swap"] = terms["swap"] + relative_distance(style_again[:, None], wanted[:, None], free[:, None])
+        # Nobody blinks at the same time as another, so the upper face has the partner's spread over time, not motion.
         upper = self.assets.regions["upper_face"].to(motion.device)
         terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], mask, mask[partner], apart, upper)
-        back = self._decode(again, style_again[partner], mask)
-        terms["cycle"] = self._compare(batch, back, motion, mask)
+        # Swapped back, D(E_C(D(C_i, S_j)), E_S(D(C_j, S_i))) ≈ M_i
+        back = self.decode_scaled(again, style_again[partner], mask)
+        terms["cycle"] = self.distance_to(batch, back, motion, mask)
         return terms
-
-    def _pair(self, batch: Batch) -> Pairing:
-        return pair_up(batch, self.readings if self.aligned_pairs and self.alignment_allowed() else None)
 
     def alignment_allowed(self) -> bool:
         """Whether the clips of a training batch are whole: two windows of a sentence need not hold the same words."""
         return self.training and self._trainer is not None and self.trainer.datamodule.window is None  # type: ignore[attr-defined]
 
-    def _decode(self, content: Tensor, style: Tensor, mask: Bool[Tensor, "batch frames"]) -> Tensor:
-        return self.network.decoder(content, style, mask).view(*content.shape[:2], self.n_vertices, 3)
-
-    def _compare(
+    def distance_to(
         self, batch: Batch, motion: Tensor, truth: Tensor, mask: Tensor, vertices: Tensor | None = None
     ) -> Tensor:
+        """The distance of scaled motions on the frames of a mask and some vertices, or the face if None."""
         pairs = self.assets.inner_lip_pairs
         return self.distance(
             motion,
@@ -237,13 +250,15 @@ class StyleContentDisentanglement(AnimationModel):
             upper=self.assets.regions["upper_face"].to(motion.device) if vertices is None else None,
         )
 
-    def _supervised_vertices(self) -> Tensor | None:
-        if self.swap_region == "face":
-            return None
-        upper = self.assets.regions["upper_face"]
+    def lower_face(self) -> Tensor:
+        """Indices of the vertices outside the upper face."""
         lower = torch.ones(self.n_vertices, dtype=torch.bool)
-        lower[upper] = False
+        lower[self.assets.regions["upper_face"]] = False
         return lower.nonzero()[:, 0].to(self.device)
+
+    def decode_scaled(self, content: Tensor, style: Tensor, mask: Bool[Tensor, "batch frames"]) -> Tensor:
+        """D(C, S): scaled motion (B, T, V, 3); what it is on padding has no meaning."""
+        return self.network.decoder(content, style, mask).view(*content.shape[:2], self.n_vertices, 3)
 
     def encode_style(
         self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
@@ -264,11 +279,10 @@ class StyleContentDisentanglement(AnimationModel):
         mask: Bool[Tensor, "batch frames"],
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Offsets from the template, zero on padding, of content and style that may be of different people."""
-        return self._decode(content, style, mask) / self.scale * mask[..., None, None]
+        return self.decode_scaled(content, style, mask) / self.scale * mask[..., None, None]
 
     def generate_clips(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
     ) -> Float[Tensor, "batch frames vertices 3"]:
-        """Content from the speech, style from the reference; one pass, nothing is drawn."""
-        heard = self.network.hear(batch.audio, batch.audio_lengths, batch.frame_lengths, batch.cached_features)
-        return self.decode(heard, self.style_of(batch), batch.mask)
+        """Content from the speech, style from the reference; nothing is random, so the seed does not matter."""
+        return self.decode(self.network.content_of_speech(batch), self.style_of(batch), batch.mask)

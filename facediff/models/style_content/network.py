@@ -5,22 +5,81 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.layers import Attention, FeedForward
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.style_encoders import StyleEncoder
 
-# The decoder that motion and speech share: content and style to motion.
-
 SLOPE = 0.2
-"""Of the leaky ReLU after each layer."""
+"""Of the leaky ReLU after each layer of the decoder."""
+
+EPSILON = 1e-5
+"""Added to the variance of the content before its root is taken."""
+
+
+class DisentanglementNetwork(nn.Module):
+    """Encoders of content and style, and the one decoder that motion and speech share.
+
+    Args:
+        content_encoder: motion to one feature per frame, E_C.
+        style_frames: motion to one feature per frame, the first half of E_S.
+        style_encoder: these features to one style vector, the second half of E_S.
+        audio_encoder: speech to one feature per frame.
+        speech_content: features of speech to content.
+        decoder: content and style to motion, D.
+        standardise_content: take mean and spread over a clip's time out of the content of motion.
+    """
+
+    def __init__(
+        self,
+        *,
+        content_encoder: MeshEncoder,
+        style_frames: MeshEncoder,
+        style_encoder: StyleEncoder,
+        audio_encoder: AudioEncoder,
+        speech_content: WindowedTransformer,
+        decoder: MotionDecoder,
+        standardise_content: bool,
+    ) -> None:
+        super().__init__()
+        self.content_encoder = content_encoder
+        self.style_frames = style_frames
+        self.style_encoder = style_encoder
+        self.audio_encoder = audio_encoder
+        self.speech_content = speech_content
+        self.decoder = decoder
+        self.standardise_content = standardise_content
+
+    def content(
+        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames content_dim"]:
+        """Content of motion; zero on padding."""
+        content = self.content_encoder(motion) * mask[..., None]
+        if not self.standardise_content:
+            return content
+        valid = mask[..., None].to(content.dtype)
+        count = valid.sum(1, keepdim=True).clamp_min(1)
+        centred = (content - content.sum(1, keepdim=True) / count) * valid
+        return centred / (centred.square().sum(1, keepdim=True) / count + EPSILON).sqrt()
+
+    def style(
+        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Style vector of a motion."""
+        return self.style_encoder(self.style_frames(motion), mask)
+
+    def content_of_speech(self, batch: Batch) -> Float[Tensor, "batch frames content_dim"]:
+        """Content of a batch's speech, or of cached features of it."""
+        cached = batch.cached_features or ()
+        return self.speech_content(self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached))
 
 
 class MotionDecoder(nn.Module):
-    """Causal convolutions over time with the style put beside the features before each, then fully connected layers.
+    """Causal convolutions over time, each fed with the style next to the features, then fully connected layers.
 
     The sequence is padded with zeros at its front, so that its length is kept and no future frame is seen. The last of
     the fully connected layers is a trainable linear basis of the vertices.
@@ -101,9 +160,6 @@ class MotionDecoder(nn.Module):
             return self.basis(coefficients.float())
 
 
-# Content from speech: a Transformer over a window of speech features around each frame.
-
-
 class WindowedTransformer(nn.Module):
     """For every frame an encoder over the features around it, and a decoder that asks with the middle one.
 
@@ -173,75 +229,3 @@ class WindowLayer(nn.Module):
         """``x`` (batch, queries, dim), ``context`` (batch, keys, dim)."""
         x = x + self.dropout(self.attention(self.norm(x), self.norm(context)))
         return x + self.dropout(self.feed_forward(x))
-
-
-EPSILON = 1e-5
-
-
-class DisentanglementNetwork(nn.Module):
-    """Encoders of content and style, and the one decoder that motion and speech share.
-
-    Args:
-        content_encoder: motion to one feature per frame, E_C.
-        style_frames: motion to one feature per frame, the first half of E_S.
-        style_encoder: these features to one style vector, the second half of E_S.
-        audio_encoder: speech to one feature per frame.
-        speech_content: features of speech to content.
-        decoder: content and style to motion, D.
-        standardise_content: take mean and spread over a clip's time out of the content of motion.
-    """
-
-    def __init__(
-        self,
-        *,
-        content_encoder: MeshEncoder,
-        style_frames: MeshEncoder,
-        style_encoder: StyleEncoder,
-        audio_encoder: AudioEncoder,
-        speech_content: WindowedTransformer,
-        decoder: MotionDecoder,
-        standardise_content: bool,
-    ) -> None:
-        super().__init__()
-        self.content_encoder = content_encoder
-        self.style_frames = style_frames
-        self.style_encoder = style_encoder
-        self.audio_encoder = audio_encoder
-        self.speech_content = speech_content
-        self.decoder = decoder
-        self.standardise_content = standardise_content
-
-    def content(
-        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch frames content_dim"]:
-        """Content of motion; zero on padding."""
-        content = self.content_encoder(motion) * mask[..., None]
-        if not self.standardise_content:
-            return content
-        valid = mask[..., None].to(content.dtype)
-        count = valid.sum(1, keepdim=True).clamp_min(1)
-        centred = (content - content.sum(1, keepdim=True) / count) * valid
-        return centred / (centred.square().sum(1, keepdim=True) / count + EPSILON).sqrt()
-
-    def style(
-        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch style_dim"]:
-        """Style vector of a motion."""
-        return self.style_encoder(self.style_frames(motion), mask)
-
-    def hear(
-        self,
-        audio: Float[Tensor, "batch samples"],
-        audio_lengths: Int[Tensor, " batch"],
-        frame_lengths: Int[Tensor, " batch"],
-        features: tuple[Tensor, Tensor] | None = None,
-    ) -> Float[Tensor, "batch frames content_dim"]:
-        """Content of speech.
-
-        Args:
-            audio: waveforms at 16 kHz.
-            audio_lengths: valid samples.
-            frame_lengths: motion frames wanted.
-            features: cached result of the audio encoder's frozen part, and its lengths.
-        """
-        return self.speech_content(self.audio_encoder(audio, audio_lengths, frame_lengths, *(features or ())))
