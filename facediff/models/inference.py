@@ -104,6 +104,12 @@ class Inference(ABC):
         Raises:
             FaceDiffError: if the identity is unknown, the reference does not fit the topology, or the speech is
                 shorter than a frame.
+
+        Example:
+            >>> model = facediff.models.load_model(Path("demo/puppet.ckpt"))  # doctest: +SKIP
+            >>> speech = torch.from_numpy(facediff.data.audio.read_speech(Path("speech.wav")))  # doctest: +SKIP
+            >>> model.animate(speech, identity="F1", seed=3).vertices.shape  # doctest: +SKIP
+            torch.Size([150, 1008, 3])
         """
         return self.animate_samples(audio, identity=identity, style=style, seeds=[seed], progress=progress)[0]
 
@@ -343,6 +349,13 @@ class WindowPlan:
 
     Raises:
         FaceDiffError: if a length is impossible.
+
+    Example:
+        >>> plan = WindowPlan(seconds=2.0, overlap=0.5)
+        >>> plan.in_frames(25.0)
+        FramePlan(frames=50, overlap=12, before=50, after=12)
+        >>> plan.look_ahead
+        2.5
     """
 
     seconds: float = 4.0

@@ -44,7 +44,13 @@ def training_losses(
 
 
 def reconstruction_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
-    """L_recon = Huber(M⁰, M̂⁰) (eq. 16)."""
+    """L_recon = Huber(M⁰, M̂⁰) (eq. 16).
+
+    Example:
+        >>> truth, mask = torch.zeros(1, 4, 5, 3), torch.ones(1, 4, dtype=torch.bool)
+        >>> reconstruction_loss(truth + 2, truth, mask)
+        tensor(1.5000)
+    """
     return huber(prediction, truth, mask)
 
 

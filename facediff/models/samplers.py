@@ -60,6 +60,11 @@ class NoiseProcess:
 
     Raises:
         FaceDiffError: if there is no such schedule.
+
+    Example:
+        >>> process = NoiseProcess(steps=4)
+        >>> [round(float(kept), 3) for kept in process.signal]
+        [0.847, 0.494, 0.144, 0.0]
     """
 
     def __init__(self, steps: int = 1000, schedule: str = "squaredcos_cap_v2") -> None:
@@ -140,6 +145,13 @@ class Sampler(ABC):
 
     Raises:
         FaceDiffError: if the number of steps is impossible.
+
+    Example:
+        >>> sampler = DdimSampler(process=NoiseProcess(), steps=4)
+        >>> sampler.timesteps
+        [999, 749, 499, 249]
+        >>> sampler.run(lambda noisy, step: torch.ones_like(noisy), torch.randn(1, 2, 3)).unique()
+        tensor([1.])
     """
 
     linear: ClassVar[bool] = False
