@@ -33,7 +33,7 @@ from facediff.data import Batch, collate
 from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.models import AnimationModel, load_model
 from facediff.models.checkpoint import corpus_class
-from facediff.models.inference import SpeechStream, WindowPlan
+from facediff.models.inference import SpeechStream, Window, WindowPlan
 
 Array = npt.NDArray[np.float64]
 
@@ -106,16 +106,33 @@ def by_windows(model: AnimationModel, clip: Batch, plan: WindowPlan) -> torch.Te
     return torch.cat([part[0] for part in stream.parts(clip.audio[0], frames=clip.motion.shape[1])])
 
 
+@dataclass(frozen=True)
+class Alone(Window):
+    """A window that shares neither frames nor noise with its neighbours.
+
+    Attributes:
+        context: frames before the window whose speech the model hears.
+    """
+
+    context: int = 0
+    shared: int = 0
+
+
+def alone(window: Window) -> Window:
+    """A window like another one, but alone."""
+    return Alone(replace(window.plan, overlap=0), window.index * 1000, window.frames, window.context)
+
+
 def hard_cut(model: AnimationModel, clip: Batch, plan: WindowPlan) -> torch.Tensor:
-    """The same windows, each made alone and cut where the next begins: what joints look like if nothing is done."""
-    generate_clips = model.generate_window
-    model.generate_window = lambda clip, window, seeds, before: generate_clips(  # type: ignore[method-assign]
-        clip, replace(window, index=window.index * 1000, shared=0, fresh=window.frames), seeds, None
+    """The same windows, each generated alone and cut where the next begins, as if nothing were done at boundaries."""
+    generate_window = model.generate_window
+    model.generate_window = lambda clip, window, seeds, before: generate_window(  # type: ignore[method-assign]
+        clip, alone(window), seeds, None
     )
     try:
         return by_windows(model, clip, plan)
     finally:
-        model.generate_window = generate_clips  # type: ignore[method-assign]
+        model.generate_window = generate_window  # type: ignore[method-assign]
 
 
 def lip_error(motion: torch.Tensor, truth: torch.Tensor, lips: torch.Tensor) -> Array:
