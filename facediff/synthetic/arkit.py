@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import CONTROLS, Shape, build_rig
 from facediff.synthetic.speakers import SPEAKERS
-from facediff.utils.files import atomic
+from facediff.utils.files import atomic_folder
 
 Array = npt.NDArray[np.float64]
 
@@ -95,13 +94,8 @@ def write_puppet_shapes(folder: Path, speaker: str | None = None) -> list[str]:
         raise FaceDiffError(f"{folder}: exists already; choose a new folder")
     neutral, faces, shapes = puppet_shapes(speaker)
     triangles = "".join(f"f {a} {b} {c}\n" for a, b, c in faces + 1)
-    with atomic(folder) as temporary:
-        try:
-            temporary.mkdir()
-            for name, vertices in {"neutral": neutral, **shapes}.items():
-                points = "".join(f"v {x:.9f} {y:.9f} {z:.9f}\n" for x, y, z in vertices)
-                (temporary / f"{name}.obj").write_text(points + triangles, encoding="ascii")
-        except BaseException:
-            shutil.rmtree(temporary, ignore_errors=True)
-            raise
+    with atomic_folder(folder) as temporary:
+        for name, vertices in {"neutral": neutral, **shapes}.items():
+            points = "".join(f"v {x:.9f} {y:.9f} {z:.9f}\n" for x, y, z in vertices)
+            (temporary / f"{name}.obj").write_text(points + triangles, encoding="ascii")
     return list(shapes)

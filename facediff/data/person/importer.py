@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import math
-import os
 import re
-import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,7 +47,14 @@ from facediff.data.prepare.runner import (
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, stable_vertices
 from facediff.mesh.alignment import chunks
-from facediff.utils.files import check_writable, describe_files, write_json
+from facediff.utils.files import (
+    atomic_folder,
+    check_writable,
+    describe_files,
+    scratch_folder,
+    write_json,
+    write_rows,
+)
 
 # Writing a person's corpus entry: all of it, or nothing.
 
@@ -86,38 +90,6 @@ def check_output(path: Path) -> None:
     check_writable(path.with_name(f".{path.name}.probe"))
 
 
-@contextmanager
-def whole_folder(path: Path) -> Iterator[tuple[Path, Path]]:
-    """A folder to fill, renamed to ``path`` at the end, and one for scratch files; both vanish if anything fails.
-
-    They lie beside ``path``, and are also removed when the user interrupts.
-
-    Raises:
-        FaceDiffError: if it cannot be written.
-    """
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    made = [folder for folder in path.parents if not folder.exists()]
-    done = False
-    try:
-        for folder in (partial / "entry", partial / "scratch"):
-            folder.mkdir(parents=True)
-        yield partial / "entry", partial / "scratch"
-        if path.is_dir():
-            path.rmdir()  # it was empty before; if it is not any more, this fails
-        (partial / "entry").rename(path)
-        done = True
-    except OSError as error:
-        raise FaceDiffError(
-            f"{path}: cannot be written ({error.strerror or error}); choose a folder that you may write to and that "
-            f"has room"
-        ) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        for folder in [] if done else made:
-            with suppress(OSError):
-                folder.rmdir()
-
-
 def write_entry(
     folder: Path,
     *,
@@ -148,12 +120,12 @@ def write_entry(
         part = fit_length(speech[first:], samples_for(clip.stop, frame_rate) - first)
         write_clip(folder, clip.name, frames[clip.start : clip.stop], part)
     write_templates(folder / "templates.pkl", {name: template.astype(np.float32)})
-    with (folder / "clips.csv").open("w", newline="", encoding="utf-8") as stream:
-        table = csv.writer(stream, lineterminator="\n")
-        table.writerow(["clip", "subject", "sentence", "split"])
-        table.writerows([clip.name, name, clip.name.rpartition("_")[2], clip.split] for clip in clips)
-    written = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    files = describe_files(folder, written, workers=2)
+    rows = [
+        {"clip": clip.name, "subject": name, "sentence": clip.name.rpartition("_")[2], "split": clip.split}
+        for clip in clips
+    ]
+    write_rows(folder / "clips.csv", rows, line_end="\n")
+    files = describe_files(folder, workers=2)
     write_json(folder / MANIFEST, {"facediff": version(), "corpus": "person", "person": name, **facts, "files": files})
 
 
@@ -366,7 +338,7 @@ def import_person(
     check_output(output)
     known = read_auxiliary(corpus, name=name, frame_rate=corpus_frame_rate)
     speech = _read_speech(audio)
-    with whole_folder(output) as (folder, scratch):
+    with scratch_folder(output) as scratch, atomic_folder(output) as folder:
         return _import(request, known, speech, folder, scratch)
 
 
