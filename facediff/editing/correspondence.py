@@ -125,8 +125,8 @@ def correspond(
     places = partners(source, laid)
     bent = _bent(source, laid, places, pairs)
     found = places.nearest(bent.vertices, bent.normals)
-    # Bending tells which place belongs to a vertex; how far the meshes lie apart is measured before bending, and how
-    # well the place is known by what bending left.
+    # Bending decides which place belongs to a vertex. The distance of the meshes is measured before bending, and the
+    # trust in a place by the distance that is left after it.
     away = np.linalg.norm(laid.vertices - found.points, axis=1) / source.size
     left = found.distances / source.size
     trust = np.clip((FAR - left) / (FAR - EXACT), 0.0, 1.0) * np.clip((found.cosines + 0.3) / 0.6, 0.0, 1.0)
@@ -298,7 +298,7 @@ def _start(moved: Surface, goal: Surface) -> Similarity:
         for _ in range(5):
             trial, apart = _by_vertices(source, target, trial)
         trials.append((apart, trial))
-    # Five rounds from every start tell good ones from bad ones; only the winner is worth more of them.
+    # Five rounds are enough to tell good starts from bad ones; only the best one is continued.
     own, (least, best) = trials[0], min(trials, key=lambda pair: pair[0])
     # Faces are nearly symmetric, so that a mirrored start fits almost as well: the meshes' own axes win unless another
     # start is clearly better.
@@ -367,7 +367,7 @@ def _towards_planes(points: Array, goals: Array, normals: Array, weights: Array,
 # Step 2: separate pieces of a mesh (teeth, eyes, skin), and which piece of the other mesh each one is.
 
 MOST = 32
-"""As many of the largest pieces are looked at; hair may be thousands."""
+"""So many of the largest pieces are paired; hair may consist of thousands."""
 ALIKE = 1.5
 """Two pieces differ in size by no more than this factor."""
 NEAR = 1.0
@@ -528,12 +528,12 @@ def _adjacency(edges: Indices, count: int) -> csr_array:
 # Step 4: the nearest points of a surface, among the sheets that face the same way.
 
 SLACK = 0.04
-"""A sheet that faces the same way is preferred to one that faces away and is nearer by this share of the face's size:
-lips that touch are two sheets in one place."""
+"""A sheet that faces the same way is preferred to one that faces away and is nearer by up to this share of the face's
+size: lips that touch are two sheets in one place."""
 FACING, AWAY = 0.3, -0.3
 """Cosines between normals from which on two sheets face the same way, and up to which they face away."""
 TIE = 1e-6
-"""Of two places that are equally near but for this share of a triangle, the one that faces the same way is taken."""
+"""Of two places whose distances differ by less than this share of a triangle, the one that faces the same way wins."""
 CHUNK_NUMBERS = 4_000_000
 """Candidate pairs of a point and a triangle that are held in memory at a time, at most."""
 

@@ -49,7 +49,7 @@ GAP = 0.15
 DOUBLE = 0.12
 """Share of blinks that another one follows immediately."""
 WIDENED = -0.5
-"""How far an eye may be open beyond the neutral face, in closings, that a blink still makes up for."""
+"""How far an eye may be open beyond the neutral face, as a share of a closing, so that a blink still shuts it."""
 
 
 def add_blinks(animation: Animation, eyes: Eyes, *, rate: float = RATE, seed: int = 0) -> Animation:
@@ -93,7 +93,8 @@ def blink_curve(frames: int, frame_rate: float, *, rate: float = RATE, seed: int
     """
     if not RATES[0] <= rate <= RATES[1]:
         raise FaceDiffError(
-            f"--blinks {rate:g}: expected blinks a minute, {RATES[0]:g} to {RATES[1]:g} (17 at rest, 26 in talk)"
+            f"--blinks {rate:g}: expected blinks a minute, {RATES[0]:g} to {RATES[1]:g} (17 at rest, 26 in "
+            f"conversation)"
         )
     random = random_of("blinks", seed)
     times = np.arange(frames) / frame_rate
@@ -123,7 +124,7 @@ def blink_curve(frames: int, frame_rate: float, *, rate: float = RATE, seed: int
 # (Carpenter, "Movements of the Eyes", 1988).
 
 DEGREES_GAZE = 4.0
-"""Default of the farthest angle from straight ahead: the eyes wander over a listener's face."""
+"""Default of the largest angle from straight ahead: the eyes wander over a listener's face."""
 WIDEST_GAZE = 20.0
 AHEAD_SECONDS, ASIDE_SECONDS = 1.6, 0.6
 """Mean duration of a fixation straight ahead, and elsewhere."""
@@ -233,14 +234,14 @@ DEGREES_SWAY = 2.0
 """Default of the largest rotation."""
 WIDEST_SWAY = 15.0
 BAND = (0.08, 0.6)
-"""Hertz: slower cannot be seen, quicker is a tremble."""
+"""Hertz: slower sway cannot be seen, and faster sway looks like a tremor."""
 WAVES = 6
 AXES = np.array([0.7, 1.0, 0.5])
 """How much of the rotation is nodding, shaking and tilting."""
 SHIFT = 0.004
 """Largest shift for each degree of rotation, as a share of the head's height: about a millimetre."""
 AT_REST = 1.0
-"""Seconds over which the sway swells and dies away."""
+"""Seconds over which the sway begins and ends."""
 
 
 def add_sway(animation: Animation, *, degrees: float = DEGREES_SWAY, seed: int = 0) -> Animation:
@@ -295,7 +296,7 @@ def sway_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_SWAY,
 
 
 def _largest(vectors: Array, size: float) -> Array:
-    """Vectors (T, 3) scaled so that the longest has a size."""
+    """Vectors (T, 3) scaled so that the longest one is as long as ``size``."""
     longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
     return vectors * (size / longest) if longest > 0 else vectors
 
@@ -303,7 +304,7 @@ def _largest(vectors: Array, size: float) -> Array:
 # What all changes to an animation have in common: arrays that may be too large for memory, and a note in the metadata.
 
 CHUNK = 256
-"""Frames that are worked on at a time where not one by one."""
+"""Frames that are processed at a time where they are not processed one by one."""
 
 
 def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -328,7 +328,7 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
     square = np.square(points - _means(labels, n_vertices).apply(points)[labels]).sum(axis=1)
     order = np.lexsort((np.arange(len(points)), square, labels))
     chosen = order[np.searchsorted(labels[order], np.arange(n_vertices))]
-    # Coarse vertices are numbered as the chosen ones are.
+    # Coarse vertices are numbered in the order of the chosen ones.
     clusters, chosen = np.argsort(np.argsort(chosen))[labels], np.sort(chosen)
     if pooling == "select":
         down = Operator(np.arange(n_vertices), chosen, np.ones(n_vertices, np.float32), (n_vertices, len(points)))
@@ -416,7 +416,7 @@ def _merged(points: Array, faces: Indices, labels: Indices, n_vertices: int) -> 
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     if not len(pairs):  # no edges are left: each cluster and the one nearest to it
         every, near = np.arange(count), cKDTree(centres).query(centres, k=2)[1]
-        # In one place with others, a cluster need not be the first that is nearest to itself.
+        # Where several clusters lie in one place, the first result need not be the cluster itself.
         pairs = np.stack([every, np.where(near[:, 0] == every, near[:, 1], near[:, 0])], axis=1)
     pairs = np.unique(np.sort(pairs, axis=1), axis=0)
     lengths = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)

@@ -122,7 +122,7 @@ def _spiral(vertex: int, rings: list[list[int]], wanted: int) -> list[int]:
             fresh = [near not in seen for near in around]
             if not any(fresh):
                 continue
-            # Counter-clockwise, what is new begins behind what is known.
+            # In counter-clockwise order, the new vertices begin after the ones that are in the spiral already.
             start = next((i for i, new in enumerate(fresh) if new and not fresh[i - 1]), 0)
             order = (*range(start, len(around)), *range(start))
             new = [around[i] for i in order if fresh[i]]
