@@ -232,9 +232,10 @@ def import_person(
         clip_seconds: length of a clip, about
         quiet: no progress bar
     """
-    for option, path in (("MOTION", motion), ("--audio", audio), ("--corpus", corpus), ("--flame", flame)):
-        if path is not None and not path.exists():
-            raise FaceDiffError(f"{option} {path}: no such file or folder")
+    needed = (("MOTION", motion, "file or folder"), ("--audio", audio, "sound file"), ("--corpus", corpus, "folder"))
+    for option, path, kind in needed:
+        if not path.exists():
+            raise FaceDiffError(f"{option} {path}: no such {kind}")
     from facediff.data.corpus import read_manifest
     from facediff.data.person import import_person as import_motion
 
