@@ -1,4 +1,4 @@
-"""What the method asks of the decoders and of the fusion beside what holds for every component."""
+"""What the method asks of decoders and fusions in addition to the laws of every component."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from facediff import registry
-from facediff.models.decoders import GruDecoder, StyleTransformer
+from facediff.models.decoders import GruDecoder, StyleTransformer, TokenAttention
 from facediff.models.fusions import AddFusion, BidirectionalCrossAttention
+from facediff.models.layers import Attention
 
 DIM, FRAMES = 16, 12
 
@@ -118,3 +119,16 @@ def test_prepare_changes_nothing(
         inputs = (first, scale * moving) if part[0] == "fusion" else (scale * moving, second)
         out, expected = module(*inputs, mask, prepared), module(*inputs, mask)
         torch.testing.assert_close(out[mask], expected[mask], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("tokens", [1, 2, 3, 4, 9])
+def test_token_attention_products_are_the_attention(tokens: int) -> None:
+    torch.manual_seed(0)
+    plain, narrow = Attention(16, 6, 4).double(), TokenAttention(16, 6, 4).double()
+    narrow.load_state_dict(plain.state_dict())
+    x, style = torch.randn(3, 7, 16, dtype=torch.float64), torch.randn(3, tokens, 6, dtype=torch.float64)
+    torch.testing.assert_close(narrow(x, style), plain(x, style), rtol=0, atol=1e-12)
+    for module in (plain, narrow):
+        module(x, style).square().sum().backward()
+    for one, other in zip(narrow.parameters(), plain.parameters(), strict=True):
+        torch.testing.assert_close(one.grad, other.grad, rtol=0, atol=1e-10)

@@ -1,15 +1,22 @@
-"""The products of the linear ends against their definition, and the cache against changed weights."""
+"""The products of the linear ends, and folded sampling against sampling on vertices: the same motion, distribution."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from facediff.models import folding
-from facediff.models.folding import Fold, WeightCache, fold
+from facediff import registry
+from facediff.data import Batch, collate
+from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion, dual_path, folding
+from facediff.models.folding import Fold, FoldedSpace, Space, VertexSpace, WeightCache, fold
+from tests.fakes.tiny import Tiny
 
 
 def ends(dim: int, coordinates: int, dtype: torch.dtype = torch.float64) -> tuple[nn.Linear, nn.Linear]:
@@ -107,3 +114,233 @@ def test_fold_root_does_not_depend_on_the_signs_of_eigenvectors(monkeypatch: pyt
 
     monkeypatch.setattr(torch.linalg, "eigh", other)
     torch.testing.assert_close(fold(*maps).root, once, rtol=0, atol=1e-14)
+
+
+Make = Callable[..., DualPathDiffusion]
+
+SAMPLERS: list[tuple[str, dict[str, Any]]] = [
+    (name, {}) for name in registry.sampler.names() if registry.sampler.get(name).linear
+]
+SAMPLERS += [("ddim", {"steps": 7, "eta": 0.5}), ("ddim", {"steps": 1}), ("dpm_solver", {"steps": 18, "order": 3})]
+
+
+@pytest.fixture
+def ready(make_model: Make, tiny: Tiny) -> Make:
+    """Models that know the miniature corpus, with biases that matter."""
+
+    def make(**options: object) -> DualPathDiffusion:
+        model = make_model(**options)
+        model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+        nn.init.normal_(model.network.embed.bias)
+        nn.init.normal_(model.network.unembed.bias)
+        return model.eval()
+
+    return make
+
+
+@pytest.fixture
+def batch(tiny: Tiny) -> Batch:
+    """Two clips, the first padded."""
+    dataset = tiny.dataset("train")
+    return collate([dataset[0], dataset[7]])
+
+
+def cast(batch: Batch, dtype: torch.dtype) -> Batch:
+    tensors = {name: value for name, value in vars(batch).items() if isinstance(value, Tensor)}
+    return replace(batch, **{name: v.to(dtype) for name, v in tensors.items() if v.is_floating_point()})
+
+
+def run(model: DualPathDiffusion, space: Space, noise: Callable[[], Tensor]) -> Tensor:
+    """The sampler in a space, with its noise given."""
+    return space.motion(model.sampler.run(space.denoise, noise(), noise=lambda _: noise()))
+
+
+def vertices(model: DualPathDiffusion, batch: Batch) -> Space:
+    """On vertices, with everything computed again in every step."""
+    return VertexSpace(model.network, model.conditions(batch))
+
+
+def choose(model: DualPathDiffusion, batch: Batch) -> Space:
+    """The space that the model samples in."""
+    made: list[Space] = []
+    prepare = model.network.prepare_for_inference
+
+    def watched(*given: Any, **named: Any) -> Space:  # noqa: ANN401
+        made.append(prepare(*given, **named))
+        return made[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model.network, "prepare_for_inference", watched)
+        model.generate(batch)
+    return made[0]
+
+
+@pytest.mark.parametrize(("name", "options"), SAMPLERS)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
+def test_folded_sampling_gives_the_same_motion_for_the_same_noise(
+    ready: Make, batch: Batch, name: str, options: dict[str, Any], dtype: torch.dtype, tolerance: float
+) -> None:
+    model = ready(sampler=partial(registry.sampler.get(name), **options)).to(dtype)
+    batch = cast(batch, dtype)
+    network = model.network
+    space = choose(model, batch)
+    assert isinstance(space, FoldedSpace)
+    shape = (*batch.motion.shape[:2], network.coordinates)
+
+    def draws(seed: int) -> Callable[[], Tensor]:
+        generator = torch.Generator().manual_seed(seed)
+        return lambda: torch.randn(shape, generator=generator, dtype=dtype) * batch.mask[..., None]
+
+    drawn = draws(1)
+    with torch.no_grad():
+        plain = run(model, vertices(model, batch), draws(1))
+        folded = run(model, space, lambda: drawn() @ network.embed.weight.T)
+    assert plain[batch.mask].std() > 0.5
+    torch.testing.assert_close(folded[batch.mask], plain[batch.mask], rtol=0, atol=tolerance)
+    with torch.no_grad():
+        other = run(model, vertices(model, batch), draws(2))
+    assert (other - plain)[batch.mask].abs().max() > 1e-2  # the noise matters
+
+
+def test_folded_sampling_gives_the_same_mean_and_covariance_for_new_noise(ready: Make, tiny: Tiny) -> None:
+    """Over 3000 clips with noise of their own, in few directions of motion."""
+    model = ready(sampler=partial(registry.sampler.ddim, steps=4, eta=1.0))
+    with torch.no_grad():  # a network in which the noise is heard
+        model.network.embed.weight.mul_(3)
+    sample = tiny.dataset("val")[0]
+    sample = replace(sample, motion=sample.motion[:3], audio=sample.audio[: 3 * 640])
+    one = collate([sample])
+    clips = 3000
+
+    def motions(space: str, seed: int) -> Tensor:
+        model.sampling_space = space
+        tensors = {k: v for k, v in vars(one).items() if isinstance(v, Tensor)}
+        many = {k: v.expand(clips, *v.shape[1:]) for k, v in tensors.items()}
+        lists = {
+            k: [f"{k}{i}" for i in range(clips)] for k, v in vars(one).items() if isinstance(v, list) and len(v) == 1
+        }
+        return model.generate(replace(one, **many, **lists), seed=seed).flatten(1) * model.scale
+
+    plain, folded = motions("vertices", 1), motions("folded", 2)
+    directions = torch.randn(plain.shape[1], 6, generator=torch.Generator().manual_seed(0))
+    mean = plain.mean(0)
+    a, b = (plain - mean) @ directions, (folded - mean) @ directions
+    deviation = a.std(0)
+    assert deviation.min() > 0.05
+    error = deviation * (2 / clips) ** 0.5
+    assert ((a.mean(0) - b.mean(0)).abs() / error).max() < 4.5
+    products = [(x / deviation)[:, :, None] * (x / deviation)[:, None, :] for x in (a, b)]
+    first, second = (product.mean(0) for product in products)
+    error = ((products[0].var(0) + products[1].var(0)) / clips).sqrt()
+    assert ((first - second).abs() / error).max() < 4.5
+
+
+def test_sampling_space_is_folded_by_default(ready: Make, batch: Batch) -> None:
+    folded, plain = ready(), ready(sampling_space="vertices")
+    assert folded.hparams["sampling_space"] == "folded"
+    assert isinstance(choose(folded, batch), FoldedSpace)
+    assert isinstance(choose(plain, batch), VertexSpace)
+    assert plain.generate(batch).shape == folded.generate(batch).shape == batch.motion.shape
+
+
+def test_sampling_space_is_vertices_without_linear_ends(ready: Make, batch: Batch) -> None:
+    model, same = ready(), ready(sampling_space="vertices")
+    for one in (model, same):
+        torch.manual_seed(1)
+        one.network.embed = nn.Sequential(nn.Linear(72, 16), nn.Tanh())
+    assert isinstance(choose(model, batch), VertexSpace)
+    assert torch.equal(model.generate(batch), same.generate(batch))
+
+
+def test_folded_sampling_works_without_biases(ready: Make, batch: Batch) -> None:
+    model = ready().double()
+    model.network.embed.bias = model.network.unembed.bias = None
+    network, batch = model.network, cast(batch, torch.float64)
+    start = torch.randn(*batch.motion.shape[:2], 72, dtype=torch.float64)
+    with torch.no_grad():
+        plain = run(model, vertices(model, batch), lambda: start)
+        folded = run(model, choose(model, batch), lambda: start @ network.embed.weight.T)
+    torch.testing.assert_close(folded, plain, rtol=0, atol=1e-10)
+
+
+def test_sampling_space_is_vertices_for_a_sampler_that_is_not_linear(
+    ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = ready()
+    monkeypatch.setattr(type(model.sampler), "linear", False)
+    assert isinstance(choose(model, batch), VertexSpace)
+    assert model.generate(batch).shape == batch.motion.shape
+
+
+def test_sampler_that_is_wrongly_declared_linear_is_an_error(
+    ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = ready()
+    honest = model.sampler.run
+    monkeypatch.setattr(model.sampler, "run", lambda *given, **named: 0.5 * honest(*given, **named))
+    with pytest.raises(FaceDiffError, match="sampling_space=vertices"):
+        model.generate(batch)
+
+
+@pytest.mark.parametrize("sampler", [registry.sampler.ddim, registry.sampler.ddpm])
+def test_generate_does_not_depend_on_the_other_clips_of_a_batch(ready: Make, tiny: Tiny, sampler: Any) -> None:  # noqa: ANN401
+    model = ready(sampler=sampler)
+    dataset = tiny.dataset("train")
+    short, long = dataset[0], dataset[7]
+    alone = model.generate(collate([short]), seed=5)[0]
+    for samples, place in (([short, long], 0), ([long, dataset[3], short], 2)):
+        together = model.generate(collate(samples), seed=5)[place, : len(short.motion)]
+        torch.testing.assert_close(together * model.scale, alone * model.scale, rtol=0, atol=1e-4)
+
+
+def test_folded_noise_is_independent_over_frames_and_zero_on_padding(ready: Make, batch: Batch) -> None:
+    space = choose(ready(), batch)
+    unit = torch.randn(*batch.motion.shape[:2], space.width) * batch.mask[..., None]
+    noise = space.noise(unit)
+    assert not noise[~batch.mask].any()
+    other = unit.clone()
+    other[:, 3] = 0
+    assert torch.equal((space.noise(other) != noise).any(-1).any(0).nonzero()[:, 0], torch.tensor([3]))
+
+
+def test_folded_sampling_follows_changed_weights(ready: Make, batch: Batch) -> None:
+    """Written as weight averaging writes them."""
+    model, fresh = ready(), ready()
+    model.generate(batch)
+    for one in (model, fresh):
+        torch.manual_seed(3)
+        for parameter in one.network.parameters():
+            parameter.data.copy_(parameter.data + 0.05 * torch.randn(parameter.shape))
+    assert torch.equal(model.generate(batch), fresh.generate(batch))
+
+
+def test_fold_is_computed_once(ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    real = dual_path.fold
+    monkeypatch.setattr(dual_path, "fold", lambda *maps: (calls.append(1), real(*maps))[1])
+    model = ready()
+    for seed in range(3):
+        model.generate(batch, seed=seed)
+    assert len(calls) == 1
+
+
+def test_folded_sampling_touches_vertices_once(ready: Make, batch: Batch) -> None:
+    model = ready(sampler=partial(registry.sampler.ddpm, steps=9))
+    calls = {"embed": 0, "unembed": 0}
+    for name in calls:
+
+        def count(*_: object, name: str = name) -> None:
+            calls[name] += 1
+
+        getattr(model.network, name).register_forward_hook(count)
+    model.generate(batch)
+    assert calls == {"embed": 0, "unembed": 1}
+
+
+def test_mixed_precision_motion_is_float32_and_near(ready: Make, batch: Batch) -> None:
+    model = ready()
+    exact = model.generate(batch)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = model.generate(batch)
+    assert mixed.dtype == torch.float32
+    assert (mixed - exact)[batch.mask].square().mean() < 0.01 * exact[batch.mask].square().mean()

@@ -23,7 +23,7 @@ DIM, FRAMES = 16, 12
 
 
 class Unprepared(Decoder):
-    """A decoder of somebody else's, which prepares nothing and takes no prepared argument."""
+    """A decoder of another package that prepares nothing and has no ``prepared`` argument."""
 
     def __init__(self, *, dim: int, style_dim: int) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ VARIANTS += [
     {"style_tokens": "single"},
     # As many pairs of head and token as channels: keys and values are not multiplied out.
     {"decoder": partial(registry.decoder.style_transformer, num_layers=1, num_heads=4), "dim": 8},
-    # From outside, and it has never heard of preparing.
+    # Of another package, without prepare.
     {"decoder": Unprepared},
 ]
 
