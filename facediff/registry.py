@@ -20,7 +20,7 @@ import inspect
 import keyword
 import types
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial, wraps
@@ -34,19 +34,19 @@ T = TypeVar("T", bound=type)
 
 
 class RegistrationError(FaceDiffError):
-    """A component was registered under a name that is malformed or taken."""
+    """A name that is malformed or taken was to be registered."""
 
 
 class UnknownComponentError(FaceDiffError, AttributeError):
-    """A name was asked for that no component of the kind has."""
+    """Nothing of a kind has the name that was asked for."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One registered component.
+    """One registered class.
 
     Attributes:
-        name: the word that chooses it.
+        name: what chooses it.
         implementation: the class as written by its author.
         alias: the empty subclass importable as ``facediff.registry.<kind>.<name>``.
     """
@@ -71,7 +71,7 @@ class Kind:
     """The components of one kind, by name.
 
     Args:
-        name: the word for the kind.
+        name: what the kind is called.
         modules: import paths of the modules that register the built-in ones, separated by spaces.
         title: what an entry of this kind does, in a few words.
         aliases: whether each entry is also an importable class below the kind, as components are.
@@ -228,7 +228,7 @@ def alias_path(component: type) -> str:
     return f"{component.__module__}.{component.__qualname__}"
 
 
-# Hyper-parameters as plain data, so that a checkpoint loads with ``weights_only=True`` however it was made.
+# Constructor arguments as plain data, so that a checkpoint loads with ``weights_only=True`` however it was made.
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401
@@ -242,34 +242,27 @@ def plain(value: Any) -> Any:  # noqa: ANN401
     """
     if isinstance(value, Enum):  # before the numbers and strings, which members of some enumerations are too
         return plain(value.value)
-    if value is None or isinstance(value, bool | int | float | str):
-        # Subclasses such as numpy.float64 would not load again with weights_only=True.
-        return value if value is None or type(value) in (bool, int, float, str) else _exact(value)
+    if value is None:
+        return None
+    for kind in (bool, int, float, str):
+        if isinstance(value, kind):  # a subclass such as numpy.float64 would not load again with weights_only=True
+            return kind(value)
     if isinstance(value, type):
         return {"class_path": alias_path(value), "init_args": {}}
     if isinstance(value, partial):
         return {"class_path": alias_path(component_class(value)), "init_args": plain(value.keywords)}
     if isinstance(value, Path):
         return str(value)
-    if isinstance(value, Mapping):
+    if hasattr(value, "items"):  # mappings, and OmegaConf's and jsonargparse's own
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, Sequence | Set) and not isinstance(value, bytes | bytearray | memoryview):
         return [plain(item) for item in value]
-    if hasattr(value, "items"):
-        return {str(key): plain(item) for key, item in value.items()}
     if hasattr(value, "tolist"):
         return plain(value.tolist())
     raise TypeError(
         f"a {type(value).__name__} cannot be kept in a checkpoint; give a component as its class or as "
         f"functools.partial(class, option=value), and everything else as numbers, strings, lists and dicts"
     )
-
-
-def _exact(value: bool | int | float | str) -> bool | int | float | str:
-    for kind in (bool, int, float, str):
-        if isinstance(value, kind):
-            return kind(value)
-    return value
 
 
 def component_class(factory: Any) -> type:  # noqa: ANN401
