@@ -1,4 +1,4 @@
-"""Batch mode: every recording gets its output, or its sentence; what is done is kept, and nothing is half-written."""
+"""Batch mode: every recording gets its output or an error; finished outputs are kept, and none is half-written."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_each_process_loads_the_model_once_and_seeds_do_not_depend_on_it(folder:
     assert seed_of_recording(Path("x/a.wav"), 3) == seeds["a.npy"] != seed_of_recording(Path("a.wav"), 4)
 
 
-def test_only_what_has_changed_is_made_anew(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_outputs_of_changed_inputs_are_made_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(folder, "--seed", "1") == 0
     first = times(folder)
 
@@ -167,7 +167,7 @@ def test_only_what_has_changed_is_made_anew(folder: Path, capsys: pytest.Capture
     assert "the options have changed" in told
 
 
-def test_a_checkpoint_that_is_no_good_stops_at_once(folder: Path) -> None:
+def test_an_unusable_checkpoint_stops_the_batch(folder: Path) -> None:
     for workers in (1, 2):
         with pytest.raises(FaceDiffError, match="no such checkpoint"):
             run(folder, "no-model", workers=workers)
@@ -228,7 +228,7 @@ def started(folder: Path, tmp_path: Path) -> subprocess.Popen[str]:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_ctrl_c_finishes_what_is_at_work_and_a_second_run_the_rest(folder: Path, tmp_path: Path) -> None:
+def test_ctrl_c_finishes_running_recordings_and_a_second_run_the_rest(folder: Path, tmp_path: Path) -> None:
     for name in "ef":
         (folder / f"{name}.wav").write_text(name)
     process = started(folder, tmp_path)
@@ -246,7 +246,7 @@ def test_ctrl_c_finishes_what_is_at_work_and_a_second_run_the_rest(folder: Path,
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
-def test_workers_end_with_a_parent_that_is_killed(folder: Path, tmp_path: Path) -> None:
+def test_workers_end_when_their_parent_is_killed(folder: Path, tmp_path: Path) -> None:
     process = started(folder, tmp_path)
     process.kill()
     process.communicate(timeout=60)
@@ -270,7 +270,7 @@ def test_workers_end_with_a_parent_that_is_killed(folder: Path, tmp_path: Path) 
     assert len(outputs(folder)) == 4
 
 
-def test_where_a_batch_goes_and_what_it_writes(
+def test_wrong_outputs_and_suffixes_of_a_batch_are_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["animate", str(folder), "--checkpoint", str(tmp_path / "C.ckpt"), "-o"]
@@ -285,7 +285,7 @@ def test_where_a_batch_goes_and_what_it_writes(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_second_batch_knows_the_map_and_the_shapes_of_the_first(
+def test_a_second_batch_keeps_outputs_made_with_the_same_correspondence_and_shapes(
     checkpoint: Path, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The map to a mesh is written on the way; blendshapes decide a table as a checkpoint does."""

@@ -85,7 +85,7 @@ def test_from_the_raw_files_to_scores(
     assert all(f"{split}   model" in table for split in splits)
 
 
-def test_a_corpus_that_was_not_prepared_to_its_end_is_not_trained_on(
+def test_an_unfinished_corpus_is_not_trained_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -95,7 +95,7 @@ def test_a_corpus_that_was_not_prepared_to_its_end_is_not_trained_on(
     assert "was not prepared to its end" in capsys.readouterr().err
 
 
-def test_data_tells_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["data"]) == 2
     assert main(["data", "--help"]) == 0
     assert "import-person" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Files from elsewhere: speech in any form, pickles that must not run, meshes."""
+"""Writing files and folders whole or not at all; files of unknown origin: speech, pickles, meshes."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_stereo_is_averaged(tmp_path: Path) -> None:
         (b"RIFF\x10\x00\x00\x00WAVEfmt ", "not a readable sound file"),
     ],
 )
-def test_what_is_no_sound_gets_one_sentence(tmp_path: Path, content: bytes | None, sentence: str) -> None:
+def test_a_file_without_sound_is_refused_by_name(tmp_path: Path, content: bytes | None, sentence: str) -> None:
     path = tmp_path / "speech.wav"
     if content is not None:
         path.write_bytes(content)
@@ -174,7 +174,7 @@ def test_an_atomic_folder_replaces_content_only_if_allowed(tmp_path: Path) -> No
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
-def test_an_atomic_folder_gives_way_to_nothing_that_appears_meanwhile(tmp_path: Path) -> None:
+def test_an_atomic_folder_handles_a_folder_that_appears_meanwhile(tmp_path: Path) -> None:
     path = tmp_path / "out"
     with pytest.raises(FaceDiffError, match="out: cannot be written"), atomic_folder(path) as folder:  # noqa: PT012
         (folder / "a").touch()
@@ -187,7 +187,7 @@ def test_an_atomic_folder_gives_way_to_nothing_that_appears_meanwhile(tmp_path: 
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
 
 
-def test_errors_of_writers_name_the_folder_that_was_asked_for(tmp_path: Path) -> None:
+def test_errors_in_an_atomic_folder_name_the_final_path(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError) as caught, atomic_folder(tmp_path / "out") as folder:  # noqa: PT012
         (folder / "file").touch()
         check_writable(folder / "file" / "below")
@@ -195,7 +195,7 @@ def test_errors_of_writers_name_the_folder_that_was_asked_for(tmp_path: Path) ->
     assert "partial" not in str(caught.value)
 
 
-def test_a_folder_of_a_killed_process_is_removed_and_that_of_a_living_one_is_kept(tmp_path: Path) -> None:
+def test_the_scratch_folder_of_a_killed_process_is_removed_and_of_a_running_one_kept(tmp_path: Path) -> None:
     path = tmp_path / "out"
     program = (
         "import os, sys, pathlib; from facediff.utils.files import atomic_folder\n"
@@ -222,7 +222,7 @@ def test_a_lock_keeps_others_out_and_leaves_nothing(tmp_path: Path) -> None:
         locked(tmp_path / "file" / ".lock", "facediff test").__enter__()
 
 
-def test_descriptions_of_files_tell_whether_all_are_there(tmp_path: Path) -> None:
+def test_described_files_are_compared_by_size(tmp_path: Path) -> None:
     write_json(tmp_path / "b" / "x.json", {"a": "ä"})
     write_rows(tmp_path / "a.csv", [{"clip": "A", "frames": 3}], line_end="\n")
     assert (tmp_path / "a.csv").read_bytes() == b"clip,frames\nA,3\n"

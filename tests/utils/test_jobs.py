@@ -88,7 +88,7 @@ def test_set_up_happens_once_in_each_worker() -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_failing_set_up_is_told_from_a_failing_task(workers: int) -> None:
+def test_a_failing_set_up_raises_an_error_of_its_own(workers: int) -> None:
     with pytest.raises(SetupError, match=r"C\.ckpt"):
         list(run_tasks(PerWorker(failing_setup), range(3), workers=workers))
 

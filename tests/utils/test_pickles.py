@@ -1,4 +1,4 @@
-"""Stand-ins for foreign objects in pickles: they keep what the pickle says and do nothing."""
+"""Stand-ins for objects of other packages in pickles: they keep what the pickle holds and do nothing."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_call_becomes_a_stand_in_with_its_arguments(file: Path) -> None:
         b"ccopy_reg\n__newobj__\n(tR.",
     ],
 )
-def test_everything_else_is_refused(file: Path, content: bytes) -> None:
+def test_other_names_in_pickles_are_refused(file: Path, content: bytes) -> None:
     file.write_bytes(content)
     with pytest.raises(FaceDiffError, match=r"file\.pkl: not a pickle of plain NumPy arrays"):
         load_pickle(file, stand_ins=("chumpy",))
@@ -62,13 +62,13 @@ def test_everything_else_is_refused(file: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("content", [b"cchumpy.ch\nCh\n(tR.", b"c__builtin__\nobject\n(tR."])
-def test_nothing_stands_in_unless_asked_for(file: Path, content: bytes) -> None:
+def test_stand_ins_are_used_only_if_requested(file: Path, content: bytes) -> None:
     file.write_bytes(content)
     with pytest.raises(FaceDiffError, match="it asks for"):
         load_pickle(file)
 
 
-def test_plain_pickles_are_read_as_before(file: Path) -> None:
+def test_plain_pickles_are_read_with_stand_ins_too(file: Path) -> None:
     file.write_bytes(pickle.dumps({"a": np.arange(4), "b": {1, 2}}))
     loaded = load_pickle(file, stand_ins=("chumpy",))
     np.testing.assert_array_equal(loaded["a"], np.arange(4))

@@ -1,4 +1,4 @@
-"""Corpora in miniature as the doctor meets them: true names and splits, few vertices."""
+"""Miniature corpora for the check: true names and splits, few vertices."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MEAD_FRAMES = {
     "M032_001_0_0": 26,
     "W040_030_7_2": 27,
 }
-"""Frames of each clip. By sentence, the last two people are in no split; by identity, everybody is in one."""
+"""Frames of each clip. By sentence, the last two speakers are in no split; by identity, all are in one."""
 
 
 class SmallBiwi(Biwi):

@@ -196,7 +196,7 @@ def test_vocaset_at_60_frames_a_second(fakes: Path) -> None:
     assert kinds(report, "warning").count("clips_missing") == 3
 
 
-def test_a_few_clips_that_vocaset_never_had_are_a_note_only(copies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_few_missing_clips_of_vocaset_are_only_a_note(copies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = sorted(path.stem for path in (copies / "vocaset" / "wav").iterdir())
     expected = {"train": [n for n in names if vocaset.TRAIN in n or vocaset.TRAIN_2 in n] * 4}
     expected["train"].append(f"{vocaset.TRAIN}_sentence03")

@@ -278,7 +278,7 @@ def test_a_blemish_leaves_a_corpus_sound(
 
 
 @pytest.mark.parametrize("file", ["templates.pkl", f"vertices_npy/{CLIP}.npy"])
-def test_a_pickle_that_would_run_code_is_told_and_does_not_run(
+def test_a_pickle_that_would_run_code_is_reported_and_not_run(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, file: str
 ) -> None:
     monkeypatch.chdir(root.parent)
@@ -308,7 +308,7 @@ def test_a_wav_from_a_pipe_is_whole(root: Path, capsys: pytest.CaptureFixture[st
     assert examined(root, capsys)[1]["findings"] == []
 
 
-def test_damaged_headers_of_all_sorts_are_told(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_headers_of_all_sorts_are_reported(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """No byte of a header of motion or sound, set to anything, ends the check."""
     rng = np.random.default_rng(3)
     for path in (motion(root), sound(root)):

@@ -1,4 +1,4 @@
-"""What a folder is; what preparing has recorded; how the report reads."""
+"""Recognising a folder, comparing it with its manifest, and the report as text."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from facediff.data.check import check, text
 from facediff.errors import FaceDiffError
 from tests.data.check.small import kinds, message, rows
 from tests.fakes import biwi
+
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.mark.parametrize(("folder", "corpus"), [("biwi", "biwi"), ("vocaset", "vocaset"), ("mead", "mead3d")])
@@ -105,7 +108,7 @@ def test_a_preparation_that_has_not_ended(copies: Path) -> None:
 
 
 @pytest.mark.parametrize("files", [[], ["wav/hello.wav", "vertices_npy/hello.npy"], ["a/b.txt"]])
-def test_a_folder_that_is_nothing_known(tmp_path: Path, capsys: pytest.CaptureFixture[str], files: list[str]) -> None:
+def test_a_folder_that_is_not_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str], files: list[str]) -> None:
     root = write_raw(tmp_path / "x", files)
     root.mkdir(exist_ok=True)
     assert run("data check", [str(root), "--quiet"]) == 1
@@ -115,7 +118,7 @@ def test_a_folder_that_is_nothing_known(tmp_path: Path, capsys: pytest.CaptureFi
     assert ("frame_*.vl" in out) == (len(files) < 2)
 
 
-def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="no such folder"):
         run("data check", [str(tmp_path / "nowhere")])
     with pytest.raises(FaceDiffError, match="--workers"):
@@ -145,7 +148,7 @@ def test_a_persons_folder(copies: Path) -> None:
     assert kinds(check(root)) == ["manifest_unreadable"]
 
 
-def test_the_manifest_of_preparing_is_held_against_the_files(copies: Path) -> None:
+def test_files_are_compared_with_the_manifest(copies: Path) -> None:
     root = copies / "tiny"
     files = sorted(path for path in root.rglob("*") if path.is_file())
     described = {
@@ -187,7 +190,7 @@ def test_the_table_groups_equal_findings_and_names_the_first(copies: Path, capsy
 
 
 @pytest.mark.skipif(os.name != "posix", reason="file names of any bytes")
-def test_names_that_would_steer_a_terminal_are_spelled_out(copies: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_with_control_characters_are_escaped(copies: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = copies / "tiny"
     (root / "wav" / "a\x1b[2Jb.wav").write_bytes(b"")
     (root / "wav" / "\x07c.mp3").write_bytes(b"")
@@ -207,3 +210,9 @@ def test_several_processes_find_the_same(copies: Path) -> None:
     together = check(root, "tests.fakes.tiny.Tiny", workers=2).state()
     assert alone == together
     assert alone["sound"] is False
+
+
+def test_worker_processes_import_nothing_heavy() -> None:
+    program = "import sys, facediff.data.check.clip; assert not {'torch', 'lightning', 'trimesh'} & set(sys.modules)"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert run.returncode == 0, run.stderr

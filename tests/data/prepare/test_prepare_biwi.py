@@ -1,4 +1,4 @@
-"""BIWI from its raw distribution: the frames' files, the normalisation, the sound, and what may be wrong."""
+"""BIWI from its raw distribution: the frames' files, the normalisation, the sound, and damaged data."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_vertices_of_a_vl_file_come_back(tmp_path: Path, header: int) -> None:
 
 
 @pytest.mark.parametrize("header", [4, 8])
-def test_no_truncated_vl_file_is_taken_for_a_whole_one(tmp_path: Path, header: int) -> None:
+def test_truncated_vl_files_are_refused(tmp_path: Path, header: int) -> None:
     vertices = np.random.default_rng(0).normal(0, 100, (9, 3)).astype(np.float32)
     whole = vl_bytes(vertices, header)
     files = [tmp_path / f"frame_{i:03d}.vl" for i in range(3)]
@@ -200,7 +200,7 @@ def test_sound_is_taken_out_of_flv(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["wav/F2_e01.wav", "sound/deep/F2_e01_cut.wav", "F2/e01.wav", "audio/F2/e01_cut.wav"])
-def test_sound_is_found_where_people_keep_it_and_before_the_video(raw: Path, place: str) -> None:
+def test_sound_is_found_in_all_known_folders_and_preferred_to_the_video(raw: Path, place: str) -> None:
     (raw / place).parent.mkdir(parents=True, exist_ok=True)
     (raw / "audio" / "F2_e01.wav").rename(raw / place)
     (raw / "videos").mkdir()
@@ -210,14 +210,14 @@ def test_sound_is_found_where_people_keep_it_and_before_the_video(raw: Path, pla
     assert soundfile.info(out / "wav" / "F2_e01.wav").frames == 6 * 640
 
 
-def test_a_recording_that_was_cut_to_the_motion_comes_before_one_that_was_not(raw: Path) -> None:
+def test_a_recording_cut_to_the_motion_is_preferred(raw: Path) -> None:
     (raw / "audio" / "F2_e01.wav").rename(raw / "audio" / "F2_e01_cut.wav")
     soundfile.write(raw / "audio" / "F2_e01.wav", np.zeros(9 * RATE), RATE)
     out, _ = prepared(raw)
     assert soundfile.info(out / "wav" / "F2_e01.wav").frames == 6 * 640
 
 
-def test_frames_are_in_numeric_order_and_gaps_are_told(raw: Path) -> None:
+def test_frames_are_in_numeric_order_and_gaps_are_noted(raw: Path) -> None:
     folder = frame(raw, 1).parent
     frames = raw_frames("F2", "e01", 12)
     shutil.rmtree(folder)
@@ -264,7 +264,7 @@ def test_unpacked_archives_are_found_a_folder_deeper(tmp_path: Path, depth: str)
     assert list(report.clips) == ["F1_e01", "F2_e01", "M3_e01"]
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
+def test_missing_files_are_named(tmp_path: Path) -> None:
     raw = write_raw_biwi(tmp_path / "raw", regions=False)
     (raw / "audio" / "F2_e02.wav").unlink()
     (raw / "rigid_scans" / "M3.obj").unlink()
@@ -308,7 +308,7 @@ def test_only_some_subjects(tmp_path: Path) -> None:
         biwi.plan(raw, subjects=["F9"])
 
 
-def test_nothing_at_all(tmp_path: Path) -> None:
+def test_an_empty_raw_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="gone: no such folder"):
         biwi.plan(tmp_path / "gone")
     with pytest.raises(FaceDiffError, match="BIWI can be prepared"):
@@ -356,7 +356,7 @@ def test_two_files_of_one_frame(raw: Path) -> None:
     assert "has the same frame number as" in problem(raw)
 
 
-def test_sound_that_is_none(raw: Path) -> None:
+def test_an_unreadable_sound_file_is_named(raw: Path) -> None:
     (raw / "audio" / "F2_e01.wav").write_bytes(b"this is text")
     assert "F2_e01.wav: not a readable sound file" in problem(raw)
 

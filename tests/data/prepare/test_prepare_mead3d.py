@@ -1,4 +1,4 @@
-"""3DMEAD from its raw distributions: parameters to vertices, the sound, whose shape a face has, what may be wrong."""
+"""3DMEAD from its raw distributions: parameters to vertices, the sound, the shape of a face, and damaged data."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_fewer_coefficients_and_other_batches(raw: Path, flame: Path) -> None:
     np.testing.assert_allclose(motion_of(out, CLIP), expected, atol=1e-7)
 
 
-def test_what_is_written_beside_the_clips(tmp_path: Path, flame: Path) -> None:
+def test_shared_files_next_to_the_clips(tmp_path: Path, flame: Path) -> None:
     raw = write_raw_emote(tmp_path / "raw", audio="wav")
     (raw / "FLAME_masks.pkl").write_bytes(python2_pickle(flame_masks(VERTICES)))
     out, report = prepared(raw, flame)
@@ -190,7 +190,7 @@ def test_what_is_written_beside_the_clips(tmp_path: Path, flame: Path) -> None:
     assert sorted(data.assets().templates) == sorted({name[:4] for name in CLIPS})
 
 
-def test_masks_beside_the_model_and_regions_of_ones_own(raw: Path, flame: Path, tmp_path: Path) -> None:
+def test_masks_next_to_the_model_and_own_regions(raw: Path, flame: Path, tmp_path: Path) -> None:
     model = shutil.copy(flame, tmp_path / "model.pkl")
     (tmp_path / "FLAME_masks.pkl").write_bytes(python2_pickle(flame_masks(VERTICES)))
     assert (prepared(raw, Path(model), "a")[0] / "FLAME_masks.pkl").is_file()
@@ -231,7 +231,7 @@ def test_the_sound_of_meads_own_files(tmp_path: Path, flame: Path) -> None:
         assert abs(list(shifts)[int(np.argmax(scores))]) <= 16
 
 
-def test_sound_is_found_wherever_it_may_lie(tmp_path: Path) -> None:
+def test_sound_is_found_in_all_known_folders(tmp_path: Path) -> None:
     tone = np.zeros(100)
     places = {
         "raw": f"MEAD/{emote_folder(CLIP, 'audio')}.wav",
@@ -442,7 +442,7 @@ def test_unusable_sound_costs_one_clip(raw: Path, flame: Path) -> None:
     assert "001.wav: not a readable sound file" in problem(raw, flame)
 
 
-def test_folders_that_are_none(tmp_path: Path, flame: Path, raw: Path) -> None:
+def test_folders_without_the_data_set_are_refused(tmp_path: Path, flame: Path, raw: Path) -> None:
     with pytest.raises(FaceDiffError, match=r"nowhere: no such folder"):
         mead3d.plan(tmp_path / "nowhere", flame=flame)
     (tmp_path / "empty").mkdir()

@@ -1,4 +1,4 @@
-"""Preparing in general: kills, resumption, refusals, the manifest."""
+"""The runner of data preparation: kills, resumption, refusals, the manifest."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_second_run_changes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("flaw", ["npy cut", "npy gone", "wav empty", "wav gone", "templates gone", "other type"])
-def test_what_is_damaged_is_written_again(tmp_path: Path, flaw: str) -> None:
+def test_damaged_files_are_written_again(tmp_path: Path, flaw: str) -> None:
     out = tmp_path / "out"
     prepare(toy_plan(), out, workers=1)
     whole = contents(out)
@@ -130,7 +130,7 @@ def test_a_failing_clip_does_not_stop_the_others_and_can_be_repaired(tmp_path: P
     assert contents(out) == contents(tmp_path / "at once")
 
 
-def test_damaged_files_of_a_clip_that_fails_do_not_stay(tmp_path: Path) -> None:
+def test_damaged_files_of_a_failing_clip_are_removed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     prepare(toy_plan(), out, workers=1)
     (out / "vertices_npy" / "A_e02.npy").write_bytes(b"half")
@@ -147,7 +147,7 @@ def full_disk() -> FaceDiffError:
 
 
 @pytest.mark.parametrize("error", [full_disk(), MissingExtraError("av", "prepare", "reading flv")])
-def test_what_would_fail_every_clip_stops_the_run(tmp_path: Path, error: FaceDiffError) -> None:
+def test_errors_that_concern_every_clip_stop_the_run(tmp_path: Path, error: FaceDiffError) -> None:
     out = tmp_path / "out"
     plan = toy_plan({"A_e01": partial(raising, error), "A_e02": partial(write_toy, "A_e02", 3)})
     with pytest.raises(FaceDiffError, match="No space left|facediff\\[prepare\\]"):
@@ -163,6 +163,18 @@ def test_a_programming_error_is_no_failed_clip(tmp_path: Path) -> None:
     assert "A_e01" in caught.value.__notes__[0]
 
 
+def killing(out: Path) -> int:
+    os._exit(9)
+
+
+def test_a_clip_that_kills_its_process_fails_alone(tmp_path: Path) -> None:
+    works = {name: partial(write_toy, name, 3 + i) for i, name in enumerate(CLIPS)}
+    report = prepare(toy_plan({**works, "A_e02": killing}), tmp_path / "out", workers=2)
+    assert set(report.clips) == {"A_e01", "B_e01"}
+    assert "A_e02" in report.failed["A_e02"]
+    assert "--workers 1" in report.failed["A_e02"]
+
+
 def test_other_options_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     prepare(toy_plan(options={"dtype": "float32", "subjects": ["A", "B"]}), out, workers=1)
@@ -172,7 +184,7 @@ def test_other_options_are_refused(tmp_path: Path) -> None:
     assert contents(out) == before
 
 
-def test_another_version_may_look_but_not_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_version_may_read_but_not_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
     prepare(toy_plan(), out, workers=1)
     monkeypatch.setattr("facediff.data.prepare.runner.version", lambda: "99.0")
@@ -201,7 +213,7 @@ def test_a_folder_that_cannot_be_written_gets_one_sentence(tmp_path: Path, where
         prepare(toy_plan(), tmp_path / where, workers=1)
 
 
-def test_two_runs_do_not_meet_in_one_folder(tmp_path: Path) -> None:
+def test_two_runs_in_one_folder_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     with (out / ".prepare.lock").open("w") as stream:
@@ -212,7 +224,9 @@ def test_two_runs_do_not_meet_in_one_folder(tmp_path: Path) -> None:
     assert prepare(toy_plan(), out, workers=1).sound  # a lock file that nobody holds is nothing
 
 
-def test_a_disk_that_is_too_small_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_disk_space_is_reported_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "out"
     # 9 frames of 2 vertices in float32, and 640 samples of 16 bit for each.
     needed = 9 * (2 * 3 * 4 + 640 * 2)
@@ -285,7 +299,7 @@ def slow(work, out):
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_stopped_run_is_taken_up_and_ends_as_if_nothing_had_happened(tmp_path: Path, how: signal.Signals) -> None:
+def test_a_stopped_run_is_resumed_to_equal_bytes(tmp_path: Path, how: signal.Signals) -> None:
     raw, out = write_raw_biwi(tmp_path / "raw", sentences=[f"e{i:02d}" for i in range(1, 12)]), tmp_path / "out"
     (tmp_path / "program.py").write_text(PROGRAM)
     (tmp_path / "slow.py").write_text(SLOW)
@@ -321,7 +335,7 @@ def test_a_stopped_run_is_taken_up_and_ends_as_if_nothing_had_happened(tmp_path:
     assert contents(out) == contents(tmp_path / "at once")
 
 
-def test_the_command_says_what_came_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_reports_the_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     raw = write_raw_biwi(tmp_path / "raw", regions=False)
     frame = raw / "faces" / "M3" / "e33" / "frame_002.vl"
     frame.write_bytes(vl_bytes(np.zeros((3, 3))))
@@ -358,7 +372,7 @@ def test_the_command_does_not_write_into_the_raw_folder(tmp_path: Path, out: str
         ["vocaset", "a", "b", "--frame-rate", "25"],
     ],
 )
-def test_wrong_words_are_refused(arguments: list[str]) -> None:
+def test_wrong_arguments_are_refused(arguments: list[str]) -> None:
     assert main(["data", "prepare", *arguments]) == 2
 
 

@@ -1,4 +1,4 @@
-"""VOCASET from its raw distribution: rows to clips, 60 to 30 frames a second, the sound, and what may be wrong."""
+"""VOCASET from its raw distribution: rows to clips, 60 to 30 frames a second, the sound, and damaged data."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def change(path: Path, key: str, value: object) -> None:
     path.write_bytes(pickle.dumps(content))
 
 
-def test_every_second_frame_is_taken_and_nothing_else_is_done(tmp_path: Path) -> None:
+def test_every_second_frame_is_used_unchanged(tmp_path: Path) -> None:
     out, report = prepared(write_raw_vocaset(tmp_path / "raw"))
     assert sorted(report.clips) == NAMES
     for subject, sentences in CLIPS.items():
@@ -85,7 +85,7 @@ def test_all_60_frames_a_second_can_be_kept(raw: Path) -> None:
     assert '"frame_rate": 60.0' in (out / "manifest.json").read_text()
 
 
-def test_filtering_removes_what_would_alias_and_keeps_the_rest() -> None:
+def test_filtering_removes_aliasing_frequencies_and_keeps_the_others() -> None:
     time = np.arange(241) / 60
     slow, fast = np.sin(2 * np.pi * 4 * time), np.sin(2 * np.pi * 23 * time)
     motion = np.zeros((241, 2, 3))
@@ -164,7 +164,7 @@ def test_sound_of_any_type_means_the_same(audio: object) -> None:
         ),
     ],
 )
-def test_sound_that_is_none_of_these(raw: Path, entry: object, sentence: str) -> None:
+def test_sound_of_another_form_is_refused(raw: Path, entry: object, sentence: str) -> None:
     change(raw / "raw_audio_fixed.pkl", "", entry)
     said = problem(raw)
     assert f"{TRAIN} sentence01" in said
@@ -177,7 +177,7 @@ def test_sound_that_is_not_finite(raw: Path) -> None:
 
 
 @pytest.mark.parametrize("row", [25, -1])
-def test_a_row_that_is_not_there(raw: Path, row: int) -> None:
+def test_a_row_beyond_the_array_is_refused(raw: Path, row: int) -> None:
     change(raw / "subj_seq_to_idx.pkl", "", {**{i: i for i in range(7)}, 7: row})
     assert (
         f"sentence01: frame 7 is row {row} in subj_seq_to_idx.pkl, but {raw / 'data_verts.npy'} has 25 rows"
@@ -193,7 +193,7 @@ def test_a_row_that_is_not_finite(raw: Path) -> None:
     assert f"frame 6, row {row} of {raw / 'data_verts.npy'}, holds NaN" in problem(raw)
 
 
-def test_frames_are_in_the_order_of_their_numbers_and_gaps_are_told(raw: Path) -> None:
+def test_frames_are_in_the_order_of_their_numbers_and_gaps_are_noted(raw: Path) -> None:
     change(raw / "subj_seq_to_idx.pkl", "", {4: 9, 0: 3, 2: 7, 1: 5})
     out, report = prepared(raw, frame_rate=60)
     motion = np.load(out / "vertices_npy" / f"{CLIP}.npy")
@@ -201,7 +201,7 @@ def test_frames_are_in_the_order_of_their_numbers_and_gaps_are_told(raw: Path) -
     assert any(CLIP in note and "leaves out some of the frames up to 4" in note for note in report.notes)
 
 
-def test_pairs_that_do_not_exist_are_counted(tmp_path: Path) -> None:
+def test_sentences_that_were_never_recorded_are_counted(tmp_path: Path) -> None:
     raw = write_raw_vocaset(tmp_path / "raw")
     audio = load_pickle(raw / "raw_audio_fixed.pkl")
     del audio[TRAIN]["sentence02"]

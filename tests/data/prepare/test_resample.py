@@ -1,4 +1,4 @@
-"""Another frame rate without aliases."""
+"""Resampling motion to another frame rate without aliasing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_constants_and_straight_lines_are_kept(rate_in: float, rate_out: float, 
         np.testing.assert_allclose(made[:, 0], np.arange(len(made)) / rate_out, atol=1e-3)
 
 
-def test_what_the_new_rate_cannot_hold_is_taken_out() -> None:
+def test_frequencies_above_the_new_nyquist_frequency_are_removed() -> None:
     """A 20 Hz tremble at 60 frames a second would look like 10 Hz if every second frame were taken."""
     time = np.arange(600) / 60
     tremble = np.sin(2 * np.pi * 20 * time)[:, None]
@@ -60,7 +60,7 @@ def test_shape_type_and_coordinates_are_independent() -> None:
     np.testing.assert_allclose(made[:, 2, 1:2], alone, atol=1e-6)
 
 
-def test_it_works_from_disk_to_disk(tmp_path: Path) -> None:
+def test_resampling_from_disk_to_disk_needs_little_memory(tmp_path: Path) -> None:
     motion = np.random.default_rng(0).normal(size=(6000, 300)).astype(np.float32)
     np.save(tmp_path / "in.npy", motion)
     source = np.load(tmp_path / "in.npy", mmap_mode="r")
@@ -74,12 +74,12 @@ def test_it_works_from_disk_to_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rates", [(0, 25), (25, -1), (25, float("nan")), (float("inf"), 25)])
-def test_rates_that_are_none(rates: tuple[float, float]) -> None:
+def test_impossible_rates_are_refused(rates: tuple[float, float]) -> None:
     with pytest.raises(FaceDiffError, match="positive numbers of frames a second"):
         resample_frames(np.zeros((9, 3)), *rates)
 
 
-def test_too_short_or_the_wrong_place() -> None:
+def test_too_short_motion_and_a_wrong_output_are_refused() -> None:
     with pytest.raises(FaceDiffError, match="too short"):
         resample_frames(np.zeros((0, 3)), 30, 25)
     with pytest.raises(FaceDiffError, match="out has shape"):
