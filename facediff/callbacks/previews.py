@@ -31,9 +31,10 @@ from facediff.data import Sample, SpeechMotionDataModule, collate
 from facediff.data.audio import fit_length, samples_for
 from facediff.data.corpus import Clip
 from facediff.errors import FaceDiffError, MissingExtraError, choices
-from facediff.metrics import Region, SequenceMetric
+from facediff.metrics import SequenceMetric
 from facediff.metrics.base import align
 from facediff.models import AnimationModel
+from facediff.models.evaluation import regions_of
 from facediff.render import VIEWS, Renderer, comparison, contact_sheet, save_image, write_video
 from facediff.utils import SAMPLE_RATE
 
@@ -419,12 +420,9 @@ def draw_clip(
 
 def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, float]:
     """The protocol's metrics of one clip; in this process alone, unlike those of a whole split."""
-    assets, protocol = model.assets, model.evaluation.protocol
-    regions = [
-        Region.from_indices(f"{assets.corpus}/{name}", assets.regions[name], n_vertices=assets.n_vertices)
-        for name in ("lips", "upper_face")
-    ]
-    metrics = cast(Iterable[tuple[str, SequenceMetric]], protocol.build(*regions).items(copy_state=False))
+    regions = regions_of(model.assets)
+    built = model.evaluation.protocol.build(regions["lips"], regions["upper_face"])
+    metrics = cast(Iterable[tuple[str, SequenceMetric]], built.items(copy_state=False))
     (clip,) = align(motion[None], sample.motion[None], clip_names=[sample.name]).clips
     return {name: float(metric.clip_value(clip)) for name, metric in metrics}
 

@@ -80,6 +80,18 @@ OF_THE_MODEL = {"samples", "conditions", "style", "time"}
 """Needs that only the model meets: metrics that have one are not taken of a still face or of shuffled speech."""
 
 
+def regions_of(assets: Assets) -> dict[str, Region]:
+    """A corpus's regions by name, for metrics."""
+    return {
+        name: Region.from_indices(
+            f"{assets.corpus}/{name if len(indices) < assets.n_vertices else 'all vertices'}",
+            indices,
+            n_vertices=assets.n_vertices,
+        )
+        for name, indices in assets.regions.items()
+    }
+
+
 class Evaluation:
     """Metrics of one protocol, and metrics chosen by name, for every split and method.
 
@@ -120,14 +132,7 @@ class Evaluation:
             FaceDiffError: if the corpus or the model lacks something that a metric needs.
         """
         assets = model.assets
-        regions = {
-            name: Region.from_indices(
-                f"{assets.corpus}/{name if len(indices) < assets.n_vertices else 'all vertices'}",
-                indices,
-                n_vertices=assets.n_vertices,
-            )
-            for name, indices in assets.regions.items()
-        }
+        regions = regions_of(assets)
         self.splits = list(splits)
         self._sequences = []
         self._corpus = root
