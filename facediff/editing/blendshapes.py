@@ -185,21 +185,13 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
 
 @dataclass(frozen=True)
 class _Moving:
-    """The shapes that move something, on the vertices that count.
+    """The shapes that move something, on the vertices that count."""
 
-    Attributes:
-        places: which of the set's shapes these are.
-        vertices: (N,) vertices that count.
-        area: (N,) their shares, which sum to one.
-        deltas: (K, 3N) displacements.
-        energy: (K,) weighted mean square of each.
-    """
-
-    places: npt.NDArray[np.int64]
-    vertices: npt.NDArray[np.int64]
-    area: Array
-    deltas: Array
-    energy: Array
+    places: npt.NDArray[np.int64]  # (K,) which of the set's shapes these are
+    vertices: npt.NDArray[np.int64]  # (N,) vertices that count
+    area: Array  # (N,) their shares of the area, which sum to one
+    deltas: Array  # (K, 3N) displacements
+    energy: Array  # (K,) weighted mean square of each
 
 
 def _moving(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> _Moving:
@@ -281,21 +273,13 @@ JITTER = 1e-10
 
 @dataclass(frozen=True)
 class Problem:
-    """½ Σ_t x_tᵀ M x_t − Σ_t r_tᵀ x_t + ½ c Σ_t ‖x_t − x_{t−1}‖², lower ≤ x_t ≤ upper; float64 throughout.
+    """½ Σ_t x_tᵀ M x_t − Σ_t r_tᵀ x_t + ½ c Σ_t ‖x_t − x_{t−1}‖², lower ≤ x_t ≤ upper; float64 throughout."""
 
-    Attributes:
-        matrix: M (K, K), symmetric, positive semi-definite, with a diagonal of about one.
-        right: r (T, K).
-        coupling: c, not negative.
-        lower: (K,).
-        upper: (K,).
-    """
-
-    matrix: Array
-    right: Array
-    coupling: float
-    lower: Array
-    upper: Array
+    matrix: Array  # M (K, K), symmetric, positive semi-definite, with a diagonal of about one
+    right: Array  # r (T, K)
+    coupling: float  # c, not negative
+    lower: Array  # (K,)
+    upper: Array  # (K,)
 
     def clip(self, x: Array) -> Array:
         """The nearest point of the box."""
@@ -327,13 +311,8 @@ def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[A
     clipped to the box, and the step is shortened until the objective falls enough, which makes it converge from
     anywhere. The free variables of all frames are solved for together.
 
-    Args:
-        problem: the program.
-        tolerance: (K,) what may be left of :meth:`Problem.residual`.
-        max_iterations: steps at most.
-
     Returns:
-        x (T, K), and whether it meets the tolerance.
+        x (T, K), and whether its :meth:`Problem.residual` meets the tolerance (K,).
     """
     x = problem.clip(_newton(problem, problem.right, np.ones(problem.right.shape, bool)))
     width = float((problem.upper - problem.lower).min())

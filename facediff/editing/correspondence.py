@@ -65,13 +65,6 @@ class Correspondence:
     target_faces: Indices
 
     @property
-    def is_identity(self) -> bool:
-        """Whether both meshes are one: same topology, same places."""
-        return np.array_equal(self.source_vertices, self.target_vertices) and np.array_equal(
-            self.source_faces, self.target_faces
-        )
-
-    @property
     def fits_badly(self) -> bool:
         """Whether the meshes lie so far apart that the carried motion should be looked at."""
         size = Surface(self.source_vertices, self.source_faces).size
@@ -211,15 +204,9 @@ def refuse_other_mesh(
 
     Triangles must be equal; vertices may have moved, as another speaker's have.
 
-    Args:
-        name: what to call the mesh in the message.
-        vertices: (V, 3).
-        faces: (F, 3).
-        expected_vertices: what they were.
-        expected_faces: what they were.
-
     Raises:
-        FaceDiffError: if it is another mesh, or the same one with its vertices or triangles in another order.
+        FaceDiffError: calling the mesh ``name``, if it is another one, or has its vertices or triangles in another
+            order.
     """
     if len(vertices) != len(expected_vertices):
         raise FaceDiffError(
@@ -274,11 +261,6 @@ def place(moved: Surface, goal: Surface, start: Similarity | None = None) -> Sim
     the best by nearest vertices, both ways and trimmed, is refined by nearest points of the surface: Besl and McKay, "A
     method for registration of 3-D shapes", PAMI 1992, and Chen and Medioni, "Object modelling by registration of
     multiple range images", IVC 1992 (distances to planes).
-
-    Args:
-        moved: what to move.
-        goal: onto what.
-        start: where to begin; searched for if None.
     """
     return _refined(moved, goal, start or _start(moved, goal))
 
@@ -378,15 +360,10 @@ WELD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Partners:
-    """Where to search for the nearest points of each target vertex.
+    """Where to search for the nearest points of each target vertex."""
 
-    Attributes:
-        parts: vertices of the target (N,) and the part of the source on which theirs lie; together all vertices.
-        size: of the source.
-    """
-
-    parts: list[tuple[Indices, Surface]]
-    size: float
+    parts: list[tuple[Indices, Surface]]  # vertices of the target, together all, and the part of the source they lie on
+    size: float  # of the whole source
 
     def nearest(self, points: Array, normals: Array) -> Nearest:
         """The nearest point of each target vertex (Vt, 3) on its part of the source."""
@@ -480,16 +457,9 @@ def edges_of(faces: Indices) -> Indices:
 
 
 def smooth_field(values: Array, trust: Array, edges: Indices, stiffness: float) -> Array:
-    """The field with the least Σ trust (x − value)² + stiffness · Σ_edges (x_a − x_b)², (V, 3).
+    """The field (V, 3) with the least Σ trust (x − value)² + stiffness · Σ_edges (x_a − x_b)².
 
-    Args:
-        values: (V, 3) what is known.
-        trust: (V,) how well, 0 to 1.
-        edges: (E, 2).
-        stiffness: 0 leaves the known values as they are.
-
-    Returns:
-        the field; zero on pieces of the mesh where nothing is known.
+    Values (V, 3) are known as well as their trust (V,) says; the field is zero on pieces where nothing is known.
     """
     from scipy.sparse import diags_array
     from scipy.sparse.csgraph import laplacian
@@ -502,11 +472,7 @@ def smooth_field(values: Array, trust: Array, edges: Indices, stiffness: float) 
 
 
 def averaging(trust: Array, faces: Indices) -> csr_array | None:
-    """The sparse (V, V) matrix that gives each vertex (1 − trust) times the mean of its neighbours.
-
-    Returns:
-        the matrix; None where every vertex is trusted.
-    """
+    """The sparse (V, V) matrix of (1 − trust) times the mean of neighbours; None if all vertices are trusted."""
     from scipy.sparse import diags_array
 
     if (trust >= 1).all():
@@ -540,12 +506,7 @@ CHUNK_NUMBERS = 4_000_000
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangle mesh whose nearest points can be searched for.
-
-    Attributes:
-        vertices: (V, 3).
-        faces: (F, 3).
-    """
+    """A triangle mesh (V, 3), (F, 3) whose nearest points can be searched for."""
 
     vertices: Array
     faces: Indices
@@ -584,23 +545,14 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """Points of a surface.
+    """N points of a surface, each the nearest one to a given point."""
 
-    Attributes:
-        corners: (N, 3) vertices of the triangle of each.
-        weights: (N, 3) barycentric weights of its corners, none negative, which sum to one.
-        points: (N, 3) where it lies.
-        normals: (N, 3) unit normals there.
-        distances: (N,) how far it is.
-        cosines: (N,) between the normals there and here.
-    """
-
-    corners: Indices
-    weights: Array
-    points: Array
-    normals: Array
-    distances: Array
-    cosines: Array
+    corners: Indices  # (N, 3) vertices of its triangle
+    weights: Array  # (N, 3) barycentric weights of the corners, none negative, which sum to one
+    points: Array  # (N, 3) where it lies
+    normals: Array  # (N, 3) unit normals of the surface there
+    distances: Array  # (N,) from the given point
+    cosines: Array  # (N,) between the surface's normal and that of the given point
 
 
 def vertex_normals(vertices: Array, faces: Indices) -> Array:
@@ -617,14 +569,9 @@ def vertex_normals(vertices: Array, faces: Indices) -> Array:
 def nearest(surface: Surface, points: Array, normals: Array, size: float | None = None) -> Nearest:
     """The nearest point of a surface to each point (N, 3), where normals decide between sheets.
 
-    Every triangle that could hold it is looked at, so that the point found is the nearest of all of its sheet.
-
-    Args:
-        surface: where to search.
-        points: from where.
-        normals: (N, 3) unit normals there; zero where there is none.
-        size: of the whole that the surface may be a part of; its own if None. At 0, the nearest point counts, whatever
-            its normal.
+    Every triangle that could hold it is looked at, so that the point found is the nearest of all of its sheet. Normals
+    (N, 3) are zero where a point has none. The slack between sheets is relative to ``size``, that of the surface if
+    None; at 0, the nearest point counts, whatever its normal.
     """
     slack = SLACK * (surface.size if size is None else size)
     faces, weights, cosines = _best(surface, points, normals, 0.0)

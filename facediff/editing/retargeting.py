@@ -146,10 +146,6 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
 def unit_of(unit: str, scale: float) -> str:
     """The target's unit: the source's own or a named one, if the sizes differ by no more than heads do; else a number.
 
-    Args:
-        unit: the source's.
-        scale: target units to a source unit.
-
     Example:
         >>> unit_of("m", 1000.0), unit_of("m", 1.1), unit_of("m", 20.0)
         ('mm', 'm', '0.05')

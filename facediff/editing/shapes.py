@@ -407,12 +407,7 @@ def _targets(gltf: GLTF2, binary: bytes) -> tuple[tuple[str, ...], Array, Array,
 def _numbers(gltf: GLTF2, binary: bytes, index: object, form: str, count: int | None = None) -> npt.NDArray[Any]:
     """An accessor's numbers (N, width): positions (``VEC3``) or indices (``SCALAR``).
 
-    Args:
-        gltf: the file's JSON.
-        binary: the file's binary chunk.
-        index: the accessor.
-        form: its type.
-        count: how many there must be; a sparse accessor without a buffer view states no size that could be trusted.
+    ``count`` is how many there must be: a sparse accessor without a buffer view states no size that could be trusted.
     """
     accessor = _entry(gltf.accessors, index, "accessor")
     kinds: dict[int, np.dtype[Any]] = {FLOAT: np.dtype("<f4")} if form == "VEC3" else INDICES

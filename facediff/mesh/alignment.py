@@ -102,11 +102,7 @@ def robust_align(
     continues by iteratively re-weighted least squares with Tukey's biweight, whose scale is the median residual. The
     triples are chosen with a fixed seed: equal input gives equal output.
 
-    Args:
-        source: points to move (N, 3).
-        target: where they should come to lie (N, 3).
-        weights: (N,), none negative, which multiply the robust ones; points of weight 0 are ignored. Alike if None.
-        scale: whether to fit the scale; 1 otherwise.
+    Arguments are those of :func:`align`; weights multiply the robust ones, and points of weight 0 are ignored.
 
     Raises:
         FaceDiffError: as :func:`align`.

@@ -263,13 +263,8 @@ def plain_array(value: object, where: str, depth: int = 0) -> Values:
     chumpy pickles an object's attributes: ``Ch`` keeps its array as ``x``; ``Reshape``, ``transpose`` and ``Select``
     keep what they reorder as ``a``.
 
-    Args:
-        value: an array or a stand-in.
-        where: names the value in messages.
-        depth: how many objects it lies in.
-
     Raises:
-        FaceDiffError: if the value is anything else.
+        FaceDiffError: calling the value ``where``, if it is anything else, or lies in too many objects.
     """
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         return value
