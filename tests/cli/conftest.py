@@ -21,7 +21,7 @@ SMALL = [
 
 @pytest.fixture(scope="session")
 def fit(tiny_root: Path) -> Callable[..., int]:
-    """`facediff fit` with the shipped experiment, on the miniature corpus."""
+    """`facediff fit` with the bundled experiment, on the miniature corpus."""
 
     def run(*words: str, config: str = "configs/experiment/puppet.yaml") -> int:
         data = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}"]

@@ -58,7 +58,7 @@ def error_of_c(path: Path, tiny: Tiny) -> float:
     return total
 
 
-def test_the_newcomer_comes_first_and_everybody_else_stays(adapted: Path, checkpoint: Path) -> None:
+def test_new_speaker_comes_first_and_the_others_stay(adapted: Path, checkpoint: Path) -> None:
     before, after = load_model(checkpoint), load_model(adapted)
     assert after.identities == ["C", *before.identities]
     assert after.assets.identity_index("C") == 0
@@ -67,7 +67,7 @@ def test_the_newcomer_comes_first_and_everybody_else_stays(adapted: Path, checkp
     assert len(table) == len(before.network.identity_encoder.coarse.weight) + 1
 
 
-def test_what_is_known_of_others_becomes_the_newcomers_start() -> None:
+def test_new_speaker_starts_as_the_mean_of_the_others() -> None:
     before = torch.randn(3, 4)
     after = grow(before, torch.empty(4, 4))
     torch.testing.assert_close(after[0], before.mean(0))
@@ -83,7 +83,7 @@ def test_adapting_helps(adapted: Path, checkpoint: Path, tiny: Tiny, tmp_path: P
     assert error_of_c(path, tiny) < 0.8 * error_of_c(checkpoint, tiny)
 
 
-def test_the_newcomer_is_tested_and_animated_by_name(
+def test_new_speaker_is_tested_and_animated_by_name(
     adapted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--model.unseen_identity=adapted", "--trainer.accelerator=cpu", f"--trainer.logger.save_dir={tmp_path}"]
@@ -113,8 +113,8 @@ def test_joint_training_uses_the_corpus_too(checkpoint: Path, tmp_path: Path) ->
     path = tmp_path / "C.ckpt"
     words = ["--checkpoint", str(checkpoint), "--person", "C", "-o", str(path), "--mode", "joint"]
     assert main(["adapt", *words, *FAST, "--epochs", "1"]) == 0
-    told = read_checkpoint(path)["datamodule_hyper_parameters"]
-    assert (told["extra_identities"], told["train_identities"]) == (["C"], None)
+    printed = read_checkpoint(path)["datamodule_hyper_parameters"]
+    assert (printed["extra_identities"], printed["train_identities"]) == (["C"], None)
 
 
 def test_the_second_system_adapts_too(second: Path, tmp_path: Path) -> None:

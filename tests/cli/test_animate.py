@@ -329,9 +329,9 @@ def test_a_renderer_that_ends_ends_the_stream(checkpoint: Path) -> None:
         assert process.stdout is not None
         process.stdout.close()
         process.stdout = None
-        _, told = process.communicate(pcm(6))
+        _, printed = process.communicate(pcm(6))
     assert process.returncode == 141
-    assert len(told.splitlines()) == 1  # the look-ahead
+    assert len(printed.splitlines()) == 1  # the look-ahead
 
 
 @pytest.mark.parametrize("rate", ["16000", "44100"])
@@ -415,8 +415,8 @@ def test_a_folder_of_recordings(checkpoint: Path, tmp_path: Path, capsys: pytest
     (tmp_path / "in" / "c.wav").write_text("no sound")
     words = [tmp_path / "in", "--checkpoint", checkpoint, "-o", tmp_path / "out", "--suffix", ".npz", "--workers", "1"]
     assert animate(*words) == 1
-    told = capsys.readouterr()
-    assert "not a readable sound file" in told.out + told.err
+    printed = capsys.readouterr()
+    assert "not a readable sound file" in printed.out + printed.err
     assert {path.name for path in (tmp_path / "out").glob("*.npz")} == {"a.npz", "b.npz"}
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.npz")}
     write(tmp_path / "in" / "c.wav", 0.1 * rng.normal(size=16000))

@@ -63,9 +63,9 @@ def words(figure: str, corpus: Path, *more: str) -> list[str]:
 @pytest.mark.parametrize("figure", FIGURES)
 def test_every_figure(figure: str, corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words(figure, corpus)) == 0
-    told = capsys.readouterr()
-    assert told.err == ""
-    assert told.out == f"written: {corpus.parent / 'figure.png'}\n"
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert printed.out == f"written: {corpus.parent / 'figure.png'}\n"
     with Image.open(corpus.parent / "figure.png") as picture:
         assert picture.size[0] == round(85 / 25.4 * 80)
 
@@ -92,7 +92,7 @@ def gather(corpus: Path, *more: str) -> Material:
     return material
 
 
-def test_what_lies_beside_the_files_is_found(corpus: Path) -> None:
+def test_material_next_to_the_files_is_found(corpus: Path) -> None:
     material = gather(corpus, *TINY)
     assert (material.n_vertices, material.rate, material.truth_stride) == (VERTICES, 25.0, 1)
     assert (material.unit, material.remark, material.corpus) == ("m", "tiny: synthetic corpus", corpus)
@@ -140,8 +140,8 @@ def test_lengths_that_differ_are_noted(corpus: Path, capsys: pytest.CaptureFixtu
     path = corpus.parent / "ours" / "A_e06_condition_A.npy"
     np.save(path, np.load(path)[:9])
     assert main(words("lips", corpus)) == 0
-    told = capsys.readouterr().out
-    assert "note: A_e06: lengths differ (truth 24, ours 9, other 24 frames): cut to the first 9" in told
+    printed = capsys.readouterr().out
+    assert "note: A_e06: lengths differ (truth 24, ours 9, other 24 frames): cut to the first 9" in printed
     assert main(words("frames", corpus, "--clip", "A_e06", "--phonemes", "f")) == 2
     assert "ours lasts from 0 to 0.36 s" in capsys.readouterr().err
 
@@ -150,11 +150,11 @@ def test_values_that_cannot_be_drawn_are_noted(corpus: Path, capsys: pytest.Capt
     table = corpus.parent / "run" / "metrics.csv"
     table.write_text("epoch,step,train/loss\n0,0,nan\n0,1,inf\n0,2,-1\n0,3,2\n")
     assert main(words("training", corpus)) == 0
-    told = capsys.readouterr().out
-    assert "note: one: 2 of 4 values of train/loss are NaN or infinity and not drawn\n" in told
+    printed = capsys.readouterr().out
+    assert "note: one: 2 of 4 values of train/loss are NaN or infinity and not drawn\n" in printed
     assert main(words("training", corpus, "--log")) == 0
-    told = capsys.readouterr().out
-    assert "note: two: 3 of 4 values of train/loss are NaN, infinity or not above 0 and not drawn\n" in told
+    printed = capsys.readouterr().out
+    assert "note: two: 3 of 4 values of train/loss are NaN, infinity or not above 0 and not drawn\n" in printed
 
 
 WRONG = {
@@ -204,11 +204,11 @@ def test_what_does_not_fit_is_one_sentence(
     given = [figure, *more] if figure == "figure" else words(figure, corpus, *more)
     before = sorted(corpus.parent.rglob("*"))
     assert main(given) == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.startswith("facediff: error: ")
-    assert message in told.err
-    assert told.err.count("\n") == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("facediff: error: ")
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
     assert sorted(corpus.parent.rglob("*")) == before
 
 
@@ -252,8 +252,8 @@ def test_folders_by_name(tmp_path: Path) -> None:
 def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["figure"]) == 2
     assert main(["figure", "--help"]) == 0
-    told = capsys.readouterr().out
-    assert all(f"  {name} " in told for name in FIGURES)
+    printed = capsys.readouterr().out
+    assert all(f"  {name} " in printed for name in FIGURES)
     for name in FIGURES:
         with pytest.raises(SystemExit) as stop:
             main(["figure", name, "--help"])

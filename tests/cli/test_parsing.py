@@ -23,7 +23,8 @@ from facediff.cli.parsing import (
 )
 from facediff.errors import FaceDiffError
 
-FUNCTIONS = sorted(name for name in COMMANDS if not COMMANDS[name].target.endswith(":run"))
+OWN_PARSERS = ("run", "lightning")
+FUNCTIONS = sorted(name for name in COMMANDS if COMMANDS[name].target.partition(":")[2] not in OWN_PARSERS)
 
 
 @dataclass(frozen=True)

@@ -41,10 +41,10 @@ def test_regions_are_coloured_where_they_are(root: Path, tmp_path: Path, capsys:
     with Image.open(path) as picture:
         assert picture.size[0] == 2 * 96
         assert picture.size[1] > 96 + 40
-    told = capsys.readouterr().out
-    assert f"lips (12 vertices, {Region.from_indices('x', range(12)).hash}) from regions/lve.txt" in told
-    assert f"upper_face (12 vertices, {Region.from_indices('x', range(12, 24)).hash}) from regions/fdd.txt" in told
-    assert str(path) in told
+    printed = capsys.readouterr().out
+    assert f"lips (12 vertices, {Region.from_indices('x', range(12)).hash}) from regions/lve.txt" in printed
+    assert f"upper_face (12 vertices, {Region.from_indices('x', range(12, 24)).hash}) from regions/fdd.txt" in printed
+    assert str(path) in printed
 
 
 def test_other_sources_and_repeated_indices(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,13 +53,13 @@ def test_other_sources_and_repeated_indices(root: Path, tmp_path: Path, capsys: 
     words = [str(root), "-o", str(path), "--lips", "mine.txt", "--upper-face", "regions/lve.txt", *TINY]
     assert run("data regions", words) == 0
     assert tinted(path, 0).mean() < tinted(path, 2).mean()
-    told = capsys.readouterr().out
-    assert "lips (3 vertices, " in told
-    assert "from mine.txt, 2 repeated indices counted once" in told
+    printed = capsys.readouterr().out
+    assert "lips (3 vertices, " in printed
+    assert "from mine.txt, 2 repeated indices counted once" in printed
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words", "told"),
+    ("spoil", "words", "printed"),
     [
         (lambda root: (root / "tiny.ply").unlink(), [], "put tiny.ply into this folder"),
         (lambda root: (root / "regions" / "fdd.txt").unlink(), [], "which vertices are the upper face"),
@@ -70,13 +70,13 @@ def test_other_sources_and_repeated_indices(root: Path, tmp_path: Path, capsys: 
         (shutil.rmtree, [], "no such folder"),
     ],
 )
-def test_what_is_missing_is_told_and_nothing_written(
-    root: Path, tmp_path: Path, spoil: Callable[[Path], object], words: list[str], told: str
+def test_what_is_missing_is_named_and_nothing_written(
+    root: Path, tmp_path: Path, spoil: Callable[[Path], object], words: list[str], printed: str
 ) -> None:
     spoil(root)
     with pytest.raises(FaceDiffError) as error:
         run("data regions", [str(root), "-o", str(tmp_path / "regions.png"), *TINY, *words])
-    assert told in str(error.value)
+    assert printed in str(error.value)
     assert not list(tmp_path.glob("*.*"))
 
 

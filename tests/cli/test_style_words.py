@@ -120,7 +120,7 @@ def unseen(model: DualPathDiffusion, tmp_path: Path) -> tuple[Path, np.ndarray, 
 
 
 @pytest.mark.parametrize("suffix", ["npy", "ply", "obj"])
-def test_a_stranger_lends_a_style_by_a_template_of_their_own(
+def test_an_unseen_speakers_style_needs_their_template(
     suffix: str, unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, tmp_path: Path
 ) -> None:
     path, face, offsets = unseen
