@@ -141,7 +141,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         """This process's batches of the current epoch."""
         batches = self._all(torch.Generator().manual_seed(self._hash("order")))
         for place in range(self.rank, len(batches), self.num_replicas):
-            # Clips are repeated only where every batch is a single clip, so places past the last clip are repeated ones.
+            # Clips are repeated only where every batch is a single clip, so places past the last clip repeat one.
             repeated = not self.training and place >= len(self.lengths)
             yield [Pick(i, self._hash(i) if self.training else 0, repeated) for i in batches[place]]
 

@@ -352,7 +352,7 @@ def test_a_person_with_one_clip_is_told_before_training(tmp_path: Path) -> None:
     for number in (2, 3, 4):
         (person / "wav" / f"Ada_s{number:02d}.wav").unlink()
     data = MiniBiwi(root=str(root), people=[str(person)])
-    with pytest.raises(FaceDiffError, match="Ada has no other clip to take a style reference from"):
+    with pytest.raises(FaceDiffError, match="Ada has no other clip"):
         data.dataset("train", training=True)
     assert len(MiniBiwi(root=str(root), people=[str(person)], reference="self").dataset("train", training=True)) == 3
 

@@ -1,4 +1,4 @@
-"""A target person: from what reconstruction tools write to a corpus entry (``facediff data import-person``)."""
+"""A speaker's video, reconstructed by another tool, as a corpus entry (``facediff data import-person``)."""
 
 from facediff.data.person.importer import Report, import_person
 

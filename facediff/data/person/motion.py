@@ -1,102 +1,27 @@
-"""Motion in any of the forms that reconstruction tools write."""
+"""A speaker's motion in any of the forms that reconstruction tools write: meshes, vertices, FLAME parameters."""
 
 from __future__ import annotations
 
-import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import SAMPLE_RATE
-from facediff.data.corpus import find_region
-from facediff.data.person.frames import (
-    MESHES,
-    RESIDUAL_LIMIT,
-    Auxiliary,
-    Faces,
-    check_faces,
-    read_frames,
-    relative_residual,
-    scratch_array,
-    spans,
-)
 from facediff.data.prepare.motion import read_parameters
 from facediff.errors import FaceDiffError
-from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
-from facediff.mesh.alignment import Indices, chunks
+from facediff.mesh import Mesh, read_mesh
 from facediff.mesh.flame import Flame
 from facediff.utils.arrays import open_array
-
-# What is done by the loudness of speech: finding frames of a neutral face, and cutting into clips.
+from facediff.utils.progress import track
 
 Array = npt.NDArray[np.float64]
-Speech = npt.NDArray[np.float32]
+Faces = npt.NDArray[np.integer]
 
-SMOOTHING = 0.2
-"""Seconds over which loudness is averaged."""
-NEUTRAL_SHARE = 0.05
-"""Share of the frames that the neutral face is the median of."""
-NEUTRAL_FRAMES = (5, 50)
-"""At least and at most so many."""
-SLACK = 0.25
-"""How far a cut may lie from an equal division, as a share of a clip."""
-
-
-def loudness(speech: Speech, frames: int, frame_rate: float) -> Array:
-    """Root-mean-square loudness around every frame (T,), averaged over 0.2 s."""
-    energy = np.concatenate([[0.0], np.cumsum(np.square(speech, dtype=np.float64))])
-    middle = (np.arange(frames) + 0.5) / frame_rate
-    low, high = (
-        np.clip(((middle + side * SMOOTHING / 2) * SAMPLE_RATE).round().astype(int), 0, len(speech)) for side in (-1, 1)
-    )
-    return np.sqrt((energy[high] - energy[low]) / np.maximum(high - low, 1))
-
-
-def neutral_frames(loud: Array, speed: Array) -> npt.NDArray[np.int64]:
-    """The twentieth of the frames in which speech is quiet and the face is still, both; sorted indices.
-
-    Frames are ranked by loudness and by speed; those whose worse rank is best are taken.
-    """
-    worse = np.maximum(*(np.searchsorted(np.sort(values), values) for values in (loud, speed)))
-    least, most = NEUTRAL_FRAMES
-    count = min(len(loud), max(least, min(most, round(NEUTRAL_SHARE * len(loud)))))
-    return np.sort(np.argsort(worse, kind="stable")[:count])
-
-
-def cut_points(loud: Array, clip_frames: float) -> list[tuple[int, int]]:
-    """Divide frames into clips of about equal length, each cut at the quietest frame near its place.
-
-    Args:
-        loud: (T,) loudness.
-        clip_frames: wanted length of a clip, in frames.
-
-    Returns:
-        first frame and frame after the last of every clip; together they are all frames.
-    """
-    clips = max(1, round(len(loud) / clip_frames))
-    length = len(loud) / clips
-    cuts = [0]
-    for i in range(1, clips):
-        first = max(cuts[-1] + 1, round((i - SLACK) * length))
-        window = loud[first : max(first + 1, round((i + SLACK) * length))]
-        quiet = np.flatnonzero(window == window.min())
-        cuts.append(first + int(quiet[len(quiet) // 2]))  # the middle of a pause, where it is wholly silent
-    return list(zip(cuts, [*cuts[1:], len(loud)], strict=True))
-
-
-def splits(clips: int) -> list[str]:
-    """Split of every clip: the last 15 % ``test``, the 10 % before them ``val``, the rest ``train``.
-
-    With four clips or more there is at least one of each; fewer are all ``train``.
-    """
-    if clips < 4:
-        return ["train"] * clips
-    test, val = max(1, round(0.15 * clips)), max(1, round(0.10 * clips))
-    return ["train"] * (clips - val - test) + ["val"] * val + ["test"] * test
-
-
+MESHES = (".obj", ".ply")
+MAX_GAP = 0.2
+"""Longest stretch of missing frames that is filled, in seconds."""
 FLAME_WIDTH = 403
 """Shape 300, expression 100 and jaw 3 in one row."""
 FLAME_FRAMES = 64
@@ -109,9 +34,9 @@ class Motion:
 
     Attributes:
         frames: (T, V, 3), usually memory-mapped.
-        faces: (F, 3) triangles; None if the source does not tell them.
-        template: (V, 3) neutral face, where the source tells it.
-        has_head_motion: whether the head's rigid motion is in it.
+        faces: (F, 3) triangles; None if the source has none.
+        template: (V, 3) neutral face, where the source has one.
+        has_head_motion: whether it contains the head's rigid motion.
         notes: remarks for the user.
     """
 
@@ -130,8 +55,8 @@ def read_motion(
     Args:
         path: the folder or file.
         n_vertices: vertices that every frame must have.
-        frame_rate: frames a second.
-        scratch: a file to make where the frames must be put together.
+        frame_rate: frames per second.
+        scratch: a temporary file for frames that must be put together.
         flame: FLAME model file, needed for parameters and only for them.
         progress: whether to show a progress bar.
 
@@ -161,8 +86,8 @@ def read_motion(
     if not parameters:
         kinds = "a folder of .obj or .ply files, a .npy array, or FLAME parameters (.hdf5 or .npy)"
         if flame is not None:
-            raise FaceDiffError(f"{path}: holds no FLAME parameters; leave --flame away, or give .hdf5 or .npy")
-        raise FaceDiffError(f"{path}: not a form of motion that is known; expected {kinds}")
+            raise FaceDiffError(f"{path}: holds no FLAME parameters; omit --flame, or give .hdf5 or .npy")
+        raise FaceDiffError(f"{path}: unknown form of motion; expected {kinds}")
     if flame is None:
         raise FaceDiffError(f"{path}: holds FLAME parameters; add --flame MODEL, your own FLAME model file")
     return _read_flame(path, flame, n_vertices, scratch)
@@ -193,226 +118,166 @@ def _read_flame(path: Path, model: Path, n_vertices: int, scratch: Path) -> Moti
     return Motion(frames, faces, np.asarray(template, np.float64), has_head_motion=False)
 
 
-# Taking the head's motion out of a person's frames, and saying how much of it there was.
-
-MIN_STABLE = 10
-STILL = 1e-6
-"""Motion whose fastest frame moves by less than this share of the face's size is none."""
+# A folder with one mesh file for each frame.
 
 
-@dataclass(frozen=True)
-class Stabilised:
-    """Frames without head motion.
+def read_frames(
+    folder: Path, *, n_vertices: int, frame_rate: float, scratch: Path, progress: bool = False
+) -> tuple[npt.NDArray[np.float32], Faces | None, list[str]]:
+    """Read the mesh files of a folder into a memory-mapped array.
 
-    Attributes:
-        frames: (T, V, 3), in the pose of ``face``.
-        face: (V, 3) their median.
-        stable: the vertices that told the head's motion.
-        turns: (T,) angle of the head from its mean pose, in radians.
-        shifts: (T,) distance of the head from its mean place, in the motion's unit.
-        jitter: root-mean-square distance of the stable vertices from ``face``, in the motion's unit.
-        speed: (T,) mean step of the vertices from frame to frame, in the motion's unit.
-    """
-
-    frames: npt.NDArray[np.floating]
-    face: Array
-    stable: Indices
-    turns: Array
-    shifts: Array
-    jitter: float
-    speed: Array
-
-
-def read_stable(source: str, n_vertices: int) -> Indices:
-    """Stable vertices from a region file.
+    A few missing frames (a tracker that lost the face) are filled by straight lines between their neighbours.
 
     Args:
-        source: a text file of indices, or ``FLAME_masks.pkl:scalp+forehead``.
-        n_vertices: vertices of the topology.
+        folder: the folder.
+        n_vertices: vertices that every mesh must have.
+        frame_rate: frames per second, to measure gaps.
+        scratch: a temporary file for the array.
+        progress: whether to show a progress bar.
+
+    Returns:
+        vertices (T, V, 3), the faces that all files share (None if they have none), and remarks for the user.
 
     Raises:
-        FaceDiffError: if the file is missing or unfit.
+        FaceDiffError: naming the file, if one is unreadable or of another topology; if too many frames are missing.
     """
-    file = Path(source.partition(".pkl:")[0] + ".pkl" if ".pkl:" in source else source)
-    if not file.is_file():
-        raise FaceDiffError(f"--stable {file}: no such file; expected vertex indices separated by commas")
-    region = find_region(file.parent, [Path(source).name], "stable vertices", n_vertices)
-    if region.count < MIN_STABLE:
-        raise FaceDiffError(
-            f"--stable {file}: names {region.count} vertices; expected at least {MIN_STABLE}, spread over the skull"
-        )
-    return np.array(region.indices, np.int64)
-
-
-def stabilise(motion: Motion, face: Array, stable: Indices, scratch: Path) -> Stabilised:
-    """Lay every frame onto the median face; parameters without head motion stay as they are.
-
-    Args:
-        motion: the frames.
-        face: (V, 3) their median, see :func:`facediff.mesh.median_face`.
-        stable: the vertices that tell the head's motion.
-        scratch: a file to make for the frames.
-
-    Raises:
-        FaceDiffError: if a frame holds NaN, or if nothing moves.
-    """
-    count = len(motion.frames)
-    if motion.has_head_motion:
-        frames = scratch_array(scratch, motion.frames.shape)
-        laid = remove_rigid_motion(motion.frames, face, stable, out=frames)
-        turns, shifts = _head_motion(laid.rotations, laid.translations, face[stable].mean(axis=0))
-        residuals = laid.residuals
-    else:
-        frames, turns, shifts = motion.frames, np.zeros(count), np.zeros(count)
-        residuals = np.array([np.sqrt(np.square(frame[stable] - face[stable]).sum(axis=-1).mean()) for frame in frames])
-    speed = _speed(frames)
-    if speed.max() < STILL * face_size(face):
-        raise FaceDiffError("the motion holds none: every frame is the same face; expected the frames of a video")
-    return Stabilised(frames, face, stable, turns, shifts, float(np.sqrt(np.square(residuals).mean())), speed)
-
-
-def middle_face(motion: Motion, stable: Indices) -> Array:
-    """The median face of a motion; of parameters without head motion, in the coordinates that they have."""
-    if motion.has_head_motion:
-        return median_face(motion.frames, stable)
-    return np.median(motion.frames[:: max(1, len(motion.frames) // 64)], axis=0).astype(np.float64)
-
-
-def _head_motion(rotations: Array, translations: Array, centre: Array) -> tuple[Array, Array]:
-    """Angles from the mean pose, and distances from the mean place, of the head.
-
-    The mean pose is the rotation nearest to the mean of the matrices (the chordal mean).
-    """
-    u, _, vt = np.linalg.svd(rotations.mean(axis=0))
-    mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    # |R - M|² = 8 sin²(angle / 2): exact for small angles too, where the arc cosine of the trace is not.
-    chord = np.sqrt(np.square(rotations - mean).sum(axis=(1, 2)))
-    places = np.einsum("tji,tj->ti", rotations, centre - translations)
-    return 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0)), np.linalg.norm(places - places.mean(0), axis=1)
-
-
-def _speed(frames: npt.NDArray[np.floating]) -> Array:
-    """Mean of the steps to the frame before and after, (T,).
-
-    The mean length over vertices: a few that jitter count for less than in a root mean square.
-    """
-    steps = np.zeros(len(frames) + 1)
-    last: Array | None = None
-    for part, chunk in chunks(frames):
-        joined = chunk if last is None else np.concatenate([last[None], chunk])
-        moved = np.sqrt(np.square(np.diff(joined, axis=0)).sum(axis=-1)).mean(axis=-1)
-        steps[part.stop - len(moved) : part.stop] = moved
-        last = chunk[-1]
-    if len(frames) > 1:
-        steps[0], steps[-1] = steps[1], steps[-2]
-    return (steps[:-1] + steps[1:]) / 2
-
-
-# A person's neutral face: given, known from the model, or found where the person is silent and still.
-
-SAME_SIZE = 1.1
-"""Template and motion must agree in size to this factor."""
-
-
-@dataclass(frozen=True)
-class Template:
-    """A neutral face that was given.
-
-    Attributes:
-        path: its file.
-        vertices: (V, 3).
-    """
-
-    path: Path
-    vertices: Array
-
-
-@dataclass(frozen=True)
-class Neutral:
-    """A neutral face.
-
-    Attributes:
-        face: (V, 3).
-        placing: from the stabilised frames' coordinates to those of ``face``; a rigid motion.
-        source: where the face is from, in words.
-        frames: the frames it is the median of, counted from 0; empty if it was not found in the motion.
-    """
-
-    face: Array
-    placing: Similarity
-    source: str
-    frames: list[int] = field(default_factory=list)
-
-
-def choose_neutral(
-    motion: Motion, made: Stabilised, given: Template | None, speech: npt.NDArray[np.float32], frame_rate: float
-) -> Neutral:
-    """The neutral face that was given, else the source's own, else one found in the frames.
-
-    Args:
-        motion: the frames as read.
-        made: the same without head motion.
-        given: a template, or None.
-        speech: (S,) at 16 kHz.
-        frame_rate: frames a second.
-
-    Raises:
-        FaceDiffError: if the template that was given does not fit the frames.
-    """
-    if given is not None:
-        return Neutral(given.vertices, _onto_template(made, given), str(given.path))
-    unmoved = Similarity(np.eye(3), np.zeros(3))
-    if motion.template is not None:
-        return Neutral(motion.template, unmoved, "the model's shape without expression")
-    covered = max(1, min(len(made.frames), round(len(speech) / SAMPLE_RATE * frame_rate)))
-    chosen = neutral_frames(loudness(speech, covered, frame_rate), made.speed[:covered]).tolist()
-    face = np.median(made.frames[chosen], axis=0).astype(np.float64)
-    source = f"median of {len(chosen)} silent and still frames (counted from 0): {spans(chosen)}"
-    return Neutral(face, unmoved, source, chosen)
-
-
-def _onto_template(made: Stabilised, given: Template) -> Similarity:
-    """The rigid motion from the stabilised frames to a template, by the stable vertices."""
-    face, template = made.face[made.stable], given.vertices[made.stable]
-    ratio = robust_align(face, template, scale=True).scale
-    rigid = robust_align(face, template)
-    residual = relative_residual(rigid.apply(made.face), given.vertices)
-    if not abs(math.log(max(ratio, 1e-9))) < math.log(SAME_SIZE):
-        raise FaceDiffError(
-            f"{given.path}: is {ratio:.4g} times as large as the faces of the motion; expected the person's neutral "
-            f"face in the motion's own unit and vertex order"
-        )
-    if not residual < RESIDUAL_LIMIT:
-        raise FaceDiffError(
-            f"{given.path}: does not lie on the faces of the motion (residual {residual:.2f} of its size, expected "
-            f"less than {RESIDUAL_LIMIT}); expected the person's neutral face in the motion's own vertex order"
-        )
-    return rigid
-
-
-def read_template(path: Path, corpus: Auxiliary) -> Template:
-    """A neutral face from .obj, .ply or .npy.
-
-    Raises:
-        FaceDiffError: if it is none of these, damaged, of another topology than the corpus, or holds NaN.
-    """
-    suffix, faces, count = path.suffix.lower(), None, corpus.n_vertices
-    vertices: Array
-    if suffix == ".npy":
-        array = open_array(path, kinds="f")
-        if array.size != 3 * count:
-            raise FaceDiffError(f"{path}: has shape {array.shape}; expected ({count}, 3) like the corpus")
-        vertices = np.array(array, np.float64).reshape(count, 3)
-    elif suffix in MESHES:
-        mesh = read_mesh(path, points_allowed=True)
-        vertices, faces = mesh.vertices, mesh.faces if len(mesh.faces) else None
-        if len(vertices) != count:
+    files = find_frames(folder)
+    gaps = files.missing()
+    for before, after in gaps:
+        if after - before - 1 > MAX_GAP * frame_rate:
+            here = files.places.index(before)
             raise FaceDiffError(
-                f"{path}: has {len(vertices)} vertices, but the corpus has {count}; its topology is another"
+                f"{folder}: {after - before - 1} frames are missing between {files.paths[here].name} and "
+                f"{files.paths[here + 1].name}; at most {MAX_GAP} s can be filled, so cut the video there"
             )
-    else:
-        raise FaceDiffError(f"{path}: not a template that is known; expected .obj, .ply or .npy")
-    if not np.isfinite(vertices).all():
-        raise FaceDiffError(f"{path}: holds NaN or infinity; expected a neutral face")
-    check_faces(path, faces, corpus)
-    return Template(path, vertices)
+    frames = scratch_array(scratch, (files.frames, n_vertices, 3))
+    first: Mesh | None = None
+    for path, place in zip(track(files.paths, "reading meshes", shown=progress), files.places, strict=True):
+        mesh = read_mesh(path, points_allowed=True)
+        first = first or mesh
+        _check(path, mesh, files.paths[0], first, n_vertices)
+        frames[place] = mesh.vertices
+    for before, after in gaps:
+        for place in range(before + 1, after):
+            share = (place - before) / (after - before)
+            frames[place] = (1 - share) * frames[before] + share * frames[after]
+    filled = [place for before, after in gaps for place in range(before + 1, after)]
+    notes = [f"{len(filled)} missing frames filled from their neighbours: {spans(filled)}"] if filled else []
+    if files.numbers[-1] - files.numbers[0] > files.places[-1]:
+        notes.append("the files' numbers go up in equal steps of more than one; they are read as consecutive frames")
+    return frames, first.faces if first is not None and len(first.faces) else None, notes
+
+
+def _check(path: Path, mesh: Mesh, first_path: Path, first: Mesh, n_vertices: int) -> None:
+    count = len(mesh.vertices)
+    if count != len(first.vertices):
+        raise FaceDiffError(
+            f"{path}: has {count} vertices, but {first_path.name} has {len(first.vertices)}; expected one topology"
+        )
+    if count != n_vertices:
+        raise FaceDiffError(f"{path}: has {count} vertices, but the corpus has {n_vertices}; so its topology differs")
+    if not np.isfinite(mesh.vertices).all():
+        raise FaceDiffError(f"{path}: holds NaN or infinity; repair the frame, or remove the file")
+    if not np.array_equal(mesh.faces, first.faces) and differing_faces(mesh.faces, first.faces):
+        raise FaceDiffError(f"{path}: its faces differ from those of {first_path.name}; expected one topology")
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """The files of a folder in order.
+
+    Attributes:
+        paths: one for each frame that is there.
+        places: its place in time, from 0; a place that is skipped is a missing frame.
+        numbers: its number in the file's name.
+    """
+
+    paths: list[Path]
+    places: list[int]
+    numbers: list[int]
+
+    @property
+    def frames(self) -> int:
+        """Number of frames, including missing ones."""
+        return self.places[-1] + 1
+
+    def missing(self) -> list[tuple[int, int]]:
+        """Stretches of missing frames: place of the last frame before, and of the first one after."""
+        return [(a, b) for a, b in zip(self.places, self.places[1:], strict=False) if b - a > 1]
+
+
+def find_frames(folder: Path) -> FrameFiles:
+    """The mesh files of a folder, in the natural order of the one number in which their names differ.
+
+    Raises:
+        FaceDiffError: if there is none, if names differ in more than that number, or if two have the same number.
+    """
+    try:
+        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESHES and not p.name.startswith("."))
+    except OSError as error:
+        raise FaceDiffError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
+    if not paths:
+        raise FaceDiffError(f"{folder}: holds no mesh files; expected one for each frame, {' or '.join(MESHES)}")
+    pieces = [re.split(r"(\d+)", path.stem) for path in paths]
+    for path, piece in zip(paths, pieces, strict=True):
+        if piece[::2] != pieces[0][::2] or len(piece) == 1:
+            raise FaceDiffError(
+                f"{folder}: {paths[0].name} and {path.name} are named in different ways; "
+                f"leave only one file for each frame in the folder, named like frame_0001.obj"
+            )
+    figures = np.array([[int(word) for word in piece[1::2]] for piece in pieces], dtype=object)
+    varying = [column for column in range(figures.shape[1]) if len(set(figures[:, column])) > 1]
+    if len(varying) > 1:
+        raise FaceDiffError(
+            f"{folder}: the names differ in more than one number ({paths[0].name}, {paths[-1].name}); expected the "
+            f"frames of one video, numbered in their names"
+        )
+    column = varying[0] if varying else figures.shape[1] - 1
+    order = sorted(range(len(paths)), key=lambda i: figures[i, column])
+    paths, numbers = [paths[i] for i in order], [int(figures[i, column]) for i in order]
+    for i in range(1, len(paths)):
+        if numbers[i] == numbers[i - 1]:
+            raise FaceDiffError(
+                f"{folder}: {paths[i - 1].name} and {paths[i].name} are both frame {numbers[i]}; remove one of them"
+            )
+    return FrameFiles(paths, _places(numbers), numbers)
+
+
+def _places(numbers: list[int]) -> list[int]:
+    """Places from 0; equal steps of more than one mean that a tool kept every second (third …) frame, not gaps."""
+    steps = {b - a for a, b in zip(numbers, numbers[1:], strict=False)}
+    step = min(steps, default=1)
+    step = step if all(other % step == 0 for other in steps) else 1
+    return [(number - numbers[0]) // step for number in numbers]
+
+
+def differing_faces(one: Faces, other: Faces) -> int:
+    """How many triangles two lists do not share; order of triangles and of their corners does not count."""
+    first, second = (np.unique(np.sort(faces, axis=1), axis=0) for faces in (one, other))
+    _, counts = np.unique(np.concatenate([first, second]), axis=0, return_counts=True)
+    return int(np.count_nonzero(counts == 1))
+
+
+# What is shared with the other steps of an import.
+
+
+def scratch_array(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    """A new memory-mapped float32 array."""
+    array: npt.NDArray[np.float32] = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+    return array
+
+
+def spans(places: list[int], most: int = 10) -> str:
+    """Sorted whole numbers in short: ``3-7, 12``; an ellipsis after ``most`` spans.
+
+    >>> spans([3, 4, 5, 12])
+    '3-5, 12'
+    """
+    parts: list[list[int]] = []
+    for place in places:
+        if parts and place == parts[-1][1] + 1:
+            parts[-1][1] = place
+        else:
+            parts.append([place, place])
+    words = [str(a) if a == b else f"{a}-{b}" for a, b in parts]
+    return ", ".join(words if len(words) <= most else [*words[:most], "…"])

@@ -11,8 +11,9 @@ import trimesh
 
 from facediff.data.corpus import read_manifest
 from facediff.data.person import import_person
-from facediff.data.person.frames import differing_faces, find_frames
-from facediff.data.person.motion import cut_points, loudness, neutral_frames, splits
+from facediff.data.person.fitting import loudness, neutral_frames
+from facediff.data.person.importer import cut_points, splits
+from facediff.data.person.motion import differing_faces, find_frames
 from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
 from facediff.mesh.flame import Flame

@@ -1,0 +1,412 @@
+"""Fitting a speaker into a corpus: head motion, neutral face, and the way into the corpus's coordinates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.audio import SAMPLE_RATE
+from facediff.data.corpus import MOTION_FOLDERS, find_region, read_manifest, read_templates
+from facediff.data.person.motion import MESHES, Array, Faces, Motion, differing_faces, scratch_array, spans
+from facediff.errors import FaceDiffError
+from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
+from facediff.mesh.alignment import Indices, chunks
+from facediff.utils.arrays import open_array
+
+Speech = npt.NDArray[np.float32]
+
+RESIDUAL_LIMIT = 0.15
+"""Largest residual of a face laid onto the corpus's mean face, as a share of its size (root mean squares).
+
+Faces of different speakers differ by some hundredths; vertices in another order by about 1.
+"""
+SAME_UNIT = 1.2
+"""A speaker's face and the corpus's mean face differ in size by less than this factor."""
+MIN_STABLE = 10
+STILL = 1e-6
+"""Motion whose fastest frame moves by less than this share of the face's size is none."""
+SAME_SIZE = 1.1
+"""Template and motion must agree in size to this factor."""
+SMOOTHING = 0.2
+"""Seconds over which loudness is averaged."""
+NEUTRAL_SHARE = 0.05
+"""Share of the frames that the neutral face is the median of."""
+NEUTRAL_FRAMES = (5, 50)
+"""At least and at most so many."""
+
+
+# The corpus that the speaker is to join: its topology, coordinates and frame rate.
+
+
+@dataclass(frozen=True)
+class Auxiliary:
+    """What a new speaker must match in a corpus.
+
+    Attributes:
+        root: its folder.
+        mean: (V, 3) mean of its templates.
+        faces: (F, 3) triangles; None if it has no mesh file.
+        frame_rate: motion frames per second.
+        unit: unit of length in its manifest; None if there is none.
+    """
+
+    root: Path
+    mean: Array
+    faces: Faces | None
+    frame_rate: float
+    unit: str | None
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of its topology."""
+        return len(self.mean)
+
+
+def read_auxiliary(root: Path, *, name: str, frame_rate: float | None) -> Auxiliary:
+    """Read what a new speaker must match.
+
+    Args:
+        root: the corpus folder.
+        name: the speaker's name, which must be new to the corpus.
+        frame_rate: the corpus's frame rate, needed where ``manifest.json`` does not record it.
+
+    Raises:
+        FaceDiffError: if the folder is no corpus, knows the name already, or its frame rate is unknown or contradicted.
+    """
+    if not root.is_dir():
+        raise FaceDiffError(f"--corpus {root}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl")
+    templates = read_templates(root / "templates.pkl")
+    stems = {path.stem for folder in MOTION_FOLDERS for path in (root / folder).glob("*.npy")}
+    subjects = {*templates, *(stem.rpartition("_")[0] for stem in stems)}
+    if name.casefold() in {subject.casefold() for subject in subjects}:
+        raise FaceDiffError(f"--name {name}: {root} has a speaker of that name already; choose another name")
+    manifest = read_manifest(root)
+    unit = manifest.get("unit")
+    mean: Array = np.stack([template.numpy() for template in templates.values()]).astype(np.float64).mean(axis=0)
+    return Auxiliary(
+        root,
+        mean,
+        _corpus_faces(root, len(mean)),
+        _frame_rate(root, manifest.get("frame_rate"), frame_rate),
+        unit if isinstance(unit, str) else None,
+    )
+
+
+def _frame_rate(root: Path, told: object, given: float | None) -> float:
+    known = float(told) if isinstance(told, int | float) and math.isfinite(told) and told > 0 else None
+    if known is None and given is None:
+        raise FaceDiffError(f"{root}: has no manifest.json with its frame rate; add --corpus-frame-rate")
+    if known is not None and given is not None and abs(known - given) > 1e-6:
+        raise FaceDiffError(f"--corpus-frame-rate {given:g}: {root / 'manifest.json'} says {known:g}; omit the option")
+    return known if known is not None else float(given or 0)
+
+
+def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:
+    """Faces of the first mesh in the folder or in ``templates/`` that has the right vertex count."""
+    for folder in (root, root / "templates"):
+        for path in sorted(folder.glob("*")):
+            if path.suffix.lower() in MESHES and path.is_file():
+                mesh = read_mesh(path, points_allowed=True)
+                if len(mesh.vertices) == n_vertices and len(mesh.faces):
+                    return mesh.faces
+    return None
+
+
+def check_faces(path: Path, faces: Faces | None, corpus: Auxiliary) -> bool:
+    """Whether faces could be compared with the corpus's.
+
+    Raises:
+        FaceDiffError: if they could, and are others.
+    """
+    if faces is None or corpus.faces is None:
+        return False
+    differing = differing_faces(faces, corpus.faces)
+    if differing:
+        raise FaceDiffError(
+            f"{path}: {differing} triangles are not those of the mesh in {corpus.root}, so the topology differs; if "
+            f"only polygons were triangulated differently, give the motion as a .npy array, which has no faces"
+        )
+    return True
+
+
+def lay_onto_corpus(path: Path, face: Array, corpus: Auxiliary) -> tuple[Similarity, float]:
+    """The similarity from a face to the corpus's mean face, and what is left as a share of the face's size.
+
+    Raises:
+        FaceDiffError: naming ``path``, if so much is left that the vertices cannot be in the corpus's order.
+    """
+    map_ = robust_align(face, corpus.mean, scale=True)
+    residual = relative_residual(map_.apply(face), corpus.mean)
+    if not residual < RESIDUAL_LIMIT:
+        raise FaceDiffError(
+            f"{path}: its face does not lie on those of {corpus.root} (residual {residual:.2f} of its size, expected "
+            f"less than {RESIDUAL_LIMIT}), so its topology or the order of its vertices differs, or it is mirrored"
+        )
+    return map_, residual
+
+
+def relative_residual(face: Array, target: Array) -> float:
+    """Root-mean-square distance of two faces (V, 3), as a share of the target's size."""
+    return float(np.sqrt(np.square(face - target).sum(axis=-1).mean())) / face_size(target)
+
+
+def into_coordinates(face: Array, best: Similarity, given: float | None) -> Similarity:
+    """The similarity that takes a speaker into the corpus's coordinates.
+
+    Its scale changes the unit and keeps the speaker's size: where the measured scale is near a power of ten
+    (millimetres, centimetres, metres), it is that power; else, as with a corpus of normalised size, it is as measured.
+
+    Args:
+        face: (V, 3) the speaker's neutral face.
+        best: the similarity that lays it onto the corpus's mean face best; kept but for its scale, about the face's
+            centre.
+        given: the scale to use instead.
+    """
+    power = round(math.log10(best.scale))
+    is_unit = abs(math.log10(best.scale) - power) < math.log10(SAME_UNIT)
+    scale = given if given is not None else 10.0**power if is_unit else best.scale
+    centre = face.mean(axis=0)
+    return Similarity(best.rotation, best.apply(centre) - scale * best.rotation @ centre, scale)
+
+
+# Removing the head's motion from the frames, and measuring how much of it there was.
+
+
+@dataclass(frozen=True)
+class Stabilised:
+    """Frames without head motion.
+
+    Attributes:
+        frames: (T, V, 3), in the pose of ``face``.
+        face: (V, 3) their median.
+        stable: the vertices from which the head's motion was measured.
+        turns: (T,) angle of the head from its mean pose, in radians.
+        shifts: (T,) distance of the head from its mean place, in the motion's unit.
+        jitter: root-mean-square distance of the stable vertices from ``face``, in the motion's unit.
+        speed: (T,) mean step of the vertices from frame to frame, in the motion's unit.
+    """
+
+    frames: npt.NDArray[np.floating]
+    face: Array
+    stable: Indices
+    turns: Array
+    shifts: Array
+    jitter: float
+    speed: Array
+
+
+def read_stable(source: str, n_vertices: int) -> Indices:
+    """Stable vertices from a region file.
+
+    Args:
+        source: a text file of indices, or ``FLAME_masks.pkl:scalp+forehead``.
+        n_vertices: vertices of the topology.
+
+    Raises:
+        FaceDiffError: if the file is missing or unfit.
+    """
+    file = Path(source.partition(".pkl:")[0] + ".pkl" if ".pkl:" in source else source)
+    if not file.is_file():
+        raise FaceDiffError(f"--stable {file}: no such file; expected vertex indices separated by commas")
+    region = find_region(file.parent, [Path(source).name], "stable vertices", n_vertices)
+    if region.count < MIN_STABLE:
+        raise FaceDiffError(
+            f"--stable {file}: names {region.count} vertices; expected at least {MIN_STABLE}, spread over the skull"
+        )
+    return np.array(region.indices, np.int64)
+
+
+def stabilise(motion: Motion, face: Array, stable: Indices, scratch: Path) -> Stabilised:
+    """Align every frame with the median face; parameters without head motion stay as they are.
+
+    Args:
+        motion: the frames.
+        face: (V, 3) their median, see :func:`facediff.mesh.median_face`.
+        stable: the vertices from which the head's motion is measured.
+        scratch: a temporary file for the frames.
+
+    Raises:
+        FaceDiffError: if a frame holds NaN, or if nothing moves.
+    """
+    count = len(motion.frames)
+    if motion.has_head_motion:
+        frames = scratch_array(scratch, motion.frames.shape)
+        laid = remove_rigid_motion(motion.frames, face, stable, out=frames)
+        turns, shifts = _head_motion(laid.rotations, laid.translations, face[stable].mean(axis=0))
+        residuals = laid.residuals
+    else:
+        frames, turns, shifts = motion.frames, np.zeros(count), np.zeros(count)
+        residuals = np.array([np.sqrt(np.square(frame[stable] - face[stable]).sum(axis=-1).mean()) for frame in frames])
+    speed = _speed(frames)
+    if speed.max() < STILL * face_size(face):
+        raise FaceDiffError("the motion is still: every frame is the same face; expected the frames of a video")
+    return Stabilised(frames, face, stable, turns, shifts, float(np.sqrt(np.square(residuals).mean())), speed)
+
+
+def middle_face(motion: Motion, stable: Indices) -> Array:
+    """The median face of a motion; of parameters without head motion, in the coordinates that they have."""
+    if motion.has_head_motion:
+        return median_face(motion.frames, stable)
+    return np.median(motion.frames[:: max(1, len(motion.frames) // 64)], axis=0).astype(np.float64)
+
+
+def _head_motion(rotations: Array, translations: Array, centre: Array) -> tuple[Array, Array]:
+    """Angles from the mean pose, and distances from the mean place, of the head.
+
+    The mean pose is the rotation nearest to the mean of the matrices (the chordal mean).
+    """
+    u, _, vt = np.linalg.svd(rotations.mean(axis=0))
+    mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    # |R - M|² = 8 sin²(angle / 2): exact for small angles too, where the arc cosine of the trace is not.
+    chord = np.sqrt(np.square(rotations - mean).sum(axis=(1, 2)))
+    places = np.einsum("tji,tj->ti", rotations, centre - translations)
+    return 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0)), np.linalg.norm(places - places.mean(0), axis=1)
+
+
+def _speed(frames: npt.NDArray[np.floating]) -> Array:
+    """Mean of the steps to the frame before and after, (T,).
+
+    The mean length over vertices: a few that jitter count for less than in a root mean square.
+    """
+    steps = np.zeros(len(frames) + 1)
+    last: Array | None = None
+    for part, chunk in chunks(frames):
+        joined = chunk if last is None else np.concatenate([last[None], chunk])
+        moved = np.sqrt(np.square(np.diff(joined, axis=0)).sum(axis=-1)).mean(axis=-1)
+        steps[part.stop - len(moved) : part.stop] = moved
+        last = chunk[-1]
+    if len(frames) > 1:
+        steps[0], steps[-1] = steps[1], steps[-2]
+    return (steps[:-1] + steps[1:]) / 2
+
+
+# The neutral face: given, known from the model, or found where the speaker is silent and still.
+
+
+@dataclass(frozen=True)
+class Template:
+    """A neutral face that was given.
+
+    Attributes:
+        path: its file.
+        vertices: (V, 3).
+    """
+
+    path: Path
+    vertices: Array
+
+
+@dataclass(frozen=True)
+class Neutral:
+    """A neutral face.
+
+    Attributes:
+        face: (V, 3).
+        placing: from the stabilised frames' coordinates to those of ``face``; a rigid motion.
+        source: how the face was obtained, in words.
+        frames: the frames it is the median of, counted from 0; empty if it was not found in the motion.
+    """
+
+    face: Array
+    placing: Similarity
+    source: str
+    frames: list[int] = field(default_factory=list)
+
+
+def choose_neutral(
+    motion: Motion, made: Stabilised, given: Template | None, speech: npt.NDArray[np.float32], frame_rate: float
+) -> Neutral:
+    """The neutral face that was given, else the source's own, else one found in the frames.
+
+    Args:
+        motion: the frames as read.
+        made: the same without head motion.
+        given: a template, or None.
+        speech: (S,) at 16 kHz.
+        frame_rate: frames a second.
+
+    Raises:
+        FaceDiffError: if the template that was given does not fit the frames.
+    """
+    if given is not None:
+        return Neutral(given.vertices, _onto_template(made, given), str(given.path))
+    unmoved = Similarity(np.eye(3), np.zeros(3))
+    if motion.template is not None:
+        return Neutral(motion.template, unmoved, "the model's shape without expression")
+    covered = max(1, min(len(made.frames), round(len(speech) / SAMPLE_RATE * frame_rate)))
+    chosen = neutral_frames(loudness(speech, covered, frame_rate), made.speed[:covered]).tolist()
+    face = np.median(made.frames[chosen], axis=0).astype(np.float64)
+    source = f"median of {len(chosen)} silent and still frames (counted from 0): {spans(chosen)}"
+    return Neutral(face, unmoved, source, chosen)
+
+
+def _onto_template(made: Stabilised, given: Template) -> Similarity:
+    """The rigid motion from the stabilised frames to a template, by the stable vertices."""
+    face, template = made.face[made.stable], given.vertices[made.stable]
+    ratio = robust_align(face, template, scale=True).scale
+    rigid = robust_align(face, template)
+    residual = relative_residual(rigid.apply(made.face), given.vertices)
+    if not abs(math.log(max(ratio, 1e-9))) < math.log(SAME_SIZE):
+        raise FaceDiffError(
+            f"{given.path}: is {ratio:.4g} times as large as the faces of the motion; expected the speaker's neutral "
+            f"face in the motion's own unit and vertex order"
+        )
+    if not residual < RESIDUAL_LIMIT:
+        raise FaceDiffError(
+            f"{given.path}: does not lie on the faces of the motion (residual {residual:.2f} of its size, expected "
+            f"less than {RESIDUAL_LIMIT}); expected the speaker's neutral face in the motion's own vertex order"
+        )
+    return rigid
+
+
+def read_template(path: Path, corpus: Auxiliary) -> Template:
+    """A neutral face from .obj, .ply or .npy.
+
+    Raises:
+        FaceDiffError: if it is none of these, damaged, of another topology than the corpus, or holds NaN.
+    """
+    suffix, faces, count = path.suffix.lower(), None, corpus.n_vertices
+    vertices: Array
+    if suffix == ".npy":
+        array = open_array(path, kinds="f")
+        if array.size != 3 * count:
+            raise FaceDiffError(f"{path}: has shape {array.shape}; expected ({count}, 3) like the corpus")
+        vertices = np.array(array, np.float64).reshape(count, 3)
+    elif suffix in MESHES:
+        mesh = read_mesh(path, points_allowed=True)
+        vertices, faces = mesh.vertices, mesh.faces if len(mesh.faces) else None
+        if len(vertices) != count:
+            raise FaceDiffError(
+                f"{path}: has {len(vertices)} vertices, but the corpus has {count}; so its topology differs"
+            )
+    else:
+        raise FaceDiffError(f"{path}: unknown form of template; expected .obj, .ply or .npy")
+    if not np.isfinite(vertices).all():
+        raise FaceDiffError(f"{path}: holds NaN or infinity; expected a neutral face")
+    check_faces(path, faces, corpus)
+    return Template(path, vertices)
+
+
+def loudness(speech: Speech, frames: int, frame_rate: float) -> Array:
+    """Root-mean-square loudness around every frame (T,), averaged over 0.2 s."""
+    energy = np.concatenate([[0.0], np.cumsum(np.square(speech, dtype=np.float64))])
+    middle = (np.arange(frames) + 0.5) / frame_rate
+    low, high = (
+        np.clip(((middle + side * SMOOTHING / 2) * SAMPLE_RATE).round().astype(int), 0, len(speech)) for side in (-1, 1)
+    )
+    return np.sqrt((energy[high] - energy[low]) / np.maximum(high - low, 1))
+
+
+def neutral_frames(loud: Array, speed: Array) -> npt.NDArray[np.int64]:
+    """The twentieth of the frames in which speech is quiet and the face is still, both; sorted indices.
+
+    Frames are ranked by loudness and by speed; those whose worse rank is best are chosen.
+    """
+    worse = np.maximum(*(np.searchsorted(np.sort(values), values) for values in (loud, speed)))
+    least, most = NEUTRAL_FRAMES
+    count = min(len(loud), max(least, min(most, round(NEUTRAL_SHARE * len(loud)))))
+    return np.sort(np.argsort(worse, kind="stable")[:count])
