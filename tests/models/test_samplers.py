@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -384,3 +384,20 @@ def test_timesteps_are_as_many_as_steps_and_descend(name: str, steps: int) -> No
     assert places[0] == 999
     assert places[-1] >= 0
     assert places == sorted(set(places), reverse=True)
+
+
+def test_sampler_of_another_package_implements_update_alone() -> None:
+    """It gets the latest predictions, the present one last, and as many as it asks for."""
+
+    class Averaging(Sampler):
+        memory = 2
+
+        def update(
+            self, i: int, noisy: Tensor, predictions: Sequence[Tensor], noise: Callable[[Tensor], Tensor]
+        ) -> Tensor:
+            assert [float(prediction) for prediction in predictions] == self.timesteps[max(0, i - 1) : i + 1]
+            return torch.stack(list(predictions)).mean(0)
+
+    sampler = Averaging(NoiseProcess(20), steps=4)
+    assert sampler.timesteps == [19, 14, 9, 4]
+    assert float(sampler.run(lambda _, step: torch.tensor(float(step)), torch.tensor(0.0))) == 6.5
