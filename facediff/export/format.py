@@ -227,7 +227,7 @@ def speech_wav(animation: Animation) -> bytes | None:
     # Readers divide by 32768, so that a 16-bit recording comes back bit by bit.
     data = np.clip(np.rint(sound * 32768), -32768, 32767).astype("<i2").tobytes()
     rate = animation.sample_rate
-    # The standard library's module wave cannot write the entry ISFT (software). It stands before the samples, where it
+    # The standard library's module wave cannot write the entry ISFT (software). It comes before the samples, where it
     # is looked for before a file is replaced: an export replaces its own .wav but never a recording of the user's.
     chunks = [
         (b"fmt ", struct.pack("<HHIIHH", 1, 1, rate, 2 * rate, 2, 16)),

@@ -95,7 +95,7 @@ class PlySequence(MeshSequence):
 
 
 def _comment(animation: Animation, space: Space) -> str:
-    """One line that says who wrote the file, and in what space."""
+    """One line with the program that wrote the file, the unit and the axes."""
     name, unit = " ".join(animation.name.split()), " ".join(space.unit.split())
     return (
         f"facediff: {name}, unit {unit} ({space.metres:g} m), {space.up} up, {animation.frame_rate:g} frames a second"

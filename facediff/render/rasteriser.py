@@ -153,7 +153,7 @@ class Renderer:
         return np.asarray(albedo / np.maximum(coverage, np.float32(1e-3))[..., None], dtype=np.float32)
 
     def _kept_light(self, coverage: Float32, window: _Window) -> Float32:
-        """Share of the light that is left where the surface lies in a hollow, per pixel (height, width, 1)."""
+        """Share of the light that is left in hollows of the surface, per pixel (height, width, 1)."""
         # Two cues: the surface's own hollows, and pixels that lie behind the mean depth of their surroundings
         # (depth-buffer unsharp masking, Luft et al. 2006), which darkens the mouth between the lips.
         cv2, (width, height) = opencv(), window.size
@@ -278,7 +278,7 @@ class Light:
     """A distant light, fixed to the camera.
 
     Attributes:
-        direction: where it stands seen from the face: x right, y up, z to the viewer; any length.
+        direction: from the face to the light: x right, y up, z to the viewer; any length.
         colour: linear red, green, blue; 1 lights a white surface fully.
         wrap: 0 for a small lamp, up to 1 for a large soft one that reaches round the edge.
         gloss: strength of its highlight.
@@ -566,7 +566,7 @@ def face_outward(faces: Faces, template: Float64) -> Faces:
 
 
 def is_open(faces: Faces) -> bool:
-    """Whether an edge belongs to one triangle only, so that the inside may be seen."""
+    """Whether an edge belongs to one triangle only, so that the inside may be visible."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     _, counts = np.unique(edges, axis=0, return_counts=True)
     return bool((counts == 1).any())
@@ -591,7 +591,7 @@ def vertex_normals(vertices: Floats, faces: Faces) -> Float64:
 
 
 def hollowness(vertices: Floats, normals: Float64, faces: Faces) -> Float64:
-    """How far each vertex lies below its neighbourhood, as a share of the neighbourhood's radius (V,).
+    """How far each vertex is below its neighbourhood, as a share of the neighbourhood's radius (V,).
 
     Positive in hollows (between the lips, in the corner of an eye), negative on ridges, near zero on smooth parts.
     """

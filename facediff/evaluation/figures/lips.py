@@ -157,7 +157,7 @@ def _span(curves: Curves, span: tuple[float, float] | None) -> tuple[float, floa
     if not (0 <= span[0] < span[1] and span[0] < end):
         raise FaceDiffError(f"--span {span[0]:g} {span[1]:g}: expected two times in order, between 0 and {end:g}")
     if not ((span[0] <= curves.times) & (curves.times <= span[1])).any():
-        raise FaceDiffError(f"--span {span[0]:g} {span[1]:g}: the middle of no frame lies in it; make it longer")
+        raise FaceDiffError(f"--span {span[0]:g} {span[1]:g}: it contains the middle of no frame; make it longer")
     return span[0], min(span[1], end)
 
 

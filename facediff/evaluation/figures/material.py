@@ -295,7 +295,7 @@ class Painter:
         self.faces, self.shape, self.look, self.colours = faces, shape, look, colours
         framed = shape if region is None else _box_around(shape[list(region)])
         whole, camera = Camera.framing(shape, view=view), Camera.framing(framed, view=view)
-        # A close-up must not cut off the ears, which lie behind what it is framed on.
+        # A close-up must not cut off the ears, which are behind what the camera is framed on.
         self._camera = replace(camera, radius=max(camera.radius, whole.radius))
         points = self._camera.to_camera(framed)
         seen = points[:, :2] / -points[:, 2:]

@@ -34,7 +34,7 @@ METRICS = "metrics.csv"
 USUAL_SCALARS = ("train/loss", "val/lve")
 
 NARROW = 120.0
-"""Width in mm below which panels stand below one another."""
+"""Width in mm below which all panels are in one column."""
 
 FEW_POINTS = 12
 """Up to this many values of a curve, each is marked and none is smoothed."""

@@ -34,7 +34,7 @@ from facediff.utils.files import atomic, check_writable
 FORMAT = "facediff page 1"
 MOST_ANIMATIONS = 4
 SCRIPTS = ("motion", "surface", "clock", "camera", "scene", "curve", "dialogs", "panels", "player")
-"""Parts of the script; each uses only what stands before it."""
+"""Parts of the script; each uses only the parts before it."""
 
 
 @export_format.register("html")
@@ -187,7 +187,7 @@ def _page_parts(facts: dict[str, Any], blobs: Blobs) -> list[str]:
         "facts": data,
         "script": script,
     }
-    # Values are put into the places {{name}} in one pass, so that what stands in a value is never taken for a place.
+    # Values are put into the places {{name}} in one pass, so that a value is never searched for places.
     before, after = (
         re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], part)
         for part in _asset("page.html").split("{{blobs}}")

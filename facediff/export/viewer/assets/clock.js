@@ -8,12 +8,12 @@ function frameAt(time, rate, frames) {
   return Math.max(0, Math.min(frames - 1, Math.floor(time * rate + FRAME_LEEWAY)));
 }
 
-/** Follows an audio element. Where a browser moves its time in jumps, fills them in, but by half a frame at most. */
+/** Follows an audio element. Where a browser's time moves in jumps, it interpolates, by half a frame at most. */
 class SoundClock {
   constructor(audio, rate) {
     this.audio = audio;
     this.leeway = 0.5 / rate;
-    this.told = -1;
+    this.reported = -1;
     this.at = 0;
     this.last = 0;
   }
@@ -23,14 +23,14 @@ class SoundClock {
   }
 
   get time() {
-    const told = this.audio.currentTime;
+    const reported = this.audio.currentTime;
     const now = performance.now() / 1000;
-    if (told !== this.told || !this.playing || this.audio.seeking) {
-      this.told = told;
+    if (reported !== this.reported || !this.playing || this.audio.seeking) {
+      this.reported = reported;
       this.at = now;
     }
     const between = this.playing ? Math.min((now - this.at) * this.audio.playbackRate, this.leeway) : 0;
-    const time = told + between;
+    const time = reported + between;
     // A guess that ran ahead waits for the sound; only a seek or a loop goes back.
     const back = this.last - time;
     this.last = this.playing && back > 0 && back <= this.leeway ? this.last : time;
@@ -58,7 +58,7 @@ class SoundClock {
   }
 }
 
-/** The same for animations without sound. */
+/** The machine's clock, for animations without sound. */
 class SilentClock {
   constructor(seconds) {
     this.seconds = seconds;
@@ -73,7 +73,7 @@ class SilentClock {
     if (!this.playing) return this.base;
     const time = this.base + ((performance.now() - this.since) / 1000) * this.rate;
     if (time < this.seconds) return time;
-    if (this.loop) { // counted anew in every round, so that without the loop this one is played to its end
+    if (this.loop) { // time starts at 0 in every round, so that this round is played to its end when the loop is switched off
       this.seek(time % this.seconds);
       return this.base;
     }

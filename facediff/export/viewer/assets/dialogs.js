@@ -10,7 +10,7 @@ function make(tag, classes, text) {
 
 const plain = (word) => word.replaceAll("_", " ");
 
-/** A list of terms and what is said of them. */
+/** A list of terms and their descriptions. */
 function describe(rows) {
   const list = make("dl");
   for (const [term, words] of rows) list.append(make("dt", "", plain(term)), make("dd", "", words));
@@ -34,7 +34,7 @@ function fillInformation(place, facts) {
   );
 }
 
-/** What is said of an animation under its name; what was not learned is marked. */
+/** The words below an animation's name, and marks for what is synthetic or procedural. */
 function captions(animation) {
   const { identity, style, corpus, procedural } = animation.metadata;
   const words = [];

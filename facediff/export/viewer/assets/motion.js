@@ -15,7 +15,7 @@ async function readBlob(number) {
   return new Response(stream).arrayBuffer();
 }
 
-/** Gives the browser a moment to draw and to listen. */
+/** Let the browser draw and handle events. */
 const breathe = () => new Promise((resolve) => setTimeout(resolve, 0));
 
 const SLICE_MS = 5;

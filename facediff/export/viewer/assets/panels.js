@@ -32,14 +32,14 @@ class Panels {
     if (number === this.facts.truth && animation.name.toLowerCase() !== "truth") head.append(make("span", "mark", "truth"));
     const { words, marks } = captions(animation);
     const error = make("p", "error");
-    const foot = make("div", "marks"); // below the face: what is procedural or synthetic is said, but hides nothing
+    const foot = make("div", "marks"); // below the face, where the marks hide nothing
     foot.append(...marks.map((mark) => make("p", "mark", mark)));
     box.append(head, make("p", "words", words), error, foot);
     const opening = make("span", "value");
     return { box, error, opening };
   }
 
-  /** Where each panel lies, in shares of the stage. */
+  /** Left, top, width and height of each panel, in shares of the stage. */
   rectangles() {
     const stage = find("stage").getBoundingClientRect();
     return this.boxes.map(({ box }) => {

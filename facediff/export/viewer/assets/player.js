@@ -3,7 +3,7 @@
 const find = (id) => document.getElementById(id);
 const errors = [];
 
-/** Keep an error for scripts, and tell the reader about it. */
+/** Keep an error for scripts, and show it on the page. */
 function report(error) {
   const words = error && error.message ? error.message : String(error);
   errors.push(words);
@@ -32,7 +32,7 @@ async function readFace(facts, animation) {
   };
 }
 
-/** A picture stands still when the camera has not moved for so long. */
+/** A picture is still when the camera has not moved for this long. */
 const STILL_MS = 200;
 
 class Player {

@@ -35,8 +35,8 @@ void main() {
   vec3 normal = normalize(gl_FrontFacing ? facing : -facing);
   if (highest > 0.0) {
     float shade = 0.6 + 0.4 * max(dot(normal, vec3(-0.199, 0.448, 0.871)), 0.0);
-    vec3 told = texture(ramp, vec2(heat, 0.5)).rgb;
-    colour = vec4(told * sqrt(shade * (gl_FrontFacing ? 1.0 : 0.4)), 1.0);
+    vec3 scale = texture(ramp, vec2(heat, 0.5)).rgb;
+    colour = vec4(scale * sqrt(shade * (gl_FrontFacing ? 1.0 : 0.4)), 1.0);
     return;
   }
   vec3 light = mix(vec3(0.12, 0.09, 0.08), vec3(0.24, 0.26, 0.30), normal.y * 0.5 + 0.5);
@@ -55,7 +55,7 @@ void main() {
 }`;
 
 const SKIN = [0.9, 0.745, 0.66];
-/** Pixels of the screen for one of the page, at most: more cannot be told apart in motion, and slows a laptop down. */
+/** Pixels of the screen for one of the page, at most: more are not visible in motion, and slow a laptop down. */
 const SHARPEST = 2;
 const COARSEST = 0.4;
 
@@ -63,8 +63,8 @@ const COARSEST = 0.4;
 function graphics() {
   const gl = document.createElement("canvas").getContext("webgl2");
   if (!gl) return { available: false, software: false };
-  const told = gl.getExtension("WEBGL_debug_renderer_info");
-  const name = String(gl.getParameter(told ? told.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
   gl.getExtension("WEBGL_lose_context")?.loseContext();
   return { available: true, software: /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name) };
 }
@@ -76,7 +76,7 @@ class Scene {
     if (!available) {
       throw new Error("this browser has no WebGL 2, or it is switched off: the faces cannot be drawn");
     }
-    // Without a graphics card soft edges cost as much as all the rest: they are for the picture that stands still.
+    // Without a graphics card soft edges cost as much as all the rest: they are drawn only while the picture is still.
     this.finest = software ? 2 : 1;
     this.gl = canvas.getContext("webgl2", { antialias: !software, powerPreference: "high-performance" });
     this.faces = faces;
@@ -161,7 +161,7 @@ class Scene {
   }
 }
 
-/** Fewer pixels while a machine cannot keep up with the motion; a standing picture is always sharp. */
+/** Fewer pixels while a machine cannot keep up with the motion; a still picture is always sharp. */
 class Pace {
   constructor(rate) {
     this.slow = 1.3 * Math.max(1000 / rate, 1000 / 60);
