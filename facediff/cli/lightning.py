@@ -1,7 +1,7 @@
-"""``facediff fit | validate | test | predict``: what was typed is checked and completed, then LightningCLI runs.
+"""``facediff fit | validate | test | predict``: the arguments are checked and completed, then LightningCLI runs.
 
-Nothing heavy is imported before the words have been looked at, so that a wrong option or a missing file is reported at
-once; :mod:`facediff.cli.lightning_cli` is what runs then.
+Nothing heavy is imported before the arguments have been checked, so that a wrong option or a missing file is reported
+within a second; :mod:`facediff.cli.lightning_cli` is what runs then.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def fresh_component(flag: str, value: str) -> str:
     """Let a component that is chosen by name start from its own defaults.
 
     jsonargparse hands options of the same name on from the component that stood there before, even where those were
-    mere defaults: ``--model.sampler=ddpm`` would silently take over the 25 steps of ``ddim``.
+    mere defaults: ``--model.sampler=ddpm`` would silently keep the 25 steps of ``ddim``.
 
     Raises:
         FaceDiffError: if there is no component of that name.

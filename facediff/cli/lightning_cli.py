@@ -1,7 +1,7 @@
 """LightningCLI as facediff uses it: components by name, one-sentence errors, callbacks that every run has, and wandb.
 
-It imports Lightning and jsonargparse, seconds that :mod:`facediff.cli.lightning` spends only where nothing was wrong
-with what was typed.
+Importing Lightning and jsonargparse takes seconds, so :mod:`facediff.cli.lightning` imports this module only once the
+arguments have been checked.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
 
 
 def built_in_callbacks(name: str) -> list[Callback]:
-    """What every run of a subcommand has beside the callbacks of its config."""
+    """The callbacks that every run of a subcommand has in addition to those of its config."""
     callbacks: list[Callback] = [ScoreTable(), RunDescription()]
     if name == "fit":
         callbacks.append(GradientNorm())
@@ -178,11 +178,11 @@ class FaceDiffCLI(LightningCLI):
             parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
 
     def before_instantiate_classes(self) -> None:
-        """Settle whether wandb uploads before anything starts it."""
+        """Decide whether wandb uploads before anything starts it."""
         settle_wandb_mode(self.config[str(self.subcommand)].trainer)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:  # noqa: ANN401
-        """Make the trainer; a callback that the config names stands in for the built-in one of its kind."""
+        """Make the trainer; a callback of the config replaces the built-in one of its class."""
         trainer = super().instantiate_trainer(**kwargs)
         built_in = self.trainer_defaults["callbacks"]
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
@@ -191,7 +191,7 @@ class FaceDiffCLI(LightningCLI):
         return trainer
 
     def _parse_ckpt_path(self) -> None:
-        """Upstream merges a checkpoint's hyper-parameters over the flags; the module ``words`` does it under them."""
+        """Do nothing: upstream would let a checkpoint override the flags; ``words_of_checkpoint`` does the opposite."""
 
 
 class RunConfig(SaveConfigCallback):
@@ -222,7 +222,7 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-# Weights & Biases without a question and without waiting: offline where there is no key or no answer.
+# Weights & Biases without questions and waiting: offline where there is no key or the server does not answer.
 
 PATIENCE = 5.0
 """Seconds that the server has for its first answer."""
@@ -233,13 +233,13 @@ def settle_wandb_mode(trainer: Mapping[str, Any]) -> None:
 
     Without a key wandb asks a question and waits for an answer, and without a network it waits for a minute and a half
     and then fails. Here one line says why the run is offline and how it is uploaded later. Whoever has chosen a mode
-    (``WANDB_MODE``, or ``offline: true``) gets that mode.
+    (``WANDB_MODE``, or ``offline: true``) keeps it.
 
     Args:
         trainer: the trainer's options as parsed, before anything is made of them.
 
     Raises:
-        FaceDiffError: if wandb is not installed or the key is no key.
+        FaceDiffError: if wandb is not installed or the key is malformed.
     """
     from lightning.pytorch.utilities import rank_zero_only
 
@@ -258,9 +258,9 @@ def settle_wandb_mode(trainer: Mapping[str, Any]) -> None:
         reason = why_offline()
     except (wandb.Error, ValueError) as error:
         raise FaceDiffError(
-            f"wandb: {error}; put the key right (`wandb login --relogin`), or set WANDB_MODE=offline"
+            f"wandb: {error}; correct the key (`wandb login --relogin`), or set WANDB_MODE=offline"
         ) from error
-    wandb.teardown()  # what comes next reads the environment anew
+    wandb.teardown()  # the logger then reads the environment again
     if reason is None:
         if silent is None:
             del os.environ["WANDB_SILENT"]  # the run's address is worth a line
@@ -284,7 +284,7 @@ def wandb_options(trainer: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def why_offline() -> str | None:
-    """What stands in the way of uploading: no key, or no answer; None if nothing does."""
+    """Why a run cannot be uploaded: no key, or no answer; None if it can."""
     import wandb
 
     if not wandb.login(prompt=False, verify=False):
@@ -294,11 +294,11 @@ def why_offline() -> str | None:
 
 
 def answers(address: str, patience: float = PATIENCE) -> bool:
-    """Whether a web server answers, with whatever but an error of its own; proxies of the environment are used.
+    """Whether a web server answers, with anything but a server error; proxies of the environment are used.
 
     In a thread of its own, since looking up a name may take longer than any time limit of the connection.
     """
-    heard = threading.Event()
+    answered = threading.Event()
 
     def ask() -> None:
         try:
@@ -308,9 +308,9 @@ def answers(address: str, patience: float = PATIENCE) -> bool:
                 return
         except (OSError, ValueError):
             return
-        heard.set()
+        answered.set()
 
     thread = threading.Thread(target=ask, daemon=True)
     thread.start()
     thread.join(patience)
-    return heard.is_set()
+    return answered.is_set()

@@ -48,7 +48,9 @@ def grow(before: Tensor, after: Tensor) -> Tensor:
     if before.shape == after.shape:
         return before
     if before.shape[1:] != after.shape[1:] or len(before) > len(after):
-        raise FaceDiffError(f"weights of the shape {tuple(before.shape)} cannot take in another identity")
+        raise FaceDiffError(
+            f"weights of the shape {tuple(before.shape)} have no row for each identity, so none can be added"
+        )
     mean = before.mean(0, keepdim=True)
     return torch.cat([mean.expand(len(after) - len(before), *mean.shape[1:]), before])
 

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as pl
 import numpy as np
@@ -14,14 +15,17 @@ import pytest
 import torch
 import yaml
 from lightning.pytorch.callbacks import EMAWeightAveraging
+from lightning.pytorch.cli import instantiate_module
 
 from facediff import registry
 from facediff.callbacks import PredictionWriter, ScoreTable
 from facediff.cli.app import main
 from facediff.data import Puppet, collate
+from facediff.data.batch import FORMAT_KEY
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion, load_model
 from facediff.models.base import Schedule, lr_factor
+from facediff.models.checkpoint import read_assets
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]
@@ -72,7 +76,7 @@ def test_a_checkpoint_is_plain_data_and_animates_without_the_corpus(trained: Pat
     assert model.animate(torch.randn(8000), identity="B").vertices.shape == (12, 24, 3)
 
 
-def test_a_reloaded_system_trains_again_saves_and_loads(
+def test_a_reloaded_model_trains_again_saves_and_loads(
     trained: Path, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
 ) -> None:
     model = load_model(trained)
@@ -94,7 +98,7 @@ def test_the_checkpoint_holds_the_averaged_weights(trained: Path) -> None:
     assert all(torch.equal(loaded[name], averaged[name]) for name in averaged)
 
 
-def test_test_scores_the_model_beside_a_still_face_and_shuffled_speech(
+def test_test_scores_the_model_next_to_a_still_face_and_shuffled_speech(
     trained: Path, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trainer = make_trainer(callbacks=[ScoreTable()])
@@ -158,7 +162,7 @@ def test_the_learning_rate_warms_up_and_ends_as_asked(schedule: Schedule) -> Non
     assert factors[-1] == (1.0 if schedule == "constant" else pytest.approx(0.0, abs=1e-3))
 
 
-def test_files_that_are_no_checkpoints(tmp_path: Path, trained: Path) -> None:
+def test_files_that_are_no_checkpoints_are_refused(tmp_path: Path, trained: Path) -> None:
     with pytest.raises(FaceDiffError, match="no such checkpoint"):
         load_model(tmp_path / "none.ckpt")
     (tmp_path / "text.ckpt").write_text("hello")
@@ -172,12 +176,50 @@ def test_files_that_are_no_checkpoints(tmp_path: Path, trained: Path) -> None:
         load_model(tmp_path / "cut.ckpt")
 
 
-def test_a_checkpoint_of_another_system_class_is_refused(tmp_path: Path, trained: Path) -> None:
+def test_a_checkpoint_of_an_unknown_model_is_refused(tmp_path: Path, trained: Path) -> None:
     checkpoint = torch.load(trained, weights_only=True)
     checkpoint["hyper_parameters"]["_class_path"] = "os.system"
     torch.save(checkpoint, tmp_path / "evil.ckpt")
     with pytest.raises(FaceDiffError, match=r'"os\.system".* was not loaded'):
         load_model(tmp_path / "evil.ckpt")
+
+
+def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path, trained: Path) -> None:
+    checkpoint = torch.load(trained, weights_only=True)
+    del checkpoint[FORMAT_KEY]
+    torch.save(checkpoint, tmp_path / "old.ckpt")
+    with pytest.raises(FaceDiffError, match=r"old.ckpt: written by another version"):
+        load_model(tmp_path / "old.ckpt")
+    with pytest.raises(FaceDiffError, match=r"old.ckpt: written by another version"):
+        read_assets(tmp_path / "old.ckpt")
+
+
+def test_a_checkpoint_is_read_once(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read, load = [], torch.load
+    monkeypatch.setattr(torch, "load", lambda *args, **options: read.append(args) or load(*args, **options))
+    load_model(trained)
+    assert len(read) == 1
+
+
+class Further(DualPathDiffusion):
+    """A model with an option of its own and another default of a common one."""
+
+    def __init__(self, *, extra: int = 3, weight_decay: float = 0.25, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(weight_decay=weight_decay, **options)
+        self.extra = extra
+
+
+def test_hyper_parameters_are_kept_without_a_word_of_the_model() -> None:
+    model = Further(n_vertices=24, identities=["A"], frame_rate=25.0, dim=16, decoder=registry.decoder.gru)
+    kept = model.hparams
+    assert (kept["extra"], kept["weight_decay"], kept["dim"], kept["warmup_steps"]) == (3, 0.25, 16, 0)
+    assert kept["identities"] == ["A"]
+    assert kept["decoder"]["init_args"] == {"num_layers": 2, "bidirectional": True, "dropout": 0.1}
+    assert kept["fusion"]["init_args"]["num_heads"]
+    options = {name: value for name, value in kept.items() if not name.startswith("_")}
+    again = instantiate_module(Further, {**options, "extra": 4})
+    assert again.hparams == {**kept, "extra": 4}
+    assert model.weight_decay == again.weight_decay == 0.25
 
 
 @pytest.mark.parametrize(
@@ -253,7 +295,9 @@ def test_a_corpus_folder_given_as_a_path_object_is_kept_as_text(tmp_path: Path) 
     assert torch.load(tmp_path / "h.pt", weights_only=True)["root"] == str(tmp_path)
 
 
-def test_the_corpus_must_fit_the_checkpoint(trained: Path, tiny_root: Path, make_trainer: MakeTrainer) -> None:
+def test_a_corpus_that_does_not_fit_the_checkpoint_is_refused(
+    trained: Path, tiny_root: Path, make_trainer: MakeTrainer
+) -> None:
     class Other(Tiny):
         identities = ["A", "C"]
 
@@ -261,5 +305,5 @@ def test_the_corpus_must_fit_the_checkpoint(trained: Path, tiny_root: Path, make
         make_trainer().test(load_model(trained), datamodule=Other(root=str(tiny_root)), verbose=False)
 
 
-def test_systems_are_speech_animators() -> None:
+def test_models_are_animation_models() -> None:
     assert issubclass(DualPathDiffusion, AnimationModel)

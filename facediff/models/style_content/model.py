@@ -61,7 +61,7 @@ class StyleContentDisentanglement(AnimationModel):
         decoder_hidden: channels of its fully connected layers before the coefficients.
         basis_size: coefficients of its linear basis.
         basis_start: the basis starts from the principal components of the training motion, or at random.
-        content_scale: ``clip`` takes mean and spread over a clip out of the content of motion, by which a speaker
+        content_scale: ``clip`` removes mean and spread over a clip from the content of motion, by which a speaker
             would be recognised; ``free`` leaves it as it is.
         aligned_pairs: where two speakers say the same sentence, supervise a swap of their styles with the other's
             recording, aligned in time; else, and everywhere if False, by the encoders' consistency.
@@ -232,7 +232,7 @@ class StyleContentDisentanglement(AnimationModel):
         return terms
 
     def alignment_allowed(self) -> bool:
-        """Whether the clips of a training batch are whole: two windows of a sentence need not hold the same words."""
+        """Whether the clips of a training batch are whole: two windows of a sentence may hold different words."""
         return self.training and self._trainer is not None and self.trainer.datamodule.window is None  # type: ignore[attr-defined]
 
     def distance_to(
@@ -278,7 +278,7 @@ class StyleContentDisentanglement(AnimationModel):
         style: Float[Tensor, "batch style_dim"],
         mask: Bool[Tensor, "batch frames"],
     ) -> Float[Tensor, "batch frames vertices 3"]:
-        """Offsets from the template, zero on padding, of content and style that may be of different people."""
+        """Offsets from the template, zero on padding, of content and style that may be of different speakers."""
         return self.decode_scaled(content, style, mask) / self.scale * mask[..., None, None]
 
     def generate_clips(

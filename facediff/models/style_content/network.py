@@ -31,7 +31,7 @@ class DisentanglementNetwork(nn.Module):
         audio_encoder: speech to one feature per frame.
         speech_content: features of speech to content.
         decoder: content and style to motion, D.
-        standardise_content: take mean and spread over a clip's time out of the content of motion.
+        standardise_content: remove mean and spread over a clip's time from the content of motion.
     """
 
     def __init__(
@@ -148,10 +148,10 @@ class MotionDecoder(nn.Module):
     ) -> Float[Tensor, "batch frames coordinates"]:
         """Motion, flattened to 3V coordinates; what stands on padding frames has no meaning and no effect."""
         x = content
-        beside = style[:, None].expand(-1, content.shape[1], -1)
+        repeated = style[:, None].expand(-1, content.shape[1], -1)
         valid = mask[..., None].to(content.dtype)
         for conv, kernel in zip(self.convolutions, self.kernels, strict=True):
-            columns = (torch.cat([x, beside], dim=-1) * valid).transpose(1, 2)
+            columns = (torch.cat([x, repeated], dim=-1) * valid).transpose(1, 2)
             columns = nn.functional.pad(columns, (kernel - 1, 0))
             x = nn.functional.leaky_relu(conv(columns).transpose(1, 2), SLOPE)
         coefficients = self.connected(x)
