@@ -231,10 +231,6 @@ def run_folder(
     return int(any(state == "failed" for state, _ in states.values()))
 
 
-def _source(task: FileTask) -> str:
-    return str(task.source)
-
-
 def _set_up(make_worker: MakeWorker, command: list[str]) -> Callable[[FileTask], None]:
     animate = make_worker(command)
     return lambda task: animate(task.source, task.output)
@@ -259,7 +255,7 @@ def _animate_all(
     workers: int | None,
     states: dict[Path, tuple[str, str]],
 ) -> None:
-    outcomes = run_batch(work, tasks, name=_source, workers=workers, record=FileTask.record, survive_bugs=True)
+    outcomes = run_batch(work, tasks, workers=workers, record=FileTask.record, survive_bugs=True)
     with closing(outcomes):
         for count, (task, outcome) in enumerate(outcomes, start=1):
             if outcome.problem:

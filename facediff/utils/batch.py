@@ -45,7 +45,6 @@ def run_batch(
     work: Callable[[Task], Result],
     tasks: Sequence[Task],
     *,
-    name: Callable[[Task], str],
     workers: int | None = None,
     record: Callable[[Task, str], None] | None = None,
     survive_bugs: bool = False,
@@ -54,8 +53,7 @@ def run_batch(
 
     Args:
         work: does a task; picklable, such as :class:`~facediff.utils.jobs.PerWorker`.
-        tasks: what it is called with.
-        name: how errors call a task.
+        tasks: what it is called with; errors name a task by its ``str()``.
         workers: number of processes; as many as processors if None.
         record: called with each task that is done and its problem, in the worker, so that also what is finished after
             Ctrl-C is recorded; picklable.
@@ -66,11 +64,11 @@ def run_batch(
         FaceDiffError: as soon as a task fails for a reason that would let all others fail too: the set-up of a worker
             failed, a package is missing or the disk is full.
     """
-    attempt = partial(_attempt, work, name, record, survive_bugs)
+    attempt = partial(_attempt, work, record, survive_bugs)
     with closing(run_tasks(attempt, tasks, workers=workers)) as results:
         for task, outcome in results:
             if isinstance(outcome, WorkerDied):
-                problem = f"{name(task)}: killed its process, perhaps for lack of memory; try --workers 1"
+                problem = f"{task}: killed its process, perhaps for lack of memory; try --workers 1"
                 outcome = Outcome(problem=problem)
                 if record is not None:
                     record(task, problem)
@@ -81,7 +79,6 @@ def run_batch(
 
 def _attempt(
     work: Callable[[Task], Result],
-    name: Callable[[Task], str],
     record: Callable[[Task, str], None] | None,
     survive_bugs: bool,
     task: Task,
@@ -96,10 +93,10 @@ def _attempt(
         outcome = Outcome(problem=str(error))
     except Exception as error:
         if not survive_bugs:
-            error.add_note(f"while working on {name(task)}")
+            error.add_note(f"while working on {task}")
             raise
         traceback.print_exc()
-        outcome = Outcome(problem=f"{name(task)}: {type(error).__name__}: {error} (see the traceback above)")
+        outcome = Outcome(problem=f"{task}: {type(error).__name__}: {error} (see the traceback above)")
     if record is not None:
         record(task, outcome.problem)
     return replace(outcome, seconds=time.monotonic() - started)
@@ -146,6 +143,9 @@ class FileTask:
     source: Path
     output: Path
     recipe: Recipe
+
+    def __str__(self) -> str:
+        return str(self.source)
 
     @property
     def _record_file(self) -> Path:

@@ -9,8 +9,8 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import partial
 from importlib import metadata
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,6 +68,9 @@ class Job:
             raise FaceDiffError(
                 f'clip name "{self.name}": expected letters, digits, "_" and "-" only; rename it in the raw data'
             )
+
+    def __str__(self) -> str:
+        return f"clip {self.name}"
 
 
 @dataclass(frozen=True)
@@ -181,7 +184,7 @@ def _write_all(
     shared = plan.shared(out)
     clips, failed = dict(finished), {}
     bar = progress_bar(plan.corpus, len(plan.jobs), done=len(finished), shown=not quiet)
-    outcomes = run_batch(partial(_do, out), pending, name=_name, workers=workers)
+    outcomes = run_batch(methodcaller("work", out), pending, workers=workers)
     with bar as step, closing(outcomes):
         for job, outcome in outcomes:
             if outcome.result is None:
@@ -197,14 +200,6 @@ def _write_all(
     write_json(out / MANIFEST, manifest)
     (out / STATE).unlink()
     return _report(plan, out, manifest, len(clips) - len(finished))
-
-
-def _do(out: Path, job: Job) -> int:
-    return job.work(out)
-
-
-def _name(job: Job) -> str:
-    return f"clip {job.name}"
 
 
 def _manifest(
