@@ -59,7 +59,7 @@ def imported(file: Path) -> Iterator[tuple[int, str]]:
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
             source = ".".join([*base, *([node.module] if node.module else [])])
-            # `from facediff import losses` names a package; `from facediff.data import Batch` names a package and a class.
+            # `from facediff import registry` names a module; `from facediff.data import Batch`, a package and a class.
             yield from ((node.lineno, f"{source}.{alias.name}") for alias in node.names)
 
 
