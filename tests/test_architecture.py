@@ -28,7 +28,7 @@ ALLOWED: dict[str, set[str]] = {
     "render": BASE,
     "animation": {"mesh", *BASE},
     "data": {"metrics", "mesh", "synthetic", *BASE},
-    "editing": {"animation", "data", "metrics", "mesh", "synthetic", *BASE},
+    "editing": {"animation", "metrics", "mesh", "synthetic", *BASE},
     "models": {"animation", "data", "metrics", "mesh", *BASE},
     "callbacks": {"__init__", "models", "data", "metrics", "mesh", "render", *BASE},
     "export": {"animation", "editing", "render", "mesh", *BASE},
