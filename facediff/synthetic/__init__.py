@@ -1,7 +1,7 @@
 """The built-in corpus: synthetic speakers with faces made by code and speech from espeak-ng.
 
-It is synthetic, needs no licence and no download, and lies on disk in the layout of BIWI's circulating
-copies. See `generate`.
+It is synthetic, needs no licence and no download, and has the layout of BIWI's circulating copies on disk. See
+:func:`generate`.
 """
 
 from facediff.synthetic.corpus import (

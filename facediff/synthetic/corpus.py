@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from facediff.errors import FaceDiffError
 from facediff.synthetic.face import build_face
 from facediff.synthetic.geometry import Array
-from facediff.synthetic.motion import FRAME_RATE, analyse, generate_clips, segments_of, visemes_of
+from facediff.synthetic.motion import FRAME_RATE, analyse, generate_weights, segments_of, visemes_of
 from facediff.synthetic.rig import Rig, build_rig, lip_pairs
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.synthetic.speech import SENTENCES, Phoneme, speak
@@ -156,7 +156,7 @@ def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, 
     end = frames / FRAME_RATE
     phonemes = _in_quiet(said.phonemes, before / SAMPLE_RATE, end)
     random = np.random.default_rng([seed, list(SPEAKERS).index(clip.identity), clip.number])
-    weights = generate_clips(
+    weights = generate_weights(
         segments_of(phonemes), analyse(samples, SAMPLE_RATE), frames, speaker.style, clip.mood, random
     )
     return np.rint(samples * 32767.0).astype(np.int16), weights, phonemes

@@ -393,7 +393,7 @@ def _fill(points: Array) -> list[tuple[float, float]]:
 
 
 def _inside(outline: Array, places: Array) -> NDArray[np.bool_]:
-    """Say which places lie inside a closed outline (crossing number)."""
+    """Which places lie inside a closed outline (crossing number)."""
     first, second = outline[:, None], np.roll(outline, -1, axis=0)[:, None]
     straddles = (first[..., 1] > places[:, 1]) != (second[..., 1] > places[:, 1])
     rising = np.where(second[..., 1] == first[..., 1], 1.0, second[..., 1] - first[..., 1])
@@ -466,8 +466,8 @@ def _curve(level: ArrayLike, column: int) -> Array:
 def radius(level: ArrayLike) -> Array:
     """Length in mm that the layout gives to a radian at a level.
 
-    Half way (as a geometric mean) between the true radius and a constant one: the true one would shear the
-    back of the crown and the nape, where it changes fast, a constant one would blow up the crown.
+    The geometric mean of the true radius and a constant one. The true radius would shear the back of the crown and the
+    nape, where it changes fast; a constant one would enlarge the crown.
     """
     true = 0.5 * _curve(level, 4) + 0.25 * (_curve(level, 2) - _curve(level, 5))
     return np.asarray(np.sqrt(82.0 * true))

@@ -1,7 +1,7 @@
 """The puppet's muscles: smooth displacement fields and the contact of the lips.
 
-A field says where every vertex of the neutral head goes when its weight is 1. In a speaker's head the same
-pose is sent through the speaker's `Shape`, so that it acts in the speaker's own proportions. Poses add up
+A field is the displacement of every vertex of the neutral head at weight 1. For a speaker's head the displaced
+neutral head is sent through the speaker's `Shape`, so that it moves in the speaker's own proportions. Poses add up
 fields linearly, except where the lips meet: `Rig.pose` measures the gap between the lips that the other
 fields leave and closes it by the share that ``lip_closure`` asks, and it never lets the lips cross.
 """
@@ -269,7 +269,7 @@ def _contact(mesh: Mesh, canonical: Array, upper: NDArray[np.int64]) -> Array:
 # Different speakers: smooth deformations of space that turn the neutral head into a speaker's.
 #
 # A `Shape` is a function of points, not a table of vertices. A pose of the neutral head can be sent through it as well
-# as the neutral head itself, and that is how the rig comes to act in the speaker's own proportions.
+# as the neutral head itself, so that the rig moves in the speaker's own proportions.
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,10 @@
-"""Real speech with the exact times of its phonemes, from espeak-ng.
+"""Synthesised speech with the exact times of its phonemes, from espeak-ng.
 
 espeak-ng arrives with ``espeakng_loader`` (library and data in one wheel) and is driven through ctypes. It
 keeps state from one utterance to the next, so that a second call in one process gives another waveform with
-other times whatever one resets, and its noise starts from the clock. Therefore the noise is given a seed,
-and each utterance is spoken by a library loaded for it alone and unloaded again; where unloading does not
-work (another user of the library in this process, a C library that never unloads), it is spoken in a fresh
-interpreter. Both ways give the same bits.
+other times whatever is reset, and its noise is seeded by the clock. Therefore the noise is given a seed, and the
+library is loaded for each utterance and unloaded again. Where it cannot be unloaded (because the process uses it
+elsewhere, or the C library never unloads), a new interpreter speaks the utterance. Both ways give the same bits.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils import SAMPLE_RATE
 
-# What the puppets say: 32 sentences written for this corpus, rich in p, b, m, rounded and open vowels.
+# The 32 sentences were written for this corpus and are rich in p, b, m, rounded and open vowels.
 
 SENTENCES: tuple[str, ...] = (
     "Mama bought a map of Bombay for papa.",
@@ -78,7 +77,7 @@ _CLOSURE = 0.045
 
 @dataclass(frozen=True)
 class Voice:
-    """How espeak-ng shall speak.
+    """The settings of espeak-ng for a speaker.
 
     Attributes:
         name: Voice and variant, such as ``"en-us+f2"``.
@@ -145,8 +144,8 @@ def speak(text: str, voice: Voice) -> Utterance:
     """Speak a sentence; the same text and voice give the same samples every time.
 
     Args:
-        text: What to say, in English.
-        voice: Who says it.
+        text: The sentence, in English.
+        voice: The speaker's voice.
 
     Returns:
         The waveform at 16 kHz and the phonemes with their times.
@@ -172,7 +171,7 @@ def _paths() -> tuple[str, str]:
 
 
 def _is_loaded(library: str) -> bool:
-    """Say whether the library is in this process already; without a way to know, say that it is."""
+    """Whether this process has loaded the library already; True where that cannot be found out."""
     if not hasattr(os, "RTLD_NOLOAD"):
         return True
     try:
@@ -216,11 +215,11 @@ def _speak_here(text: str, voice: Voice) -> tuple[int, bytes, list[tuple[int, st
     try:
         rate = library.espeak_Initialize(_SYNCHRONOUS, 0, data.encode(), _PHONEME_EVENTS_AS_IPA | _DONT_EXIT)
         if rate <= 0:
-            raise FaceDiffError(f"espeak-ng could not be started with its data in {data}: reinstall espeakng-loader")
+            raise FaceDiffError(f"espeak-ng could not be started with its data in {data}; reinstall espeakng-loader")
         # Breathy voices mix noise in, which starts from the clock unless told otherwise.
         library.espeak_ng_SetRandSeed(ctypes.c_long(_NOISE_SEED))
         if library.espeak_SetVoiceByName(voice.name.encode()) != 0:
-            raise FaceDiffError(f"espeak-ng knows no voice {voice.name!r}: use one like 'en-us+f2'")
+            raise FaceDiffError(f"espeak-ng knows no voice {voice.name!r}; use one like 'en-us+f2'")
         library.espeak_SetSynthCallback(callback)
         for parameter, value in (
             (_RATE, voice.rate),
@@ -239,7 +238,7 @@ def _speak_here(text: str, voice: Voice) -> tuple[int, bytes, list[tuple[int, st
 
 
 def _speak_elsewhere(text: str, voice: Voice) -> tuple[int, bytes, list[tuple[int, str]]]:
-    """Speak in a fresh interpreter."""
+    """Speak in a new interpreter."""
     request = json.dumps([text, voice.name, voice.rate, voice.pitch, voice.pitch_range])
     done = subprocess.run(  # noqa: S603 - this very interpreter, no outside input
         [sys.executable, "-m", "facediff.synthetic.speech"],
@@ -268,7 +267,7 @@ def _finish(rate: int, pcm: bytes, events: list[tuple[int, str]]) -> Utterance:
 
     native = np.frombuffer(pcm, dtype="<i2").astype(np.float32) / 32768.0
     if native.size == 0:
-        raise FaceDiffError("espeak-ng spoke nothing: give it a text with words")
+        raise FaceDiffError("espeak-ng returned no samples; give it a text with words")
     samples = soxr.resample(native, rate, SAMPLE_RATE, quality="HQ").astype(np.float32)
     end = native.size / rate
     starts = [min(sample / rate, end) for sample, _ in events]
@@ -283,8 +282,8 @@ def _finish(rate: int, pcm: bytes, events: list[tuple[int, str]]) -> Utterance:
 def _with_closures(phonemes: list[Phoneme]) -> list[Phoneme]:
     """Give voiceless plosives their silent closure.
 
-    espeak-ng starts p, t, k and ch at the burst and counts the silence before it, in which the lips or the
-    tongue are shut already, to the sound before.
+    In espeak-ng p, t, k and ch start at the burst. The silence before it, in which the lips or the tongue are shut
+    already, belongs to the previous sound there.
     """
     result: list[Phoneme] = []
     for phoneme in phonemes:
