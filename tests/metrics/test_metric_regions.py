@@ -102,7 +102,7 @@ def test_weights_above_a_threshold(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("0.1\nx\n", "entry 2 is 'x'; expected one finite weight a line"),
+        ("0.1\nx\n", "entry 2 is 'x'; expected one finite weight"),
         ("0.1\nnan", "entry 2 is 'nan'"),
         ("0.1,0.2", "entry 1 is '0.1,0.2'"),
         ("0.1\n0.2", "none of the 2 weights is above 0.5; lower it"),
