@@ -52,7 +52,7 @@ def facediff(site: Path, *commands: list[str]) -> str:
         [sys.executable, "-c", program, json.dumps(commands)],
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=500,
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
     )
@@ -78,7 +78,9 @@ def test_an_installed_decoder_is_chosen_by_name(site: Path) -> None:
     assert "reach: 2" in printed
 
 
-def test_an_installed_model_trains_tests_animates_and_exports(site: Path, tiny_root: Path, tmp_path: Path) -> None:
+def test_an_installed_model_is_trained_scored_animated_exported_and_adapted(
+    site: Path, tiny_root: Path, tmp_path: Path
+) -> None:
     """A model and a corpus of a package, from training to a file in the package's own format."""
     trainer = [
         "--trainer.accelerator=cpu",
@@ -89,6 +91,8 @@ def test_an_installed_model_trains_tests_animates_and_exports(site: Path, tiny_r
     fit += ["--data=ThreeSpeakers", f"--data.root={tiny_root}", "--trainer.max_epochs=3"]
     checkpoint = tmp_path / "fit" / "version_0" / "checkpoints" / "epoch=2-step=24.ckpt"
     speech, archive, boxes = (tmp_path / f"speech.{suffix}" for suffix in ("wav", "npz", "bounds"))
+    predictions, scores = tmp_path / "predict" / "version_0" / "predictions", tmp_path / "scores.json"
+    adapted, adapt = tmp_path / "C.ckpt", ["--train", "person", "--epochs", "1", "--accelerator", "cpu", "--quiet"]
     soundfile.write(speech, np.random.default_rng(0).normal(0, 0.1, 12 * 16_000), 16_000)
     printed = facediff(
         site,
@@ -97,6 +101,9 @@ def test_an_installed_model_trains_tests_animates_and_exports(site: Path, tiny_r
         # Twelve seconds: longer than what is animated in one pass.
         ["animate", str(speech), "--checkpoint", str(checkpoint), "--identity", "C", "-o", str(archive), "--quiet"],
         ["export", str(archive), "-o", str(boxes)],
+        ["predict", "--ckpt_path", str(checkpoint), *trainer],
+        ["evaluate", str(predictions), str(tiny_root), "--metric", "lip_range", "--json", str(scores), "--quiet"],
+        ["adapt", "--checkpoint", str(checkpoint), "--person", "C", "-o", str(adapted), *adapt],
     )
     assert "three_speakers" in printed
     assert "metric lip_range: in each sequence" in printed
@@ -107,6 +114,9 @@ def test_an_installed_model_trains_tests_animates_and_exports(site: Path, tiny_r
     table = np.loadtxt(boxes)
     assert table.shape == (300, 6)
     assert (table[:, :3] < table[:, 3:]).any(1).all()
+    assert len(list(predictions.iterdir())) == 4
+    assert "lip_range" in scores.read_text()
+    assert torch.load(adapted, weights_only=True)["state_dict"]["identity_table.weight"].shape == (3, 16)
 
 
 def test_a_metric_of_its_own_needs_one_short_file() -> None:

@@ -65,6 +65,10 @@ class AutoregressiveTransformer(AnimationModel):
         """One feature per frame."""
         return self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *(batch.cached_features or ()))
 
+    def personal_modules(self) -> list[nn.Module]:
+        """What `facediff adapt --train person` trains."""
+        return [self.identity_table]
+
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Mean squared error of the next frame, with the true frames before it."""
         truth = batch.motion.flatten(2) * self.scale
