@@ -57,7 +57,7 @@ class FileOptions:
     truth_stride: Annotated[int | None, Option(metavar="N", least=1)] = None
     unit: Annotated[str | None, Option(metavar="U")] = None
 
-    def gather(self, predictions: str, truth: Path, page: PageOptions, output: Path) -> tuple[Paper, Material]:
+    def gather(self, predictions: str, truth: Path, page: PageOptions) -> tuple[Paper, Material]:
         """The page and what is drawn on it.
 
         Raises:
@@ -68,7 +68,7 @@ class FileOptions:
         check_folders(methods)
         if not truth.is_dir() and str(truth) != "puppet":
             raise FaceDiffError(f"{truth}: no such folder; expected a corpus, a folder of truths, or puppet")
-        paper = page.paper(output)
+        paper = page.paper()
         from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN
         from facediff.evaluation.figures.gather import gather
 
@@ -93,16 +93,18 @@ class PageOptions:
     """Page.
 
     Attributes:
+        output: .png, .pdf or .svg
         width: mm; 175 fills a page, 85 a column
         dpi: pixels an inch
         font: an installed font; DejaVu Sans has the IPA
     """
 
+    output: Output
     width: Annotated[float, Option(metavar="MM")] = 175.0
     dpi: Annotated[int, Option(metavar="N")] = 300
     font: Annotated[str, Option(metavar="NAME")] = "DejaVu Sans"
 
-    def paper(self, output: Path) -> Paper:
+    def paper(self) -> Paper:
         """The page, after a check that the figure can be written.
 
         Raises:
@@ -112,7 +114,7 @@ class PageOptions:
         from facediff.evaluation.figures.page import check_output, matplotlib
 
         matplotlib()
-        check_output(output)
+        check_output(self.output)
         return Paper(self.width, self.dpi, self.font)
 
 
@@ -120,7 +122,6 @@ def frames(
     predictions: Predictions,
     truth: Truth,
     *,
-    output: Output,
     clip: Clip = None,
     times: Annotated[list[float] | None, Option(metavar="SECONDS", many=True)] = None,
     phonemes: Annotated[list[str] | None, Option(metavar="IPA", many=True)] = None,
@@ -137,7 +138,6 @@ def frames(
     Args:
         predictions: folder of predictions, or NAME=FOLDER
         truth: corpus folder, folder of truths, or puppet
-        output: .png, .pdf or .svg
         clip: <subject>_<sentence> (default: the first that all have)
         times: columns by time
         phonemes: columns by phoneme or viseme; m:2 is the clip's second /m/
@@ -151,7 +151,7 @@ def frames(
     """
     if bool(times) == bool(phonemes):
         raise FaceDiffError("choose what the columns show, with either --times or --phonemes")
-    paper, material = files.gather(predictions, truth, page, output)
+    paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import Moment, draw_frames, find_phoneme
     from facediff.evaluation.figures.gather import phonemes_of
 
@@ -173,15 +173,14 @@ def frames(
 
         folder = regions or (material.corpus / "regions" if material.corpus else None)
         region = read_region("lips", material.n_vertices, folder=folder, source=lips).indices
-    draw_frames(material, chosen, moments, output, paper=paper, view=view, region=region)
-    report(output)
+    draw_frames(material, chosen, moments, page.output, paper=paper, view=view, region=region)
+    report(page.output)
 
 
 def heatmap(
     predictions: Predictions,
     truth: Truth,
     *,
-    output: Output,
     clips: Clips = None,
     highest_mean: Highest = None,
     highest_std: Highest = None,
@@ -194,7 +193,6 @@ def heatmap(
     Args:
         predictions: folder of predictions, or NAME=FOLDER
         truth: corpus folder, folder of truths, or puppet
-        output: .png, .pdf or .svg
         clips: clips to count (default: all that truth and methods have)
         highest_mean: end of the mean's scale in the unit shown
         highest_std: end of the standard deviation's scale
@@ -202,18 +200,17 @@ def heatmap(
         files: what is drawn.
         page: how it is printed.
     """
-    paper, material = files.gather(predictions, truth, page, output)
+    paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_heatmap
 
     chosen, highest = material.choose(clips), (highest_mean, highest_std)
-    report(output, draw_heatmap(material, chosen, output, paper=paper, view=view, highest=highest))
+    report(page.output, draw_heatmap(material, chosen, page.output, paper=paper, view=view, highest=highest))
 
 
 def error(
     predictions: Predictions,
     truth: Truth,
     *,
-    output: Output,
     clips: Clips = None,
     statistic: Literal["mean", "max", "both"] = "mean",
     highest_mean: Highest = None,
@@ -227,7 +224,6 @@ def error(
     Args:
         predictions: folder of predictions, or NAME=FOLDER
         truth: corpus folder, folder of truths, or puppet
-        output: .png, .pdf or .svg
         clips: clips to count (default: all that truth and methods have)
         statistic: over frames
         highest_mean: end of the mean's scale in the unit shown
@@ -236,26 +232,25 @@ def error(
         files: what is drawn.
         page: how it is printed.
     """
-    paper, material = files.gather(predictions, truth, page, output)
+    paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_error
 
     notes = draw_error(
         material,
         material.choose(clips),
-        output,
+        page.output,
         paper=paper,
         view=view,
         statistic=statistic,
         highest=(highest_mean, highest_max),
     )
-    report(output, notes)
+    report(page.output, notes)
 
 
 def lips(
     predictions: Predictions,
     truth: Truth,
     *,
-    output: Output,
     clip: Clip = None,
     lip_pairs: Annotated[str | None, Option(metavar="FILE")] = None,
     audio: File = None,
@@ -269,7 +264,6 @@ def lips(
     Args:
         predictions: folder of predictions, or NAME=FOLDER
         truth: corpus folder, folder of truths, or puppet
-        output: .png, .pdf or .svg
         clip: <subject>_<sentence> (default: the first that all have)
         lip_pairs: pairs of upper and lower lip vertices (default: the corpus's)
         audio: the clip's speech (default: the corpus's)
@@ -278,7 +272,7 @@ def lips(
         files: what is drawn.
         page: how it is printed.
     """
-    paper, material = files.gather(predictions, truth, page, output)
+    paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import Sound, draw_lips, opening_curves, read_pairs
     from facediff.evaluation.figures.gather import phonemes_of, sound_of
 
@@ -290,14 +284,13 @@ def lips(
         notes.append(f"there is no sound of {chosen}; give --audio to have its waveform")
     phonemes = phonemes_of(material, chosen, phoneme_file)
     sound = Sound(phonemes=phonemes) if samples is None else Sound(samples, phonemes=phonemes)
-    draw_lips(curves, sound, output, paper=paper, scale=material.scale, span=span, remark=material.remark)
-    report(output, notes)
+    draw_lips(curves, sound, page.output, paper=paper, scale=material.scale, span=span, remark=material.remark)
+    report(page.output, notes)
 
 
 def training(
     runs: Annotated[list[str], Option(metavar="RUN")],
     *,
-    output: Output,
     scalar: Annotated[list[str] | None, Option(metavar="NAME")] = None,
     smooth: Annotated[float, Option(metavar="W")] = 0.0,
     log: bool = False,
@@ -308,7 +301,6 @@ def training(
 
     Args:
         runs: run folder with metrics.csv, or NAME=FOLDER
-        output: .png, .pdf or .svg
         scalar: such as val/lve, repeatable (default: train/loss, val/lve)
         smooth: weight of the past, 0 to below 1
         log: logarithmic values
@@ -319,13 +311,13 @@ def training(
     for folder in folders.values():
         if not folder.exists():
             raise FaceDiffError(f"{folder / 'metrics.csv'}: no such file; expected the folder of a run")
-    paper = page.paper(output)
+    paper = page.paper()
     from facediff.evaluation.figures import choose_scalars, draw_training, find_gaps, find_metrics, read_curves
 
     curves = {name: read_curves(find_metrics(folder), x) for name, folder in folders.items()}
     scalars = choose_scalars(curves, scalar)
-    draw_training(curves, scalars, output, paper=paper, axis=x, smoothing=smooth, log=log)
-    report(output, find_gaps(curves, scalars, log=log))
+    draw_training(curves, scalars, page.output, paper=paper, axis=x, smoothing=smooth, log=log)
+    report(page.output, find_gaps(curves, scalars, log=log))
 
 
 def report(output: Path, notes: Sequence[str] = ()) -> None:

@@ -153,7 +153,7 @@ def test_the_mean_of_several_clips(second: Path, tmp_path: Path) -> None:
     ("words", "said"),
     [
         (["--person", "A"], "the checkpoint knows A"),
-        (["--person", "nobody"], "neither a person's folder nor a subject"),
+        (["--person", "nobody"], "neither a person's folder"),
         (["--person", "C", "-o", "out.pt"], "ends in .ckpt"),
         (["--person", "C", "--epochs", "0"], "--epochs 0"),
         (["--person", "C", "--data-root", "nowhere"], "nowhere"),

@@ -88,7 +88,7 @@ def gather(corpus: Path, *more: str) -> Material:
     """What the command finds by its options."""
     words = [str(corpus.parent / "ours"), str(corpus), "-o", "a.png", *more]
     given = arguments_of(load("figure heatmap"), "facediff figure heatmap", words)
-    material: Material = given["files"].gather(given["predictions"], given["truth"], given["page"], given["output"])[1]
+    material: Material = given["files"].gather(given["predictions"], given["truth"], given["page"])[1]
     return material
 
 
@@ -269,7 +269,7 @@ def test_documented_commands_parse(page: str) -> None:
     assert len(lines) >= 3
     for line in lines:
         figure, *rest = shlex.split(line)
-        assert arguments_of(load(f"figure {figure}"), "", rest)["output"]
+        assert arguments_of(load(f"figure {figure}"), "", rest)["page"].output
     if page != "README.md":
         assert {shlex.split(line)[0] for line in lines} == {
             name.split()[1] for name in COMMANDS if name.startswith("figure ")
