@@ -52,7 +52,7 @@ def print_table(
     try:
         from rich.console import Console
     except ImportError as error:
-        raise MissingExtraError("rich", "train", "printing tables") from error
+        raise MissingExtraError("rich", "cli", "printing tables") from error
     console = Console(file=stream, highlight=False)
     if not console.is_terminal:
         console = Console(file=stream, highlight=False, width=UNLIMITED, color_system=None)

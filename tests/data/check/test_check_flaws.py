@@ -42,7 +42,7 @@ from tests.fakes.tiny import VERTICES, write_tiny
 
 @pytest.fixture(scope="module")
 def sound_corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny(tmp_path_factory.mktemp("doctor") / "tiny")
+    return write_tiny(tmp_path_factory.mktemp("check") / "tiny")
 
 
 @pytest.fixture
