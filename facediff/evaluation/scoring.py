@@ -124,7 +124,7 @@ class Scorer:
             except ValueError as error:
                 raise FaceDiffError(f"protocol {protocol.name}: {error}") from error
             self.remarks += [remark for remark in built.summary().remarks if remark not in self.remarks]
-            for name, metric in cast(Sequence[tuple[str, SequenceMetric]], built.items(copy_state=False)):
+            for name, metric in built.scores().items():
                 self._add(protocol, name, metric)
         self.needs_template = any(isinstance(metric, FaceDynamicsDeviation) for metric in self.metrics.values())
         if self.needs_template and not templates:

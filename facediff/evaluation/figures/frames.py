@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from facediff.data.phonemes import LENGTH, STRESS, Phoneme
-from facediff.data.phonemes import phonemes_file as phonemes_file
 from facediff.errors import FaceDiffError, choices
 from facediff.evaluation.figures.material import Array, Material, Painter
 from facediff.evaluation.figures.page import Grid, Heading, Paper, check_output, save, style
