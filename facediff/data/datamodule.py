@@ -1,6 +1,6 @@
 """The base of all corpora's data modules: options, splits, style references, loaders, and what a checkpoint keeps.
 
-A corpus adds its facts (class attributes) and says which clip belongs to which split.
+A corpus adds its facts (class attributes) and decides which clip belongs to which split.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Split = Literal["train", "val", "test_a", "test_b"]
 class SpeechMotionDataModule(LightningDataModule, ABC):
     """Speech with motion for training, validation and two tests: seen speakers (test A) and unseen ones (test B).
 
-    A corpus subclasses this, states the facts below and says which clips belong to a split. Options of its own go into
+    A corpus subclasses this, states the facts below and decides which clips belong to a split. Options of its own go into
     a constructor that passes the others on::
 
         def __init__(self, *, seed: int = 0, **options: Any) -> None:

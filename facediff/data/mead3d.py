@@ -24,7 +24,7 @@ EMOTIONAL_SENTENCES = {"train": range(1, 25), "val": range(25, 28), "test_a": ra
 class Mead3D(SpeechMotionDataModule):
     """3DMEAD as vertices, from EMOTE's reconstructions or in ProbTalk3D's layout.
 
-    25 frames a second, FLAME topology (5 023 vertices, metres), 47 speakers, eight emotions at three intensities; the
+    25 frames per second, FLAME topology (5 023 vertices, metres), 47 speakers, eight emotions at three intensities; the
     clip attributes are ``emotion`` and ``intensity``, and style references share the emotion of their target.
 
     Args:

@@ -29,7 +29,7 @@ def built_in_mesh() -> Mesh:
 class Puppet(SpeechMotionDataModule):
     """The built-in corpus: a face made by code that speaks with a real speech synthesiser; made on first use.
 
-    Synthetic: scores on it say nothing about real people. Eight speakers, 25 frames a second, metres; sentences
+    Synthetic: scores on it say nothing about real people. Eight speakers, 25 frames per second, metres; sentences
     1–24 train, 25–27 validate, 28–32 test six seen speakers (test A) and two unseen ones (test B).
 
     Args:

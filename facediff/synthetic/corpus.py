@@ -146,15 +146,15 @@ def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, 
         The waveform at 16 kHz, shape (640 T,); rig weights, shape (T, controls); and the phonemes in time.
     """
     speaker = SPEAKERS[clip.identity]
-    said = speak(SENTENCES[clip.number - 1], speaker.voice)
+    spoken = speak(SENTENCES[clip.number - 1], speaker.voice)
     before = round(_QUIET_BEFORE * SAMPLE_RATE)
-    length = before + said.samples.size + round(_QUIET_AFTER * SAMPLE_RATE)
+    length = before + spoken.samples.size + round(_QUIET_AFTER * SAMPLE_RATE)
     frames = round(length / _SAMPLES_PER_FRAME)
-    samples = np.zeros(max(frames * _SAMPLES_PER_FRAME, before + said.samples.size), dtype=np.float32)
-    samples[before : before + said.samples.size] = said.samples * (_PEAK / np.abs(said.samples).max())
+    samples = np.zeros(max(frames * _SAMPLES_PER_FRAME, before + spoken.samples.size), dtype=np.float32)
+    samples[before : before + spoken.samples.size] = spoken.samples * (_PEAK / np.abs(spoken.samples).max())
     samples = samples[: frames * _SAMPLES_PER_FRAME]
     end = frames / FRAME_RATE
-    phonemes = _in_quiet(said.phonemes, before / SAMPLE_RATE, end)
+    phonemes = _in_quiet(spoken.phonemes, before / SAMPLE_RATE, end)
     random = np.random.default_rng([seed, list(SPEAKERS).index(clip.identity), clip.number])
     weights = generate_weights(
         segments_of(phonemes), analyse(samples, SAMPLE_RATE), frames, speaker.style, clip.mood, random

@@ -182,7 +182,7 @@ def _add_eyeball(half: HalfMesh) -> None:
 
 
 def _add_ear(half: HalfMesh) -> None:
-    """A shell beside the head: rim, hollow and lobe."""
+    """A shell next to the head: rim, hollow and lobe."""
     turn = -2.0 * np.pi * np.arange(8) / 8.0
     # Outline in the ear's own plane, (backwards, up) in mm.
     outline = np.stack([-16.0 * np.sin(turn) * (1.0 + 0.18 * np.cos(turn)), 30.0 * np.cos(turn)], axis=1)
@@ -203,7 +203,7 @@ def _add_ear(half: HalfMesh) -> None:
 
 
 def _beside_head(flat: Array, out: Array) -> Array:
-    """Turn (backwards, up) and a distance outwards, in mm, into a place beside the head."""
+    """Turn (backwards, up) and a distance outwards, in mm, into a place next to the head."""
     tilt, flare = np.deg2rad(-12.0), np.deg2rad(24.0)
     back = flat[:, 0] * np.cos(tilt) - flat[:, 1] * np.sin(tilt)
     up = flat[:, 0] * np.sin(tilt) + flat[:, 1] * np.cos(tilt)
@@ -546,7 +546,7 @@ def _nose(x: Array, y: Array) -> Array:
 
 
 def _smile_fold(x: Array, y: Array) -> Array:
-    """Slight fold from the wing of the nose to beside the mouth."""
+    """Slight fold from the wing of the nose to the side of the mouth."""
     along = np.clip((-14.0 - y) / 34.0, 0.0, 1.0)
     beside = x - (20.0 + 13.0 * along)
     fade = rise(y, -58.0, -40.0) * rise(y, -8.0, -20.0)

@@ -216,7 +216,7 @@ def _speak_here(text: str, voice: Voice) -> tuple[int, bytes, list[tuple[int, st
         rate = library.espeak_Initialize(_SYNCHRONOUS, 0, data.encode(), _PHONEME_EVENTS_AS_IPA | _DONT_EXIT)
         if rate <= 0:
             raise FaceDiffError(f"espeak-ng could not be started with its data in {data}; reinstall espeakng-loader")
-        # Breathy voices mix noise in, which starts from the clock unless told otherwise.
+        # Breathy voices mix noise in, which is seeded by the clock unless a seed is set.
         library.espeak_ng_SetRandSeed(ctypes.c_long(_NOISE_SEED))
         if library.espeak_SetVoiceByName(voice.name.encode()) != 0:
             raise FaceDiffError(f"espeak-ng knows no voice {voice.name!r}; use one like 'en-us+f2'")

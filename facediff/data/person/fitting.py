@@ -96,12 +96,12 @@ def read_auxiliary(root: Path, *, name: str, frame_rate: float | None) -> Auxili
     )
 
 
-def _frame_rate(root: Path, told: object, given: float | None) -> float:
-    known = float(told) if isinstance(told, int | float) and math.isfinite(told) and told > 0 else None
+def _frame_rate(root: Path, stored: object, given: float | None) -> float:
+    known = float(stored) if isinstance(stored, int | float) and math.isfinite(stored) and stored > 0 else None
     if known is None and given is None:
         raise FaceDiffError(f"{root}: has no manifest.json with its frame rate; add --corpus-frame-rate")
     if known is not None and given is not None and abs(known - given) > 1e-6:
-        raise FaceDiffError(f"--corpus-frame-rate {given:g}: {root / 'manifest.json'} says {known:g}; omit the option")
+        raise FaceDiffError(f"--corpus-frame-rate {given:g}: {root / 'manifest.json'} records {known:g}; omit the option")
     return known if known is not None else float(given or 0)
 
 
@@ -327,7 +327,7 @@ def choose_neutral(
         made: the same without head motion.
         given: a template, or None.
         speech: (S,) at 16 kHz.
-        frame_rate: frames a second.
+        frame_rate: frames per second.
 
     Raises:
         FaceDiffError: if the template that was given does not fit the frames.
