@@ -41,8 +41,8 @@ Split = Literal["train", "val", "test_a", "test_b"]
 class SpeechMotionDataModule(LightningDataModule, ABC):
     """Speech with motion for training, validation and two tests: seen speakers (test A) and unseen ones (test B).
 
-    A corpus subclasses this, states the facts below and decides which clips belong to a split. Options of its own go into
-    a constructor that passes the others on::
+    A corpus subclasses this, states the facts below and decides which clips belong to a split. Options of its own go
+    into a constructor that passes the others on::
 
         def __init__(self, *, seed: int = 0, **options: Any) -> None:
             super().__init__(**options)

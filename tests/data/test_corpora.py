@@ -346,7 +346,7 @@ def test_a_persons_table_may_come_from_a_spreadsheet_but_must_name_splits(tmp_pa
         MiniBiwi(root=str(root), people=[str(person)]).clips("val")
 
 
-def test_a_person_with_one_clip_is_told_before_training(tmp_path: Path) -> None:
+def test_a_speaker_with_one_clip_is_reported_before_training(tmp_path: Path) -> None:
     root = write(tmp_path / "biwi", ["F2_e01", "F2_e02"], {"F2"})
     person = write_person(tmp_path / "ada")
     for number in (2, 3, 4):

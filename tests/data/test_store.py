@@ -36,7 +36,7 @@ def test_keys_tell_their_parts_apart(store: ArrayStore) -> None:
 
 
 @pytest.mark.parametrize("keep", [0, 60, 200])
-def test_a_half_written_file_is_said_and_made_anew(store: ArrayStore, keep: int) -> None:
+def test_a_half_written_file_is_reported_and_made_again(store: ArrayStore, keep: int) -> None:
     store.put("abc", np.zeros(100))
     path = store.path("abc")
     path.write_bytes(path.read_bytes()[:keep])
@@ -46,7 +46,7 @@ def test_a_half_written_file_is_said_and_made_anew(store: ArrayStore, keep: int)
     assert np.array_equal(store.get("abc"), np.ones(100))
 
 
-def test_a_place_that_cannot_be_written_is_said_once(tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_written_is_reported_once(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     store = ArrayStore(tmp_path / "file" / "cache")
     with pytest.warns(UserWarning, match="going on without the cache"):

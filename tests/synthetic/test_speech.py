@@ -82,7 +82,7 @@ def test_sentences_use_every_mouth_shape_and_are_all_different() -> None:
     assert used == set(VISEMES)
 
 
-def test_unknown_voice_and_missing_package_are_told_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_voice_and_missing_package_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(FaceDiffError, match="no voice 'nobody'"):
         speech.speak("Hello.", speech.Voice("nobody", 150, 50, 50))
     monkeypatch.setitem(__import__("sys").modules, "espeakng_loader", None)

@@ -101,7 +101,7 @@ def _frame_rate(root: Path, stored: object, given: float | None) -> float:
     if known is None and given is None:
         raise FaceDiffError(f"{root}: has no manifest.json with its frame rate; add --corpus-frame-rate")
     if known is not None and given is not None and abs(known - given) > 1e-6:
-        raise FaceDiffError(f"--corpus-frame-rate {given:g}: {root / 'manifest.json'} records {known:g}; omit the option")
+        raise FaceDiffError(f"--corpus-frame-rate {given:g}: {root / 'manifest.json'} has {known:g}; omit the option")
     return known if known is not None else float(given or 0)
 
 

@@ -227,7 +227,7 @@ def test_a_person_s_size_is_kept_and_another_unit_is_not(files: Path, tmp_path: 
     assert factors == pytest.approx({"big": 1.1, "odd": 1.0, "told": 3.7 * 0.5}, rel=1e-4)
 
 
-def test_missing_frames_are_filled_and_told(
+def test_missing_frames_are_filled_and_reported(
     files: Path, tmp_path: Path, known: Person, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = write_objs(tmp_path / "motion", known.seen[:90])
