@@ -103,7 +103,8 @@ def find(words: Sequence[str]) -> tuple[str, list[str]]:
     if first in COMMANDS:
         return first, rest
     if first not in GROUPS:
-        raise FaceDiffError(f'there is no command "{first}": {choices(first, [*GROUPS, *COMMANDS])}')
+        known = list(dict.fromkeys(name.partition(" ")[0] for name in COMMANDS))
+        raise FaceDiffError(f'there is no command "{first}": {choices(first, known)}')
     name = f"{first} {rest[0]}"
     if name not in COMMANDS:
         known = [each.partition(" ")[2] for each in COMMANDS if in_group(each, first)]
