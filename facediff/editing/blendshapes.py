@@ -22,8 +22,7 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 CHUNK_BYTES = 32 * 2**20
-STATED_RATE = 30.0
-"""Frames a second for which the smoothness is stated."""
+STATED_RATE = 30.0  # Frames a second for which the smoothness is stated
 
 
 @dataclass(frozen=True)
@@ -262,13 +261,10 @@ def _residuals(animation: Animation, moving: _Moving, values: Array) -> tuple[Ar
 # A box-bounded quadratic program over all frames, solved by projected Newton steps. scipy's bounded solvers either know
 # no banded matrices or stop far from the 1e-8 that is promised for weights; its banded Cholesky solver takes the steps.
 
-SUFFICIENT = 1e-4
-"""Share of the promised decrease that a step must bring (Armijo)."""
+SUFFICIENT = 1e-4  # Share of the promised decrease that a step must bring (Armijo)
 SHORTEST = 1e-12
-NEAR = 1e-3
-"""How near a bound counts as on it, at most; less near the solution."""
-JITTER = 1e-10
-"""Added to the diagonal, which is one, of the matrix of a step only: dependent shapes leave it singular."""
+NEAR = 1e-3  # How near a bound counts as on it, at most; less near the solution
+JITTER = 1e-10  # Added to the diagonal, which is one, of the matrix of a step only: dependent shapes leave it singular
 
 
 @dataclass(frozen=True)

@@ -32,37 +32,23 @@ CLOSE, FAR = 0.1, 0.3
 """Distances, as shares of the face's size, from which on motion fades, and from which on a vertex stands still."""
 EXACT = 0.005
 """Nearer than this share of the face's size, the place on the surface is trusted fully if the sheet is right."""
-BADLY = 0.05
-"""A median distance above this share of the face's size is reported as a bad fit."""
+BADLY = 0.05  # A median distance above this share of the face's size is reported as a bad fit
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
-    """Where each vertex of a target mesh lies on a source mesh.
+    """Where each vertex of a target mesh lies on a source mesh."""
 
-    Attributes:
-        corners: (Vt, 3) vertices of the source's triangle.
-        weights: (Vt, 3) their barycentric weights, none negative, which sum to one.
-        similarity: from the source to the target, in the target's unit.
-        distances: (Vt,) between a target vertex and its place on the source after the similarity, target's unit.
-        trust: (Vt,) how well the place is known, 0 to 1; where little, neighbours are averaged.
-        share: (Vt,) how much of the motion is carried, 0 (too far away from anything) to 1.
-        source_vertices: (Vs, 3) the source mesh that this was made for.
-        source_faces: (Fs, 3).
-        target_vertices: (Vt, 3) the target mesh.
-        target_faces: (Ft, 3).
-    """
-
-    corners: Indices
-    weights: Array
-    similarity: Similarity
-    distances: Array
-    trust: Array
-    share: Array
-    source_vertices: Array
-    source_faces: Indices
-    target_vertices: Array
-    target_faces: Indices
+    corners: Indices  # (Vt, 3) vertices of the source's triangle
+    weights: Array  # (Vt, 3) their barycentric weights, none negative, which sum to one
+    similarity: Similarity  # from the source to the target, in the target's unit
+    distances: Array  # (Vt,) between a target vertex and its place on the source after the similarity, target's unit
+    trust: Array  # (Vt,) how well the place is known, 0 to 1; where little, neighbours are averaged
+    share: Array  # (Vt,) how much of the motion is carried, 0 (too far away from anything) to 1
+    source_vertices: Array  # (Vs, 3) the source mesh that this was made for
+    source_faces: Indices  # (Fs, 3)
+    target_vertices: Array  # (Vt, 3) the target mesh
+    target_faces: Indices  # (Ft, 3)
 
     @property
     def fits_badly(self) -> bool:
@@ -189,8 +175,7 @@ def _vertex_by_vertex(source: Surface, target: Surface) -> Correspondence:
     )
 
 
-ROUNDED = 1e-4
-"""Files round coordinates; two places nearer than this share of the mesh's extent are one."""
+ROUNDED = 1e-4  # Files round coordinates; two places nearer than this share of the mesh's extent are one
 
 
 def refuse_other_mesh(
@@ -242,15 +227,11 @@ def _sorted(points: npt.NDArray[np.floating], extent: float) -> Array:
 
 # Step 1: the similarity that aligns two meshes of unknown unit, axes and vertices.
 
-SAMPLES = 400
-"""Vertices of each mesh by which starts are compared."""
-FINE_SAMPLES = 1500
-"""Vertices of the moved mesh by which the alignment is refined."""
+SAMPLES = 400  # Vertices of each mesh by which starts are compared
+FINE_SAMPLES = 1500  # Vertices of the moved mesh by which the alignment is refined
 COARSE_ROUNDS, FINE_ROUNDS = 30, 60
-TRIMMED = 0.8
-"""Share of the nearest pairs that counts, so that a neck or hair that one mesh lacks does not."""
-CLEARLY = 0.9
-"""Another start than the meshes' own axes must fit better by this factor."""
+TRIMMED = 0.8  # Share of the nearest pairs that counts, so that a neck or hair that one mesh lacks does not
+CLEARLY = 0.9  # Another start than the meshes' own axes must fit better by this factor
 SETTLED = 1e-10
 
 
@@ -348,14 +329,10 @@ def _towards_planes(points: Array, goals: Array, normals: Array, weights: Array,
 
 # Step 2: separate pieces of a mesh (teeth, eyes, skin), and which piece of the other mesh each one is.
 
-MOST = 32
-"""So many of the largest pieces are paired; hair may consist of thousands."""
-ALIKE = 1.5
-"""Two pieces differ in size by no more than this factor."""
-NEAR = 1.0
-"""Partners' centres lie no further apart than this share of the smaller one's size."""
-WELD = 1e-6
-"""Vertices nearer than this share of the mesh's size are one: seams of textures do not part a mesh."""
+MOST = 32  # So many of the largest pieces are paired; hair may consist of thousands
+ALIKE = 1.5  # Two pieces differ in size by no more than this factor
+NEAR = 1.0  # Partners' centres lie no further apart than this share of the smaller one's size
+WELD = 1e-6  # Vertices nearer than this share of the mesh's size are one: seams of textures do not part a mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -500,8 +477,7 @@ FACING, AWAY = 0.3, -0.3
 """Cosines between normals from which on two sheets face the same way, and up to which they face away."""
 TIE = 1e-6
 """Of two places whose distances differ by less than this share of a triangle, the one that faces the same way wins."""
-CHUNK_NUMBERS = 4_000_000
-"""Candidate pairs of a point and a triangle that are held in memory at a time, at most."""
+CHUNK_NUMBERS = 4_000_000  # Candidate pairs of a point and a triangle that are held in memory at a time, at most
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,10 @@ from facediff.editing.eyes import Array, Eyes, Indices, smooth_step
 from facediff.editing.procedural import EDITED, noted, room_for
 from facediff.errors import FaceDiffError, choices
 
-ALL = "all"
-"""The name of all vertices that no other name is given for."""
+ALL = "all"  # The name of all vertices that no other name is given for
 FALL_OFF = 0.06
 """Width of a region's soft border, as a share of the face's size (the diagonal of its box): about 2 cm on a head."""
-HIGHEST = 4.0
-"""Motion more than this many times as large does not look like a face's any more."""
+HIGHEST = 4.0  # Motion more than this many times as large does not look like a face's any more
 
 
 def read_factors(words: str) -> dict[str, float]:

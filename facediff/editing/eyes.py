@@ -25,38 +25,29 @@ GIVE = (
     "give --eyes FILE, which says where lids and eyeballs are (docs/animation_controls.md shows one for FLAME and for "
     "any mesh)"
 )
-STILL = 0.01
-"""Vertices that a blink moves by less than this share of its largest way are left alone."""
-MEET = 0.12
-"""Where the lids meet, from the lower (0) to the upper edge (1): the lower lid hardly rises in a blink."""
+STILL = 0.01  # Vertices that a blink moves by less than this share of its largest way are left alone
+MEET = 0.12  # Where the lids meet, from the lower (0) to the upper edge (1): the lower lid hardly rises in a blink
 AHEAD = 0.025
 """The shut upper lid lies further out by this share of the eye's width: its way is straight, the eyeball is round."""
-REACH = 0.4
-"""How far from the edges the skin follows, as a share of the eye's width."""
+REACH = 0.4  # How far from the edges the skin follows, as a share of the eye's width
 KEYS = ("neutral", "blinks", "lids", "eyeballs")
-PLAUSIBLE = (0.002, 0.2)
-"""The largest way of a lid, as a share of the face's size (the diagonal of its box)."""
-SAME_FACE = 1e-3
-"""Metres that a face may differ from a puppet's to count as that puppet's."""
+PLAUSIBLE = (0.002, 0.2)  # The largest way of a lid, as a share of the face's size (the diagonal of its box)
+SAME_FACE = 1e-3  # Metres that a face may differ from a puppet's to count as that puppet's
 
 
 @dataclass(frozen=True, eq=False)
 class Eyes:
     """The eyes of a face.
 
-    Attributes:
-        closing: (V, 3) way from open to shut lids, in the face's unit; zero wherever a blink moves nothing. None if it
-            is not known.
-        eyeballs: vertices of each eyeball.
-        source: who says so, for messages.
-
     Raises:
         FaceDiffError: if the closing moves nothing or is not finite, or an eyeball is no set of four vertices or more.
     """
 
+    # (V, 3) way from open to shut lids, in the face's unit; zero wherever a blink moves nothing. None if it is
+    # not known
     closing: npt.NDArray[np.float32] | None
-    eyeballs: tuple[Indices, ...]
-    source: str
+    eyeballs: tuple[Indices, ...]  # vertices of each eyeball
+    source: str  # who says so, for messages
 
     def __post_init__(self) -> None:
         if self.closing is not None and not (np.isfinite(self.closing).all() and self.closing.any()):

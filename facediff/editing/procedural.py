@@ -18,10 +18,8 @@ from facediff.editing.eyes import GIVE, Array, Eyes, smooth_step
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import rotations
 
-PROCEDURAL = "procedural"
-"""Metadata key: what was added by rules."""
-EDITED = "edited"
-"""Metadata key: how the animation's own motion was changed."""
+PROCEDURAL = "procedural"  # Metadata key: what was added by rules
+EDITED = "edited"  # Metadata key: how the animation's own motion was changed
 SWAYS = "head sway"
 """Name of a swaying head in the metadata; such an animation moves as a whole, so that nothing can be added any more."""
 
@@ -37,17 +35,13 @@ def random_of(layer: Layer, seed: int) -> np.random.Generator:
 # Blinks. How often people blink is from Bentivoglio et al., "Analysis of blink rate patterns in normal subjects",
 # Movement Disorders 12(6), 1997: 17 times a minute at rest, 26 in conversation, 4.5 when reading.
 
-RATE = 17.0
-"""Blinks a minute of somebody at rest."""
+RATE = 17.0  # Blinks a minute of somebody at rest
 RATES = (1.0, 40.0)
 CLOSE, SHUT, OPEN = 0.10, 0.03, 0.20
 """Seconds that the lids take to shut, stay shut, and take to open: about a third of a second, quicker down than up."""
-SPREAD = (0.85, 1.2)
-"""How much shorter and longer than that a blink may be."""
-GAP = 0.15
-"""Seconds from one blink's end to the next one's start at least."""
-DOUBLE = 0.12
-"""Share of blinks that another one follows immediately."""
+SPREAD = (0.85, 1.2)  # How much shorter and longer than that a blink may be
+GAP = 0.15  # Seconds from one blink's end to the next one's start at least
+DOUBLE = 0.12  # Share of blinks that another one follows immediately
 WIDENED = -0.5
 """How far an eye may be open beyond the neutral face, as a share of a closing, so that a blink still shuts it."""
 
@@ -123,15 +117,11 @@ def blink_curve(frames: int, frame_rate: float, *, rate: float = RATE, seed: int
 # Gaze: fixations, and quick turns of both eyes (saccades) between them. A saccade of A degrees takes 21 ms + 2.2 ms · A
 # (Carpenter, "Movements of the Eyes", 1988).
 
-DEGREES_GAZE = 4.0
-"""Default of the largest angle from straight ahead: the eyes wander over a listener's face."""
+DEGREES_GAZE = 4.0  # Default of the largest angle from straight ahead: the eyes wander over a listener's face
 WIDEST_GAZE = 20.0
-AHEAD_SECONDS, ASIDE_SECONDS = 1.6, 0.6
-"""Mean duration of a fixation straight ahead, and elsewhere."""
-SHORTEST = 0.2
-"""Seconds between saccades at least."""
-UPWARDS = 0.5
-"""The eyes turn up and down less than sideways."""
+AHEAD_SECONDS, ASIDE_SECONDS = 1.6, 0.6  # Mean duration of a fixation straight ahead, and elsewhere
+SHORTEST = 0.2  # Seconds between saccades at least
+UPWARDS = 0.5  # The eyes turn up and down less than sideways
 LIDS_PER_DEGREE = 0.012
 """How far the lids close with each degree that the eyes look down, as a share of a full closing (up: they open)."""
 
@@ -230,18 +220,13 @@ def sphere_centre(points: npt.NDArray[np.floating]) -> Array:
 
 # Head sway: slow, small rotations and shifts of the whole head.
 
-DEGREES_SWAY = 2.0
-"""Default of the largest rotation."""
+DEGREES_SWAY = 2.0  # Default of the largest rotation
 WIDEST_SWAY = 15.0
-BAND = (0.08, 0.6)
-"""Hertz: slower sway cannot be seen, and faster sway looks like a tremor."""
+BAND = (0.08, 0.6)  # Hertz: slower sway cannot be seen, and faster sway looks like a tremor
 WAVES = 6
-AXES = np.array([0.7, 1.0, 0.5])
-"""How much of the rotation is nodding, shaking and tilting."""
-SHIFT = 0.004
-"""Largest shift for each degree of rotation, as a share of the head's height: about a millimetre."""
-AT_REST = 1.0
-"""Seconds over which the sway begins and ends."""
+AXES = np.array([0.7, 1.0, 0.5])  # How much of the rotation is nodding, shaking and tilting
+SHIFT = 0.004  # Largest shift for each degree of rotation, as a share of the head's height: about a millimetre
+AT_REST = 1.0  # Seconds over which the sway begins and ends
 
 
 def add_sway(animation: Animation, *, degrees: float = DEGREES_SWAY, seed: int = 0) -> Animation:
@@ -303,8 +288,7 @@ def _largest(vectors: Array, size: float) -> Array:
 
 # What all changes to an animation have in common: arrays that may be too large for memory, and a note in the metadata.
 
-CHUNK = 256
-"""Frames that are processed at a time where they are not processed one by one."""
+CHUNK = 256  # Frames that are processed at a time where they are not processed one by one
 
 
 def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -26,11 +26,9 @@ from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
 
-ROUNDS = 20
-"""How often vertices whose place is not well known are averaged with their neighbours."""
+ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20
-SAME_UNIT = 1.4
-"""Named units lie further apart than this factor, and heads differ by less."""
+SAME_UNIT = 1.4  # Named units lie further apart than this factor, and heads differ by less
 
 
 def retarget(

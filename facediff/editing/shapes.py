@@ -103,11 +103,9 @@ ANOTHER_ORDER = 0.3
 ANOTHER_FACE, ENOUGH = 0.01, 8
 """Without a neutral face, so many shapes may have no more than this share of the face's size in common: each moves a
 part of its own, so that their median is the face at rest that they were made from."""
-SAME_SIZE = 1.25
-"""Heads differ by less than this factor; units of length differ by more."""
+SAME_SIZE = 1.25  # Heads differ by less than this factor; units of length differ by more
 SAME_POSE = np.deg2rad(20.0)
-STILL = 1e-6
-"""A shape that moves no vertex by more than this share of the face's size moves nothing."""
+STILL = 1e-6  # A shape that moves no vertex by more than this share of the face's size moves nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,29 +251,17 @@ SUFFIXES = (".obj", ".ply")
 
 @dataclass(frozen=True, eq=False)
 class ShapeFiles:
-    """Shapes as read, whatever their topology, unit and axes.
+    """Shapes as read, whatever their topology, unit and axes."""
 
-    Attributes:
-        path: the folder or the file.
-        first: the file to name where the topology is wrong.
-        names: K names as written.
-        shapes: (K, V, 3) vertices of each shape.
-        neutral: (V, 3) the face at rest; None if there is none.
-        faces: (F, 3) triangles; None if there are none.
-        metric: whether lengths are in metres by definition of the format, as in .glb.
-        rest: name of the file with the face at rest.
-        notes: what was done to the shapes since, a sentence each.
-    """
-
-    path: Path
-    first: Path
-    names: tuple[str, ...]
-    shapes: npt.NDArray[np.floating]
-    neutral: npt.NDArray[np.floating] | None
-    faces: npt.NDArray[np.integer] | None
-    metric: bool = False
-    rest: str = ""
-    notes: tuple[str, ...] = ()
+    path: Path  # the folder or the file
+    first: Path  # the file to name where the topology is wrong
+    names: tuple[str, ...]  # K names as written
+    shapes: npt.NDArray[np.floating]  # (K, V, 3) vertices of each shape
+    neutral: npt.NDArray[np.floating] | None  # (V, 3) the face at rest; None if there is none
+    faces: npt.NDArray[np.integer] | None  # (F, 3) triangles; None if there are none
+    metric: bool = False  # whether lengths are in metres by definition of the format, as in .glb
+    rest: str = ""  # name of the file with the face at rest
+    notes: tuple[str, ...] = ()  # what was done to the shapes since, a sentence each
 
 
 def read_shape_files(path: Path) -> ShapeFiles:

@@ -19,8 +19,7 @@ MEDIAN_TO_SCALE = 1.5382
 """Median length of a 3-D normal vector of unit standard deviation (the Maxwell distribution's median)."""
 TRIALS = 64
 """Random triples for the robust start: with 42 % outliers, every triple holds one only once in ten million times."""
-JUDGES = 256
-"""Points by which the triples' fits are compared."""
+JUDGES = 256  # Points by which the triples' fits are compared
 ITERATIONS = 60
 TOLERANCE = 1e-9
 DEGENERATE = 1e-12
@@ -234,15 +233,11 @@ def _checked(
 
 CHUNK_BYTES = 32 * 2**20
 """Size of the frames that are processed at a time, as float64; processing needs a few times as much."""
-SAMPLE = 64
-"""Frames, evenly spread, from which a sequence's median face and its stable vertices are found."""
-STILLEST = 0.3
-"""Share of the vertices that counts as stable."""
+SAMPLE = 64  # Frames, evenly spread, from which a sequence's median face and its stable vertices are found
+STILLEST = 0.3  # Share of the vertices that counts as stable
 ROUNDS = 10
-AGREED = 0.98
-"""Share of the stable vertices that two rounds must have in common to end the search."""
-ANCHORS = 2000
-"""As many vertices, evenly spread over the list, are enough to align sampled frames with one another."""
+AGREED = 0.98  # Share of the stable vertices that two rounds must have in common to end the search
+ANCHORS = 2000  # As many vertices, evenly spread over the list, are enough to align sampled frames with one another
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,8 @@ from facediff.utils.pickles import StandIn, load_pickle
 
 SHAPES, EXPRESSIONS, JOINTS = 300, 100, 5
 POSE_FEATURES = 9 * (JOINTS - 1)
-JAW = 2
-"""Joints are in this order: root, neck, jaw, left eye, right eye."""
-CHUNK = 32
-"""Frames that are computed at a time: their vertices stay in a processor's cache."""
+JAW = 2  # Joints are in this order: root, neck, jaw, left eye, right eye
+CHUNK = 32  # Frames that are computed at a time: their vertices stay in a processor's cache
 
 Array = npt.NDArray[np.float64]
 Values = npt.NDArray[np.generic]
@@ -171,8 +169,7 @@ def _coefficients(name: str, values: npt.NDArray[np.floating], most: int, dimens
 
 PACKAGES = ("chumpy", "scipy.sparse")
 SPARSE = {f"{kind}_{name}" for kind in ("csc", "csr", "coo") for name in ("matrix", "array")}
-DEEPEST = 16
-"""Objects within objects; a file could hold one that contains itself."""
+DEEPEST = 16  # Objects within objects; a file could hold one that contains itself
 MOST_VERTICES = 1_000_000
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
 HELP = "expected generic_model.pkl of FLAME 2020, from flame.is.tue.mpg.de, as it is distributed"
@@ -180,25 +177,15 @@ HELP = "expected generic_model.pkl of FLAME 2020, from flame.is.tue.mpg.de, as i
 
 @dataclass(frozen=True)
 class FlameArrays:
-    """Content of a model file as plain arrays; V vertices, F triangles.
+    """Content of a model file as plain arrays; V vertices, F triangles."""
 
-    Attributes:
-        template: (V, 3) mean face, in metres.
-        directions: (V, 3, 400) 300 directions of shape, then 100 of expression.
-        pose_directions: (V, 3, 36) correctives, nine for each joint but the root.
-        joint_regressor: (5, V) from vertices to joints.
-        parents: (5,) parent of each joint; −1 for the root.
-        weights: (V, 5) skinning weights.
-        faces: (F, 3) vertex indices.
-    """
-
-    template: npt.NDArray[np.float64]
-    directions: npt.NDArray[np.float64]
-    pose_directions: npt.NDArray[np.float64]
-    joint_regressor: npt.NDArray[np.float64]
-    parents: npt.NDArray[np.int64]
-    weights: npt.NDArray[np.float64]
-    faces: npt.NDArray[np.int32]
+    template: npt.NDArray[np.float64]  # (V, 3) mean face, in metres
+    directions: npt.NDArray[np.float64]  # (V, 3, 400) 300 directions of shape, then 100 of expression
+    pose_directions: npt.NDArray[np.float64]  # (V, 3, 36) correctives, nine for each joint but the root
+    joint_regressor: npt.NDArray[np.float64]  # (5, V) from vertices to joints
+    parents: npt.NDArray[np.int64]  # (5,) parent of each joint; −1 for the root
+    weights: npt.NDArray[np.float64]  # (V, 5) skinning weights
+    faces: npt.NDArray[np.int32]  # (F, 3) vertex indices
 
 
 def read_flame_arrays(path: Path) -> FlameArrays:

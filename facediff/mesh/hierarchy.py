@@ -22,25 +22,17 @@ from facediff.utils.files import atomic, cache_dir
 
 Pooling = Literal["select", "mean"]
 
-VERSION = 1
-"""Part of every key in the cache; to be raised whenever equal input gives another result."""
+VERSION = 1  # Part of every key in the cache; to be raised whenever equal input gives another result
 
 
 @dataclass(frozen=True)
 class Operator:
-    """A sparse linear map from one set of vertices to another, as plain arrays; no row is without an entry.
+    """A sparse linear map from one set of vertices to another, as plain arrays; no row is without an entry."""
 
-    Attributes:
-        rows: (N,) row of each entry, ascending.
-        columns: (N,) column of each entry.
-        weights: (N,) float32, none negative; those of a row sum to one.
-        shape: vertices after and before the map.
-    """
-
-    rows: Indices
-    columns: Indices
-    weights: npt.NDArray[np.float32]
-    shape: tuple[int, int]
+    rows: Indices  # (N,) row of each entry, ascending
+    columns: Indices  # (N,) column of each entry
+    weights: npt.NDArray[np.float32]  # (N,) float32, none negative; those of a row sum to one
+    shape: tuple[int, int]  # vertices after and before the map
 
     def apply(self, values: npt.NDArray[np.floating]) -> Array:
         """The map of values (shape[1], ...) in float64."""
@@ -273,27 +265,18 @@ The simplifier compares errors with thresholds in absolute units that grow from 
 edges of a reduction by four fall some fifteen to thirty passes in, where a threshold is little above the one before
 it; in metres all edges would be below the first threshold, and would be collapsed in the order of the file.
 """
-AGGRESSION = 7.0
-"""Power of the passes' thresholds; the simplifier's own default."""
+AGGRESSION = 7.0  # Power of the passes' thresholds; the simplifier's own default
 
 
 @dataclass(frozen=True)
 class Coarse:
-    """A mesh with fewer vertices, and its relation to the one that it was made from.
+    """A mesh with fewer vertices, and its relation to the one that it was made from."""
 
-    Attributes:
-        template: (M, 3) positions: those of the chosen vertices, or the clusters' means.
-        faces: (G, 3) vertex indices; no face names a vertex twice and no two faces have the same vertices.
-        clusters: (V,) which coarse vertex each vertex became part of.
-        down: from the V vertices to the M coarse ones.
-        up: from the M coarse vertices to the V ones.
-    """
-
-    template: Array
-    faces: Indices
-    clusters: Indices
-    down: Operator
-    up: Operator
+    template: Array  # (M, 3) positions: those of the chosen vertices, or the clusters' means
+    faces: Indices  # (G, 3) vertex indices; no face names a vertex twice and no two faces have the same vertices
+    clusters: Indices  # (V,) which coarse vertex each vertex became part of
+    down: Operator  # from the V vertices to the M coarse ones
+    up: Operator  # from the M coarse vertices to the V ones
 
 
 def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, pooling: Pooling = "select") -> Coarse:
