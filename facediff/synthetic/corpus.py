@@ -47,17 +47,11 @@ REFERENCE_SENTENCES = tuple(range(1, 25))
 
 @dataclass(frozen=True)
 class Clip:
-    """One clip of the corpus.
+    """One clip of the corpus."""
 
-    Attributes:
-        identity: Who speaks.
-        number: Which sentence, from 1.
-        mood: One of `MOODS`.
-    """
-
-    identity: str
-    number: int
-    mood: str
+    identity: str  # Who speaks
+    number: int  # Which sentence, from 1
+    mood: str  # One of `MOODS`
 
     @property
     def sentence(self) -> str:

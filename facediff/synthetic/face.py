@@ -233,20 +233,14 @@ _NOSE_ROWS: dict[float, tuple[float, ...]] = {
 
 @dataclass(frozen=True)
 class Layout:
-    """The left half of the skin before it is put into space.
+    """The left half of the skin before it is put into space."""
 
-    Attributes:
-        theta: Angle round the head of every point, shape (n,).
-        level: Level of every point, shape (n,).
-        triangles: Indices of points, counter-clockwise, shape (m, 3).
-        rings: Named index lists: ``mouth_0`` (the lips' outer border) to ``mouth_2``, from the upper midline
-            over the corner to the lower midline; ``eye_0`` (the lids' edge) to ``eye_2``, from the inner
-            corner over the upper lid; ``brow`` (middle line of the brow).
-    """
-
-    theta: Array
-    level: Array
-    triangles: NDArray[np.int64]
+    theta: Array  # Angle round the head of every point, shape (n,)
+    level: Array  # Level of every point, shape (n,)
+    triangles: NDArray[np.int64]  # Indices of points, counter-clockwise, shape (m, 3)
+    # Named index lists: `mouth_0` (the lips' outer border) to `mouth_2`, from the upper midline over the corner
+    # to the lower midline; `eye_0` (the lids' edge) to `eye_2`, from the inner corner over the upper lid; `brow`
+    # (middle line of the brow)
     rings: dict[str, list[int]]
 
 

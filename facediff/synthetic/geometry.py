@@ -13,20 +13,13 @@ Faces = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh with named vertices.
+    """A triangle mesh with named vertices."""
 
-    Attributes:
-        vertices: Positions, shape (V, 3).
-        faces: Vertex indices, counter-clockwise seen from outside, shape (F, 3).
-        colours: Red, green, blue of every vertex in 0..255, shape (V, 3), uint8.
-        mirror: Index of the vertex on the other side, shape (V,); its own on the midline.
-        groups: Named lists of vertices of the left half (x >= 0), in the order in which they were made.
-    """
-
-    vertices: Array
-    faces: Faces
-    colours: NDArray[np.uint8]
-    mirror: NDArray[np.int64]
+    vertices: Array  # Positions, shape (V, 3)
+    faces: Faces  # Vertex indices, counter-clockwise seen from outside, shape (F, 3)
+    colours: NDArray[np.uint8]  # Red, green, blue of every vertex in 0..255, shape (V, 3), uint8
+    mirror: NDArray[np.int64]  # Index of the vertex on the other side, shape (V,); its own on the midline
+    # Named lists of vertices of the left half (x >= 0), in the order in which they were made
     groups: dict[str, NDArray[np.int64]]
 
     def both(self, *names: str) -> NDArray[np.int64]:

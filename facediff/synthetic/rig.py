@@ -50,21 +50,14 @@ _SOFT_CONTACT = 0.0004
 
 @dataclass(frozen=True)
 class Rig:
-    """A speaker's head that can be posed.
+    """A speaker's head that can be posed."""
 
-    Attributes:
-        neutral: Vertices at rest in metres, shape (V, 3).
-        fields: Displacement at weight 1 in metres, shape (K, V, 3), in the order of `LINEAR_FIELDS`.
-        upper: Inner border of the upper lip from right to left, shape (C,).
-        lower: Inner border of the lower lip, facing ``upper``, shape (C,).
-        contact: How far each vertex follows the closing of each column of the lips, shape (V, C); negative
-            for the upper lip, which comes down.
-    """
-
-    neutral: Array
-    fields: Array
-    upper: NDArray[np.int64]
-    lower: NDArray[np.int64]
+    neutral: Array  # Vertices at rest in metres, shape (V, 3)
+    fields: Array  # Displacement at weight 1 in metres, shape (K, V, 3), in the order of `LINEAR_FIELDS`
+    upper: NDArray[np.int64]  # Inner border of the upper lip from right to left, shape (C,)
+    lower: NDArray[np.int64]  # Inner border of the lower lip, facing `upper`, shape (C,)
+    # How far each vertex follows the closing of each column of the lips, shape (V, C); negative for the upper
+    # lip, which comes down
     contact: Array
 
     def pose(self, weights: Array) -> Array:
@@ -274,61 +267,33 @@ def _contact(mesh: Mesh, canonical: Array, upper: NDArray[np.int64]) -> Array:
 
 @dataclass(frozen=True)
 class Shape:
-    """How a head differs from the neutral one; every number is about -1 to 1, and 0 changes nothing.
+    """How a head differs from the neutral one; every number is about -1 to 1, and 0 changes nothing."""
 
-    Attributes:
-        width: Whole head wider.
-        length: Lower face longer.
-        depth: Back of the head fuller.
-        jaw: Jaw wider at its angle.
-        chin_width: Chin broader and squarer.
-        chin: Chin longer and further forward.
-        neck: Neck thicker.
-        nose_length: Nose longer downwards.
-        nose_width: Nose broader at its wings.
-        nose_bridge: Bridge higher.
-        nose_tip: Tip further forward.
-        nose_up: Tip turned up.
-        eye_size: Eyes larger.
-        eye_gap: Eyes further apart.
-        eye_tilt: Outer corners higher.
-        brow_height: Brows higher.
-        brow_ridge: Ridge above the eyes stronger.
-        brow_tilt: Outer ends of the brows higher.
-        lips: Lips fuller.
-        mouth_width: Mouth wider.
-        mouth_forward: Mouth further forward.
-        cheekbones: Cheekbones stronger.
-        cheeks: Cheeks fuller.
-        forehead: Forehead higher and rounder.
-        ears: Ears larger and further from the head.
-    """
-
-    width: float = 0.0
-    length: float = 0.0
-    depth: float = 0.0
-    jaw: float = 0.0
-    chin_width: float = 0.0
-    chin: float = 0.0
-    neck: float = 0.0
-    nose_length: float = 0.0
-    nose_width: float = 0.0
-    nose_bridge: float = 0.0
-    nose_tip: float = 0.0
-    nose_up: float = 0.0
-    eye_size: float = 0.0
-    eye_gap: float = 0.0
-    eye_tilt: float = 0.0
-    brow_height: float = 0.0
-    brow_ridge: float = 0.0
-    brow_tilt: float = 0.0
-    lips: float = 0.0
-    mouth_width: float = 0.0
-    mouth_forward: float = 0.0
-    cheekbones: float = 0.0
-    cheeks: float = 0.0
-    forehead: float = 0.0
-    ears: float = 0.0
+    width: float = 0.0  # Whole head wider
+    length: float = 0.0  # Lower face longer
+    depth: float = 0.0  # Back of the head fuller
+    jaw: float = 0.0  # Jaw wider at its angle
+    chin_width: float = 0.0  # Chin broader and squarer
+    chin: float = 0.0  # Chin longer and further forward
+    neck: float = 0.0  # Neck thicker
+    nose_length: float = 0.0  # Nose longer downwards
+    nose_width: float = 0.0  # Nose broader at its wings
+    nose_bridge: float = 0.0  # Bridge higher
+    nose_tip: float = 0.0  # Tip further forward
+    nose_up: float = 0.0  # Tip turned up
+    eye_size: float = 0.0  # Eyes larger
+    eye_gap: float = 0.0  # Eyes further apart
+    eye_tilt: float = 0.0  # Outer corners higher
+    brow_height: float = 0.0  # Brows higher
+    brow_ridge: float = 0.0  # Ridge above the eyes stronger
+    brow_tilt: float = 0.0  # Outer ends of the brows higher
+    lips: float = 0.0  # Lips fuller
+    mouth_width: float = 0.0  # Mouth wider
+    mouth_forward: float = 0.0  # Mouth further forward
+    cheekbones: float = 0.0  # Cheekbones stronger
+    cheeks: float = 0.0  # Cheeks fuller
+    forehead: float = 0.0  # Forehead higher and rounder
+    ears: float = 0.0  # Ears larger and further from the head
 
     def __call__(self, points: Array) -> Array:
         """Deform points of the neutral head.

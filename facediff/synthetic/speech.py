@@ -77,47 +77,29 @@ _CLOSURE = 0.045
 
 @dataclass(frozen=True)
 class Voice:
-    """The settings of espeak-ng for a speaker.
+    """The settings of espeak-ng for a speaker."""
 
-    Attributes:
-        name: Voice and variant, such as ``"en-us+f2"``.
-        rate: Words per minute.
-        pitch: Base pitch, 0 to 100.
-        pitch_range: Liveliness of the melody, 0 (monotone) to 100.
-    """
-
-    name: str
-    rate: int
-    pitch: int
-    pitch_range: int
+    name: str  # Voice and variant, such as `"en-us+f2"`
+    rate: int  # Words per minute
+    pitch: int  # Base pitch, 0 to 100
+    pitch_range: int  # Liveliness of the melody, 0 (monotone) to 100
 
 
 @dataclass(frozen=True)
 class Phoneme:
-    """One phoneme of an utterance.
+    """One phoneme of an utterance."""
 
-    Attributes:
-        start: Where it starts, in seconds.
-        end: Where the next one starts, in seconds.
-        ipa: Its name in the International Phonetic Alphabet, with stress and length marks; empty for a pause.
-    """
-
-    start: float
-    end: float
-    ipa: str
+    start: float  # Where it starts, in seconds
+    end: float  # Where the next one starts, in seconds
+    ipa: str  # Its name in the International Phonetic Alphabet, with stress and length marks; empty for a pause
 
 
 @dataclass(frozen=True)
 class Utterance:
-    """A spoken sentence.
+    """A spoken sentence."""
 
-    Attributes:
-        samples: Waveform at 16 kHz, shape (samples,), float32 in [-1, 1].
-        phonemes: The phonemes in order, without gaps.
-    """
-
-    samples: NDArray[np.float32]
-    phonemes: tuple[Phoneme, ...]
+    samples: NDArray[np.float32]  # Waveform at 16 kHz, shape (samples,), float32 in [-1, 1]
+    phonemes: tuple[Phoneme, ...]  # The phonemes in order, without gaps
 
 
 class _EventId(ctypes.Union):
