@@ -146,7 +146,12 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     # In weights times the root of each shape's energy, the matrix of the problem has ones on its diagonal.
     scale = np.sqrt(moving.energy)
     weighted = moving.deltas * np.repeat(moving.area, 3) / scale[:, None]
-    right, amplitude = _products(animation, moving, weighted)
+    products, square = [], 0.0
+    for _, moved in _displacements(animation, moving):
+        products.append(moved.reshape(len(moved), -1) @ weighted.T)
+        square += float(np.square(moved).sum())
+    right = np.concatenate(products)
+    amplitude = float(np.sqrt(square / (len(animation.vertices) * len(moving.vertices))))
     matrix = weighted @ (moving.deltas / scale[:, None]).T + options.ridge * np.eye(len(scale))
     for left, other in mirror_pairs(tuple(shapes.names[k] for k in moving.places)):
         cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[other] ** 2)
@@ -237,15 +242,6 @@ def _displacements(animation: Animation, moving: _Moving) -> Iterator[tuple[slic
             raise FaceDiffError(f"{animation.name}: frame {bad} holds NaN or infinity; generate the motion again")
         moved = (chunk - np.asarray(animation.template, np.float64))[:, moving.vertices]
         yield slice(first, first + len(chunk)), moved
-
-
-def _products(animation: Animation, moving: _Moving, weighted: Array) -> tuple[Array, float]:
-    """Each frame's products with the weighted shapes (T, K), and the motion's root mean square."""
-    products, square = [], 0.0
-    for _, moved in _displacements(animation, moving):
-        products.append(moved.reshape(len(moved), -1) @ weighted.T)
-        square += float(np.square(moved).sum())
-    return np.concatenate(products), float(np.sqrt(square / (len(animation.vertices) * len(moving.vertices))))
 
 
 def _residuals(animation: Animation, moving: _Moving, values: Array) -> tuple[Array, Array]:

@@ -91,7 +91,12 @@ def correspond(
     """
     source = _checked("source mesh", source_vertices, source_faces)
     target = _checked("target mesh", target_vertices, target_faces)
-    pairs = _checked_landmarks(landmarks, len(source.vertices), len(target.vertices))
+    pairs: Indices = np.zeros((0, 2), np.int64) if landmarks is None else np.asarray(landmarks, np.int64).reshape(-1, 2)
+    for column, (name, count) in enumerate((("source", len(source.vertices)), ("target", len(target.vertices)))):
+        if len(pairs) and not 0 <= pairs[:, column].min() <= pairs[:, column].max() < count:
+            raise FaceDiffError(
+                f"landmarks: name {name} vertex {int(pairs[:, column].max())} of {count}; count vertices from 0"
+            )
     if source.vertices.shape == target.vertices.shape and np.array_equal(source.faces, target.faces):
         return _vertex_by_vertex(source, target)
     if _volume(target) * _volume(source) < 0:  # triangles that run the other way round turn a mesh inside out
@@ -139,16 +144,6 @@ def _checked(name: str, vertices: npt.NDArray[np.floating], faces: npt.NDArray[n
     return Surface(points, corners)
 
 
-def _checked_landmarks(pairs: npt.NDArray[np.integer] | None, sources: int, targets: int) -> Indices:
-    made: Indices = np.zeros((0, 2), np.int64) if pairs is None else np.asarray(pairs, np.int64).reshape(-1, 2)
-    for column, (name, count) in enumerate((("source", sources), ("target", targets))):
-        if len(made) and not 0 <= made[:, column].min() <= made[:, column].max() < count:
-            raise FaceDiffError(
-                f"landmarks: name {name} vertex {int(made[:, column].max())} of {count}; count vertices from 0"
-            )
-    return made
-
-
 def _volume(surface: Surface) -> float:
     """Six times the volume between a surface and its mean; negative where triangles run clockwise seen from outside."""
     a, b, c = (surface.vertices[surface.faces[:, k]] - surface.vertices.mean(axis=0) for k in range(3))
@@ -185,9 +180,7 @@ def refuse_other_mesh(
     expected_vertices: npt.NDArray[np.floating],
     expected_faces: npt.NDArray[np.integer],
 ) -> None:
-    """Compare a mesh with the one that a correspondence was made for.
-
-    Triangles must be equal; vertices may have moved, as another speaker's have.
+    """Require the triangles of the mesh that a correspondence was made for; vertices may have moved.
 
     Raises:
         FaceDiffError: calling the mesh ``name``, if it is another one, or has its vertices or triangles in another
@@ -201,7 +194,9 @@ def refuse_other_mesh(
     if np.array_equal(faces, expected_faces):
         return
     extent = float(np.ptp(expected_vertices, axis=0).max())
-    first, second = (_sorted(points, extent) for points in (vertices, expected_vertices))
+    # Rows in an order that does not depend on that of the vertices, rounding aside.
+    both = (np.asarray(points, np.float64) for points in (vertices, expected_vertices))
+    first, second = (rows[np.lexsort(np.rint(rows / (ROUNDED * extent)).T)] for rows in both)
     if np.abs(first - second).max() > 2 * ROUNDED * extent:
         raise FaceDiffError(
             f"{name}: has as many vertices as the correspondence's mesh and other triangles; give the mesh that it was "
@@ -217,12 +212,6 @@ def refuse_other_mesh(
         f"{name}: has its vertices where they were and other triangles; give the mesh that the correspondence was made "
         f"for, or make a new one"
     )
-
-
-def _sorted(points: npt.NDArray[np.floating], extent: float) -> Array:
-    """Rows in an order that does not depend on that of the vertices, rounding aside."""
-    rows = np.asarray(points, np.float64)
-    return rows[np.lexsort(np.rint(rows / (ROUNDED * extent)).T)]
 
 
 # Step 1: the similarity that aligns two meshes of unknown unit, axes and vertices.
@@ -243,14 +232,33 @@ def place(moved: Surface, goal: Surface, start: Similarity | None = None) -> Sim
     method for registration of 3-D shapes", PAMI 1992, and Chen and Medioni, "Object modelling by registration of
     multiple range images", IVC 1992 (distances to planes).
     """
-    return _refined(moved, goal, start or _start(moved, goal))
+    random = np.random.default_rng(0)
+    used = np.unique(moved.faces)
+    used = used if len(used) <= FINE_SAMPLES else np.sort(random.choice(used, FINE_SAMPLES, replace=False))
+    points, normals, found = moved.vertices[used], moved.normals[used], start or _start(moved, goal)
+    for _ in range(FINE_ROUNDS):  # Gauss-Newton on the distances to the planes, with Tukey's biweight
+        laid = found.apply(points)
+        there = nearest(goal, laid, normals @ found.rotation.T, size=0.0)
+        # The weights follow the spread of the distances, so that parts that one mesh lacks lose their influence as the
+        # rest comes closer.
+        spread = max(1.4826 * float(np.median(there.distances)), 1e-9 * goal.size)
+        weights = np.square(np.clip(1.0 - np.square(there.distances / (TUKEY * spread)), 0.0, None))
+        weights *= there.cosines > 0.5
+        if np.count_nonzero(weights) < 20:
+            break
+        step = _towards_planes(laid, there.points, there.normals, weights, goal.size)
+        found = found.then(step)
+        if np.abs(step.apply(laid) - laid).max() < SETTLED * goal.size:
+            break
+    return found
 
 
 def _start(moved: Surface, goal: Surface) -> Similarity:
     from scipy.spatial.transform import Rotation
 
     random = np.random.default_rng(0)
-    source, target = (_some(surface, SAMPLES, random) for surface in (moved, goal))
+    used = [(surface.vertices, np.unique(surface.faces)) for surface in (moved, goal)]
+    source, target = (points[random.choice(some, min(SAMPLES, len(some)), replace=False)] for points, some in used)
     axes = [np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2] for points in (source, target)]
     principal = [axes[1].T @ np.diag(signs) @ axes[0] for signs in itertools.product((1.0, -1.0), repeat=3)]
     proper = [turn for turn in principal if np.linalg.det(turn) > 0]
@@ -271,11 +279,6 @@ def _start(moved: Surface, goal: Surface) -> Similarity:
     return found
 
 
-def _some(surface: Surface, count: int, random: np.random.Generator) -> Array:
-    used = np.unique(surface.faces)
-    return surface.vertices[random.choice(used, min(count, len(used)), replace=False)]
-
-
 def _by_vertices(source: Array, target: Array, current: Similarity) -> tuple[Similarity, float]:
     """One round of nearest vertices, both ways; and how far apart the pairs were, as a share of the size."""
     from scipy.spatial.distance import cdist
@@ -287,29 +290,6 @@ def _by_vertices(source: Array, target: Array, current: Similarity) -> tuple[Sim
     counted = apart <= np.quantile(apart, TRIMMED)
     found = align(source[pairs[0]], target[pairs[1]], weights=counted.astype(np.float64), scale=True)
     return found, float(apart[counted].mean() / face_size(target))
-
-
-def _refined(moved: Surface, goal: Surface, start: Similarity) -> Similarity:
-    """Gauss-Newton on distances to the planes at the nearest points, with Tukey's biweight."""
-    random = np.random.default_rng(0)
-    used = np.unique(moved.faces)
-    used = used if len(used) <= FINE_SAMPLES else np.sort(random.choice(used, FINE_SAMPLES, replace=False))
-    points, normals, found = moved.vertices[used], moved.normals[used], start
-    for _ in range(FINE_ROUNDS):
-        laid = found.apply(points)
-        there = nearest(goal, laid, normals @ found.rotation.T, size=0.0)
-        # The weights follow the spread of the distances, so that parts that one mesh lacks lose their influence as the
-        # rest comes closer.
-        spread = max(1.4826 * float(np.median(there.distances)), 1e-9 * goal.size)
-        weights = np.square(np.clip(1.0 - np.square(there.distances / (TUKEY * spread)), 0.0, None))
-        weights *= there.cosines > 0.5
-        if np.count_nonzero(weights) < 20:
-            break
-        step = _towards_planes(laid, there.points, there.normals, weights, goal.size)
-        found = found.then(step)
-        if np.abs(step.apply(laid) - laid).max() < SETTLED * goal.size:
-            break
-    return found
 
 
 def _towards_planes(points: Array, goals: Array, normals: Array, weights: Array, size: float) -> Similarity:
@@ -494,7 +474,7 @@ class Surface:
 
     @cached_property
     def size(self) -> float:
-        """Root-mean-square distance of the vertices that triangles touch from their mean."""
+        """Size of the part that triangles touch."""
         return face_size(self.vertices[np.unique(self.faces)])
 
     @cached_property
@@ -564,10 +544,7 @@ def nearest(surface: Surface, points: Array, normals: Array, size: float | None 
 
 
 def _best(surface: Surface, points: Array, normals: Array, slack: float) -> tuple[Indices, Array, Array]:
-    """Face (N,), weights (N, 3) and cosine (N,) of the best place for each point.
-
-    ``slack`` is how much nearer a sheet that faces away must be to be preferred.
-    """
+    """Face (N,), weights (N, 3) and cosine (N,) of the best place; a sheet that faces away must be nearer by slack."""
     faces, weights, cosines = np.empty(len(points), np.int64), np.empty((len(points), 3)), np.empty(len(points))
     step = max(1, CHUNK_NUMBERS // len(surface.faces))
     for first in range(0, len(points), step):

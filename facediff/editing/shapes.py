@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.mesh import Mesh, face_size, read_mesh, robust_align
+from facediff.mesh import face_size, read_mesh, robust_align
 
 if TYPE_CHECKING:
     from pygltflib import GLTF2
@@ -169,13 +169,7 @@ def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m")
 
 
 def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m") -> ShapeSet:
-    """Shapes as read, turned and scaled to a template of the same topology.
-
-    Where the set has a face at rest, its unit and axes are found by aligning that face with the template.
-
-    Raises:
-        FaceDiffError: as :func:`read_shapes`.
-    """
+    """Shapes as read, turned and scaled to a template by aligning their face at rest with it, if there is one."""
     if files.shapes.shape[1] != len(template):
         raise FaceDiffError(
             f"{files.first}: has {files.shapes.shape[1]} vertices and the animation's template {len(template)}; give "
@@ -284,8 +278,20 @@ def read_shape_files(path: Path) -> ShapeFiles:
         raise FaceDiffError(f"{path}: holds no shapes; expected .obj or .ply files named jawOpen, mouthFunnel …")
     files = [*rest, *shapes]
     meshes = [read_mesh(file, points_allowed=True) for file in files]
+    first = meshes[0]
     for file, mesh in zip(files, meshes, strict=True):
-        _check_alike(file, mesh, files[0], meshes[0])
+        if len(mesh.vertices) != len(first.vertices):
+            raise FaceDiffError(
+                f"{file}: has {len(mesh.vertices)} vertices and {files[0].name} {len(first.vertices)}; expected shapes "
+                f"of one mesh"
+            )
+        if len(first.faces) and len(mesh.faces) and not np.array_equal(mesh.faces, first.faces):
+            raise FaceDiffError(
+                f"{file}: its triangles are not those of {files[0].name}; expected shapes of one mesh with the order "
+                f"of its vertices kept"
+            )
+        if not np.isfinite(mesh.vertices).all():
+            raise FaceDiffError(f"{file}: holds NaN or infinity; write it again")
     points, faces = np.stack([mesh.vertices for mesh in meshes]), meshes[0].faces
     return ShapeFiles(
         path,
@@ -296,21 +302,6 @@ def read_shape_files(path: Path) -> ShapeFiles:
         faces if len(faces) else None,
         rest=rest[0].name if rest else "",
     )
-
-
-def _check_alike(file: Path, mesh: Mesh, first_file: Path, first: Mesh) -> None:
-    if len(mesh.vertices) != len(first.vertices):
-        raise FaceDiffError(
-            f"{file}: has {len(mesh.vertices)} vertices and {first_file.name} {len(first.vertices)}; expected shapes "
-            f"of one mesh"
-        )
-    if len(first.faces) and len(mesh.faces) and not np.array_equal(mesh.faces, first.faces):
-        raise FaceDiffError(
-            f"{file}: its triangles are not those of {first_file.name}; expected shapes of one mesh with the order of "
-            f"its vertices kept"
-        )
-    if not np.isfinite(mesh.vertices).all():
-        raise FaceDiffError(f"{file}: holds NaN or infinity; write it again")
 
 
 # Morph targets of binary glTF 2.0 files. pygltflib parses the container and never opens another file by itself.

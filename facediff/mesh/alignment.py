@@ -114,12 +114,9 @@ def robust_align(
 def robust_fit(
     source: Array, target: Array, weights: Array | None = None, *, scale: bool = False, near: bool = False
 ) -> tuple[Array, Array, Array]:
-    """:func:`robust_align` of many sources (B, N, 3) to one target (N, 3) in one pass; inputs are not checked.
+    """Rotations (B, 3, 3), translations (B, 3), scales (B,): :func:`robust_align` of sources (B, N, 3) to one target.
 
-    With ``near``, the sources are nearly aligned already, and the search for a start is skipped.
-
-    Returns:
-        rotations (B, 3, 3), translations (B, 3) and scales (B,).
+    Inputs are not checked. With ``near``, the sources are nearly aligned already: the search for a start is skipped.
     """
     base = np.ones(len(target)) if weights is None else weights
     used = base > 0

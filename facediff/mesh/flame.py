@@ -53,7 +53,10 @@ class Flame:
         self._jaw_basis: Array = np.einsum("v,evc->ec", self._jaw_regressor, expressions)
         # Joints below the jaw turn with it and all others stay. The weights of a vertex add up to one, so that a single
         # weight for each vertex says how much it follows the jaw.
-        moved = [joint for joint in range(JOINTS) if JAW in _ancestors(arrays.parents, joint)]
+        moved = [JAW]
+        for joint in range(JAW + 1, JOINTS):  # parents come before their children
+            if arrays.parents[joint] in moved:
+                moved.append(joint)
         weights = arrays.weights[:, moved].sum(axis=1)
         self._turning = np.flatnonzero(weights)
         self._weights = weights[self._turning, None]
@@ -106,25 +109,22 @@ class Flame:
             raise FaceDiffError(
                 f"jaw has shape {jaw.shape} and expression {expression.shape}; expected (frames, 3) and (frames, E)"
             )
-        face = self.shaped(shape)
+        face, count = self.shaped(shape), expression.shape[1]
         result = np.empty((len(jaw), *face.shape))
         for first in range(0, len(jaw), CHUNK):
             part = slice(first, first + CHUNK)
-            self._pose(face, expression[part], jaw[part], result[part])
+            turns = rotations(jaw[part]) - np.eye(3)
+            # The pose features of eq. 9 are the rotation without the identity, so that they are zero for a jaw at rest.
+            posed = result[part]
+            flat = posed.reshape(len(posed), -1)
+            np.matmul(expression[part], self._basis[:count], out=flat)
+            flat += turns.reshape(-1, 9) @ self._basis[EXPRESSIONS:]
+            posed += face
+            joint = (self._jaw_regressor @ face + expression[part] @ self._jaw_basis[:count])[:, None]
+            # Eq. 2, (1 − w) x + w (R (x − j) + j), with the identity for every joint that stays.
+            arms = posed[:, self._turning] - joint
+            posed[:, self._turning] += self._weights * (arms @ turns.transpose(0, 2, 1))
         return result
-
-    def _pose(self, face: Array, expression: Array, jaw: Array, result: Array) -> None:
-        turns = rotations(jaw) - np.eye(3)
-        count = expression.shape[1]
-        # The pose features of eq. 9 are the rotation without the identity, so that they are zero for a jaw at rest.
-        flat = result.reshape(len(result), -1)
-        np.matmul(expression, self._basis[:count], out=flat)
-        flat += turns.reshape(-1, 9) @ self._basis[EXPRESSIONS:]
-        result += face
-        joint = (self._jaw_regressor @ face + expression @ self._jaw_basis[:count])[:, None]
-        # Eq. 2, (1 − w) x + w (R (x − j) + j), with the identity for every joint that stays.
-        arms = result[:, self._turning] - joint
-        result[:, self._turning] += self._weights * (arms @ turns.transpose(0, 2, 1))
 
 
 def rotations(axis_angles: npt.NDArray[np.floating]) -> Array:
@@ -144,15 +144,6 @@ def rotations(axis_angles: npt.NDArray[np.floating]) -> Array:
     first, second = np.sinc(angles / np.pi), 0.5 * np.sinc(angles / (2 * np.pi)) ** 2
     result: Array = np.eye(3) + first * cross + second * (cross @ cross)
     return result
-
-
-def _ancestors(parents: npt.NDArray[np.int64], joint: int) -> list[int]:
-    """A joint, its parent, the parent of that … up to the root, whose parent is −1."""
-    chain = []
-    while joint >= 0:
-        chain.append(joint)
-        joint = int(parents[joint])
-    return chain
 
 
 def _coefficients(name: str, values: npt.NDArray[np.floating], most: int, dimensions: int) -> Array:
@@ -325,11 +316,12 @@ def read_masks(path: Path, names: str) -> list[int]:
     loaded = load_pickle(path)
     if names and not isinstance(loaded, dict):
         raise FaceDiffError(f"{path}: expected a dict from mask to vertex indices, got {type(loaded).__name__}")
-    for name in names.split("+") if names else ():
+    wanted = names.split("+") if names else []
+    for name in wanted:
         if name not in loaded:
             raise FaceDiffError(f'{path}: has no mask "{name}": {choices(name, list(map(str, loaded)))}')
     try:
-        arrays = [np.asarray(mask) for mask in ([loaded[name] for name in names.split("+")] if names else [loaded])]
+        arrays = [np.asarray(mask) for mask in ([loaded[name] for name in wanted] if names else [loaded])]
     except ValueError as error:
         raise FaceDiffError(f"{path}: expected lists of vertex indices ({error})") from error
     if any(array.ndim != 1 or not np.issubdtype(array.dtype, np.integer) for array in arrays):

@@ -184,7 +184,11 @@ def mesh_hierarchy(
     cached = _read(path)
     if cached is not None:
         return cached
-    points, inner = (template, faces) if chosen is None else submesh(template, faces, chosen)
+    points, inner = template, faces
+    if chosen is not None:
+        place = np.full(len(template), -1)
+        place[chosen] = np.arange(len(chosen))
+        points, inner = template[chosen], place[faces][(place[faces] >= 0).all(axis=1)]
     made = []
     for _ in range(levels):
         coarse = coarsen(points, inner, -(-len(points) // factor), pooling)
@@ -199,20 +203,8 @@ def mesh_hierarchy(
     return hierarchy
 
 
-def submesh(template: Points, faces: Indices, vertices: Indices) -> tuple[Array, Indices]:
-    """Some vertices of a mesh (ascending indices), and the faces all of whose corners are among them."""
-    place = np.full(len(template), -1)
-    place[vertices] = np.arange(len(vertices))
-    kept = place[faces]
-    return np.asarray(template, np.float64)[vertices], kept[(kept >= 0).all(axis=1)]
-
-
 def checked_template(template: Points) -> Array:
-    """Positions as float64.
-
-    Raises:
-        FaceDiffError: if they are not (V, 3) with at least one vertex, or not finite.
-    """
+    """Positions as float64; refuses what is not (V, 3) with at least one vertex, or not finite."""
     points = np.asarray(template, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise FaceDiffError(f"template: shape {points.shape}; expected (V, 3) with at least one vertex")
@@ -368,11 +360,7 @@ def _nearest(points: Array, targets: Array) -> tuple[Indices, Array]:
 
 
 def _collapses(points: Array, faces: Indices, n_vertices: int) -> Indices:
-    """Collapses (N, 2) in their order: the vertex that stays and the one that goes; usually enough of them.
-
-    Raises:
-        MissingExtraError: if the simplifier is not installed.
-    """
+    """Collapses (N, 2) in their order: the vertex that stays and the one that goes; usually enough of them."""
     try:
         import fast_simplification
     except ImportError as error:
@@ -412,19 +400,11 @@ def _merged(points: Array, faces: Indices, labels: Indices, n_vertices: int) -> 
 
 
 def project(points: Array, coarse: Array, faces: Indices, clusters: Indices) -> tuple[Indices, Array]:
-    """The nearest point on a coarse mesh, by the corners of its face.
+    """The point on a coarse mesh (M, 3), (G, 3) nearest to each point (V, 3): corners of its face and their weights.
 
-    Searched for among the faces at the coarse vertex that a point belongs to and at that one's neighbours. Where there
-    are no such faces, the coarse vertex itself is taken.
-
-    Args:
-        points: (V, 3).
-        coarse: (M, 3) vertices of the coarse mesh.
-        faces: (G, 3) its faces.
-        clusters: (V,) the coarse vertex that each point belongs to.
-
-    Returns:
-        corners (V, 3) and their weights (V, 3), none negative, which sum to one; equal points choose the first face.
+    Searched for among the faces at the coarse vertex (V,) that a point belongs to and at that one's neighbours. Where
+    there are no such faces, the coarse vertex itself is taken. Weights are none negative and sum to one; of equally
+    near faces, the first counts.
     """
     from scipy.sparse import csr_array
 

@@ -103,11 +103,7 @@ def _read_obj(path: Path) -> Mesh:
 # The frames of a sequence and the shapes of a set repeat the same face lines, and parsing them takes most of the time.
 @lru_cache(maxsize=2)
 def _triangles(lines: bytes, n_vertices: int) -> npt.NDArray[np.int32]:
-    """Triangles (F, 3) of an OBJ's face lines; polygons become fans.
-
-    Raises:
-        ValueError: if a line is damaged or a face names a vertex that does not exist.
-    """
+    """Triangles (F, 3) of an OBJ's face lines; polygons become fans; ValueError if a line is damaged."""
     triangles = []
     for line in lines.splitlines():
         corners = [int(word.partition(b"/")[0]) for word in line.split()[1:]]
@@ -124,8 +120,7 @@ def triangle_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.int
     first, second, third = (np.asarray(vertices, np.float64)[faces[:, corner]] for corner in range(3))
     (ax, ay, az), (bx, by, bz) = (second - first).T, (third - first).T
     square = (ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2
-    areas: npt.NDArray[np.float64] = 0.5 * np.sqrt(square)
-    return areas
+    return np.asarray(0.5 * np.sqrt(square))
 
 
 def surface_area(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> float:
@@ -141,8 +136,17 @@ def closest_on_triangles(points: Array, triangles: Array) -> tuple[Array, Array]
     # trimesh finds the same points, but its barycentric weights may be negative, and NaN for degenerate triangles.
     # The nearest point lies inside or on an edge: of the foot of the perpendicular, where it is inside, and the nearest
     # points of the three edges, the nearest counts.
+    best, square = np.zeros((len(points), 3)), np.full(len(points), np.inf)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        start, along = triangles[:, i], triangles[:, j] - triangles[:, i]
+        length = np.maximum(_dot(along, along), np.finfo(float).tiny)
+        part = np.clip(_dot(points - start, along) / length, 0.0, 1.0)
+        away = np.square(points - start - part[:, None] * along).sum(axis=1)
+        better = away < square
+        square[better] = away[better]
+        best[better] = 0.0
+        best[better, i], best[better, j] = 1.0 - part[better], part[better]
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    best, square = _on_edges(points, triangles)
     ab, ac, ap = b - a, c - a, points - a
     d00, d01, d11 = (_dot(x, y) for x, y in ((ab, ab), (ab, ac), (ac, ac)))
     d20, d21 = _dot(ap, ab), _dot(ap, ac)
@@ -157,20 +161,5 @@ def closest_on_triangles(points: Array, triangles: Array) -> tuple[Array, Array]
     return np.where(better[:, None], foot, best), np.where(better, away, square)
 
 
-def _on_edges(points: Array, triangles: Array) -> tuple[Array, Array]:
-    best, square = np.zeros((len(points), 3)), np.full(len(points), np.inf)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        start, along = triangles[:, i], triangles[:, j] - triangles[:, i]
-        length = np.maximum(_dot(along, along), np.finfo(float).tiny)
-        part = np.clip(_dot(points - start, along) / length, 0.0, 1.0)
-        away = np.square(points - start - part[:, None] * along).sum(axis=1)
-        better = away < square
-        square[better] = away[better]
-        best[better] = 0.0
-        best[better, i], best[better, j] = 1.0 - part[better], part[better]
-    return best, square
-
-
 def _dot(x: Array, y: Array) -> Array:
-    product: Array = np.einsum("ij,ij->i", x, y)
-    return product
+    return np.asarray(np.einsum("ij,ij->i", x, y))

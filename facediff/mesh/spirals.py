@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import islice
-
 import numpy as np
 import numpy.typing as npt
 
@@ -55,7 +53,11 @@ def spirals(
         spiral = _spiral(vertex, rings, wanted)
         if len(spiral) < wanted:
             spiral += _nearest(vertex, spiral, wanted, template)
-        table[vertex] = _dilated(spiral, length, dilation) if dilation > 1 or wanted < length else spiral
+        if dilation > 1 or wanted < length:
+            # Every so many, then the ones between if vertices are scarce, then the vertex itself.
+            between = [entry for i, entry in enumerate(spiral) if i % dilation]
+            spiral = [*spiral[::dilation], *between, *[vertex] * length][:length]
+        table[vertex] = spiral
     return table
 
 
@@ -93,21 +95,19 @@ def ordered_rings(faces: Indices, n_vertices: int) -> list[list[int]]:
         for vertex, here, there in ((a, b, c), (b, c, a), (c, a, b)):
             if follows[vertex].setdefault(here, there) != there:
                 loose.setdefault(vertex, set()).add(there)
-    return [_fan(follow, loose.get(vertex, set())) for vertex, follow in enumerate(follows)]
-
-
-def _fan(follow: dict[int, int], loose: set[int]) -> list[int]:
-    """Neighbours in order, from the neighbour that comes after each; ``loose`` are those that come after no other."""
-    # An open fan starts at the neighbour that follows no other; a closed one has no such neighbour.
-    ends = set(follow.values())
-    starts = [*sorted(follow.keys() - ends), *sorted(follow.keys() & ends), *sorted(loose)]
-    seen: dict[int, None] = {}  # a set that keeps its order
-    for start in starts:
-        step: int | None = start
-        while step is not None and step not in seen:
-            seen[step] = None
-            step = follow.get(step)
-    return list(seen)
+    rings = []
+    for vertex, follow in enumerate(follows):
+        # An open fan starts at the neighbour that follows no other; a closed one has no such neighbour.
+        ends = set(follow.values())
+        starts = [*sorted(follow.keys() - ends), *sorted(follow.keys() & ends), *sorted(loose.get(vertex, ()))]
+        seen: dict[int, None] = {}  # a set that keeps its order
+        for start in starts:
+            step: int | None = start
+            while step is not None and step not in seen:
+                seen[step] = None
+                step = follow.get(step)
+        rings.append(list(seen))
+    return rings
 
 
 def _spiral(vertex: int, rings: list[list[int]], wanted: int) -> list[int]:
@@ -149,12 +149,3 @@ def _nearest(vertex: int, spiral: list[int], wanted: int, template: Points | Non
     near = np.flatnonzero(square <= reach)  # by index, so that ties go to the smaller one
     nearest: list[int] = near[np.argsort(square[near], kind="stable")][:missing].tolist()
     return nearest
-
-
-def _dilated(spiral: list[int], length: int, dilation: int) -> list[int]:
-    """Every ``dilation``-th entry, then the ones between if vertices are scarce, then the vertex itself."""
-    chosen = list(islice(spiral, 0, None, dilation))[:length]
-    if len(chosen) < length:
-        between = [entry for i, entry in enumerate(spiral) if i % dilation]
-        chosen += between[: length - len(chosen)]
-    return chosen + [spiral[0]] * (length - len(chosen))
