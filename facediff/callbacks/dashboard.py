@@ -152,20 +152,13 @@ def gradients_by_part(module: LightningModule) -> dict[str, list[Tensor]]:
 
 @dataclass(frozen=True)
 class ClipErrors:
-    """The errors of a clip's motion by vertex.
-
-    Attributes:
-        split: its test split.
-        clip: its name.
-        identity: whose face.
-        audio: its speech (S,), 16 kHz.
-        errors: distance between prediction and truth (V,), mean over the frames, in the corpus's unit.
-    """
+    """The errors of a clip's motion by vertex."""
 
     split: str
     clip: str
     identity: str
-    audio: npt.NDArray[np.float32]
+    audio: npt.NDArray[np.float32]  # its speech (S,), 16 kHz
+    # Distance between prediction and truth (V,), mean over the frames, in the corpus's unit.
     errors: npt.NDArray[np.float32]
 
 

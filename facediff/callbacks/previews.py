@@ -334,21 +334,13 @@ def default_error_scale(samples: Sequence[Sample]) -> float:
 
 @dataclass(frozen=True)
 class ClipPreview:
-    """What was drawn of a clip.
-
-    Attributes:
-        name: the clip.
-        video: the mp4 file.
-        sheet: frames of it on one picture (height, width, 3), sRGB.
-        audio: its sound (samples,) at 16 kHz.
-        scores: the protocol's metrics of the seconds drawn, by name.
-    """
+    """What was drawn of a clip."""
 
     name: str
     video: Path
-    sheet: Picture
-    audio: npt.NDArray[np.float32]
-    scores: dict[str, float]
+    sheet: Picture  # frames of it on one picture (height, width, 3), sRGB
+    audio: npt.NDArray[np.float32]  # its sound (samples,) at 16 kHz
+    scores: dict[str, float]  # the protocol's metrics of the seconds drawn, by name
 
 
 def draw_clip(

@@ -27,17 +27,11 @@ FIELDS = ("subject", "sentence", "identity")
 
 @dataclass(frozen=True)
 class Name:
-    """What a file's name says.
+    """What a file's name says."""
 
-    Attributes:
-        subject: who speaks.
-        sentence: what is said.
-        identity: whose style the prediction was given; None if the name does not say.
-    """
-
-    subject: str
-    sentence: str
-    identity: str | None = None
+    subject: str  # who speaks
+    sentence: str  # what is said
+    identity: str | None = None  # whose style the prediction was given; None if the name does not say
 
     @property
     def clip(self) -> str:
@@ -127,12 +121,7 @@ OWN = "own"
 
 @dataclass(frozen=True)
 class Truth:
-    """The truth of one clip.
-
-    Attributes:
-        path: its file.
-        name: who says what.
-    """
+    """The truth of one clip."""
 
     path: Path
     name: Name
@@ -140,17 +129,12 @@ class Truth:
 
 @dataclass(frozen=True)
 class Pair:
-    """A clip and the predictions that are scored on it.
-
-    Attributes:
-        clip: ``<subject>_<sentence>``.
-        truth: its truth.
-        predictions: files by identity; several only if the mean over conditions is asked for. The identity is "" where
-            the file's name does not say it.
-    """
+    """A clip and the predictions that are scored on it."""
 
     clip: str
     truth: Truth
+    # Files by identity; several only if the mean over conditions is asked for. The identity is "" where the file's name
+    # does not say it.
     predictions: dict[str, Path]
 
 

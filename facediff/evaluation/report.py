@@ -19,12 +19,7 @@ from facediff.utils.tables import format_table
 
 @dataclass(frozen=True)
 class Interval:
-    """A bootstrap confidence interval over sequences.
-
-    Attributes:
-        low: its lower end.
-        high: its upper end.
-    """
+    """A bootstrap confidence interval over sequences."""
 
     low: float
     high: float
@@ -32,25 +27,16 @@ class Interval:
 
 @dataclass(frozen=True)
 class Score:
-    """One number of one method.
-
-    Attributes:
-        protocol: whose definition.
-        metric: ``mve``, ``lve``, ``fdd``, ``fdd_absolute`` or ``fdd_signed``, or a metric that was chosen by name.
-        value: the number, in the unit that the definition names.
-        interval: None with a single sequence, without resamples, or if the metric is no mean of sequences.
-        frames: frames behind it.
-        sequences: sequences behind it.
-        region: name, count and hash of the vertices that it was taken over, or "all vertices".
-    """
+    """One number of one method."""
 
     protocol: str
     metric: str
-    value: float
+    value: float  # the number, in the unit that the definition names
+    # None with a single sequence, without resamples, or if the metric is no mean of sequences.
     interval: Interval | None
     frames: int
     sequences: int
-    region: dict[str, Any] | str
+    region: dict[str, Any] | str  # name, count and hash of the vertices that it was taken over, or "all vertices"
 
     @property
     def name(self) -> str:
@@ -60,29 +46,18 @@ class Score:
 
 @dataclass(frozen=True)
 class SequenceScores:
-    """The numbers of one clip under one method.
-
-    Attributes:
-        method: the method.
-        clip: ``<subject>_<sentence>``.
-        subject: who speaks.
-        sentence: what is said.
-        conditions: identities that the predictions were given; empty where the names do not say.
-        frames: frames scored, all conditions together.
-        cut_prediction: frames cut from predictions.
-        cut_truth: frames cut from the truth.
-        scores: ``<protocol>/<metric>`` to value; the mean over conditions where there are several; None where the
-            metric has no value on the clip.
-    """
+    """The numbers of one clip under one method."""
 
     method: str
     clip: str
     subject: str
     sentence: str
-    conditions: tuple[str, ...]
-    frames: int
-    cut_prediction: int
+    conditions: tuple[str, ...]  # identities that the predictions were given; empty where the names do not say
+    frames: int  # frames scored, all conditions together
+    cut_prediction: int  # frames cut from predictions
     cut_truth: int
+    # ``<protocol>/<metric>`` to value; the mean over conditions where there are several; None where the metric has no
+    # value on the clip.
     scores: dict[str, float | None]
 
     def row(self) -> dict[str, Any]:
@@ -94,100 +69,60 @@ class SequenceScores:
 
 @dataclass(frozen=True)
 class Missing:
-    """What of one method was not scored.
+    """What of one method was not scored."""
 
-    Attributes:
-        without_truth: files of clips that have no truth.
-        without_prediction: clips that have no prediction of the conditions asked for.
-        unused: files under conditions that were not asked for.
-        unnamed: files whose names no pattern fits.
-        unusable: clip to reason: unreadable files, other meshes, speakers without a template.
-    """
-
-    without_truth: list[str] = field(default_factory=list)
+    without_truth: list[str] = field(default_factory=list)  # files of clips that have no truth
+    # Clips that have no prediction of the conditions asked for.
     without_prediction: list[str] = field(default_factory=list)
-    unused: list[str] = field(default_factory=list)
-    unnamed: list[str] = field(default_factory=list)
+    unused: list[str] = field(default_factory=list)  # files under conditions that were not asked for
+    unnamed: list[str] = field(default_factory=list)  # files whose names no pattern fits
+    # Clip to reason: unreadable files, other meshes, speakers without a template.
     unusable: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """Everything about one method.
-
-    Attributes:
-        name: what it is called.
-        folder: where its files lie.
-        scores: its numbers, protocol by protocol.
-        sequences: the numbers of each clip, sorted by clip.
-        missing: what was not scored.
-    """
+    """Everything about one method."""
 
     name: str
     folder: str
-    scores: list[Score]
-    sequences: list[SequenceScores]
+    scores: list[Score]  # protocol by protocol
+    sequences: list[SequenceScores]  # sorted by clip
     missing: Missing
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A method against the first, over the sequences that both have.
-
-    Attributes:
-        method: the method.
-        baseline: the first.
-        protocol: whose definition.
-        metric: which number.
-        difference: the method's score minus the baseline's.
-        interval: of the difference, over the same resamples; None as in :class:`Score`.
-        sequences: how many sequences both have.
-    """
+    """A method against the first, over the sequences that both have."""
 
     method: str
-    baseline: str
+    baseline: str  # the first method
     protocol: str
     metric: str
-    difference: float
-    interval: Interval | None
-    sequences: int
+    difference: float  # the method's score minus the baseline's
+    interval: Interval | None  # of the difference, over the same resamples; None as in :class:`Score`
+    sequences: int  # that both have
 
 
 @dataclass(frozen=True)
 class Report:
-    """What an evaluation found.
+    """What an evaluation found."""
 
-    Attributes:
-        truth: the folder of truths.
-        lips: lip vertices.
-        upper_face: upper-face vertices; None if no protocol uses them.
-        n_vertices: vertices of the mesh.
-        protocols: the definition of each protocol, by name; under ``metrics`` those of metrics chosen by name.
-        identity: which conditions were scored.
-        truth_stride: 2 if every second frame of the truth was taken, and so on.
-        resamples: bootstrap resamples; 0 for none.
-        level: of the intervals, e.g. 0.95.
-        seed: of the resamples.
-        methods: the results, in the order asked for.
-        comparisons: every further method against the first.
-        unnamed_truths: files among the truths whose names do not fit the pattern.
-        remarks: whether the regions are those in use on the topology, if one was named.
-    """
-
-    truth: str
+    truth: str  # the folder of truths
     lips: Region
-    upper_face: Region | None
+    upper_face: Region | None  # upper-face vertices; None if no protocol uses them
     n_vertices: int
+    # The definition of each protocol, by name; under ``metrics`` those of metrics chosen by name.
     protocols: dict[str, str]
-    identity: str
-    truth_stride: int
-    resamples: int
-    level: float
+    identity: str  # which conditions were scored
+    truth_stride: int  # 2 if every second frame of the truth was taken, and so on
+    resamples: int  # of the bootstrap; 0 for none
+    level: float  # of the intervals, e.g. 0.95
     seed: int
-    methods: list[MethodResult]
-    comparisons: list[Comparison]
-    unnamed_truths: list[str]
-    remarks: list[str]
+    methods: list[MethodResult]  # the results, in the order asked for
+    comparisons: list[Comparison]  # every further method against the first
+    unnamed_truths: list[str]  # files among the truths whose names do not fit the pattern
+    remarks: list[str]  # whether the regions are those in use on the topology, if one was named
 
     def regions(self) -> dict[str, dict[str, Any]]:
         """Name, vertex count, hash and repeated indices of each region."""

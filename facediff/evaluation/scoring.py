@@ -31,25 +31,15 @@ NATIVE = (np.float16, np.float32, np.float64)
 
 @dataclass(frozen=True)
 class Column:
-    """One score of one protocol.
+    """One score of one protocol."""
 
-    Attributes:
-        protocol: the protocol's name; ``metrics`` for metrics that were chosen by name.
-        metric: the score's name there: ``mve``, ``lve``, ``fdd``, ``fdd_absolute``, or the metric as it was chosen.
-        pooling: how sequences become one number.
-        rule: what the protocol does where lengths differ.
-        source: which of the scorer's metrics gives the value of a sequence.
-        absolute: whether its sign is dropped.
-        region: name, count and hash of what the score was taken over.
-    """
-
-    protocol: str
-    metric: str
+    protocol: str  # the protocol's name; ``metrics`` for metrics that were chosen by name
+    metric: str  # the score's name there: ``mve``, ``lve``, ``fdd``, ``fdd_absolute``, or the metric as it was chosen
     pooling: Pooling
-    rule: LengthRule
-    source: str
-    absolute: bool = False
-    region: dict[str, Any] | str = "all vertices"
+    rule: LengthRule  # what the protocol does where lengths differ
+    source: str  # which of the scorer's metrics gives the value of a sequence
+    absolute: bool = False  # whether its sign is dropped
+    region: dict[str, Any] | str = "all vertices"  # name, count and hash of what the score was taken over
 
     @property
     def name(self) -> str:
@@ -59,22 +49,14 @@ class Column:
 
 @dataclass(frozen=True)
 class ClipScores:
-    """What one clip gave, the mean over its conditions where there are several.
+    """What one clip gave, the mean over its conditions where there are several."""
 
-    Attributes:
-        values: a value for each column; NaN where the metric has none on this clip.
-        weights: frames behind it, for pooling by frames.
-        frames: frames scored, all conditions together.
-        cut_prediction: frames cut from predictions.
-        cut_truth: frames cut from the truth.
-        states: the metrics of this clip that have a value over all clips only, by name.
-    """
-
-    values: tuple[float, ...]
-    weights: tuple[float, ...]
-    frames: int
-    cut_prediction: int
+    values: tuple[float, ...]  # a value for each column; NaN where the metric has none on this clip
+    weights: tuple[float, ...]  # frames behind it, for pooling by frames
+    frames: int  # frames scored, all conditions together
+    cut_prediction: int  # frames cut from predictions
     cut_truth: int
+    # The metrics of this clip that have a value over all clips only, by name.
     states: Mapping[str, Metric] = field(default_factory=dict)
 
 

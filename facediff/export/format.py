@@ -121,19 +121,12 @@ class Format(ABC):
 
 @dataclass(frozen=True)
 class Space:
-    """The unit of length and the axes of a file.
-
-    Attributes:
-        unit: unit of length in words.
-        metres: metres in one unit.
-        up: the axis that points up.
-        factor: what the animation's coordinates are multiplied by.
-    """
+    """The unit of length and the axes of a file."""
 
     unit: str
-    metres: float
+    metres: float  # in one unit
     up: Up
-    factor: float
+    factor: float  # what the animation's coordinates are multiplied by
 
     @classmethod
     def of(cls, animation: Animation, options: ExportOptions, prescribed: str | None = None) -> Space:

@@ -60,17 +60,11 @@ class Glb(Format):
 
 @dataclass(frozen=True)
 class Morphs:
-    """A motion as shapes and their weights: frame t is ``rest + Σ weights[t, m] · shapes[m]``.
+    """A motion as shapes and their weights: frame t is ``rest + Σ weights[t, m] · shapes[m]``."""
 
-    Attributes:
-        shapes: (M, V, 3) offsets from the rest face.
-        weights: (T, M) from 0 to 1.
-        components: number of principal components that were kept; None where there is a shape for every frame.
-    """
-
-    shapes: Array
-    weights: Array
-    components: int | None
+    shapes: Array  # (M, V, 3) offsets from the rest face
+    weights: Array  # (T, M) from 0 to 1
+    components: int | None  # number of principal components that were kept; None where there is a shape for every frame
 
 
 def compress(offsets: Array, tolerance: float) -> Morphs:

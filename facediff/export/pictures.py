@@ -18,19 +18,12 @@ from facediff.render import Camera, Renderer, contact_sheet, heat_colours, save_
 
 @dataclass(frozen=True)
 class Panel:
-    """A face to draw.
-
-    Attributes:
-        label: the text above it.
-        vertices: (V, 3), y up, z to the viewer.
-        faces: (F, 3).
-        colours: (V, 3) sRGB; None for plain material.
-    """
+    """A face to draw."""
 
     label: str
-    vertices: npt.NDArray[np.floating]
-    faces: npt.NDArray[np.integer]
-    colours: npt.NDArray[np.uint8] | None = None
+    vertices: npt.NDArray[np.floating]  # (V, 3), y up, z to the viewer
+    faces: npt.NDArray[np.integer]  # (F, 3)
+    colours: npt.NDArray[np.uint8] | None = None  # (V, 3) sRGB; plain material if None
 
 
 def draw_worst_frame(path: Path, animation: Animation, shapes: ShapeSet, weights: Weights) -> None:

@@ -53,15 +53,10 @@ def _without_marks(ipa: str) -> str:
 
 @dataclass(frozen=True)
 class Moment:
-    """A moment of a clip.
+    """A moment of a clip."""
 
-    Attributes:
-        time: in seconds.
-        phoneme: what is spoken then; None if it was chosen by its time alone.
-    """
-
-    time: float
-    phoneme: Phoneme | None = None
+    time: float  # in seconds
+    phoneme: Phoneme | None = None  # what is spoken then; None if it was chosen by its time alone
 
     @property
     def heading(self) -> Heading:

@@ -39,18 +39,11 @@ unit, and the value of the last colour in the unit shown, or None for the larges
 
 @dataclass(frozen=True)
 class VertexMap:
-    """A number at each vertex, in the vertices' unit.
+    """A number at each vertex, in the vertices' unit."""
 
-    Attributes:
-        mean: mean over frames (V,).
-        deviation: population standard deviation over frames (V,).
-        maximum: maximum over frames (V,).
-        frames: number of frames.
-    """
-
-    mean: Array
-    deviation: Array
-    maximum: Array
+    mean: Array  # over frames (V,)
+    deviation: Array  # population standard deviation over frames (V,)
+    maximum: Array  # over frames (V,)
     frames: int
 
 

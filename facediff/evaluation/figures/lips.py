@@ -40,30 +40,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Curves:
-    """The opening of the mouth.
+    """The opening of the mouth."""
 
-    Attributes:
-        times: middle of each frame (T,), in seconds.
-        openings: opening (T,) by name, the truth's first, in the vertices' unit.
-    """
-
-    times: Array
-    openings: dict[str, Array]
+    times: Array  # middle of each frame (T,), in seconds
+    openings: dict[str, Array]  # opening (T,) by name, the truth's first, in the vertices' unit
 
 
 @dataclass(frozen=True)
 class Sound:
-    """The speech of a clip.
+    """The speech of a clip."""
 
-    Attributes:
-        samples: speech (S,); empty if there is none.
-        sample_rate: samples a second.
-        phonemes: phonemes in time; empty if they are not known.
-    """
-
+    # Speech (S,); empty if there is none.
     samples: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     sample_rate: int = SAMPLE_RATE
-    phonemes: Sequence[Phoneme] = ()
+    phonemes: Sequence[Phoneme] = ()  # phonemes in time; empty if they are not known
 
 
 def opening_curves(material: Material, clip: str, pairs: LipPairs) -> tuple[Curves, str | None]:

@@ -60,35 +60,22 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Material:
-    """The files of truth and methods, and what is known about them.
+    """The files of truth and methods, and what is known about them."""
 
-    Attributes:
-        truths: truths by clip, ``<subject>_<sentence>``.
-        methods: each method's predictions by clip; methods in the order in which they are drawn.
-        n_vertices: vertices V of the mesh.
-        frame_rate: frames a second of the predictions, and of the truth after ``truth_stride``; None if not known.
-        truth_stride: every n-th frame of a truth is used.
-        unit: unit of length of the vertices.
-        templates: neutral face (V, 3) by identity.
-        faces: triangles (F, 3); None if no mesh is known.
-        rest: positions (V, 3) of the mesh file; None if no mesh is known.
-        colours: sRGB (V, 3) of the mesh file; None if it has none.
-        corpus: the corpus folder that the truth belongs to, if it does.
-        remark: text below every figure, such as that the corpus is synthetic.
-    """
-
-    truths: dict[str, Truth]
+    truths: dict[str, Truth]  # truths by clip, ``<subject>_<sentence>``
+    # Each method's predictions by clip; methods in the order in which they are drawn.
     methods: dict[str, dict[str, Path]]
     n_vertices: int
+    # Frames a second of the predictions, and of the truth after ``truth_stride``; None if not known.
     frame_rate: float | None = None
-    truth_stride: int = 1
-    unit: str = ""
-    templates: Mapping[str, Tensor] = field(default_factory=dict)
-    faces: npt.NDArray[np.int32] | None = None
-    rest: Array | None = None
-    colours: npt.NDArray[np.uint8] | None = None
-    corpus: Path | None = None
-    remark: str = ""
+    truth_stride: int = 1  # every n-th frame of a truth is used
+    unit: str = ""  # of length of the vertices
+    templates: Mapping[str, Tensor] = field(default_factory=dict)  # neutral face (V, 3) by identity
+    faces: npt.NDArray[np.int32] | None = None  # triangles (F, 3); None if no mesh is known
+    rest: Array | None = None  # positions (V, 3) of the mesh file; None if no mesh is known
+    colours: npt.NDArray[np.uint8] | None = None  # sRGB (V, 3) of the mesh file; None if it has none
+    corpus: Path | None = None  # the corpus folder that the truth belongs to, if it does
+    remark: str = ""  # below every figure, such as that the corpus is synthetic
 
     @property
     def names(self) -> list[str]:

@@ -59,17 +59,11 @@ NAME_LINES = 2
 
 @dataclass(frozen=True)
 class Paper:
-    """Size, resolution and font of a figure.
+    """Size, resolution and font of a figure."""
 
-    Attributes:
-        width: of the figure in mm.
-        dpi: pixels an inch, of PNG and of the pictures inside PDF and SVG.
-        font: family of all letters.
-    """
-
-    width: float = PAGE
-    dpi: int = 300
-    font: str = FONT
+    width: float = PAGE  # in mm
+    dpi: int = 300  # of PNG and of the pictures inside PDF and SVG
+    font: str = FONT  # family of all letters
 
     def __post_init__(self) -> None:
         if not 30 <= self.width <= 1000:

@@ -42,15 +42,10 @@ FEW_POINTS = 12
 
 @dataclass(frozen=True)
 class Curve:
-    """One scalar of one run.
+    """One scalar of one run."""
 
-    Attributes:
-        at: steps or epochs (N,).
-        values: the scalar (N,), as logged: NaN or infinity where training diverged.
-    """
-
-    at: Array
-    values: Array
+    at: Array  # steps or epochs (N,)
+    values: Array  # (N,), as logged: NaN or infinity where training diverged
 
 
 def find_metrics(run: Path) -> Path:
