@@ -1,8 +1,8 @@
 """Scoring files of predictions against files of truth, whoever wrote them."""
 
 from facediff.evaluation.evaluator import evaluate
-from facediff.evaluation.files import DEFAULT_PATTERNS, TRUTH_PATTERN, read_region
-from facediff.evaluation.report import Comparison, Interval, MethodResult, Missing, Report, Score, SequenceScores, text
+from facediff.evaluation.files import DEFAULT_PATTERNS, TRUTH_PATTERN, Missing, read_region
+from facediff.evaluation.report import Comparison, Interval, MethodResult, Report, Score, SequenceScores, text
 
 __all__ = [
     "DEFAULT_PATTERNS",

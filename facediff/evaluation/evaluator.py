@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 
 from facediff.data.audio import SAMPLE_RATE, read_speech
 from facediff.data.corpus import ALL, read_manifest
@@ -23,7 +22,6 @@ from facediff.evaluation.files import (
     TRUTH_PATTERN,
     NamePattern,
     Pair,
-    Pairing,
     index_truths,
     list_names,
     pair_up,
@@ -108,11 +106,7 @@ def evaluate(
     needed = {need for request in requests for need in request.needs}
     if lip_pairs is None and "lip_pairs" in needed and corpus is not None and (corpus / PAIRS_FILE).is_file():
         lip_pairs = read_pairs(None, corpus, n_vertices)
-    material = Material(
-        corpus if requests else None,
-        frame_rate,
-        sorted({name.subject for name in names.values()}),
-    )
+    material = Material(corpus if requests else None, frame_rate, sorted({name.subject for name in names.values()}))
     context = material.context(lips, upper_face, lip_pairs, templated=bool(templates), every_condition=identity == ALL)
     chosen = {request.text: request.build(context) for request in requests}
     scorer = Scorer(
@@ -126,23 +120,27 @@ def evaluate(
         inputs=partial(material.inputs, needed=needed),
     )
     readers = [NamePattern(pattern, templates or ()) for pattern in patterns]
-    pairings: dict[str, Pairing] = {}
+    paired = {}
     for method, folder in methods.items():
         files, unnamed = list_names(Path(folder), readers)
-        pairings[method] = pair_up(files, truths, identity)
-        pairings[method].unnamed = unnamed
-    jobs = [(method, pair) for method, pairing in pairings.items() for pair in pairing.pairs]
+        pairs, missing = pair_up(files, truths, identity)
+        paired[method] = pairs, replace(missing, unnamed=unnamed)
+    jobs = [(method, pair) for method, (pairs, _) in paired.items() for pair in pairs]
     found = score_all(scorer, jobs, workers, progress=progress)
     tables = [
-        MethodTable(method, str(methods[method]), pairing, found.get(method, {}), scorer.columns)
-        for method, pairing in pairings.items()
+        MethodTable(method, str(methods[method]), pairs, missing, found.get(method, {}), scorer.columns)
+        for method, (pairs, missing) in paired.items()
     ]
+    definitions = {setting.name: setting.describe() for setting in settings}
+    if chosen:
+        words = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in chosen.items()]
+        definitions[METRICS] = "\n".join(["further metrics", *words])
     return Report(
         truth=str(truth),
         lips=lips,
         upper_face=upper_face if needs_upper_face(settings, metrics) else None,
         n_vertices=n_vertices,
-        protocols={setting.name: setting.describe() for setting in settings} | describe_metrics(chosen),
+        protocols=definitions,
         identity=identity,
         truth_stride=truth_stride,
         resamples=bootstrap,
@@ -162,25 +160,13 @@ def needs_upper_face(protocols: Sequence[Protocol], metrics: Sequence[str]) -> b
     )
 
 
-def describe_metrics(chosen: Mapping[str, Metric]) -> dict[str, str]:
-    """The definitions of metrics chosen by name, under the name that stands in place of a protocol's."""
-    words = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in chosen.items()]
-    return {METRICS: "\n".join(["further metrics", *words])} if words else {}
-
-
 @dataclass(frozen=True)
 class Material:
-    """What metrics may read of a corpus in addition to motion.
-
-    Args:
-        corpus: the corpus folder, if there is one.
-        frame_rate: frames per second of the predictions, if known.
-        identities: names of all speakers.
-    """
+    """What metrics may read of a corpus in addition to motion."""
 
     corpus: Path | None
-    frame_rate: float | None
-    identities: Sequence[str]
+    frame_rate: float | None  # of the predictions, if known
+    identities: Sequence[str]  # names of all speakers
 
     def context(
         self,

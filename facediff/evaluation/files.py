@@ -68,23 +68,20 @@ class NamePattern:
         if "identity" in fields and fields.index("subject") < fields.index("identity"):
             readings.append({"subject": "[^/]+", "sentence": "[^/]+", "identity": "(?P=subject)"})
         readings += [{"subject": "[^/]+", "sentence": "[^/_]+"}, {"subject": "[^/]+", "sentence": "[^/]+"}]
-        self._readings = [re.compile(_expression(parts, reading)) for reading in readings]
+        self._readings = [
+            re.compile(
+                "".join(
+                    f"(?P<{part}>{reading.get(part, '[^/]+')})" if place % 2 else re.escape(part)
+                    for place, part in enumerate(parts)
+                )
+            )
+            for reading in readings
+        ]
 
     def match(self, name: str) -> Name | None:
         """The fields of a name; None if it is not of this pattern."""
-        for reading in self._readings:
-            found = reading.fullmatch(name)
-            if found:
-                return Name(**found.groupdict())
-        return None
-
-
-def _expression(parts: Sequence[str], reading: dict[str, str]) -> str:
-    """The regular expression of a pattern whose fields read as given."""
-    return "".join(
-        f"(?P<{part}>{reading.get(part, '[^/]+')})" if place % 2 else re.escape(part)
-        for place, part in enumerate(parts)
-    )
+        found = next((found for reading in self._readings if (found := reading.fullmatch(name))), None)
+        return Name(**found.groupdict()) if found else None
 
 
 def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path, Name], list[str]]:
@@ -138,23 +135,17 @@ class Pair:
     predictions: dict[str, Path]
 
 
-@dataclass
-class Pairing:
-    """What one method has.
+@dataclass(frozen=True)
+class Missing:
+    """What of one method was not scored."""
 
-    Attributes:
-        pairs: what can be scored, sorted by clip.
-        without_truth: files of clips that have no truth.
-        without_prediction: clips that have no prediction of the conditions asked for.
-        unused: files of clips that have a truth, under conditions that were not asked for.
-        unnamed: files whose names no pattern fits.
-    """
-
-    pairs: list[Pair] = field(default_factory=list)
-    without_truth: list[str] = field(default_factory=list)
+    without_truth: list[str] = field(default_factory=list)  # files of clips that have no truth
+    # Clips that have no prediction of the conditions asked for.
     without_prediction: list[str] = field(default_factory=list)
-    unused: list[str] = field(default_factory=list)
-    unnamed: list[str] = field(default_factory=list)
+    unused: list[str] = field(default_factory=list)  # files under conditions that were not asked for
+    unnamed: list[str] = field(default_factory=list)  # files whose names no pattern fits
+    # Clip to reason: unreadable files, other meshes, speakers without a template.
+    unusable: dict[str, str] = field(default_factory=dict)
 
 
 def index_truths(names: Mapping[Path, Name]) -> dict[str, Truth]:
@@ -173,8 +164,8 @@ def index_truths(names: Mapping[Path, Name]) -> dict[str, Truth]:
     return truths
 
 
-def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], identity: str) -> Pairing:
-    """Find each truth's predictions.
+def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], identity: str) -> tuple[list[Pair], Missing]:
+    """Find each truth's predictions: what can be scored, sorted by clip, and what not.
 
     Args:
         predictions: what the names of a method's files say.
@@ -185,12 +176,12 @@ def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], ident
     Raises:
         FaceDiffError: if two files are of the same clip and condition.
     """
-    made = Pairing()
+    pairs, missing = list[Pair](), Missing()
     by_clip: dict[str, dict[str, Path]] = {}
     own: dict[str, str] = {}
     for path, name in predictions.items():
         if name.clip not in truths:
-            made.without_truth.append(path.name)
+            missing.without_truth.append(path.name)
             continue
         conditions = by_clip.setdefault(name.clip, {})
         condition = name.identity or ""
@@ -204,20 +195,17 @@ def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], ident
             own[name.clip] = name.identity
     for clip, truth in sorted(truths.items()):
         there = by_clip.get(clip, {})
-        chosen = _choose(there, own.get(clip, "") if identity == OWN else identity)
-        made.unused += sorted(path.name for name, path in there.items() if name not in chosen)
-        if chosen:
-            made.pairs.append(Pair(clip, truth, {name: there[name] for name in chosen}))
+        if identity == ALL:  # "" stands for a name without a condition
+            chosen = sorted(name for name in there if name) or list(there)
         else:
-            made.without_prediction.append(clip)
-    return made
-
-
-def _choose(there: Mapping[str, Path], wanted: str) -> list[str]:
-    """The conditions to score of those that are there; "" stands for a name without a condition."""
-    if wanted == ALL:
-        return sorted(name for name in there if name) or list(there)
-    return [wanted] if wanted in there else []
+            wanted = own.get(clip, "") if identity == OWN else identity
+            chosen = [wanted] if wanted in there else []
+        missing.unused.extend(sorted(path.name for name, path in there.items() if name not in chosen))
+        if chosen:
+            pairs.append(Pair(clip, truth, {name: there[name] for name in chosen}))
+        else:
+            missing.without_prediction.append(clip)
+    return pairs, missing
 
 
 # What belongs to the files that are scored: the corpus folder, the mesh's size, regions and lip pairs.

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.evaluation.files import Pair, Pairing
+from facediff.evaluation.files import Missing, Pair
 from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
 from facediff.utils.tables import format_table
@@ -62,22 +62,9 @@ class SequenceScores:
 
     def row(self) -> dict[str, Any]:
         """The same in one flat row for a table."""
-        found = asdict(self)
-        scores = found.pop("scores")
-        return {**found, "conditions": " ".join(self.conditions), **scores}
-
-
-@dataclass(frozen=True)
-class Missing:
-    """What of one method was not scored."""
-
-    without_truth: list[str] = field(default_factory=list)  # files of clips that have no truth
-    # Clips that have no prediction of the conditions asked for.
-    without_prediction: list[str] = field(default_factory=list)
-    unused: list[str] = field(default_factory=list)  # files under conditions that were not asked for
-    unnamed: list[str] = field(default_factory=list)  # files whose names no pattern fits
-    # Clip to reason: unreadable files, other meshes, speakers without a template.
-    unusable: dict[str, str] = field(default_factory=dict)
+        row = asdict(self) | {"conditions": " ".join(self.conditions)}
+        scores = row.pop("scores")
+        return row | scores
 
 
 @dataclass(frozen=True)
@@ -159,30 +146,16 @@ BLOCK = 2**20
 
 
 def pooled(values: Array, weights: Array) -> Array:
-    """Scores of sequences: Σ w v / Σ w.
+    """Scores (columns,) of values (sequences, columns): Σ w v / Σ w, NaN where no sequence has a value.
 
-    Args:
-        values: (sequences, columns).
-        weights: likewise; frames where all frames count alike, 1 where all sequences do, 0 where there is no value.
-
-    Returns:
-        (columns,); NaN where no sequence has a value.
+    The weights are frames where all frames count alike, 1 where all sequences do, and 0 where there is no value.
     """
     with np.errstate(invalid="ignore"):
         return np.asarray((values * weights).sum(0) / weights.sum(0))
 
 
 def draws(sequences: int, resamples: int, seed: int) -> Iterator[Array]:
-    """How often each sequence is in each resample, drawn with replacement, a block of resamples at a time.
-
-    Args:
-        sequences: how many there are, and how many are drawn for each resample.
-        resamples: how many resamples.
-        seed: of the random numbers.
-
-    Yields:
-        (resamples of the block, sequences).
-    """
+    """How often each sequence is in each resample, drawn with replacement: (resamples of a block, sequences)."""
     random = np.random.default_rng(seed)
     step = max(1, BLOCK // sequences)
     shares = np.full(sequences, 1 / sequences)
@@ -208,7 +181,6 @@ class Bootstrap:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if self.resamples < 0:
             raise FaceDiffError(f"bootstrap is {self.resamples}; expected a number of resamples, or 0 for no intervals")
         if not 0 < self.level < 1:
@@ -219,12 +191,8 @@ class Bootstrap:
     def scores(self, values: Array, weights: Array) -> Array | None:
         """The score of every resample: a ratio of sums, so that a sequence keeps the weight of its frames.
 
-        Args:
-            values: (sequences, columns).
-            weights: likewise.
-
-        Returns:
-            (resamples, columns); None without resamples, or with a single sequence, of which they would tell nothing.
+        From values and weights (sequences, columns) to (resamples, columns); None without resamples, or with a single
+        sequence, of which they would tell nothing.
         """
         if not self.resamples or len(values) < 2:
             return None
@@ -238,12 +206,7 @@ class Bootstrap:
         return np.concatenate(blocks)
 
     def intervals(self, scores: Array | None, columns: int) -> list[Interval | None]:
-        """The middle of the scores of the resamples, for each column.
-
-        Args:
-            scores: (resamples, columns), as :meth:`scores` gives them.
-            columns: how many columns.
-        """
+        """The middle of the scores of the resamples (resamples, columns), for each column."""
         if scores is None:
             return [None] * columns
         places = [(1 - self.level) / 2, (1 + self.level) / 2]
@@ -260,7 +223,8 @@ class MethodTable:
     Args:
         name: what the method is called.
         folder: where its files lie.
-        pairing: what it has, and what not.
+        pairs: its clips.
+        missing: what of it cannot be scored for its names alone.
         found: scores by clip, or in words why there are none.
         columns: what the values are.
 
@@ -272,25 +236,17 @@ class MethodTable:
         self,
         name: str,
         folder: str,
-        pairing: Pairing,
+        pairs: Sequence[Pair],
+        missing: Missing,
         found: Mapping[str, ClipScores | str],
         columns: Sequence[Column],
     ) -> None:
         self.name = name
         self.folder = folder
         self.columns = columns
-        self.missing = Missing(
-            pairing.without_truth,
-            pairing.without_prediction,
-            pairing.unused,
-            pairing.unnamed,
-            {clip: reason for clip, reason in sorted(found.items()) if isinstance(reason, str)},
-        )
-        self.rows: list[tuple[Pair, ClipScores]] = []
-        for pair in pairing.pairs:
-            scores = found[pair.clip]
-            if isinstance(scores, ClipScores):
-                self.rows.append((pair, scores))
+        unusable = {clip: reason for clip, reason in sorted(found.items()) if isinstance(reason, str)}
+        self.missing = replace(missing, unusable=unusable)
+        self.rows = [(pair, scores) for pair in pairs if isinstance(scores := found[pair.clip], ClipScores)]
         if not self.rows:
             raise FaceDiffError(f"{folder}: {_why_nothing(self.missing)}")
         self.clips = [pair.clip for pair, _ in self.rows]
@@ -371,10 +327,10 @@ class MethodTable:
 
         Empty if they share no clip.
         """
-        common = sorted(set(self.clips) & set(baseline.clips))
+        common = set(self.clips) & set(baseline.clips)
         if not common:
             return []
-        ours, theirs = (table.places(common) for table in (self, baseline))
+        ours, theirs = ([row for row, clip in enumerate(table.clips) if clip in common] for table in (self, baseline))
         a = self.values[ours], self.weights[ours]
         b = baseline.values[theirs], baseline.weights[theirs]
         mine, other = bootstrap.scores(*a), bootstrap.scores(*b)
@@ -388,11 +344,6 @@ class MethodTable:
             )
             if not math.isnan(difference)
         ]
-
-    def places(self, clips: Sequence[str]) -> list[int]:
-        """The rows of some clips."""
-        place = {clip: row for row, clip in enumerate(self.clips)}
-        return [place[clip] for clip in clips]
 
 
 def _why_nothing(missing: Missing) -> str:
@@ -438,8 +389,7 @@ def text(report: Report) -> str:
             f"[…]: {report.level:.0%} intervals, {report.resamples} bootstrap resamples of the sequences, "
             f"seed {report.seed}",
         ]
-    left_out = _left_out(report)
-    lines += ["", *(left_out or ["everything there was scored; nothing was cut, skipped or missing"])]
+    lines += ["", *(_left_out(report) or ["everything there was scored; nothing was cut, skipped or missing"])]
     for definition in report.protocols.values():
         lines += ["", definition]
     return "\n".join(lines)
@@ -489,14 +439,9 @@ def _left_out(report: Report) -> list[str]:
         lines.append(f"truths whose names do not fit: {_names(report.unnamed_truths)}")
     for method in report.methods:
         lines += [f"{method.name}: {line}" for line in _table_method(method)]
-    shared = {clip for method in report.methods[:1] for clip in _clips(method)}
-    if any(_clips(method) != shared for method in report.methods):
+    if len({tuple(sequence.clip for sequence in method.sequences) for method in report.methods}) > 1:
         lines.append("the methods were not scored on the same sequences: compare the differences, not the scores")
     return lines
-
-
-def _clips(method: MethodResult) -> set[str]:
-    return {sequence.clip for sequence in method.sequences}
 
 
 def _table_method(method: MethodResult) -> list[str]:
@@ -519,8 +464,7 @@ def _table_method(method: MethodResult) -> list[str]:
     return lines + unusable[:SHOWN] + more
 
 
-def _names(names: Iterable[str]) -> str:
+def _names(names: Sequence[str]) -> str:
     """How many, and the first few."""
-    found = list(names)
-    more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
-    return f"{len(found)}: {', '.join(found[:SHOWN])}{more}"
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{len(names)}: {', '.join(names[:SHOWN])}{more}"

@@ -286,7 +286,7 @@ def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
 def score_all(
     scorer: Scorer, jobs: Sequence[tuple[str, Pair]], workers: int | None, *, progress: bool = False
 ) -> dict[str, dict[str, ClipScores | str]]:
-    """The scores of every job.
+    """What the scorer says of every job, by method and clip.
 
     The workers are threads: nearly all of the time is spent in torch, which lets other threads run, and a thread
     starts immediately where a process would take seconds, and a hundred megabytes, to import torch.
@@ -296,9 +296,6 @@ def score_all(
         jobs: method and clip.
         workers: clips that are scored at a time; as many as processors if None.
         progress: whether to show a bar.
-
-    Returns:
-        what the scorer said, by method and clip.
 
     Raises:
         FaceDiffError: the first that a clip raises; clips not yet begun are left.

@@ -178,7 +178,7 @@ WRONG = {
     "too many pixels": (["error", "--width", "30", "--dpi", "50"], "raise --width or --dpi"),
     "pairs": (["lips", "--lip-pairs", "3-900"], "--lip-pairs 3-900"),
     "span": (["lips", "--span", "3", "1"], "--span 3 1"),
-    "span without a frame": (["lips", "--span", "0.03", "0.05"], "the middle of no frame lies in it"),
+    "span without a frame": (["lips", "--span", "0.03", "0.05"], "the middle of no frame"),
     "audio": (["lips", "--audio", "gone.wav"], "gone.wav: no such sound file"),
     "phoneme file": (["lips", "--phoneme-file", "gone.csv"], "gone.csv: not readable as phonemes"),
     "rate": (["lips", "--frame-rate", "-3"], "--frame-rate -3"),

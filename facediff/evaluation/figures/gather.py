@@ -24,9 +24,6 @@ from facediff.mesh.mesh import SUFFIXES, Mesh, read_mesh
 
 Module = type[SpeechMotionDataModule]
 
-PUPPET = Path("puppet")
-"""Stands for the built-in corpus in the user's cache folder."""
-
 
 def gather(
     methods: Mapping[str, Path],
@@ -42,30 +39,36 @@ def gather(
     truth_stride: int | None = None,
     unit: str | None = None,
 ) -> Material:
-    """Find truth, methods and what is known about their mesh.
+    """Find truth, methods and what is known about their mesh; where an option is None, the corpus says it.
 
     Args:
         methods: each method's folder of predictions.
-        truth: a corpus folder, any folder of .npy files, or ``puppet``.
+        truth: a corpus folder, any folder of .npy files, or ``puppet``, the built-in corpus in the user's cache folder.
         patterns: how predictions are named.
         truth_pattern: how truths are named.
         identity: whose style the predictions were given.
-        topology: the corpus that the mesh belongs to; recognised by itself if None.
-        templates: file of each speaker's neutral face; the corpus's if None.
-        mesh: file with the faces; the corpus's if None.
-        frame_rate: frames a second of the predictions; the corpus's if None.
+        topology: the corpus that the mesh belongs to.
+        templates: file of each speaker's neutral face.
+        mesh: file with the faces.
+        frame_rate: frames a second of the predictions.
         truth_stride: use every n-th frame of the truth; by the frame rates if None.
-        unit: unit of the vertices; the corpus's if None.
+        unit: unit of the vertices.
 
     Raises:
         FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others.
     """
-    folder, corpus = find_truths(_truth_folder(truth))
+    if truth == Path("puppet") and not truth.is_dir():
+        truth = cache_root(0)
+        if not truth.is_dir():
+            raise FaceDiffError(f"{truth}: the built-in corpus does not exist yet; `facediff demo` makes it")
+    folder, corpus = find_truths(truth)
     manifest = read_manifest(corpus) if corpus else {}
     module = _recognise(topology, corpus or folder, manifest)
     if templates is None and corpus is not None and (corpus / "templates.pkl").is_file():
         templates = corpus / "templates.pkl"
-    n_vertices = module.n_vertices if module else _count_vertices(templates, folder)
+    if module is None and templates is None and not any(folder.glob("**/*.npy")):
+        raise FaceDiffError(f"{folder}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
+    n_vertices = module.n_vertices if module else count_vertices(None, templates, folder)
     faces = {} if templates is None else read_templates(templates, n_vertices)
     found_mesh = _find_mesh(mesh, corpus or folder, module, n_vertices)
     rate, stride = _rates(frame_rate, truth_stride, manifest, module)
@@ -110,15 +113,6 @@ def phonemes_of(material: Material, clip: str, file: Path | None = None) -> list
     return read_phonemes(path) if path else []
 
 
-def _truth_folder(truth: Path) -> Path:
-    if truth != PUPPET or truth.is_dir():
-        return truth
-    root = cache_root(0)
-    if not root.is_dir():
-        raise FaceDiffError(f"{root}: the built-in corpus does not exist yet; `facediff demo` makes it")
-    return root
-
-
 def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module | None:
     """The data module whose topology this is; None if it is not recognised."""
     folder = list_folder(root, MOTION_FOLDERS)
@@ -130,13 +124,6 @@ def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module
         return None
     module = recognise(folder, manifest.get("corpus"), folder.n_vertices())
     return module if module is not None and module.n_vertices == folder.n_vertices() else None
-
-
-def _count_vertices(templates_file: Path | None, truth: Path) -> int:
-    """Vertices of the mesh where no data module is known: those of the templates, else of the first readable truth."""
-    if templates_file is None and not any(truth.glob("**/*.npy")):
-        raise FaceDiffError(f"{truth}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
-    return count_vertices(None, templates_file, truth)
 
 
 def _find_mesh(given: Path | None, root: Path, module: Module | None, n_vertices: int) -> Mesh | None:

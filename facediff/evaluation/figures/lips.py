@@ -123,10 +123,22 @@ def draw_lips(
         figure = new_figure(paper, PANEL_HEIGHT * sum(parts) + 16 + 3.5 * bool(remark), layout="constrained")
         figure.get_layout_engine().set(hspace=0.02, h_pad=0.03, w_pad=0.03)  # type: ignore[union-attr, call-arg]
         axes = figure.subplots(len(parts), 1, sharex=True, height_ratios=parts, squeeze=False)[:, 0]
-        _draw_openings(axes[0], curves, scale)
+        methods = [name for name in curves.openings if name != TRUTH]
+        for name, values in curves.openings.items():
+            look = {"color": BLACK, "linewidth": 1.6} if name == TRUTH else line_style(methods.index(name))
+            axes[0].plot(curves.times, values * scale[0], label=plain(name), **look)
+        axes[0].set_ylabel(plain(f"lip opening [{scale[1]}]"))
+        axes[0].set_ylim(bottom=min(0.0, axes[0].get_ylim()[0]))
         rest = list(axes[1:])
         if sound.phonemes:
-            _mark_closures(axes[0], sound.phonemes)
+            # Grey where the lips close in speech: a good method's curve is low there.
+            label: str | None = ", ".join(f"/{each}/" for each in BILABIALS)
+            for phoneme in sound.phonemes:
+                if phoneme.plain in BILABIALS:
+                    axes[0].axvspan(
+                        phoneme.start, phoneme.end, color=FAINT, alpha=0.45, linewidth=0, label=label, zorder=0
+                    )
+                    label = None
             _draw_phonemes(rest.pop(0), sound.phonemes, (low, high), paper)
         if sound.samples.size:
             _draw_waveform(rest[0], sound, (low, high), paper)
@@ -149,24 +161,6 @@ def _span(curves: Curves, span: tuple[float, float] | None) -> tuple[float, floa
     if not ((span[0] <= curves.times) & (curves.times <= span[1])).any():
         raise FaceDiffError(f"--span {span[0]:g} {span[1]:g}: it contains the middle of no frame; make it longer")
     return span[0], min(span[1], end)
-
-
-def _draw_openings(axes: Axes, curves: Curves, scale: tuple[float, str]) -> None:
-    methods = [name for name in curves.openings if name != TRUTH]
-    for name, values in curves.openings.items():
-        look = {"color": BLACK, "linewidth": 1.6} if name == TRUTH else line_style(methods.index(name))
-        axes.plot(curves.times, values * scale[0], label=plain(name), **look)  # type: ignore[arg-type]
-    axes.set_ylabel(plain(f"lip opening [{scale[1]}]"))
-    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-
-
-def _mark_closures(axes: Axes, phonemes: Sequence[Phoneme]) -> None:
-    """Grey where the lips close in speech: a good method's curve is low there."""
-    label: str | None = ", ".join(f"/{each}/" for each in BILABIALS)
-    for phoneme in phonemes:
-        if phoneme.plain in BILABIALS:
-            axes.axvspan(phoneme.start, phoneme.end, color=FAINT, alpha=0.45, linewidth=0, label=label, zorder=0)
-            label = None
 
 
 def _draw_phonemes(axes: Axes, phonemes: Sequence[Phoneme], span: tuple[float, float], paper: Paper) -> None:

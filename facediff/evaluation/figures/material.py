@@ -204,7 +204,7 @@ def find_clips(
     found: dict[str, dict[str, Path]] = {}
     for method, folder in methods.items():
         files, _ = list_names(folder, readers)
-        pairs = pair_up(files, truths, identity).pairs
+        pairs, _ = pair_up(files, truths, identity)
         if not pairs:
             raise FaceDiffError(
                 f"{folder}: no file is a prediction of a truth's clip under the condition {identity}; the truth has "
@@ -237,16 +237,7 @@ def shortest(motions: Mapping[str, Tensor]) -> tuple[int, str | None]:
 
 
 def chunks(motion: Tensor, path: Path, frames: int) -> Iterator[Array]:
-    """The first frames of a motion (T, V, 3) in float64, a few at a time.
-
-    Args:
-        motion: the motion.
-        path: its file, for messages.
-        frames: number of frames to read.
-
-    Raises:
-        FaceDiffError: at NaN or infinity.
-    """
+    """The first ``frames`` frames of a motion (T, V, 3) in float64, a few at a time; refuses NaN and infinity."""
     step = max(1, CHUNK // max(1, motion[0].numel()))
     for first in range(0, frames, step):
         part = np.asarray(motion[first : min(first + step, frames)], np.float64)
@@ -280,7 +271,14 @@ class Painter:
         region: Sequence[int] | None = None,
     ) -> None:
         self.faces, self.shape, self.look, self.colours = faces, shape, look, colours
-        framed = shape if region is None else _box_around(shape[list(region)])
+        framed = shape
+        if region is not None:
+            # Points (N, 3) of the region, and the corners of a box wider by 0.45 of their width on every side.
+            points = shape[list(region)]
+            more = 0.45 * np.ptp(points[:, 0])
+            limits = zip(points.min(0) - (more, more, 0), points.max(0) + (more, more, 0), strict=True)
+            corners = np.stack(np.meshgrid(*limits), -1).reshape(-1, 3)
+            framed = np.concatenate([points, corners])
         whole, camera = Camera.framing(shape, view=view), Camera.framing(framed, view=view)
         # A close-up must not cut off the ears, which are behind what the camera is framed on.
         self._camera = replace(camera, radius=max(camera.radius, whole.radius))
@@ -331,12 +329,3 @@ class Painter:
         picture = self._renderer.render(vertices, colours=colours)[self._cut]
         picture[(picture == self._renderer.backdrop[self._cut]).all(-1)] = 255  # the backdrop darkens in its corners
         return picture
-
-
-def _box_around(points: Array) -> Array:
-    """Points (N, 3) of the lips, and the corners of a box that is wider by 0.45 of their width on every side."""
-    low, high = points.min(0), points.max(0)
-    more = 0.45 * (high[0] - low[0])
-    low, high = low - (more, more, 0), high + (more, more, 0)
-    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
-    return np.concatenate([points, corners])

@@ -64,15 +64,7 @@ def draw_regions(
 
 
 def find_view(root: Path, corpus: str | None) -> View:
-    """What a folder is, as ``facediff data check`` recognises it.
-
-    Args:
-        root: the folder.
-        corpus: name of the corpus, or import path of its data module; recognised if None.
-
-    Raises:
-        FaceDiffError: if there is no such folder or corpus, or the folder is not recognised.
-    """
+    """What a folder is, as ``facediff data check`` recognises it."""
     if not root.is_dir():
         raise FaceDiffError(f"{root}: no such folder; expected a corpus folder with a mesh and regions/")
     report = Report(root, quick=True)
@@ -85,11 +77,7 @@ def find_view(root: Path, corpus: str | None) -> View:
 
 
 def find_mesh(root: Path, view: View) -> Mesh:
-    """The corpus's mesh: its neutral vertices and its faces.
-
-    Raises:
-        FaceDiffError: if there is no mesh file, or it does not belong to this corpus.
-    """
+    """The corpus's mesh: its neutral vertices and its faces."""
     mesh = Corpus(root, view.n_vertices, view.frame_rate, stored_frame_rate=view.frame_rate).read_mesh(view.mesh_files)
     if mesh is None and not view.mesh_files:
         whose = "a person's folder" if view.data_module is None else view.corpus
@@ -108,18 +96,7 @@ def legend(root: Path, sources: Sequence[str], region: Region) -> str:
 
 
 def draw(mesh: Mesh, regions: dict[str, Region], lines: dict[str, str], title: str, size: int) -> npt.NDArray[np.uint8]:
-    """The picture: the views side by side, the regions coloured, a line in its colour for each below.
-
-    Args:
-        mesh: what to draw on.
-        regions: vertices by name, the names of `COLOURS`.
-        lines: text for each region.
-        title: text for all.
-        size: height and width of each view in pixels.
-
-    Returns:
-        (height, width, 3), sRGB.
-    """
+    """The views side by side (height, width, 3), the regions coloured, a line in its colour for each below."""
     colours = np.full((len(mesh.vertices), 3), REST, np.uint8)
     for part, region in regions.items():
         colours[list(region.indices)] = COLOURS[part]
