@@ -33,127 +33,69 @@ that all metrics share are those of `facediff.metrics.base.SequenceOptions` and 
 A new metric is a `SequenceMetric` that defines `clip_value`, registered with ``@facediff.registry.metric.register``.
 """
 
-from facediff.metrics.base import Clip, Coverage, ExactMetric, LipMetric, SequenceMetric, align, functional
-from facediff.metrics.by_name import NEEDS, Context, Request, feed, parse
-from facediff.metrics.mouth import (
-    BilabialClosureRate,
-    Closures,
-    LipOpeningCorrelation,
-    LipSpeedCorrelation,
-    MouthOpeningDifference,
-    OpeningMetric,
-    bilabial_closure_rate,
-    lip_opening_correlation,
-    lip_speed_correlation,
-    mouth_opening_difference,
-)
-from facediff.metrics.protocols import PROTOCOLS, Protocol, ProtocolMetrics, Summary, protocol
-from facediff.metrics.regions import TOPOLOGIES, LipPairs, Region, Topology, as_region
-from facediff.metrics.samples import (
-    CoverageError,
-    IdentityDiversity,
-    MeanEstimateError,
-    SampleDiversity,
-    SamplesMetric,
-    coverage_error,
-    identity_diversity,
-    mean_estimate_error,
-    sample_diversity,
-)
-from facediff.metrics.speech import (
-    ClipSpeechLipCorrelation,
-    FrameSpeechLipCorrelation,
-    SpeechLipMetric,
-    clip_speech_lip_correlation,
-    frame_speech_lip_correlation,
-    speech_intensity,
-)
-from facediff.metrics.speed import RealTimeFactor, device_name, real_time_factor
-from facediff.metrics.style import StyleRetrievalAccuracy, style_retrieval_accuracy
-from facediff.metrics.timing import (
-    LipWarpingDistance,
-    TemporalMisalignment,
-    lip_warping_distance,
-    temporal_misalignment,
-    warp,
-)
-from facediff.metrics.vertex_errors import (
-    FaceDynamicsDeviation,
-    LipVertexError,
-    MeanVertexError,
-    UpperFaceVertexError,
-    VertexError,
-    face_dynamics_deviation,
-    lip_vertex_error,
-    mean_vertex_error,
-    upper_face_vertex_error,
-)
-
-__all__ = [
-    "NEEDS",
-    "PROTOCOLS",
-    "TOPOLOGIES",
-    "BilabialClosureRate",
-    "Clip",
-    "ClipSpeechLipCorrelation",
-    "Closures",
-    "Context",
-    "Coverage",
-    "CoverageError",
-    "ExactMetric",
-    "FaceDynamicsDeviation",
-    "FrameSpeechLipCorrelation",
-    "IdentityDiversity",
-    "LipMetric",
-    "LipOpeningCorrelation",
-    "LipPairs",
-    "LipSpeedCorrelation",
-    "LipVertexError",
-    "LipWarpingDistance",
-    "MeanEstimateError",
-    "MeanVertexError",
-    "MouthOpeningDifference",
-    "OpeningMetric",
-    "Protocol",
-    "ProtocolMetrics",
-    "RealTimeFactor",
-    "Region",
-    "Request",
-    "SampleDiversity",
-    "SamplesMetric",
-    "SequenceMetric",
-    "SpeechLipMetric",
-    "StyleRetrievalAccuracy",
-    "Summary",
-    "TemporalMisalignment",
-    "Topology",
-    "UpperFaceVertexError",
-    "VertexError",
-    "align",
-    "as_region",
-    "bilabial_closure_rate",
-    "clip_speech_lip_correlation",
-    "coverage_error",
-    "device_name",
-    "face_dynamics_deviation",
-    "feed",
-    "frame_speech_lip_correlation",
-    "functional",
-    "identity_diversity",
-    "lip_opening_correlation",
-    "lip_speed_correlation",
-    "lip_vertex_error",
-    "lip_warping_distance",
-    "mean_estimate_error",
-    "mean_vertex_error",
-    "mouth_opening_difference",
-    "parse",
-    "protocol",
-    "real_time_factor",
-    "sample_diversity",
-    "speech_intensity",
-    "style_retrieval_accuracy",
-    "temporal_misalignment",
-    "upper_face_vertex_error",
-    "warp",
-]
+from facediff.metrics.base import Clip as Clip
+from facediff.metrics.base import Coverage as Coverage
+from facediff.metrics.base import ExactMetric as ExactMetric
+from facediff.metrics.base import LipMetric as LipMetric
+from facediff.metrics.base import SequenceMetric as SequenceMetric
+from facediff.metrics.base import align as align
+from facediff.metrics.base import functional as functional
+from facediff.metrics.by_name import NEEDS as NEEDS
+from facediff.metrics.by_name import Context as Context
+from facediff.metrics.by_name import Request as Request
+from facediff.metrics.by_name import feed as feed
+from facediff.metrics.by_name import parse as parse
+from facediff.metrics.mouth import BilabialClosureRate as BilabialClosureRate
+from facediff.metrics.mouth import Closures as Closures
+from facediff.metrics.mouth import LipOpeningCorrelation as LipOpeningCorrelation
+from facediff.metrics.mouth import LipSpeedCorrelation as LipSpeedCorrelation
+from facediff.metrics.mouth import MouthOpeningDifference as MouthOpeningDifference
+from facediff.metrics.mouth import OpeningMetric as OpeningMetric
+from facediff.metrics.mouth import bilabial_closure_rate as bilabial_closure_rate
+from facediff.metrics.mouth import lip_opening_correlation as lip_opening_correlation
+from facediff.metrics.mouth import lip_speed_correlation as lip_speed_correlation
+from facediff.metrics.mouth import mouth_opening_difference as mouth_opening_difference
+from facediff.metrics.protocols import PROTOCOLS as PROTOCOLS
+from facediff.metrics.protocols import Protocol as Protocol
+from facediff.metrics.protocols import ProtocolMetrics as ProtocolMetrics
+from facediff.metrics.protocols import Summary as Summary
+from facediff.metrics.protocols import protocol as protocol
+from facediff.metrics.regions import TOPOLOGIES as TOPOLOGIES
+from facediff.metrics.regions import LipPairs as LipPairs
+from facediff.metrics.regions import Region as Region
+from facediff.metrics.regions import Topology as Topology
+from facediff.metrics.regions import as_region as as_region
+from facediff.metrics.samples import CoverageError as CoverageError
+from facediff.metrics.samples import IdentityDiversity as IdentityDiversity
+from facediff.metrics.samples import MeanEstimateError as MeanEstimateError
+from facediff.metrics.samples import SampleDiversity as SampleDiversity
+from facediff.metrics.samples import SamplesMetric as SamplesMetric
+from facediff.metrics.samples import coverage_error as coverage_error
+from facediff.metrics.samples import identity_diversity as identity_diversity
+from facediff.metrics.samples import mean_estimate_error as mean_estimate_error
+from facediff.metrics.samples import sample_diversity as sample_diversity
+from facediff.metrics.speech import ClipSpeechLipCorrelation as ClipSpeechLipCorrelation
+from facediff.metrics.speech import FrameSpeechLipCorrelation as FrameSpeechLipCorrelation
+from facediff.metrics.speech import SpeechLipMetric as SpeechLipMetric
+from facediff.metrics.speech import clip_speech_lip_correlation as clip_speech_lip_correlation
+from facediff.metrics.speech import frame_speech_lip_correlation as frame_speech_lip_correlation
+from facediff.metrics.speech import speech_intensity as speech_intensity
+from facediff.metrics.speed import RealTimeFactor as RealTimeFactor
+from facediff.metrics.speed import device_name as device_name
+from facediff.metrics.speed import real_time_factor as real_time_factor
+from facediff.metrics.style import StyleRetrievalAccuracy as StyleRetrievalAccuracy
+from facediff.metrics.style import style_retrieval_accuracy as style_retrieval_accuracy
+from facediff.metrics.timing import LipWarpingDistance as LipWarpingDistance
+from facediff.metrics.timing import TemporalMisalignment as TemporalMisalignment
+from facediff.metrics.timing import lip_warping_distance as lip_warping_distance
+from facediff.metrics.timing import temporal_misalignment as temporal_misalignment
+from facediff.metrics.timing import warp as warp
+from facediff.metrics.vertex_errors import FaceDynamicsDeviation as FaceDynamicsDeviation
+from facediff.metrics.vertex_errors import LipVertexError as LipVertexError
+from facediff.metrics.vertex_errors import MeanVertexError as MeanVertexError
+from facediff.metrics.vertex_errors import UpperFaceVertexError as UpperFaceVertexError
+from facediff.metrics.vertex_errors import VertexError as VertexError
+from facediff.metrics.vertex_errors import face_dynamics_deviation as face_dynamics_deviation
+from facediff.metrics.vertex_errors import lip_vertex_error as lip_vertex_error
+from facediff.metrics.vertex_errors import mean_vertex_error as mean_vertex_error
+from facediff.metrics.vertex_errors import upper_face_vertex_error as upper_face_vertex_error

@@ -18,11 +18,12 @@ from facediff.metrics.base import (
     Pooling,
     Reduction,
     SequenceMetric,
+    SequenceOptions,
     Sign,
     align,
     check_option,
 )
-from facediff.metrics.regions import Region, find_topology
+from facediff.metrics.regions import TOPOLOGIES, Region
 from facediff.metrics.vertex_errors import (
     FaceDynamicsDeviation,
     LipVertexError,
@@ -74,7 +75,7 @@ class Protocol:
         check_option("pooling", self.pooling, Pooling)
         check_option("length rule", self.length_rule, LengthRule)
         if self.topology is not None:
-            find_topology(self.topology)
+            check_option("topology", self.topology, TOPOLOGIES)
 
     def describe(self) -> str:
         """The definition in plain words, one line per number."""
@@ -105,7 +106,7 @@ class Protocol:
             ValueError: If the upper face is needed and missing, or a region does not fit the topology.
         """
         if self.topology is not None:
-            topology = find_topology(self.topology)
+            topology = TOPOLOGIES[self.topology]
             lips, upper = topology.bind(lips), None if upper is None else topology.bind(upper)
         return ProtocolMetrics(self, lips, upper)
 
@@ -178,8 +179,8 @@ class Summary:
         """Whether each region is one in use on the topology; empty where that is not known."""
         if self.topology is None:
             return []
-        found = [find_topology(self.topology).remark("lips", self.lips)]
-        return found if self.upper is None else [*found, find_topology(self.topology).remark("upper", self.upper)]
+        mesh, upper = TOPOLOGIES[self.topology], self.upper
+        return [mesh.remark("lips", self.lips), *([] if upper is None else [mesh.remark("upper", upper)])]
 
     def __str__(self) -> str:
         """One line for people."""
@@ -224,21 +225,16 @@ class ProtocolMetrics(MetricCollection):
         self.protocol = protocol
         self.lips = lips
         self.upper = upper if protocol.fdd else None
-        rule, pooling = protocol.length_rule, protocol.pooling
+        pooling = protocol.pooling
+        options: SequenceOptions = {"length_rule": protocol.length_rule, "check_finite": False}
         scores: dict[str, Metric] = {}
         if protocol.mve is not None:
             scores["mve"] = MeanVertexError(
-                reduction=protocol.mve,
-                squared=protocol.mve_squared,
-                pooling=pooling,
-                length_rule=rule,
-                check_finite=False,
+                reduction=protocol.mve, squared=protocol.mve_squared, pooling=pooling, **options
             )
-        scores["lve"] = LipVertexError(
-            lips, squared=protocol.lve_squared, pooling=pooling, length_rule=rule, check_finite=False
-        )
+        scores["lve"] = LipVertexError(lips, squared=protocol.lve_squared, pooling=pooling, **options)
         for name, sign in protocol.deviations().items():
-            scores[name] = FaceDynamicsDeviation(cast(Region, upper), sign=sign, length_rule=rule, check_finite=False)
+            scores[name] = FaceDynamicsDeviation(cast(Region, upper), sign=sign, **options)
         for name, score in scores.items():  # one by one: a dictionary would be sorted by name
             self.add_metrics({name: score})
 
@@ -266,14 +262,6 @@ class ProtocolMetrics(MetricCollection):
         """Add a batch like `update` and return the scores of this batch alone."""
         self._check(prediction, truth, template, batch)
         return cast(dict[str, Tensor], super().forward(prediction, truth, template=template, **batch))
-
-    def compute(self) -> dict[str, Tensor]:
-        """The scores over all sequences so far, by name.
-
-        Raises:
-            ValueError: If no process had any sequence.
-        """
-        return cast(dict[str, Tensor], super().compute())
 
     def summary(self) -> Summary:
         """Regions, frames, sequences and cut frames behind the scores, over all processes."""

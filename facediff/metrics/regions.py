@@ -19,8 +19,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from facediff.errors import choices
-
 
 def _short_hash(words: Iterable[str]) -> str:
     return hashlib.sha256(",".join(words).encode("ascii")).hexdigest()[:8]
@@ -460,14 +458,3 @@ TOPOLOGIES: dict[str, Topology] = {
     "multiface": Topology("multiface", 6172, _MULTIFACE_LIPS, _MULTIFACE_UPPER),
 }
 """Every known mesh by the name of its data set."""
-
-
-def find_topology(name: str) -> Topology:
-    """The topology of that name.
-
-    Raises:
-        ValueError: If there is none; the message lists them and the nearest.
-    """
-    if name not in TOPOLOGIES:
-        raise ValueError(f"unknown topology {name!r}: {choices(name, TOPOLOGIES)}")
-    return TOPOLOGIES[name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -30,15 +31,9 @@ released test scripts do. ``adapted``: their own, which the model must have been
 def conditioned(
     batch: Batch, policy: IdentityPolicy, identities: Sequence[str], references: Mapping[str, Reference]
 ) -> list[tuple[str, Batch]]:
-    """The batches to score in place of one, each with the name of the identity for its unseen speakers.
+    """The batches to score in place of one, each with the name of the identity that its unseen speakers get.
 
-    A clip of a training identity comes once.
-
-    Args:
-        batch: clips of training identities and of unseen speakers.
-        policy: which identity the unseen speakers get.
-        identities: training identities in the order of the identity index.
-        references: their style references.
+    A clip of a training identity comes once. ``identities`` are in the order of the identity index.
 
     Raises:
         FaceDiffError: if the policy is ``adapted`` and a speaker is unseen, or an identity has no style reference.
@@ -93,14 +88,9 @@ def regions_of(assets: Assets) -> dict[str, Region]:
 
 
 class Evaluation:
-    """Metrics of one protocol, and metrics chosen by name, for every split and method.
+    """Metrics of one protocol, and ``metrics`` chosen by name with their options, for every split and method.
 
     No part of the model's module tree: weight averaging copies that tree before the regions are known.
-
-    Args:
-        protocol_name: the protocol.
-        unseen_identity: which identity unseen speakers are tested with; reported next to the scores.
-        metrics: further metrics by name, with their options: ``temporal_misalignment:at=path``.
 
     Raises:
         FaceDiffError: if there is no such metric or option.
@@ -120,13 +110,7 @@ class Evaluation:
         self._speakers: list[str] = []
 
     def prepare(self, model: Inference, splits: Sequence[str], device: torch.device, root: Path) -> None:
-        """Make empty metrics for a model's corpus, on the device where processes reduce them.
-
-        Args:
-            model: the model with its assets.
-            splits: the splits that are scored.
-            device: the device.
-            root: the corpus folder.
+        """Make empty metrics for the corpus in the folder ``root``, on the device where processes reduce them.
 
         Raises:
             FaceDiffError: if the corpus or the model lacks something that a metric needs.
@@ -140,9 +124,7 @@ class Evaluation:
         self._speakers = sorted(assets.templates)
         methods = METHODS if self.splits != ["val"] else METHODS[:1]
         self.metrics = {
-            split: {
-                method: self.protocol.build(regions["lips"], regions["upper_face"]).to(device) for method in methods
-            }
+            split: {each: self.protocol.build(regions["lips"], regions["upper_face"]).to(device) for each in methods}
             for split in self.splits
         }
         context = self._context(model, regions, device) if self.requests else Context()
@@ -200,11 +182,7 @@ class Evaluation:
     def score(self, model: Inference, split: str, batch: Batch, identity: str = "") -> None:
         """Generate a batch's motion, and whatever else metrics need of the model, and add its scores.
 
-        Args:
-            model: the model.
-            split: the split.
-            batch: the clips with their true motion.
-            identity: the identity that all clips are generated with, if it is not their own.
+        ``identity`` is the one that all clips are generated with, if it is not their own.
         """
         start = self._clock(model)
         motion = model.generate(batch, seed=0)
@@ -246,13 +224,7 @@ class Evaluation:
     ) -> None:
         """Add a batch's motion (offsets from the template), unless another process adds the same clips.
 
-        Args:
-            split: the split.
-            method: who made the motion.
-            motion: offsets from the template.
-            batch: the clips with their true motion.
-            identity: the identity that all clips were generated with, if it is not their own.
-            inputs: what metrics chosen by name read in addition, by the name under which they take it.
+        ``inputs`` is what metrics chosen by name read in addition, by the name under which they take it.
         """
         if batch.repeated:
             return
@@ -309,9 +281,10 @@ class Evaluation:
             shares: list[Any] = [None] * torch.distributed.get_world_size()
             torch.distributed.all_gather_object(shares, rows)
             rows = [row for share in shares for row in share]
-        return evened(
-            sorted(rows, key=lambda row: (row["split"], METHODS.index(row["method"]), row["clip"], row["identity"]))
-        )
+        rows = sorted(rows, key=lambda row: (row["split"], METHODS.index(row["method"]), row["clip"], row["identity"]))
+        keys = dict.fromkeys(key for row in rows for key in row)
+        # NaN, which alone differs from itself, is a clip that a metric leaves out.
+        return [{key: None if row.get(key) != row.get(key) else row.get(key) for key in keys} for row in rows]
 
     def scalars(self, split: str) -> dict[str, float]:
         """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics."""
@@ -339,7 +312,10 @@ class Evaluation:
                 continue  # no clip of the split had speech of another sentence to shuffle with
             scores: dict[str, float | None] = {name: float(value) for name, value in metrics.compute().items()}
             for name in self.chosen[split]["model"]:
-                scores[name] = value_of(self.chosen[split][method].get(name))
+                scores[name] = None
+                if name in self.chosen[split][method]:
+                    with contextlib.suppress(ValueError):  # no value on any sequence
+                        scores[name] = float(self.chosen[split][method][name].compute())
             facts = {"split": split, "method": method, "unseen_identity": self.unseen_identity}
             table.append({**facts, **scores, **summary.as_dict()})
         return table
@@ -350,17 +326,3 @@ class Evaluation:
         for name, metric in next(iter(self.chosen.values()), {}).get("model", {}).items():
             lines.append(f"metric {name}: {getattr(metric, 'definition', type(metric).__doc__)}")
         return "\n".join(lines)
-
-
-def value_of(metric: Metric | None) -> float | None:
-    """A metric's score; None without a metric, or if it has no value on any sequence."""
-    try:
-        return None if metric is None else float(metric.compute())
-    except ValueError:
-        return None
-
-
-def evened(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Rows with the keys of all of them, in the order in which they first come; None where a row has no value."""
-    keys = dict.fromkeys(key for row in rows for key in row)
-    return [{key: None if row.get(key) != row.get(key) else row.get(key) for key in keys} for row in rows]
