@@ -130,15 +130,7 @@ def is_complete(root: Path, *, seed: int = 0) -> bool:
 
 
 def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, tuple[Phoneme, ...]]:
-    """Make one clip.
-
-    Args:
-        clip: Who speaks what in which mood.
-        seed: The corpus's seed.
-
-    Returns:
-        The waveform at 16 kHz, shape (640 T,); rig weights, shape (T, controls); and the phonemes in time.
-    """
+    """One clip's waveform (640 T,) at 16 kHz, rig weights (T, controls), and phonemes in time."""
     speaker = SPEAKERS[clip.identity]
     spoken = speak(SENTENCES[clip.number - 1], speaker.voice)
     before = round(_QUIET_BEFORE * SAMPLE_RATE)
@@ -183,10 +175,7 @@ def regions() -> dict[str, NDArray[np.int64]]:
     above = (y > 32.0) & (y < 84.0) & (np.abs(x) < 62.0) & (z > 30.0)
     upper = np.flatnonzero(skin & above)
     eyes = mesh.both("eye_0", "eye_1", "eye_2", "lid_inner", "brow")
-    return {
-        "lve": mesh.both("mouth_0", "lip_crest", "lip_front", "lip_inner"),
-        "fdd": np.union1d(upper, eyes),
-    }
+    return {"lve": mesh.both("mouth_0", "lip_crest", "lip_front", "lip_inner"), "fdd": np.union1d(upper, eyes)}
 
 
 def _facts(seed: int, count: int) -> dict[str, int | str]:
@@ -271,14 +260,7 @@ def _write_clip(folder: Path, clip: Clip, seed: int) -> int:
 
 
 def write_ply(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], colours: NDArray[np.uint8]) -> None:
-    """Write a coloured triangle mesh as binary little-endian PLY.
-
-    Args:
-        path: The file.
-        vertices: Positions, shape (V, 3).
-        faces: Vertex indices, shape (F, 3).
-        colours: Red, green, blue, shape (V, 3).
-    """
+    """Write a triangle mesh (V, 3), (F, 3) with colours (V, 3) in red, green, blue as binary little-endian PLY."""
     header = [
         "ply",
         "format binary_little_endian 1.0",

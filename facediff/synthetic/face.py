@@ -6,8 +6,8 @@ the face's left, y up, z to the viewer. Only the left half is built; the other h
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,8 +36,7 @@ BROW_COLUMNS = np.array([13.0, 19.5, 27.0, 34.5, 42.0, 48.5])
 def build_face() -> Mesh:
     """Build the neutral head, in metres; speakers' heads have the same faces and other vertices."""
     half = HalfMesh()
-    layout = lay_out()
-    _add_skin(half, layout)
+    _add_skin(half)
     _add_mouth(half)
     _add_teeth(half)
     _add_lids(half)
@@ -47,26 +46,24 @@ def build_face() -> Mesh:
     return Mesh(mesh.vertices / 1000.0, mesh.faces, mesh.colours, mesh.mirror, mesh.groups)
 
 
-def _add_skin(half: HalfMesh, layout: Layout) -> None:
-    points = skin(layout.theta, layout.level)
-    points[layout.theta == 0.0, 0] = 0.0
-    points[layout.theta > np.pi - 1e-6, 0] = 0.0
+def _add_skin(half: HalfMesh) -> None:
+    """Place, connect and colour the skin."""
+    theta, level, triangles, rings = lay_out()
+    points = skin(theta, level)
+    points[theta == 0.0, 0] = 0.0
+    points[theta > np.pi - 1e-6, 0] = 0.0
     index = half.add("skin", points, _SKIN)
-    half.faces.append(index[layout.triangles])
-    top = np.flatnonzero(layout.level == layout.level.max())
-    top = top[np.argsort(layout.theta[top])]
+    half.faces.append(index[triangles])
+    top = np.flatnonzero(level == level.max())
+    top = top[np.argsort(theta[top])]
     crown = int(half.add("crown", np.array([CROWN]), _HAIR)[0])
-    half.faces.append(np.array([[a, b, crown] for a, b in zip(top[:-1], top[1:], strict=True)]))
-    for name, ring in layout.rings.items():
+    half.faces.append(np.array([[a, b, crown] for a, b in pairwise(top)]))
+    for name, ring in rings.items():
         half.groups[name] = index[ring]
-    _paint_skin(half, points, layout)
-
-
-def _paint_skin(half: HalfMesh, points: Array, layout: Layout) -> None:
     colours = half.colours[0]
     x, y, z = points.T
-    line = hairline(layout.theta)
-    _mix(colours, rise(layout.level, line + 0.5, line + 8.0), _HAIR)
+    line = hairline(theta)
+    _mix(colours, rise(level, line + 0.5, line + 8.0), _HAIR)
     blush = 0.30 * bump(x, y, (44, -6), (13, 11)) + 0.25 * bump(x, y, (0, -10), (8, 6))
     _mix(colours, np.where(z > 0, blush, 0.0), (222, 128, 110))
     _mix(colours, np.where(z > 0, bump(x, y, (7.0, -20.5), (2.4, 2.4)), 0.0), _NOSTRIL)
@@ -116,14 +113,7 @@ def _add_mouth(half: HalfMesh) -> None:
     roll = loop("lip_roll", 0.96, 0.0, -side * 2.0 * full - 0.2 * side, -5.0 - 0.5 * full, _MOUTH)
     bag = loop("mouth_bag", 0.86, 0.0, -side * (8.0 * full), -15.0 - 2.0 * full, tuple(np.array(_MOUTH) * 2 // 3))
     back = loop("mouth_back", 0.7, 0.0, -side * (9.0 * full), -28.0 - 2.0 * full, _THROAT)
-    for outer, inner in (
-        (border, crest),
-        (crest, front),
-        (front, contact),
-        (contact, roll),
-        (roll, bag),
-        (bag, back),
-    ):
+    for outer, inner in pairwise((border, crest, front, contact, roll, bag, back)):
         half.strip(outer, inner)
     for i in range(7):
         a, b, c, d = back[i], back[i + 1], back[13 - i], back[14 - i]
@@ -140,8 +130,8 @@ def _add_teeth(half: HalfMesh) -> None:
             half.add(f"{name}_{k}", np.stack([columns * s, np.full(4, y), arc - back - behind], axis=1), _TEETH)
             for k, (s, y, back) in enumerate(((0.97, root, 1.5), (1.0, edge, 0.0)))
         ]
-        for outer, inner in zip(rows[:-1], rows[1:], strict=True):
-            half.strip(*((outer, inner) if root > edge else (inner, outer)))
+        outer, inner = rows if root > edge else rows[::-1]
+        half.strip(outer, inner)
 
 
 def _add_lids(half: HalfMesh) -> None:
@@ -166,16 +156,10 @@ def _add_eyeball(half: HalfMesh) -> None:
     ):
         angle = np.deg2rad(degrees)
         r = EYEBALL_RADIUS + cornea
-        ring = np.stack(
-            [
-                r * np.sin(angle) * np.cos(turn),
-                r * np.sin(angle) * np.sin(turn),
-                np.full(10, r * np.cos(angle)),
-            ],
-            axis=1,
-        )
+        across, up = r * np.sin(angle) * np.cos(turn), r * np.sin(angle) * np.sin(turn)
+        ring = np.stack([across, up, np.full(10, r * np.cos(angle))], axis=1)
         rings.append(half.add(f"eyeball_{k}", ring + np.array(EYE_CENTRE), colour))
-    for outer, inner in zip(rings[:-1], rings[1:], strict=True):
+    for outer, inner in pairwise(rings):
         half.strip(outer, inner, closed=True)
     tip = np.array([[EYE_CENTRE[0], EYE_CENTRE[1], EYE_CENTRE[2] + EYEBALL_RADIUS + 0.8]])
     half.fan(rings[-1], int(half.add("pupil", tip, _PUPIL)[0]))
@@ -186,7 +170,6 @@ def _add_ear(half: HalfMesh) -> None:
     turn = -2.0 * np.pi * np.arange(8) / 8.0
     # Outline in the ear's own plane, (backwards, up) in mm.
     outline = np.stack([-16.0 * np.sin(turn) * (1.0 + 0.18 * np.cos(turn)), 30.0 * np.cos(turn)], axis=1)
-    lift = np.array([0.0, 0.0])
     rings = []
     for name, scale, out in (
         ("ear_back", 0.72, -7.0),
@@ -194,15 +177,14 @@ def _add_ear(half: HalfMesh) -> None:
         ("ear_front", 0.9, 2.6),
         ("ear_valley", 0.68, -1.0),
     ):
-        flat = outline * scale + lift
-        rings.append(half.add(name, _beside_head(flat, np.full(8, out)), _SKIN))
-    for outer, inner in zip(rings[:-1], rings[1:], strict=True):
+        rings.append(half.add(name, _beside_head(outline * scale, out), _SKIN))
+    for outer, inner in pairwise(rings):
         half.strip(outer, inner, closed=True)
-    centre = half.add("ear_hollow", _beside_head(np.array([[3.0, -4.0]]), np.array([-5.0])), (190, 130, 110))
+    centre = half.add("ear_hollow", _beside_head(np.array([[3.0, -4.0]]), -5.0), (190, 130, 110))
     half.fan(rings[-1], int(centre[0]))
 
 
-def _beside_head(flat: Array, out: Array) -> Array:
+def _beside_head(flat: Array, out: float) -> Array:
     """Turn (backwards, up) and a distance outwards, in mm, into a place next to the head."""
     tilt, flare = np.deg2rad(-12.0), np.deg2rad(24.0)
     back = flat[:, 0] * np.cos(tilt) - flat[:, 1] * np.sin(tilt)
@@ -229,19 +211,6 @@ _NOSE_ROWS: dict[float, tuple[float, ...]] = {
     -18.5: (0.0, 4.0, 8.5, 13.5, 18.0, 22.5),
     -23.0: (0.0, 4.5, 9.5, 15.0),
 }
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The left half of the skin before it is put into space."""
-
-    theta: Array  # Angle round the head of every point, shape (n,)
-    level: Array  # Level of every point, shape (n,)
-    triangles: NDArray[np.int64]  # Indices of points, counter-clockwise, shape (m, 3)
-    # Named index lists: `mouth_0` (the lips' outer border) to `mouth_2`, from the upper midline over the corner
-    # to the lower midline; `eye_0` (the lids' edge) to `eye_2`, from the inner corner over the upper lid; `brow`
-    # (middle line of the brow)
-    rings: dict[str, list[int]]
 
 
 def contact_line(x: Array) -> Array:
@@ -276,11 +245,6 @@ def eye_ring(distance: float) -> Array:
     return np.asarray(ring + distance * away * squeeze)
 
 
-def brow_line(x: Array) -> Array:
-    """Height in mm of the middle of the brow."""
-    return through([8, 20, 36, 50], [40.5, 43.5, 45.0, 39.5], x)
-
-
 def hairline(theta: Array) -> Array:
     """Level at which the hair begins, going round the head."""
     return through([0, 0.35, 0.7, 1.0, 1.2, 1.5, 1.9, 3.2], [88, 88, 76, 56, 34, 12, -12, -52], theta)
@@ -293,8 +257,15 @@ def spacing(theta: Array, level: Array) -> Array:
     return np.minimum(round_head * height, 34.0)
 
 
-def lay_out() -> Layout:
-    """Place and connect the points of the left half of the skin."""
+def lay_out() -> tuple[Array, Array, NDArray[np.int64], dict[str, list[int]]]:
+    """Place and connect the points of the left half of the skin.
+
+    Returns:
+        the angle round the head and the level of every point, both (n,); triangles (m, 3), counter-clockwise; and named
+        lists of points: ``mouth_0`` (the lips' outer border) to ``mouth_2``, from the upper midline over the corner to
+        the lower midline; ``eye_0`` (the lids' edge) to ``eye_2``, from the inner corner over the upper lid; ``brow``
+        (middle line of the brow) and others.
+    """
     features, rings = _features()
     points = [tuple(point) for point in features]
     points += _edges(np.array(points))
@@ -303,19 +274,23 @@ def lay_out() -> Layout:
     places = _relax(np.array(points), fixed)
     triangles = _cut(places, delaunay(places))
     theta = np.clip(places[:, 0] / radius(places[:, 1]), 0.0, np.pi)
-    return Layout(theta, places[:, 1], triangles, rings)
+    return theta, places[:, 1], triangles, rings
 
 
 def to_plane(front: Array) -> Array:
-    """Turn places (x, y) on the front of the head into the plane of the layout."""
-    theta, level = locate(front[:, 0], front[:, 1])
+    """Turn places (x, y) in mm on the front of the head, before the relief, into the plane of the layout."""
+    across, height = front[:, 0], front[:, 1]
+    theta, level = np.zeros_like(across), height.copy()
+    for _ in range(30):
+        theta = np.arcsin(np.clip(across / _curve(level, 4), 0.0, 1.0))
+        level = level + 0.7 * (height - _curve(level, 1) - _curve(level, 6) * _climb(theta))
     return np.stack([theta * radius(level), level], axis=1)
 
 
 def _features() -> tuple[Array, dict[str, list[int]]]:
     groups = {f"mouth_{k}": mouth_ring(distance) for k, distance in enumerate((0.0, 4.5, 10.5))}
     groups |= {f"eye_{k}": eye_ring(distance) for k, distance in enumerate((0.0, 3.5, 9.0))}
-    brow = np.stack([BROW_COLUMNS, brow_line(BROW_COLUMNS)], axis=1)
+    brow = np.stack([BROW_COLUMNS, through([8, 20, 36, 50], [40.5, 43.5, 45.0, 39.5], BROW_COLUMNS)], axis=1)
     groups["brow"] = brow
     groups["brow_above"] = brow + np.array([0.0, 5.0])
     groups["brow_below"] = brow[:2] - np.array([0.0, 4.5])
@@ -339,8 +314,7 @@ def _edges(features: Array) -> list[tuple[float, float]]:
     front_levels = [*ends, *features[features[:, 0] == 0.0, 1]]
     lips = mouth_ring(0.0)[[-1, 0], 1]
     front = [level for level in _between(sorted(front_levels), 0.0) if not lips[0] < level < lips[1]]
-    edge = [(0.0, level) for level in front]
-    edge += [(0.0, level) for level in ends]
+    edge = [(0.0, level) for level in (*front, *ends)]
     # Where nape and crown bend, the outline of the back needs more points than the even spacing gives.
     bends = [LOWEST_LEVEL, -112.0, -96.0, 112.0, 134.0, HIGHEST_LEVEL]
     back = [*bends, *_between(bends, np.pi)]
@@ -354,7 +328,7 @@ def _edges(features: Array) -> list[tuple[float, float]]:
 def _between(levels: list[float], theta: float) -> list[float]:
     """Levels that divide the gaps between the given ones at the wanted spacing."""
     added: list[float] = []
-    for low, high in zip(levels[:-1], levels[1:], strict=True):
+    for low, high in pairwise(levels):
         walk = np.linspace(low, high, 65)
         density = 1.0 / spacing(np.full(65, theta), walk)
         reach = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(walk))])
@@ -395,10 +369,10 @@ def _inside(outline: Array, places: Array) -> NDArray[np.bool_]:
     return np.asarray((straddles & (cross > places[:, 0])).sum(axis=0) % 2 == 1)
 
 
-def _relax(places: Array, fixed: int, rounds: int = 6) -> Array:
+def _relax(places: Array, fixed: int) -> Array:
     """Even out the free points: each moves towards the mean of its neighbours."""
     places = places.copy()
-    for _ in range(rounds):
+    for _ in range(6):
         triangles = delaunay(places)
         total, degree = np.zeros_like(places), np.zeros(len(places))
         for a, b in ((0, 1), (1, 2), (2, 0)):
@@ -471,36 +445,8 @@ def _climb(theta: ArrayLike) -> Array:
     return rise(theta, 0.3, 1.4)
 
 
-def locate(x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
-    """Find the parameters of a place on the front of the head.
-
-    Args:
-        x: Distance from the midline, in mm, less than the head's half width.
-        y: Height, in mm.
-
-    Returns:
-        ``theta`` and ``level`` of the skin in front of (x, y), before the relief.
-    """
-    across, height = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    level = height.copy()
-    theta = np.zeros_like(across)
-    for _ in range(30):
-        theta = np.arcsin(np.clip(across / _curve(level, 4), 0.0, 1.0))
-        level = level + 0.7 * (height - _curve(level, 1) - _curve(level, 6) * _climb(theta))
-    return theta, level
-
-
-def skin(theta: ArrayLike, level: ArrayLike) -> Array:
-    """Place points on the skin.
-
-    Args:
-        theta: Angle round the head, 0 (front) to pi (back), shape (n,).
-        level: Level, shape (n,).
-
-    Returns:
-        Positions in mm, shape (n, 3).
-    """
-    angle = np.asarray(theta, dtype=np.float64)
+def skin(angle: Array, level: Array) -> Array:
+    """Positions (n, 3) in mm of points on the skin, by angle round the head, 0 (front) to pi (back), and level."""
     front, widest, back = _curve(level, 2), _curve(level, 3), _curve(level, 5)
     cosine = np.cos(angle)
     x = _curve(level, 4) * np.sin(angle)

@@ -81,13 +81,7 @@ class HalfMesh:
 def through(knots: ArrayLike, values: ArrayLike, at: ArrayLike) -> Array:
     """Interpolate with cubic Hermite pieces whose slopes never overshoot (Fritsch and Carlson, 1980).
 
-    Args:
-        knots: Rising places of the values, shape (n,).
-        values: Values there, shape (n,).
-        at: Where to look, any shape; outside the knots the end values hold.
-
-    Returns:
-        Values with a continuous first derivative, the shape of ``at``.
+    Knots (n,) rise; ``at`` has any shape, and outside the knots the end values hold.
     """
     x, y = np.asarray(knots, dtype=np.float64), np.asarray(values, dtype=np.float64)
     places = np.clip(np.asarray(at, dtype=np.float64), x[0], x[-1])
@@ -134,17 +128,9 @@ _LARGEST = 2**14
 
 
 def delaunay(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Triangulate points by inserting them one by one (Bowyer and Watson, 1981).
+    """Triangulate points (n, 2) in mm, all different, by inserting them one by one (Bowyer and Watson, 1981).
 
-    Args:
-        points: Coordinates in mm, shape (n, 2), all different.
-
-    Returns:
-        Triangles as indices of points, counter-clockwise, shape (m, 3); together they fill the points' convex
-        hull up to slivers along it.
-
-    Raises:
-        ValueError: If the points spread over more than the exact arithmetic can hold.
+    The triangles (m, 3) are counter-clockwise; together they fill the convex hull up to slivers along it.
     """
     whole = np.rint((points - points.min(axis=0)) * _STEPS_PER_MM).astype(np.int64)
     extent = int(whole.max())

@@ -61,14 +61,7 @@ class Rig:
     contact: Array
 
     def pose(self, weights: Array) -> Array:
-        """Pose the head.
-
-        Args:
-            weights: One row of weights per frame in the order of `CONTROLS`, shape (T, K + 1).
-
-        Returns:
-            Vertices in metres, shape (T, V, 3).
-        """
+        """Vertices (T, V, 3) in metres for one row of weights (T, K + 1) per frame, in the order of `CONTROLS`."""
         # Sums are written out: a BLAS may split them differently from run to run, and then bits differ.
         vertices = np.repeat(self.neutral[None], len(weights), axis=0)
         for column, field in enumerate(self.fields):
@@ -86,27 +79,16 @@ class Rig:
 
 
 def build_rig(shape: Shape, asymmetry: float = 0.0) -> Rig:
-    """Build a speaker's rig.
-
-    Args:
-        shape: The speaker's shape.
-        asymmetry: How much stronger the left side of the face moves (negative: the right side), about
-            -0.2 to 0.2.
-
-    Returns:
-        The speaker's head at rest and its fields.
-    """
+    """Build a speaker's rig; ``asymmetry`` is how much stronger the left side of the face moves, about -0.2 to 0.2."""
     mesh = build_face()
     canonical = 1000.0 * mesh.vertices
     side = 1.0 + asymmetry * np.tanh(canonical[:, 0] / 15.0)
     neutral = shape(mesh.vertices)
     moves = _fields(mesh, canonical)
-    posed = [
-        shape((canonical + side[:, None] * moves[name]) / 1000.0) - neutral
-        if name not in ("jaw_open", "lids_close")
-        else shape((canonical + moves[name]) / 1000.0) - neutral
-        for name in LINEAR_FIELDS
-    ]
+    for name in LINEAR_FIELDS:
+        if name not in ("jaw_open", "lids_close"):
+            moves[name] *= side[:, None]
+    posed = [shape((canonical + moves[name]) / 1000.0) - neutral for name in LINEAR_FIELDS]
     upper, lower = lip_pairs(mesh)
     return Rig(neutral, np.stack(posed), upper, lower, _contact(mesh, canonical, upper))
 
@@ -115,10 +97,7 @@ def lip_pairs(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Facing vertices of the lips' inner borders, (upper, lower), from right to left without the corners."""
     chain = mesh.groups["lip_inner"]
     top, bottom = chain[:7], chain[:7:-1]
-    return (
-        np.concatenate([mesh.mirror[top[:0:-1]], top]),
-        np.concatenate([mesh.mirror[bottom[:0:-1]], bottom]),
-    )
+    return np.concatenate([mesh.mirror[top[:0:-1]], top]), np.concatenate([mesh.mirror[bottom[:0:-1]], bottom])
 
 
 def lip_side(mesh: Mesh, canonical: Array) -> Array:
@@ -296,18 +275,10 @@ class Shape:
     ears: float = 0.0  # Ears larger and further from the head
 
     def __call__(self, points: Array) -> Array:
-        """Deform points of the neutral head.
-
-        Args:
-            points: Positions in metres, shape (..., 3).
-
-        Returns:
-            Where they lie in this speaker's head, in metres, the same shape.
-        """
+        """Where points (..., 3) of the neutral head lie in this speaker's head, both in metres."""
         x, y, z = (1000.0 * points[..., axis] for axis in range(3))
         moves = _moves(np.abs(x), y, z)
-        total = sum(getattr(self, f.name) * moves[f.name] for f in fields(self))
-        moved = np.asarray(total)
+        moved = np.asarray(sum(getattr(self, f.name) * moves[f.name] for f in fields(self)))
         side = np.stack([np.sign(x), np.ones_like(x), np.ones_like(x)], axis=-1)
         return np.asarray(points + moved * side / 1000.0)
 

@@ -136,11 +136,7 @@ def speak(text: str, voice: Voice) -> Utterance:
         FaceDiffError: If espeakng_loader is not installed or espeak-ng refuses the voice.
     """
     library, _ = _paths()
-    if _is_loaded(library):
-        rate, pcm, events = _speak_elsewhere(text, voice)
-    else:
-        rate, pcm, events = _speak_here(text, voice)
-    return _finish(rate, pcm, events)
+    return _finish(*(_speak_elsewhere if _is_loaded(library) else _speak_here)(text, voice))
 
 
 def _paths() -> tuple[str, str]:
@@ -173,11 +169,7 @@ def _unload(library: ctypes.CDLL) -> None:
 
 
 def _speak_here(text: str, voice: Voice) -> tuple[int, bytes, list[tuple[int, str]]]:
-    """Speak with a freshly loaded library.
-
-    Returns:
-        Sample rate, 16-bit samples, and (sample index, IPA) of each phoneme, closed by the end of speech.
-    """
+    """Sample rate, 16-bit samples, and (sample index, IPA) of each phoneme, from a freshly loaded library."""
     path, data = _paths()
     library = ctypes.CDLL(path)
     chunks: list[bytes] = []
