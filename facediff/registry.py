@@ -179,9 +179,9 @@ class Kind:
 
 
 audio_encoder = Kind("audio_encoder", "facediff.models.audio_encoders", "speech to one feature per frame")
-identity_encoder = Kind("identity_encoder", "facediff.models.identity_encoders", "a speaker's label to a vector")
+identity_encoder = Kind("identity_encoder", "facediff.models.speaker_encoders", "a speaker's label to a vector")
 mesh_encoder = Kind("mesh_encoder", "facediff.models.mesh_encoders", "a mesh's motion to one feature per frame")
-style_encoder = Kind("style_encoder", "facediff.models.style_encoders", "a reference motion to its speaking style")
+style_encoder = Kind("style_encoder", "facediff.models.speaker_encoders", "a reference motion to its speaking style")
 fusion = Kind("fusion", "facediff.models.fusions", "speech features meet the noisy motion")
 decoder = Kind("decoder", "facediff.models.decoders", "fused features and style to clean motion")
 sampler = Kind("sampler", "facediff.models.samplers", "runs the reverse diffusion process")

@@ -5,7 +5,7 @@ import os
 # The shapes in the signatures of the mathematics are checked in tests only; the hook must come before the imports.
 from jaxtyping import install_import_hook
 
-SHAPED = "audio_encoders identity_encoders mesh_encoders style_encoders fusions decoders layers losses samplers folding"
+SHAPED = "audio_encoders speaker_encoders mesh_encoders fusions decoders layers losses samplers folding"
 SHAPED += " losses_fused"
 install_import_hook([f"facediff.models.{module}" for module in SHAPED.split()], "beartype.beartype")
 

@@ -104,10 +104,20 @@ class AnimationModel(LightningModule, Inference, ABC):
         self.lr_schedule = lr_schedule
         self.warmup_steps = warmup_steps
         self.unseen_identity: IdentityPolicy = unseen_identity
-        self.evaluation = Evaluation(protocol, unseen_identity, metrics)
+        self.protocol = protocol
+        self.metrics = list(metrics)
         self.windows = WindowPlan()
         self.data_source: dict[str, str] = {}
         self._assets: Assets | None = None
+
+    @functools.cached_property
+    def evaluation(self) -> Evaluation:
+        """The metrics of validation and test; a model that only animates makes none.
+
+        Raises:
+            FaceDiffError: if there is no such protocol, metric or option.
+        """
+        return Evaluation(self.protocol, self.unseen_identity, self.metrics)
 
     def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
         """Let every model keep its constructor's arguments."""
@@ -136,6 +146,10 @@ class AnimationModel(LightningModule, Inference, ABC):
             mask: True on valid frames.
         """
         return reference.new_zeros(len(reference), 0)
+
+    def style_of(self, batch: Batch) -> Float[Tensor, "batch style_dim"]:
+        """A batch's own style vectors, or else those of its references."""
+        return self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
 
     def personal_modules(self) -> list[nn.Module]:
         """The parts that hold identity and style; ``facediff adapt --train person`` trains them alone."""
@@ -267,6 +281,8 @@ class AnimationModel(LightningModule, Inference, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, SpeechMotionDataModule):
             raise FaceDiffError("facediff's models train and test on a SpeechMotionDataModule; pass datamodule=…")
+        if stage != "predict":
+            _ = self.evaluation  # an unknown protocol or metric is reported before the corpus is read
         self.data_source = {
             "class_path": f"{type(data).__module__}.{type(data).__qualname__}",
             "root": str(data.root.resolve()),

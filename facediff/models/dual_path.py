@@ -33,13 +33,19 @@ from facediff.models.folding import (
     unchanged,
 )
 from facediff.models.fusions import BidirectionalCrossAttention, Fusion, FusionFactory
-from facediff.models.identity_encoders import HierarchicalIdentity, IdentityEncoder, IdentityEncoderFactory
 from facediff.models.inference import ClipNoise, Progress, Window, WindowNoise, WindowOverlap
 from facediff.models.layers import frame_mask
 from facediff.models.losses_fused import fused_losses
 from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoder, MeshEncoderFactory
 from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, SamplerFactory, unit_noise
-from facediff.models.style_encoders import StyleEncoder, StyleEncoderFactory, TcnGruTransformer
+from facediff.models.speaker_encoders import (
+    HierarchicalIdentity,
+    IdentityEncoder,
+    IdentityEncoderFactory,
+    StyleEncoder,
+    StyleEncoderFactory,
+    TcnGruTransformer,
+)
 
 TokenForm = Literal["levels", "single"]
 

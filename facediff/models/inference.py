@@ -243,10 +243,6 @@ class Inference(ABC):
             raise FaceDiffError(f"style: the checkpoint holds no reference motion of {identity}; give one with --style")
         return self.assets.references[identity]
 
-    def style_of(self, batch: Batch) -> Float[Tensor, "batch style_dim"]:
-        """A batch's own style vectors, or else those of its references."""
-        return self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
-
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """Change the sampler for all that follows; a model that does not sample has none.
 
@@ -504,7 +500,8 @@ class SpeechStream:
         self.frames = 0
         with torch.inference_mode():
             # Encoded once for all windows: the style does not change during a recording.
-            self.clip = replace(clip, style=model.style_of(clip), features=None, feature_lengths=None)
+            style = model.encode_style(clip.reference, clip.reference_mask) if clip.style is None else clip.style
+            self.clip = replace(clip, style=style, features=None, feature_lengths=None)
         self._speech = clip.audio.new_zeros(0)
         self._dropped = 0  # samples before these, which no window will hear again
         self._level = Level()

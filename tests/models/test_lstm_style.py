@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from facediff.models.style_encoders import LstmStyle
+from facediff.models.speaker_encoders import LstmStyle
 
 DIM, STYLE = 6, 5
 

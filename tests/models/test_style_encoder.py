@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.nn.utils.rnn import pad_packed_sequence
 
-from facediff.models.style_encoders import AttentionPooling, TcnGruTransformer, TemporalBlock
+from facediff.models.speaker_encoders import AttentionPooling, TcnGruTransformer, TemporalBlock
 
 DIM = 6
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from facediff.models.folding import SamplingSpace, Space, fold
 from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.inference import ClipNoise
 from facediff.models.samplers import Sampler
-from facediff.models.style_encoders import TcnGruTransformer
+from facediff.models.speaker_encoders import TcnGruTransformer
 
 FRAME_RATE = 25.0
 REFERENCE_FRAMES = 100

@@ -26,7 +26,7 @@ from facediff.models.decoders import StyleTransformer
 from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.losses import training_losses
 from facediff.models.samplers import unit_noise
-from facediff.models.style_encoders import TcnGruTransformer
+from facediff.models.speaker_encoders import TcnGruTransformer
 from facediff.utils.arrays import ArrayStore
 
 SUBJECTS = ["F2", "F3"]

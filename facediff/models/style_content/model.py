@@ -21,6 +21,7 @@ from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.inference import Progress
 from facediff.models.mesh_encoders import MeshEncoderFactory, SpiralMeshEncoder
+from facediff.models.speaker_encoders import LstmStyle, StyleEncoderFactory
 from facediff.models.style_content.losses import (
     Alignments,
     MotionDistance,
@@ -31,7 +32,6 @@ from facediff.models.style_content.losses import (
     style_contrast,
 )
 from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
-from facediff.models.style_encoders import LstmStyle, StyleEncoderFactory
 
 SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
 """Terms that the speech network has as well, by the name ``speech_<term>``."""

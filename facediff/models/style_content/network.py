@@ -12,7 +12,7 @@ from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.layers import Attention, FeedForward
 from facediff.models.mesh_encoders import MeshEncoder
-from facediff.models.style_encoders import StyleEncoder
+from facediff.models.speaker_encoders import StyleEncoder
 
 SLOPE = 0.2
 """Of the leaky ReLU after each layer of the decoder."""

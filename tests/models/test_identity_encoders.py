@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from facediff.models.identity_encoders import HierarchicalIdentity
+from facediff.models.speaker_encoders import HierarchicalIdentity
 
 
 @pytest.fixture
