@@ -48,10 +48,8 @@ UNITS: dict[Normalisation, str] = {
 }
 
 SOUND_NAME = re.compile(r"([FM]\d)_(e\d\d)(_cut)?")
-SOUND_SUFFIXES = (".wav", ".flac", ".flv", ".mp4", ".avi", ".mov", ".mkv", ".webm")
-"""The first that is there is used."""
-SOUND_DEPTH = 4
-"""Levels of folders that are searched for sound."""
+SOUND_SUFFIXES = (".wav", ".flac", ".flv", ".mp4", ".avi", ".mov", ".mkv", ".webm")  # the first that is there is used
+SOUND_DEPTH = 4  # levels of folders that are searched
 
 FRAME_NAME = re.compile(r"frame_(\d+)\.vl", re.IGNORECASE)
 HEADERS = (4, 8)
@@ -129,15 +127,6 @@ def prepare_clip(
     name: str, folder: Path, sound: Path, template_file: Path, normalise: Normalisation, dtype: Precision, out: Path
 ) -> int:
     """Write one sequence and return its number of frames.
-
-    Args:
-        name: the clip's name.
-        folder: the folder with its frames.
-        sound: its sound, alone or in a video.
-        template_file: the subject's personal template, for the faces.
-        normalise: what is done to each frame.
-        dtype: of the motion on disk.
-        out: the corpus folder.
 
     Raises:
         FaceDiffError: if a frame or the sound cannot be used; the file is named.

@@ -8,11 +8,12 @@ MEAD's own sound in the same folders or elsewhere; or ProbTalk3D's ``param/<clip
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Literal, NamedTuple, NoReturn
+from typing import Literal, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -40,10 +41,9 @@ EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry"
 """In the order of the index in clip names."""
 LEVELS = (1, 2, 3)
 RECONSTRUCTION = "shape_pose_cam.hdf5"
+# The first that is there is used, converted files before MEAD's own.
 SOUND_SUFFIXES = (".wav", ".flac", ".m4a", ".mp4", ".aac", ".mp3", ".ogg")
-"""The first that is there is used, converted files before MEAD's own."""
-DEPTH = 3
-"""Levels of folders that are searched, as ``processed/reconstructions/EMICA-MEAD_flame2020`` of inferno."""
+DEPTH = 3  # levels of folders that are searched, as processed/reconstructions/EMICA-MEAD_flame2020 of inferno
 
 SPEAKER = re.compile(r"[MW]\d{3}")
 NUMBER = re.compile(r"\d{1,3}")
@@ -65,12 +65,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, order=True)
 class Recording:
-    """One clip of the raw data.
-
-    Attributes:
-        name: e.g. ``M003_001_0_0``: speaker, sequence, index of emotion, index of intensity.
-        file: its parameters.
-    """
+    """The parameters of a clip, e.g. ``M003_001_0_0``: speaker, sequence, index of emotion, index of intensity."""
 
     name: str
     file: Path
@@ -99,20 +94,6 @@ class Recording:
     def sound(self) -> str:
         """Where MEAD has its sound, below the folder with the speakers."""
         return f"{self.subject}/audio/{self.emotion}/level_{self.level}/{self.sequence}.m4a"
-
-
-class Survey(NamedTuple):
-    """A first look at every clip.
-
-    Attributes:
-        frames: of every clip that can be read.
-        shapes: each speaker's shape coefficients, their mean over all frames of all of the speaker's clips.
-        problems: why the other clips cannot be read.
-    """
-
-    frames: dict[str, int]
-    shapes: dict[str, Array]
-    problems: dict[str, str]
 
 
 def plan(
@@ -150,7 +131,7 @@ def plan(
     recordings = [recording for recording in found.recordings if recording.subject in chosen]
     missing = {name: text for name, text in found.missing.items() if name[:4] in chosen}
     sounds = find_sounds(raw if audio is None else audio)
-    survey = _survey(recordings, quiet)
+    frames, shapes, problems = _survey(recordings, quiet)
     jobs = []
     for recording in recordings:
         name = recording.name
@@ -159,12 +140,12 @@ def plan(
                 f"expected its sound, {name}.wav or {recording.sound}, in {raw if audio is None else audio}; --audio "
                 f"names another folder"
             )
-        elif name in survey.problems:
-            jobs.append(Job(name, partial(refuse, survey.problems[name])))
+        elif name in problems:
+            jobs.append(Job(name, partial(refuse, problems[name])))
         else:
-            mean = survey.shapes[recording.subject] if shape == "subject" else None
+            mean = shapes[recording.subject] if shape == "subject" else None
             work = partial(prepare_clip, name, recording.file, sounds[name], flame, mean, dtype)
-            jobs.append(Job(name, work, survey.frames[name]))
+            jobs.append(Job(name, work, frames[name]))
     if not jobs:
         raise nothing_to_prepare(raw, "3DMEAD", missing)
     masks = [path for path in (find_file(raw, MASKS_FILE), flame.parent / MASKS_FILE) if path and path.is_file()][:1]
@@ -180,7 +161,7 @@ def plan(
         n_vertices=model.n_vertices,
         options={"shape": shape, "dtype": dtype, "subjects": chosen if subjects else "all", "flame": digest},
         jobs=jobs,
-        shared=partial(_write_shared, flame, recordings, survey.shapes, masks, region_files),
+        shared=partial(_write_shared, flame, recordings, shapes, masks, region_files),
         missing=missing,
         notes=_compare_speakers(speakers, found.base, missing) if subjects is None else [],
     )
@@ -189,16 +170,7 @@ def plan(
 def prepare_clip(
     name: str, file: Path, sound: Path, model: Path, shape: Array | None, dtype: Precision, out: Path
 ) -> int:
-    """Write one clip and return its number of frames.
-
-    Args:
-        name: the clip's name.
-        file: its FLAME parameters.
-        sound: its sound.
-        model: the FLAME model file.
-        shape: (S,) shape coefficients of the vertices; the clip's own if None.
-        dtype: of the motion on disk.
-        out: the corpus folder.
+    """Write one clip, with its own shape if ``shape`` is None, and return its number of frames.
 
     Raises:
         FaceDiffError: if the parameters or the sound cannot be used; the file is named.
@@ -212,11 +184,7 @@ def prepare_clip(
 
 
 def refuse(problem: str, out: Path) -> NoReturn:
-    """The work for a clip whose parameters cannot be read.
-
-    Raises:
-        FaceDiffError: always.
-    """
+    """The work for a clip whose parameters cannot be read."""
     raise FaceDiffError(problem)
 
 
@@ -226,25 +194,25 @@ def load_flame(path: Path) -> Flame:
     return Flame.read(path)
 
 
-def _survey(recordings: Sequence[Recording], quiet: bool) -> Survey:
-    survey = Survey({}, {}, {})
+def _survey(recordings: Sequence[Recording], quiet: bool) -> tuple[dict[str, int], dict[str, Array], dict[str, str]]:
+    """Frames of every clip, every speaker's mean shape over all frames, and why clips cannot be read."""
+    lengths: dict[str, int] = {}
+    problems: dict[str, str] = {}
     sums: dict[str, Array] = {}
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for recording in track(recordings, "shapes", shown=not quiet):
         try:
             parameters = read_parameters(recording.file)
         except MissingExtraError:
             raise
         except FaceDiffError as error:
-            survey.problems[recording.name] = str(error)
+            problems[recording.name] = str(error)
             continue
-        frames, subject = len(parameters.jaw), recording.subject
-        survey.frames[recording.name] = frames
-        total = sums.setdefault(subject, np.zeros(SHAPES))
+        frames = lengths[recording.name] = len(parameters.jaw)
+        total = sums.setdefault(recording.subject, np.zeros(SHAPES))
         total[: len(parameters.shape)] += frames * parameters.shape
-        counts[subject] = counts.get(subject, 0) + frames
-    survey.shapes.update({subject: total / counts[subject] for subject, total in sums.items()})
-    return survey
+        counts[recording.subject] += frames
+    return lengths, {subject: total / counts[subject] for subject, total in sums.items()}, problems
 
 
 def _chosen(subjects: Sequence[str] | None, speakers: list[str]) -> list[str]:
@@ -314,13 +282,7 @@ def _refuse_other_templates(templates: dict[str, Array], out: Path) -> None:
 
 @dataclass
 class Found:
-    """What a raw folder holds.
-
-    Attributes:
-        base: the folder with the speakers' folders, or with ``param/``.
-        recordings: every clip, sorted by name.
-        missing: clips without parameters, and where they were expected.
-    """
+    """What a raw folder holds: clips, those that lack parameters, and the folder above the speakers or ``param/``."""
 
     base: Path
     recordings: list[Recording] = field(default_factory=list)

@@ -21,14 +21,10 @@ if TYPE_CHECKING:
 
 # Changing the frame rate of motion without aliasing.
 
-CROSSINGS = 24
-"""Zero crossings of the filter on each side."""
-BAND = 0.9
-"""Where the filter has fallen to one half, as a share of the lower one of the two Nyquist frequencies."""
-KAISER = 8.0
-"""Shape of the window: the stop band lies 80 dB down, the transition is a tenth of the Nyquist frequency wide."""
-BLOCK = 64
-"""Frames that are computed at a time."""
+CROSSINGS = 24  # zero crossings of the filter on each side
+BAND = 0.9  # where the filter has fallen to one half, as a share of the lower one of the two Nyquist frequencies
+KAISER = 8.0  # window: the stop band lies 80 dB down, the transition is a tenth of the Nyquist frequency wide
+BLOCK = 64  # frames that are computed at a time
 
 
 def resampled_length(frames: int, rate_in: float, rate_out: float) -> int:
@@ -94,18 +90,11 @@ def _blocks(
     for first in range(0, length, BLOCK):
         times = np.arange(first, min(first + BLOCK, length)) * step
         sources = np.arange(math.floor(times[0] - reach), math.ceil(times[-1] + reach) + 1)
-        weights = _filter(times[:, None] - sources, band, reach)
+        distances = times[:, None] - sources
+        window = np.i0(KAISER * np.sqrt(np.clip(1.0 - np.square(distances / reach), 0.0, None)))
+        weights = np.where(np.abs(distances) < reach, np.sinc(band * distances) * window, 0.0)
         weights /= weights.sum(axis=1, keepdims=True)
         yield (slice(first, first + len(times)), *_reflected(weights, sources, frames))
-
-
-def _filter(distance: npt.NDArray[np.floating], band: float, reach: float) -> npt.NDArray[np.float64]:
-    """The windowed sinc at distances in input frames."""
-    inside = np.sqrt(np.clip(1.0 - np.square(distance / reach), 0.0, None))
-    weights: npt.NDArray[np.float64] = np.where(
-        np.abs(distance) < reach, np.sinc(band * distance) * np.i0(KAISER * inside), 0.0
-    )
-    return weights
 
 
 def _reflected(
@@ -149,13 +138,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of a clip of T frames.
-
-    Attributes:
-        shape: (S,) shape coefficients, their mean over the clip.
-        expression: (T, E) expression coefficients.
-        jaw: (T, 3) rotation of the jaw, axis-angle in radians.
-    """
+    """Mean shape (S,), expression (T, E) and rotation of the jaw (T, 3), axis-angle in radians, of a clip."""
 
     shape: Array
     expression: Array

@@ -41,8 +41,7 @@ MANIFEST = "manifest.json"
 """In the output folder when preparation has ended: what was written, what is missing, what failed."""
 LOCK = ".prepare.lock"
 CLIP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,199}")
-WAV_HEADER = 44
-"""Bytes."""
+WAV_HEADER = 44  # bytes
 
 
 @dataclass(frozen=True)
@@ -116,12 +115,10 @@ class Report:
     """What preparation did.
 
     Attributes:
-        out: the corpus folder.
         clips: frames of every clip that is there now.
         written: number of clips written by this run; the others were there.
         failed: what went wrong, by clip.
         missing: what the raw folder lacks, and what was expected where.
-        notes: other remarks.
         totals: counts, as in the manifest.
     """
 
@@ -347,11 +344,7 @@ def write_clip(
     speech: npt.NDArray[np.floating],
     dtype: Precision = "float32",
 ) -> int:
-    """Write vertices (T, V, 3) and speech (S,) of a clip, and return the number of frames.
-
-    Raises:
-        FaceDiffError: as :func:`write_motion`.
-    """
+    """Write vertices (T, V, 3) and speech (S,) of a clip, and return the number of frames."""
     motion_file, speech_file = clip_files(out, clip)
     write_motion(motion_file, vertices, dtype)
     write_speech(speech_file, speech)

@@ -40,8 +40,7 @@ OPTIONAL = {
     "FLAME_masks.pkl": "lips and upper face; from flame.is.tue.mpg.de (FLAME vertex masks)",
 }
 LISTS = "not needed in addition to FLAME_masks.pkl; the FaceDiffuser repository has it in data/vocaset/regions/"
-FULL_SCALE = 32768.0
-"""Of 16-bit samples."""
+FULL_SCALE = 32768.0  # of 16-bit samples
 SAMPLE_RATES = (8_000, 192_000)
 
 Decimation = Literal["every_second", "filtered"]
@@ -49,13 +48,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Recording(NamedTuple):
-    """One clip of the raw data.
-
-    Attributes:
-        rows: row of ``data_verts.npy`` for each frame, in the order of the frames.
-        audio: the entry of ``raw_audio_fixed.pkl``: ``{"audio": samples, "sample_rate": …}``.
-        where: how errors call the clip.
-    """
+    """One clip: row of every frame in ``data_verts.npy``, entry of ``raw_audio_fixed.pkl``, how errors call it."""
 
     rows: npt.NDArray[np.int64]
     audio: object
@@ -130,15 +123,6 @@ def prepare_clip(
     """Write one clip and return its number of frames.
 
     As many frames are used as both the map and the sound have, as in VOCA.
-
-    Args:
-        name: the clip's name.
-        recording: its rows and its sound.
-        vertices: ``data_verts.npy``.
-        frame_rate: 30 or 60.
-        decimate: how 60 becomes 30.
-        dtype: of the motion on disk.
-        out: the corpus folder.
 
     Raises:
         FaceDiffError: if a row is missing or holds NaN, or the sound cannot be used.
