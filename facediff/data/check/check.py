@@ -8,7 +8,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from facediff.data.check.clip import LENGTHS, ClipFacts, ClipFiles, Rules, examine, is_about
 from facediff.data.check.layouts import (
@@ -46,16 +46,8 @@ REFERENCES = "none"
 """The split of clips that give style references only."""
 
 
-class CheckFigure(NamedTuple):
-    """What every complete copy of a split has."""
-
-    split: str
-    clips: int
-    frames: int
-
-
-CHECK_FIGURES = {"biwi": CheckFigure("test_a", 24, 3879)}
-"""BIWI: what users of CodeTalker's scoring script report for its six speakers and sentences 37 to 40."""
+CHECK_FIGURES = {"biwi": ("test_a", 24, 3879)}
+"""Split, clips and frames of BIWI that users of CodeTalker's scoring script report; every complete copy has them."""
 INCOMPLETE = {"vocaset"}
 """Corpora of which some clips were never recorded."""
 NEVER_RECORDED = 0.05
@@ -106,7 +98,8 @@ def check(
         "missing": [],
     }
     if view is not None:
-        workers = workers or (1 if quick or _size_of_motion(folder) <= WORTH_IT else processors())
+        size = sum(path.stat().st_size for path in folder.motions.values() if path.is_file())
+        workers = workers or (1 if quick or size <= WORTH_IT else processors())
         _check_corpus(report, view, folder, manifest, partial(_examine_all, workers=workers, progress=progress))
     report.sort()
     return report
@@ -171,10 +164,6 @@ def _clips(opened: Corpus | None, view: View, folder: Folder, findings: Findings
             read = opened.clips
             clips = {name: read.get(name, clip) for name, clip in clips.items()}
     return clips
-
-
-def _size_of_motion(folder: Folder) -> int:
-    return sum(path.stat().st_size for path in folder.motions.values() if path.is_file())
 
 
 def _examine_all(rules: Rules, view: View, folder: Folder, *, workers: int, progress: bool) -> list[ClipFacts]:
@@ -287,15 +276,7 @@ def _check_sound_forms(facts: Iterable[ClipFacts], findings: Findings) -> None:
 def _check_frame_rate(
     view: View, stored: float, facts: Sequence[ClipFacts], findings: Findings, *, recorded: bool
 ) -> bool:
-    """Whether the lengths of the speech agree with the frame rate; one finding if most clips disagree.
-
-    Args:
-        view: the corpus.
-        stored: motion frames a second on disk, as they are read.
-        facts: what the clips hold.
-        findings: what is wrong is added here.
-        recorded: whether ``manifest.json`` has the frame rate.
-    """
+    """Whether the lengths of the speech agree with the frame rate; one finding if most clips disagree."""
     rates = [clip.frames / clip.seconds for clip in facts if clip.frames is not None and clip.seconds]
     # Only twice and half the rate are recognised: other ratios come from clips that are cut differently.
     found = median(rates) if rates else stored
@@ -334,14 +315,7 @@ def _check_copies(facts: Iterable[ClipFacts], findings: Findings) -> None:
 def _count_splits(
     view: View, clips: Mapping[str, Clip], frames: Mapping[str, int], findings: Findings
 ) -> list[dict[str, Any]]:
-    """One row for each split of each of the ways in which a corpus is split.
-
-    Args:
-        view: the corpus.
-        clips: the clips that training reads, by name.
-        frames: their frames at the frame rate that models see; those that cannot be read are left out.
-        findings: what is missing is added here.
-    """
+    """One row for each split of each of the ways in which a corpus is split."""
     rows: list[dict[str, Any]] = []
     for way, split_of in view.split_of.items():
         members: dict[str, list[str]] = {split: [] for split in (*SPLITS, REFERENCES)}
@@ -394,22 +368,22 @@ def _report_missing(view: View, clips: Mapping[str, Clip], findings: Findings) -
 
 
 def _compare_check_figure(view: View, rows: Iterable[Mapping[str, Any]], findings: Findings) -> None:
-    figure = CHECK_FIGURES.get(view.corpus)
-    if figure is None:
+    if view.corpus not in CHECK_FIGURES:
         return
+    split, *figure = CHECK_FIGURES[view.corpus]
 
     def words(clips: int, frames: int) -> str:
         return f"{counted(clips, 'sequence')} and {counted(frames, 'frame')}"
 
-    row = next((row for row in rows if row["split"] == figure.split), {"present": 0, "frames": 0})
-    where, published = f"split {figure.split}", words(figure.clips, figure.frames)
-    if (row["present"], row["frames"]) == (figure.clips, figure.frames):
+    row = next((row for row in rows if row["split"] == split), {"present": 0, "frames": 0})
+    where, found, published = f"split {split}", words(row["present"], row["frames"]), words(*figure)
+    if found == published:
         message = f"agrees with the check figure of published work, {published}"
         findings.note("check_figure_agrees", where, message)
     else:
         message = (
-            f"differs from the check figure of published work: {words(row['present'], row['frames'])} instead of "
-            f"{published}; scores on it are not comparable with published ones until clips are complete and cut alike"
+            f"differs from the check figure of published work: {found} instead of {published}; "
+            f"scores on it are not comparable with published ones until clips are complete and cut alike"
         )
         findings.warning("check_figure_differs", where, message)
 

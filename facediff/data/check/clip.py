@@ -19,10 +19,8 @@ from facediff.errors import FaceDiffError
 from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.files import sha256
 
-CHUNK = 16
-"""Frames that are read at a time."""
-SAMPLED = 16
-"""Frames, evenly spread, whose distance from the template is measured."""
+CHUNK = 16  # frames that are read at a time
+SAMPLED = 16  # frames, evenly spread, whose distance from the template is measured
 STILL = 1e-6
 """A clip moves if some coordinate changes by more than this share of the face's size."""
 FAR = 0.1
@@ -32,13 +30,11 @@ NEAR = 0.005
 NEARER = 0.5
 """Motion belongs to another subject if that subject's template is nearer than this share of the own distance."""
 
-BLOCK = 1 << 16
-"""Samples of all channels together that are decoded at a time."""
+BLOCK = 1 << 16  # samples of all channels together that are decoded at a time
 OPEN_END = 0xFFFF0000
 """Programs that write to a pipe put a size like this into the header, because they do not know it yet."""
 
-SLIGHT = 0.1
-"""Seconds by which the lengths of speech and motion may differ without a remark."""
+SLIGHT = 0.1  # seconds by which the lengths of speech and motion may differ without a remark
 MUCH = (0.5, 0.1)
 """Speech and motion that differ by more than so many seconds and by more than this share do not belong together."""
 LENGTHS = ("length", "speech_shorter", "speech_longer")
@@ -49,14 +45,7 @@ Array = npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class ClipFiles:
-    """The files of one clip.
-
-    Attributes:
-        name: the clip's name.
-        subject: the speaker.
-        motion: its motion; None if there is none.
-        sound: its speech; None if there is none.
-    """
+    """The files of one clip; None for one that is not there."""
 
     name: str
     subject: str
@@ -66,15 +55,7 @@ class ClipFiles:
 
 @dataclass(frozen=True)
 class Rules:
-    """What every clip is compared with.
-
-    Attributes:
-        root: the corpus folder.
-        n_vertices: vertices of its meshes.
-        stored_frame_rate: motion frames a second on disk.
-        templates: neutral faces (V, 3) by subject.
-        quick: read headers only.
-    """
+    """What every clip is compared with, and whether headers only are read (``quick``)."""
 
     root: Path
     n_vertices: int
@@ -85,17 +66,12 @@ class Rules:
 
 @dataclass
 class ClipFacts:
-    """What one clip holds.
+    """What one clip holds; None for what cannot be used.
 
     Attributes:
-        name: the clip's name.
-        frames: frames on disk; None if they cannot be used.
-        n_vertices: vertices of each frame; None if the file's shape is not that of motion.
-        seconds: length of the speech; None if it cannot be used.
-        sample_rate: of the speech.
-        channels: of the speech.
+        frames: frames on disk.
+        seconds: length of the speech.
         hashes: SHA-256 by file, relative to the corpus folder; empty where headers only are read.
-        findings: what is wrong with it.
     """
 
     name: str

@@ -9,6 +9,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -29,10 +30,8 @@ STATE = "prepare.json"
 """In the folder while preparation is running or was interrupted."""
 SPLITS = ("train", "val", "test_a", "test_b")
 
-PROBED = 8
-"""Files of motion whose header is read to find the topology."""
-HALF = 0.5
-"""Share of the names that a corpus must know to be recognised by them."""
+PROBED = 8  # files of motion whose header is read to find the topology
+HALF = 0.5  # share of the names that a corpus must know to be recognised by them
 FACEXHUBERT = re.compile(r"[FM]\d_(\d\d)(_cut)?")
 """BIWI's clips in FaceXHuBERT's preparation: NN for a neutral sequence, NN + 40 for an emotional one."""
 
@@ -48,21 +47,12 @@ RAW_FILES = {
     ),
 }
 """Files that a raw distribution has, by the name under which ``facediff data prepare`` knows it."""
-BASES = 100
-"""Folders in the raw folder that are searched: an archive may have been unpacked to one of them."""
+BASES = 100  # folders in the raw folder that are searched: an archive may have been unpacked to one of them
 
 
 @dataclass(frozen=True)
 class Folder:
-    """Files of clips.
-
-    Attributes:
-        root: the corpus folder.
-        motions: files of motion by clip name.
-        sounds: files of speech by clip name.
-        leftovers: files that a killed program left half-written.
-        strays: other files among the clips, which nothing reads.
-    """
+    """Files of clips by name, files that a killed program left half-written, and files that nothing reads."""
 
     root: Path
     motions: dict[str, Path] = field(default_factory=dict)
@@ -93,18 +83,14 @@ class View:
     """What the check needs to know about a corpus, from its data module or from a person's own folder.
 
     Attributes:
-        corpus: its name.
         data_module: import path of the data module; None for a person's folder.
-        n_vertices: vertices of its topology.
         frame_rate: motion frames a second that models see.
         stored_frame_rate: those on disk where ``manifest.json`` has none.
         parse: subject and sentence of a clip by its name; None for a name that is none of the corpus.
         split_of: a clip's split, for each of the ways in which the corpus is split.
         identities: speakers who are trained on.
         expected: clips of a complete corpus by split; empty where there is no such list.
-        mesh_files: files with the faces.
-        region_sources: files that hold the regions.
-        region_help: where such files can be obtained.
+        region_help: where the files of the regions can be obtained.
         obtain: how the corpus can be obtained.
     """
 
@@ -123,11 +109,7 @@ class View:
     obtain: str = ""
 
     def open(self, root: Path) -> Corpus:
-        """The folder as training reads it.
-
-        Raises:
-            FaceDiffError: if ``manifest.json`` has a frame rate that does not fit.
-        """
+        """The folder as training reads it."""
         from facediff.data.corpus import Corpus
 
         return Corpus(
@@ -188,15 +170,7 @@ def identify(
 
 
 def list_folder(root: Path, motion_folders: tuple[str, ...]) -> Folder:
-    """List the files of clips in a corpus folder.
-
-    Args:
-        root: the folder.
-        motion_folders: where motion may lie, in the order of preference.
-
-    Raises:
-        FaceDiffError: if the folder cannot be read.
-    """
+    """List the files of clips in a corpus folder; ``motion_folders`` are in the order of preference."""
     folder = Folder(root)
     motions = [(name, ".npy", folder.motions) for name in motion_folders]
     for name, suffix, files in [*motions, ("wav", ".wav", folder.sounds)]:
@@ -236,23 +210,16 @@ def read_record(root: Path, name: str, findings: Findings) -> dict[str, Any]:
 
 def _raw_distribution(root: Path) -> tuple[str, str] | None:
     """The data set whose raw distribution a folder holds, and a file that shows it; None if it holds none."""
-
-    def bases() -> Iterator[Path]:
-        yield root
-        try:
-            yield from islice((path for path in sorted(root.iterdir()) if path.is_dir()), BASES)
-        except OSError:
-            return
-
-    for base in bases():
+    try:
+        inner = list(islice((path for path in sorted(root.iterdir()) if path.is_dir()), BASES))
+    except OSError:
+        inner = []
+    for base in [root, *inner]:
         for corpus, patterns in RAW_FILES.items():
             for pattern in patterns:
-                try:
-                    found = next(base.glob(pattern), None)
-                except OSError:
-                    found = None
-                if found is not None:
-                    return corpus, found.relative_to(root).as_posix()
+                with suppress(OSError):
+                    for found in base.glob(pattern):
+                        return corpus, found.relative_to(root).as_posix()
     return None
 
 
@@ -262,12 +229,7 @@ def _raw_distribution(root: Path) -> tuple[str, str] | None:
 def by_name(name: str, n_vertices: int | None) -> Module:
     """The data module of a corpus name (``biwi``), a class name (``Biwi``) or an import path (``package.Class``).
 
-    Args:
-        name: what the user asks for.
-        n_vertices: vertices found in the folder; decides between several modules of one corpus.
-
-    Raises:
-        FaceDiffError: naming the known corpora.
+    The vertices found in the folder decide between several modules of one corpus.
     """
     if "." in name:
         return _import(name)
@@ -286,11 +248,6 @@ def recognise(folder: Folder, recorded: object, n_vertices: int | None) -> Modul
 
     ``manifest.json`` decides; else most of the clips' names together with the vertex count; else names of a form of
     their own (so that wrong vertices are reported as such); else a vertex count that only one corpus has.
-
-    Args:
-        folder: the folder.
-        recorded: the corpus that ``manifest.json`` names, if it does.
-        n_vertices: vertices found in the folder.
     """
     modules = _known()
     if isinstance(recorded, str):

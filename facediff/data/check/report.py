@@ -13,12 +13,9 @@ from facediff.utils.tables import format_table
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-FEW = 3
-"""How many names of a list are printed."""
-LISTED = 4
-"""Findings of a kind that are printed one by one; of more, only the first is."""
-FORMAT = 1
-"""Goes up when a field of the JSON object changes its meaning; new fields do not count."""
+FEW = 3  # how many names of a list are printed
+LISTED = 4  # findings of a kind that are printed one by one; of more, only the first is
+FORMAT = 1  # goes up when a field of the JSON object changes its meaning; new fields do not count
 
 SPLIT_NAMES = {"test_a": "test A", "test_b": "test B", "none": "(style references only)"}
 
@@ -60,11 +57,6 @@ class Findings(list[Finding]):
     def guard(self, kind: str, path: Path, root: Path) -> Iterator[None]:
         """Turn whatever goes wrong with a file into an error: the folder is not trusted.
 
-        Args:
-            kind: the kind of the error.
-            path: the file that is read.
-            root: the corpus folder.
-
         Raises:
             MissingExtraError: unchanged, since that is not the folder's fault.
         """
@@ -84,14 +76,12 @@ class Report:
     """What a folder is and what is wrong in it.
 
     Attributes:
-        root: the folder.
         quick: whether headers only were read.
         corpus: name of the corpus; None if it was not recognised.
         data_module: import path of the data module that reads it; None for a person's folder, or if unknown.
         raw: name of the raw distribution that the folder holds instead of a corpus; None if it does not.
         frame_rate: motion frames a second that models see; None if unknown, as the next two.
         stored_frame_rate: motion frames a second on disk.
-        n_vertices: vertices of the topology.
         findings: errors first, then warnings, then notes.
         splits: one row a split: way, split, expected, present, missing, frames, seconds, missing_clips.
         subjects: one row a subject: subject, trained_on, clips, frames, seconds, template.

@@ -29,8 +29,7 @@ TEMPLATES = {
 
 UNIT_AREA = {"biwi"}
 """Corpora whose circulating templates have a surface area of one."""
-AREA_TOLERANCE = 1e-3
-"""How far a surface area may be from one; float32 templates are within 1e-6."""
+AREA_TOLERANCE = 1e-3  # float32 templates are within 1e-6
 
 FLAME_REGIONS = {
     "regions/lve.txt": 428,
@@ -69,15 +68,8 @@ def check_files(
 ) -> dict[str, list[str]]:
     """Compare the files with their sizes (``quick``), or their SHA-256, in ``manifest.json``.
 
-    Args:
-        root: the corpus folder.
-        manifest: the content of ``manifest.json``.
-        hashes: SHA-256 of the files that were read already.
-        findings: what is wrong is added here.
-        quick: compare sizes only.
-
-    Returns:
-        the names of the files that are not as recorded: ``changed`` and ``missing``.
+    ``hashes`` holds the SHA-256 of files that were read already. Returns the names of the files that are not as
+    recorded: ``changed`` and ``missing``.
     """
     files = manifest.get("files")
     found: dict[str, list[str]] = {"changed": [], "missing": []}
@@ -125,16 +117,7 @@ def check_account(manifest: Mapping[str, Any], findings: Findings) -> None:
 
 
 def check_templates(root: Path, view: View, findings: Findings) -> tuple[dict[str, Array], dict[str, Any]]:
-    """Check ``templates.pkl``.
-
-    Args:
-        root: the corpus folder.
-        view: the corpus.
-        findings: what is wrong is added here.
-
-    Returns:
-        the usable templates (V, 3) by subject, float32, and the report's section.
-    """
+    """Check ``templates.pkl``; returns its usable templates (V, 3) by subject, and the report's section."""
     from facediff.data.corpus import as_template
 
     path = root / "templates.pkl"
@@ -180,17 +163,9 @@ def _origin(view: View, blob: str, findings: Findings) -> str | None:
 def check_areas(
     view: View, unit: object, templates: dict[str, Array], faces: npt.NDArray[np.int32], findings: Findings
 ) -> dict[str, float] | None:
-    """Surface area of every template, which must be one in a corpus whose unit is defined by it.
+    """Surface area of every template, which must be one in a corpus whose unit is defined by it; None in others.
 
-    Args:
-        view: the corpus.
-        unit: unit of length in ``manifest.json``, if it has one.
-        templates: neutral faces (V, 3) by subject.
-        faces: triangles (F, 3).
-        findings: what is wrong is added here.
-
-    Returns:
-        the areas; None for a corpus for which they mean nothing.
+    ``unit`` is that in ``manifest.json``, if it has one.
     """
     if view.corpus not in UNIT_AREA or not templates:
         return None
@@ -210,11 +185,7 @@ def check_areas(
 
 
 def check_mesh(root: Path, view: View, findings: Findings) -> tuple[npt.NDArray[np.int32] | None, str | None]:
-    """Check the mesh file.
-
-    Returns:
-        its faces (F, 3), None if they cannot be used; and its path relative to the folder, None if there is none.
-    """
+    """Check the mesh file; returns its faces (F, 3) if they can be used, and its path relative to the folder."""
     from facediff.mesh import read_mesh
 
     places = [folder / file for file in view.mesh_files for folder in (root, root / "templates")]
@@ -265,13 +236,8 @@ def _check_region(
                 f"has {number(usual)}: scores over it differ from published ones"
             )
             findings.note("region_unusual", str(source), message)
-        section = {
-            "source": source,
-            "count": region.count,
-            "hash": region.hash,
-            "duplicates": region.duplicates,
-            "circulating_count": usual,
-        }
+        section = {"source": source, "count": region.count, "hash": region.hash}
+        section |= {"duplicates": region.duplicates, "circulating_count": usual}
     return section
 
 
