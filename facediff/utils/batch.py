@@ -26,14 +26,7 @@ RECORDS = ".facediff-batch"
 
 @dataclass(frozen=True)
 class Outcome(Generic[Result]):
-    """What became of a task.
-
-    Attributes:
-        result: what it returned; None if it failed.
-        problem: the sentence that says why it failed; empty if it did not.
-        seconds: how long it took.
-        fatal: whether every other task would fail for the same reason.
-    """
+    """What became of a task: its result, or why it failed (``fatal``: all others would fail for the same reason)."""
 
     result: Result | None = None
     problem: str = ""
@@ -107,12 +100,7 @@ def _attempt(
 
 @dataclass(frozen=True)
 class Recipe:
-    """What decides an output in addition to the file that it is made of.
-
-    Attributes:
-        command: the options.
-        files: SHA-256 of the files that they name (checkpoint, styles …), by path.
-    """
+    """What decides an output in addition to its source: options, and SHA-256 of the files that they name, by path."""
 
     command: tuple[str, ...]
     files: Mapping[str, str]
@@ -132,13 +120,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class FileTask:
-    """A file to make of another one.
-
-    Attributes:
-        source: the file that is read.
-        output: the file to write.
-        recipe: what else decides it.
-    """
+    """A file to make of another one; ``recipe`` is what else decides it."""
 
     source: Path
     output: Path
@@ -152,11 +134,7 @@ class FileTask:
         return self.output.parent / RECORDS / f"{self.output.name}.json"
 
     def record(self, problem: str) -> None:
-        """Record that the task is done; an empty problem means that the output is there.
-
-        Raises:
-            FaceDiffError: if the record cannot be written.
-        """
+        """Record that the task is done; an empty problem means that the output is there."""
         record = {
             "speech": _stat(self.source) | {"sha256": sha256(self.source) if self.source.is_file() else ""},
             "recipe": {"command": list(self.recipe.command), "files": dict(self.recipe.files)},
@@ -199,9 +177,7 @@ class FileTask:
     def _same_source(self, known: Mapping[str, Any]) -> bool:
         """By path, size and time; where path or time differ, by the content."""
         stat = _stat(self.source)
-        if all(known.get(name) == value for name, value in stat.items()):
-            return True
-        return (
+        return all(known.get(name) == value for name, value in stat.items()) or (
             self.source.is_file()
             and known.get("bytes") == stat.get("bytes")
             and known.get("sha256") == sha256(self.source)

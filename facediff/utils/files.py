@@ -18,8 +18,7 @@ from typing import IO, Any
 from facediff.errors import FaceDiffError
 from facediff.utils.jobs import run_tasks
 
-ABANDONED_AFTER = 86_400.0
-"""Seconds after which a half-written folder is removed even where the file system has no locks."""
+ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then even where the file system has no locks
 
 
 def cache_dir() -> Path:
@@ -170,13 +169,7 @@ def check_writable(path: Path) -> None:
 
 
 def remove_partial(folder: Path, stem: str = "*", *, recursive: bool = False) -> None:
-    """Remove what killed processes have left half-written in a folder; no other process may be writing there.
-
-    Args:
-        folder: the folder.
-        stem: only of files of this name without suffix.
-        recursive: whether to look into subfolders.
-    """
+    """Remove what killed processes have left of files named ``stem``; no other process may be writing there."""
     pattern = f".{stem if stem == '*' else glob.escape(stem)}.partial-*"
     for left in list(folder.rglob(pattern) if recursive else folder.glob(pattern)):
         if left.is_dir():

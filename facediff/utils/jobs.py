@@ -45,8 +45,7 @@ class PerWorker(Generic[Task, Result]):
     """Work that needs something loaded first, such as a model: it is loaded once in each worker.
 
     Args:
-        setup: loads it, and returns the function that does a task. Must be picklable: a function of a module, or a
-            ``functools.partial`` of one.
+        setup: loads it, and returns the function that does a task; picklable.
     """
 
     def __init__(self, setup: Callable[[], Callable[[Task], Result]]) -> None:

@@ -119,8 +119,7 @@ class NoBytes:
 
 
 SAFE: dict[tuple[str, str], Any] = {
-    ("__builtin__", "bytes"): NoBytes(),
-    ("builtins", "bytes"): NoBytes(),
+    **{(module, "bytes"): NoBytes() for module in ("builtins", "__builtin__")},
     ("numpy", "ndarray"): ArrayType(),
     ("numpy", "dtype"): PlainType,
     **{(f"numpy.{core}.multiarray", "_reconstruct"): Reconstruct() for core in ("core", "_core")},
@@ -129,28 +128,18 @@ SAFE: dict[tuple[str, str], Any] = {
 }
 """What replaces each of NumPy's names that a pickle may ask for."""
 
-
 ALLOWED = {
     ("_codecs", "encode"),
     ("collections", "OrderedDict"),
-    ("builtins", "set"),
-    ("builtins", "frozenset"),
     ("builtins", "complex"),
-    ("__builtin__", "set"),
-    ("__builtin__", "frozenset"),
+    *((module, name) for module in ("builtins", "__builtin__") for name in ("set", "frozenset")),
 }
 
 
 class StandIn:
-    """Takes the place of an object of another package: keeps what the pickle holds of it, and does nothing.
+    """Takes the place of an object of another package: keeps what the pickle holds of it, and does nothing."""
 
-    Attributes:
-        origin: what the pickle asked for, e.g. ``chumpy.ch.Ch``.
-        arguments: what it would have been called with.
-        state: its state; None if the pickle gives none.
-    """
-
-    origin: ClassVar[str] = ""
+    origin: ClassVar[str] = ""  # what the pickle asked for, e.g. chumpy.ch.Ch
     arguments: tuple[object, ...]
     state: object
 
@@ -182,10 +171,8 @@ class _Reconstructor:
 
 
 FOR_STAND_INS: dict[tuple[str, str], Any] = {
-    ("copy_reg", "_reconstructor"): _Reconstructor(),
-    ("copyreg", "_reconstructor"): _Reconstructor(),
-    ("__builtin__", "object"): object,
-    ("builtins", "object"): object,
+    **{(module, "_reconstructor"): _Reconstructor() for module in ("copyreg", "copy_reg")},
+    **{(module, "object"): object for module in ("builtins", "__builtin__")},
 }
 
 

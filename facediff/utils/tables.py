@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, TextIO
+from typing import TextIO
 
 from facediff.errors import MissingExtraError
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-UNLIMITED = 100_000
-"""Width of a table that nothing cuts, in characters."""
+UNLIMITED = 100_000  # width of a table that nothing cuts, in characters
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[object]], *, left: int = 1) -> str:
@@ -40,29 +36,20 @@ def print_table(
 ) -> None:
     """Print a table: with bold titles and within the width of a terminal, or as plain text in full anywhere else.
 
-    Args:
-        head: titles of the columns; no titles if empty.
-        rows: cells; None becomes ``-``.
-        left: how many columns are aligned to the left, as in :func:`format_table`.
-        stream: where to print; standard output if None.
+    The arguments are those of :func:`format_table`; ``stream`` is standard output if None.
 
     Raises:
         MissingExtraError: if rich is not installed.
     """
     try:
         from rich.console import Console
+        from rich.table import Table
+        from rich.text import Text
     except ImportError as error:
         raise MissingExtraError("rich", "cli", "printing tables") from error
     console = Console(file=stream, highlight=False)
     if not console.is_terminal:
         console = Console(file=stream, highlight=False, width=UNLIMITED, color_system=None)
-    console.print(_table(head, rows, left))
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[object]], left: int) -> Table:
-    from rich.table import Table
-    from rich.text import Text
-
     # Text and not str: brackets in a file's name are no markup.
     cells = [[Text("-" if cell is None else str(cell)) for cell in row] for row in rows]
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=bool(head), header_style="bold")
@@ -71,4 +58,4 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]], left: int) -> 
         table.add_column(Text(title), justify="left" if place < left else "right", overflow="fold")
     for row in cells:
         table.add_row(*row)
-    return table
+    console.print(table)
