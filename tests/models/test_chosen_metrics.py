@@ -116,4 +116,4 @@ def test_what_the_corpus_lacks_is_named(make_model: Make, rich: Tiny, make_train
 
 def test_wrong_names_are_refused_with_the_nearest(make_model: Make) -> None:
     with pytest.raises(FaceDiffError, match="lip_vertex_error"):
-        make_model(metrics=["lip_vertex_eror"])
+        _ = make_model(metrics=["lip_vertex_eror"]).evaluation
