@@ -51,6 +51,8 @@ def grow(before: Tensor, after: Tensor) -> Tensor:
         raise FaceDiffError(
             f"weights of the shape {tuple(before.shape)} have no row for each identity, so none can be added"
         )
+    # New rows come first, as new identities do in the list. Starting from the mean, fine-tuning takes fewer steps than
+    # from noise, and no known identity is preferred.
     mean = before.mean(0, keepdim=True)
     return torch.cat([mean.expand(len(after) - len(before), *mean.shape[1:]), before])
 

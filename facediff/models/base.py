@@ -197,6 +197,7 @@ class AnimationModel(LightningModule, Inference, ABC):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss with fixed random numbers, so that epochs compare, and the protocol's metrics of generated motion."""
+        # The same steps and noise in every epoch; otherwise the curve would show their chance.
         losses = self.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
@@ -212,6 +213,7 @@ class AnimationModel(LightningModule, Inference, ABC):
         split = self.evaluation.splits[dataloader_idx]
         for name, view in conditioned(batch, self.unseen_identity, self.identities, self.assets.references):
             self.evaluation.score(self, split, view, name)
+        # Two yardsticks: a face that does not move, and the model with speech that does not belong to the clip.
         self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
         if batch.decoy_audio is not None:
             decoy = replace(batch, audio=batch.decoy_audio, features=None)
@@ -287,6 +289,7 @@ class AnimationModel(LightningModule, Inference, ABC):
             "class_path": f"{type(data).__module__}.{type(data).__qualname__}",
             "root": str(data.root.resolve()),
         }
+        # Measured on the training split once; a resumed or adapted model keeps the scale that its weights know.
         scale = self._assets.motion_scale if self._assets is not None else None
         if scale is None and stage == "fit":
             scale = data.motion_scale()

@@ -101,6 +101,8 @@ def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
 
     hparams = {name: value for name, value in checkpoint["hyper_parameters"].items() if name != "_instantiator"}
     try:
+        # The model is rebuilt from its own options with the sizes that the checkpoint states; then come the assets,
+        # before the weights, since tables of mesh encoders are among these.
         made: AnimationModel = instantiate_module(check_classes(path, hparams), hparams)
         made.on_load_checkpoint(checkpoint)
         made.load_state_dict(checkpoint["state_dict"])
@@ -127,6 +129,8 @@ def check_classes(path: Path | str, hparams: dict[str, Any]) -> type[AnimationMo
     from facediff.models.base import AnimationModel
     from facediff.models.samplers import Sampler
 
+    # Lightning and jsonargparse import and call whatever class path they find. weights_only=True does not prevent that:
+    # a path is plain text. So every path must be known before either of them sees the file.
     found: type[AnimationModel] | None = find_class(model, str(hparams.get("_class_path")), AnimationModel)
     if found is None:
         raise unknown_class(path, "model", hparams.get("_class_path"))

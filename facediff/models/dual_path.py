@@ -179,6 +179,8 @@ class DualPathDiffusion(AnimationModel):
         """Everything that is computed once per clip; in training, identities are hidden now and then."""
         identity = batch.identity
         if self.training and self.identity_dropout:
+            # Index −1 stands for an unseen speaker. Clips that are shown under it teach the model to take the person
+            # from the style alone.
             hidden = torch.rand(identity.shape, device=identity.device) < self.identity_dropout
             identity = identity.masked_fill(hidden, -1)
         return self.network.conditions(batch, identity, self.style_of(batch))
@@ -214,6 +216,7 @@ class DualPathDiffusion(AnimationModel):
         self, clip: Batch, window: Window, seeds: Sequence[int], before: list[Tensor] | None
     ) -> tuple[Float[Tensor, "samples frames vertices 3"], list[Tensor]]:
         """The same for a window of long speech, blended in every denoising step with the window before it."""
+        # The speech before the window is encoded with it but not animated: features at its start depend on it.
         conditions = self.conditions(clip).frames(window.context, window.context + window.frames)
         overlap_blend = WindowOverlap(before, window.kept)
         noise = WindowNoise(clip.names[0], window, seeds, self.device)
@@ -230,6 +233,7 @@ class DualPathDiffusion(AnimationModel):
             blend: changes the features of every step.
             progress: wraps the iteration over steps.
         """
+        # A sampler that clips or thresholds acts on vertices, and no fold can follow it.
         folded = self.sampling_space == "folded" and self.sampler.linear
         space = self.network.prepare_for_inference(conditions, self.process.steps, folded=folded, blend=blend)
         rows, frames = conditions.mask.shape
@@ -397,6 +401,8 @@ class DualPathNetwork(nn.Module):
             table = self.step_embedding(torch.arange(steps, device=conditions.audio.device))
             return table, fold(first.weight, last.weight, last.bias) if folded else None
 
+        # The table and the fold depend on weights only. They are kept between runs, and made again as soon as any of
+        # these weights has changed, as it has after training or moving to another device.
         weights = [self.step_embedding.frequencies, *self.step_embedding.parameters(), *ends]
         table, product = self._of_weights.get(weights, (steps, folded), of_weights)
         audio, style, mask = conditions.audio, conditions.style, conditions.mask
@@ -419,6 +425,7 @@ class StyleTokens(nn.Module):
 
     def __init__(self, token_dims: tuple[int, ...], dim: int, form: TokenForm) -> None:
         super().__init__()
+        # The paper's form, whose attention has nothing to choose between; kept for comparison.
         if form == "single" and token_dims:
             token_dims = (sum(token_dims),)
         self.token_dims = token_dims
@@ -451,5 +458,6 @@ class StepEmbedding(nn.Module):
 
     def forward(self, step: Int[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
         """Embed step numbers counted from 0."""
+        # Wavelengths from 2π to 2π · 10 000 steps, so that near and far steps differ in some channel.
         angle = step[:, None].float() * self.frequencies
         return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))

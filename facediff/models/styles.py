@@ -96,6 +96,7 @@ def split_styles(words: str, clips: Sequence[str] = ()) -> list[Weighted]:
     >>> split_styles(r"C:\ann\x.npy:0.3,F1_e05:-1")
     [Weighted(name='C:\\ann\\x.npy', weight=0.3), Weighted(name='F1_e05', weight=-1.0)]
     """
+    # Before anything is split: a file or clip may have commas and colons in its name.
     if words in clips or Path(words).is_file():
         return [Weighted(words, None)]
     parts = []
@@ -125,6 +126,8 @@ def normalised(words: str, weights: Sequence[float | None]) -> list[float]:
     if len(given) < len(weights):
         raise FaceDiffError(f"--style {words}: give every style a weight (A:0.3,B:0.7), or none of them")
     total = math.fsum(given)
+    # Weights may be negative (to lead away from a style), so their sum may cancel to almost nothing; the mixture that is
+    # divided by it would be huge.
     if not all(map(math.isfinite, given)) or not abs(total) > CANCELLED * math.fsum(map(abs, given)):
         raise FaceDiffError(
             f"--style {words}: expected finite weights whose sum is not 0, since they are divided by it"
@@ -221,6 +224,7 @@ def read_style(
         face, whose, rate = torch.from_numpy(opened.template), None, opened.frame_rate or assets.frame_rate
         if opened.unit not in (None, assets.unit):
             scale = metres_per_unit(str(opened.unit)) / metres_per_unit(assets.unit)
+    # Networks see offsets from the speaker's own neutral face, at the frame rate and in the unit of their corpus.
     motion = torch.from_numpy(frames_of(opened, assets, stride_of(path, rate, assets.frame_rate)))
     offsets = scale * (motion - face)
     check_face(path, offsets, assets, whose)
@@ -335,6 +339,7 @@ def face_of_array(
 
     path, assets, source = opened.path, model.assets, model.data_source
     templates, rate = dict(assets.templates), assets.frame_rate
+    # A file below a corpus folder is one of that corpus's clips, whose templates and frame rate lie next to it.
     in_corpus = path.resolve().parent.name in MOTION_FOLDERS
     if in_corpus:
         root = path.resolve().parent.parent

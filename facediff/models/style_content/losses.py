@@ -83,6 +83,7 @@ class MotionDistance:
         if vertices is not None:
             motion, truth = motion[:, :, vertices], truth[:, :, vertices]
         error = motion - truth
+        # A velocity needs two valid frames: the step from the last frame into the padding is no movement.
         both = mask[:, 1:] & mask[:, :-1]
         moved = frame_mean(error.square().mean((2, 3)), mask)
         changed = frame_mean(error.diff(dim=1).square().mean((2, 3)), both)
@@ -117,6 +118,8 @@ def relative_distance(
     kept, other = values[mask], others[mask]
     if len(kept) < 2:
         return values.new_zeros(())
+    # Two independent values of one distribution are twice its variance apart, hence the factor 2: unrelated contents
+    # then have the distance 2, and equal ones 0.
     spread = kept.var(0, correction=0).mean() + other.var(0, correction=0).mean()
     return 2 * (kept - other).square().mean() / (spread + EPSILON)
 
@@ -139,9 +142,12 @@ def style_contrast(
     own = torch.eye(len(identities), dtype=torch.bool, device=styles.device)
     same &= ~own
     directions = torch.nn.functional.normalize(styles.float(), dim=1)
+    # A style is not compared with itself. Its logit of −∞ takes it out of the softmax; what the logarithm then makes of
+    # it is set to 0, since −∞ times the mask's 0 would be NaN.
     logits = (directions @ directions.T / temperature).masked_fill(own, -torch.inf)
     chances = logits.log_softmax(1).masked_fill(own, 0.0)
     counts = same.sum(1)
+    # Nobody has two styles, or all styles are of one identity: there is nothing to choose between.
     if not counts.any() or bool(same.logical_or(own).all()):
         return styles.new_zeros(())
     each = -(chances * same).sum(1) / counts.clamp_min(1)
@@ -171,6 +177,7 @@ def dynamics_distance(
     """
     if not chosen.any():
         return motion.new_zeros(())
+    # FDD's own quantity is the spread of the squared displacement, so the loss compares the same one.
     squared = [each[chosen][:, :, vertices].square().sum(-1) for each in (motion, truths)]
     spread, wanted = masked_std(squared[0], mask[chosen]), masked_std(squared[1], truth_mask[chosen])
     return (spread - wanted).square().mean() / (wanted.mean().square() + EPSILON)
@@ -273,6 +280,8 @@ def align(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> np
         from dtaidistance.dtw import best_path
     except ImportError as error:
         raise MissingExtraError("dtaidistance", "mesh", "aligning two recordings of one sentence") from error
+    # The path may leave the diagonal by a quarter of the sentence. Without a band, a pause of one recording could be
+    # aligned with half a sentence of the other.
     window = round(BAND * max(len(first), len(second))) + abs(len(first) - len(second)) + 1
     _, costs = dtw_ndim.warping_paths_fast(np.ascontiguousarray(first), np.ascontiguousarray(second), window=window)
     partners: list[list[int]] = [[] for _ in first]
@@ -286,12 +295,15 @@ def cepstra(audio: Float[Tensor, " samples"], frames: int, frame_rate: float) ->
 
     The mean and the variance over the sentence, which depend on voice and microphone more than on sounds, are removed.
     """
+    # One window of speech per motion frame, centred on the frame, so that an alignment of features is one of frames.
     hop = SAMPLE_RATE / frame_rate
     padded = torch.nn.functional.pad(audio.double(), (N_FFT // 2, N_FFT // 2 + int(hop)))
     starts = [round(hop * (frame + 0.5)) for frame in range(frames)]
     stretch = torch.stack([padded[start : start + N_FFT] for start in starts])
     power = torch.fft.rfft(stretch * torch.hann_window(N_FFT, dtype=torch.float64)).abs().square()
     energy = torch.log(power @ mel_filters(N_MELS, N_FFT, 60.0, 7600.0).double().T + 1e-6)
+    # The cosine transform of the log energies: its first coefficients describe the shape of the vocal tract, its later
+    # ones the pitch, which differs between speakers.
     place = (torch.arange(N_MELS, dtype=torch.float64) + 0.5) * torch.pi / N_MELS
     features = energy @ torch.cos(place[:, None] * torch.arange(N_CEPSTRA, dtype=torch.float64))
     features = torch.cat([features, torch.gradient(features, dim=0)[0]], 1) if frames > 1 else features.repeat(1, 2)

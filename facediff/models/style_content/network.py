@@ -61,6 +61,8 @@ class DisentanglementNetwork(nn.Module):
         content = self.content_encoder(motion) * mask[..., None]
         if not self.standardise_content:
             return content
+        # How far somebody opens the mouth is style, not content. Removing each channel's mean and spread over the clip
+        # takes it away before the decoder could rely on it.
         valid = mask[..., None].to(content.dtype)
         count = valid.sum(1, keepdim=True).clamp_min(1)
         centred = (content - content.sum(1, keepdim=True) / count) * valid
@@ -136,6 +138,7 @@ class MotionDecoder(nn.Module):
         Where there are fewer of them than the basis has, the rest stay as they are but small.
         """
         with torch.no_grad():
+            # Small, not zero: shapes past the given ones still get gradients.
             self.basis.weight.mul_(0.01)
             self.basis.weight[:, : len(shapes)] = shapes[: self.basis.in_features].T
             self.basis.bias.copy_(mean)
@@ -151,6 +154,7 @@ class MotionDecoder(nn.Module):
         repeated = style[:, None].expand(-1, content.shape[1], -1)
         valid = mask[..., None].to(content.dtype)
         for conv, kernel in zip(self.convolutions, self.kernels, strict=True):
+            # Padding is zeroed again before each convolution: its own bias would otherwise fill it.
             columns = (torch.cat([x, repeated], dim=-1) * valid).transpose(1, 2)
             columns = nn.functional.pad(columns, (kernel - 1, 0))
             x = nn.functional.leaky_relu(conv(columns).transpose(1, 2), SLOPE)
@@ -207,6 +211,7 @@ class WindowedTransformer(nn.Module):
     def forward(self, features: Float[Tensor, "batch frames in_dim"]) -> Float[Tensor, "batch frames out_dim"]:
         """Content of every frame; features are zero on padding, which then is like the silence past a clip's end."""
         batch, frames, _ = features.shape
+        # Every frame's window is a sequence of its own, so that long clips cost time in proportion to their length.
         source = self.windows(features).flatten(0, 1)
         x = self.embed(source) + self.positions
         for layer in self.layers:
