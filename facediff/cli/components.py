@@ -49,8 +49,10 @@ def options_of(entry: Entry) -> list[str]:
 
     if not inspect.isclass(entry.implementation):
         return []
-    parsed = docstring_parser.parse(inspect.getdoc(entry.implementation) or "", docstring_parser.DocstringStyle.GOOGLE)
-    meanings = {each.arg_name: plain_text(each.description or "") for each in parsed.params}
+    meanings: dict[str, str] = {}
+    for base in reversed(inspect.getmro(entry.implementation)):  # a class describes only options of its own
+        parsed = docstring_parser.parse(base.__doc__ or "", docstring_parser.DocstringStyle.GOOGLE)
+        meanings |= {each.arg_name: plain_text(each.description or "") for each in parsed.params}
     lines = []
     for name, parameter in inspect.signature(entry.implementation).parameters.items():
         if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):

@@ -277,64 +277,49 @@ def _valid_frames(name: str, lengths: Lengths | None, motion: Tensor) -> list[in
 
 
 class ProcessOptions(TypedDict, total=False):
-    """Options of every metric; those of `torchmetrics.Metric`.
-
-    Args:
-        sync_on_compute: Whether `compute` reduces the states over processes.
-        process_group: Over which processes; all if None.
-    """
+    """Options of every metric; see `ExactMetric`."""
 
     sync_on_compute: bool
     process_group: Any
 
 
-class SequenceOptions(ProcessOptions, total=False):
-    """Options of every metric that compares sequences.
+class FiniteOptions(ProcessOptions, total=False):
+    """Options of every metric of sequences; see `SequenceMetric`."""
 
-    Args:
-        length_rule: ``"min"`` cuts prediction and truth to the shorter of the two; ``"error"`` refuses different
-            lengths; ``"prediction"`` cuts the prediction and refuses one that is shorter than the truth.
-        check_finite: Whether `update` refuses NaN and infinity; off only where the caller has looked already.
-    """
-
-    length_rule: LengthRule
     check_finite: bool
 
 
-class BatchOptions(TypedDict, total=False):
-    """What every `update` takes in addition to motion.
+class SequenceOptions(FiniteOptions, total=False):
+    """Options of every metric that compares sequences with their truth; see `SequenceMetric`."""
 
-    Args:
-        lengths: Valid frames (batch,) or a mask (batch, frames), of the truth and, unless the next is given, of the
-            prediction. Padding is never read.
-        prediction_lengths: Valid frames of the prediction.
-        clip_names: One name per sequence, for messages.
-    """
+    length_rule: LengthRule
+
+
+class BatchOptions(TypedDict, total=False):
+    """What every `update` takes in addition to motion; see `SequenceMetric.update`."""
 
     lengths: Lengths | None
     prediction_lengths: Lengths | None
     clip_names: Sequence[str] | None
 
 
-_PACKED = {each.__name__: each for each in (ProcessOptions, SequenceOptions, BatchOptions)}
-_PROCESS_DEFAULTS = {"sync_on_compute": True, "process_group": None}
+_PACKED = {each.__name__: each for each in (ProcessOptions, FiniteOptions, SequenceOptions, BatchOptions)}
 
 
 def _full_signature(cls: type, name: str) -> inspect.Signature:
-    """A method's signature in which ``**options: Unpack[…]`` is written out, with `SequenceMetric`'s defaults."""
+    """A method's signature in which ``**options: Unpack[…]`` is written out, with the defaults of the base classes."""
+    known: dict[str, inspect.Parameter] = {}
+    bases = [vars(base)[name] for base in cls.__mro__[1:] if issubclass(base, ExactMetric) and name in vars(base)]
+    for source in (*bases, align):
+        known |= {key: each for key, each in inspect.signature(source).parameters.items() if key not in known}
     signature = inspect.signature(vars(cls)[name])
     written: list[inspect.Parameter] = []
     for parameter in signature.parameters.values():
         packed = _PACKED.get(str(parameter.annotation).rpartition("[")[2].rstrip("]").rpartition(".")[2])
         if parameter.kind is not inspect.Parameter.VAR_KEYWORD or packed is None:
             written.append(parameter)
-            continue
-        known = (
-            dict(inspect.signature(getattr(SequenceMetric, name)).parameters) if packed is not ProcessOptions else {}
-        )
-        for key, default in _PROCESS_DEFAULTS.items():
-            known.setdefault(key, inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default))
-        written += [known[key] for key in packed.__annotations__]
+        else:
+            written += [known[key] for key in known if key in packed.__annotations__]
     return signature.replace(parameters=written)
 
 
@@ -347,7 +332,9 @@ class ExactMetric(Metric):
     Args:
         definition: The metric in plain words, with its options.
         settings: Further options that distinguish the metric from others but need not be described.
-        **kwargs: For `torchmetrics.Metric`: those of `ProcessOptions` and others.
+        sync_on_compute: Whether `compute` reduces the states over processes.
+        process_group: Over which processes; all if None.
+        **kwargs: For `torchmetrics.Metric`.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
@@ -359,8 +346,16 @@ class ExactMetric(Metric):
     full_state_update = False
     is_differentiable = False
 
-    def __init__(self, *, definition: str, settings: str = "", **kwargs: object) -> None:
-        super().__init__(**kwargs)
+    def __init__(
+        self,
+        *,
+        definition: str,
+        settings: str = "",
+        sync_on_compute: bool = True,
+        process_group: Any = None,  # noqa: ANN401 - as torchmetrics has it
+        **kwargs: object,
+    ) -> None:
+        super().__init__(sync_on_compute=sync_on_compute, process_group=process_group, **kwargs)
         self.definition = definition
         # A MetricCollection merges metrics whose states have the same names and were nearly equal after the
         # first batch; a signed and an absolute deviation would be merged. A state with a name of its own prevents
@@ -426,11 +421,12 @@ class SequenceMetric(ExactMetric):
 
     Args:
         definition: The metric in plain words, with all its options; `words` if None.
-        pooling: All frames alike, or the mean of sequence means.
+        pooling: ``"frames"``, all frames of all sequences alike, or ``"sequences"``, the mean of the sequences' means.
         region: Vertices that are looked at, None for all; motion of another mesh is refused.
-        length_rule: What to do where prediction and truth differ in length.
+        length_rule: ``"min"`` cuts prediction and truth to the shorter of the two; ``"error"`` refuses different
+            lengths; ``"prediction"`` cuts the prediction and refuses one that is shorter than the truth.
         check_finite: Whether `update` refuses NaN and infinity; off only where the caller has looked already.
-        **kwargs: For `torchmetrics.Metric`: those of `ProcessOptions` and others.
+        **kwargs: Those of `ExactMetric`.
 
     Raises:
         ValueError: If an option is unknown.
@@ -466,7 +462,7 @@ class SequenceMetric(ExactMetric):
         region: RegionLike | None = None,
         length_rule: LengthRule = "min",
         check_finite: bool = True,
-        **kwargs: object,
+        **kwargs: Any,  # noqa: ANN401 - whatever torchmetrics takes
     ) -> None:
         check_option("pooling", pooling, Pooling)
         check_option("length rule", length_rule, LengthRule)
@@ -501,15 +497,7 @@ class SequenceMetric(ExactMetric):
         if self.over is not None:
             self.over.check(n_vertices)
 
-    def update(
-        self,
-        prediction: Tensor,
-        truth: Tensor,
-        *,
-        lengths: Lengths | None = None,
-        prediction_lengths: Lengths | None = None,
-        clip_names: Sequence[str] | None = None,
-    ) -> None:
+    def update(self, prediction: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> None:
         """Add a batch of sequences.
 
         Args:
@@ -524,11 +512,6 @@ class SequenceMetric(ExactMetric):
             ValueError: If shapes or lengths do not fit or the length rule refuses them, or a valid frame
                 holds NaN or infinity. Nothing is added then.
         """
-        batch: BatchOptions = {
-            "lengths": lengths,
-            "prediction_lengths": prediction_lengths,
-            "clip_names": clip_names,
-        }
         self.add(self.align(prediction, truth, **batch))
 
     def align(self, prediction: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> Clips:
@@ -652,7 +635,10 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
         return typing.cast(Tensor, one.compute())
 
     name = re.sub(r"(?<!^)(?=[A-Z])", "_", metric.__name__).lower()
-    described = _arguments(SequenceOptions) | _arguments(BatchOptions) | _arguments(metric.update) | _arguments(metric)
+    described: dict[str, str] = {}
+    for base in reversed(metric.__mro__):
+        if issubclass(base, ExactMetric):
+            described |= _arguments(base.update) | _arguments(base)
     summary, _, _ = (inspect.getdoc(metric) or "").partition("\n")
     function.__name__ = function.__qualname__ = name
     function.__module__ = metric.__module__

@@ -33,15 +33,10 @@ from facediff.registry import metric
 
 
 def opening(motion: Tensor, offsets_from: Tensor | None, pairs: Tensor) -> Tensor:
-    """How far the mouth is open in each frame: the mean distance of the lip pairs.
+    """How far the mouth is open in each frame: the mean distance of the lip pairs, (frames,) float64.
 
-    Args:
-        motion: (frames, vertices, 3).
-        offsets_from: (vertices, 3) that ``motion`` is offsets from; None if it is absolute vertices.
-        pairs: (pairs, 2) int64, an upper and a lower vertex each.
-
-    Returns:
-        (frames,), float64, in the vertices' unit.
+    ``motion`` (frames, vertices, 3) is absolute vertices, or offsets from ``offsets_from`` (vertices, 3); ``pairs`` are
+    (pairs, 2) int64.
     """
     gap = motion.index_select(1, pairs[:, 0]).double() - motion.index_select(1, pairs[:, 1]).double()
     if offsets_from is not None:
@@ -50,14 +45,9 @@ def opening(motion: Tensor, offsets_from: Tensor | None, pairs: Tensor) -> Tenso
 
 
 def speed(motion: Tensor, indices: Tensor) -> Tensor:
-    """How far the vertices move from each frame to the next: m[t] = mean_v ‖x[t, v] − x[t − 1, v]‖₂.
+    """How far the vertices move from each frame to the next: m[t] = mean_v ‖x[t, v] − x[t − 1, v]‖₂, (frames − 1,).
 
-    Args:
-        motion: (frames, vertices, 3); a template would cancel.
-        indices: Vertices to look at, (region,) int64.
-
-    Returns:
-        (frames − 1,), float64, in the vertices' unit for each frame.
+    ``motion`` is (frames, vertices, 3), where a template would cancel; ``indices`` are those of a region.
     """
     frames = len(motion)
     out = torch.zeros(frames - 1, dtype=torch.float64, device=motion.device)
@@ -71,15 +61,8 @@ def speed(motion: Tensor, indices: Tensor) -> Tensor:
 def correlation(reference: Tensor, other: Tensor) -> Tensor:
     """Pearson's correlation coefficient of two series of equal length.
 
-    A series varies if its range exceeds 1e-12 of its largest absolute value, which rounding alone does not
-    reach.
-
-    Args:
-        reference: (frames,) float64, what is to be followed.
-        other: (frames,) float64, what should follow it.
-
-    Returns:
-        Scalar, float64; 0 where ``other`` does not vary, NaN where ``reference`` does not.
+    0 where ``other`` does not vary, NaN where ``reference``, which it should follow, does not. A series varies if its
+    range exceeds 1e-12 of its largest absolute value, which rounding alone does not reach.
     """
     if len(reference) < 2:
         return torch.full((), torch.nan, dtype=torch.float64, device=reference.device)
@@ -103,7 +86,6 @@ class OpeningMetric(SequenceMetric):
     Args:
         pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
         definition: The metric in words, `words` if None; ``{pairs}`` becomes the pairs' name, number and hash.
-        pooling: ``"frames"`` or ``"sequences"``.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lip_pairs",)
@@ -148,8 +130,7 @@ class OpeningMetric(SequenceMetric):
                 without it give another, meaningless number.
 
         Raises:
-            ValueError: As for `SequenceMetric.update`, and if ``offsets_from`` does not fit. Nothing is
-                added then.
+            ValueError: As for `SequenceMetric.update`, and if ``offsets_from`` does not fit.
         """
         self.add(self.align(prediction, truth, **batch).attach_templates(offsets_from, "offsets_from"))
 
@@ -164,10 +145,6 @@ class MouthOpeningDifference(OpeningMetric):
     projects of that name compute the root mean square over frames of the difference between two landmarks
     (MSMD, by its authors' account), or the mean instead of the maximum of the lip vertex error (ARTalk, by its
     author's account). The numbers cannot be compared.
-
-    Args:
-        pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
-        pooling: ``"frames"`` or ``"sequences"``.
 
     >>> import torch
     >>> metric = MouthOpeningDifference([(0, 1)])
@@ -207,9 +184,6 @@ class LipOpeningCorrelation(OpeningMetric):
     A prediction that does not vary counts 0. A truth that does not vary, as in a clip of one frame, cannot be
     followed: the sequence is left out and counted by `coverage`. Both are choices, as is the mean over sequences.
 
-    Args:
-        pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
-
     >>> import torch
     >>> truth = torch.tensor([0.0, 1.0, 0.0, 2.0])[:, None, None] * torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     >>> lip_opening_correlation(0.5 * truth, truth, [(0, 1)]).item()
@@ -240,9 +214,6 @@ class LipSpeedCorrelation(LipMetric):
     over frames between m_g and m_p in each sequence; then the mean over sequences. From −1 to 1, without unit.
     A template cancels. A prediction that does not vary counts 0; where the truth does not vary, or has fewer
     than three frames, the sequence is left out and counted by `coverage`. The definition is ours.
-
-    Args:
-        lips: Lip vertices, a `Region` or indices.
     """
 
     higher_is_better = True
@@ -291,7 +262,6 @@ class BilabialClosureRate(OpeningMetric):
     is a share of.
 
     Args:
-        pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
         threshold: Share of the truth's range up to which a mouth counts as closed, 0 to 1.
         count: ``"frames"``: the share of all frames of closures in which the mouth is closed; ``"closures"``:
             the share of closures in which it is closed in at least one frame.
@@ -379,8 +349,7 @@ class BilabialClosureRate(OpeningMetric):
                 are absolute vertices**.
 
         Raises:
-            ValueError: As for `OpeningMetric.update`, and if the closures are missing or do not fit. Nothing is
-                added then.
+            ValueError: As for `OpeningMetric.update`, and if the closures are missing or do not fit.
         """
         if closures is None:
             raise ValueError("closures= is missing; say in which frames the mouth is known to close")

@@ -6,9 +6,9 @@ identities.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
-from typing import Any, ClassVar, Literal, Unpack
+from typing import ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
@@ -17,11 +17,11 @@ from facediff.metrics.base import (
     BatchOptions,
     Clip,
     Clips,
+    FiniteOptions,
     Inferred,
     LengthRule,
     Lengths,
     Pooling,
-    ProcessOptions,
     SequenceMetric,
     SequenceOptions,
     align,
@@ -41,20 +41,10 @@ def align_samples(
     rule: LengthRule = "min",
     **batch: Unpack[BatchOptions],
 ) -> Clips:
-    """As `align`, for several predictions of each sequence.
+    """As `align`, for equally long predictions of each sequence, which become (frames, samples, vertices, 3).
 
-    Args:
-        samples: (batch, samples, frames, vertices, 3), or (samples, frames, vertices, 3) of one sequence.
-        truth: (batch, frames, vertices, 3) or (frames, vertices, 3); None if there is none.
-        n_samples: How many samples there must be; None for any number.
-        rule: What to do where the lengths differ.
-        **batch: As for `align`; the samples of a sequence are equally long.
-
-    Returns:
-        Sequences whose predictions are (frames, samples, vertices, 3).
-
-    Raises:
-        ValueError: As `align`, and if there is another number of samples.
+    ``samples`` are (batch, samples, frames, vertices, 3), or of one sequence (samples, frames, vertices, 3); without
+    ``truth`` only their number of frames counts, and ``n_samples`` is None where there may be any number.
     """
     if samples.ndim not in (4, 5) or samples.shape[-4] == 0:
         raise ValueError(
@@ -76,11 +66,7 @@ def align_samples(
     return clips if truth is not None else clips.attach("truth", predictions)
 
 
-def _sample_count(given: Mapping[str, Any]) -> int:
-    return given["samples"].shape[-4] if given["samples"].ndim > 3 else 2
-
-
-_INFERRED: Inferred = {"n_samples": _sample_count}
+_INFERRED: Inferred = {"n_samples": lambda given: given["samples"].shape[-4] if given["samples"].ndim > 3 else 2}
 
 
 class SamplesMetric(SequenceMetric):
@@ -90,7 +76,6 @@ class SamplesMetric(SequenceMetric):
         lips: Lip vertices, a `Region` or indices.
         n_samples: N, how many samples there are of each sequence; other numbers are refused.
         squared: Whether distances are squared; the score is then in the vertices' unit squared.
-        pooling: ``"frames"`` or ``"sequences"``.
     """
 
     higher_is_better = False
@@ -126,8 +111,7 @@ class SamplesMetric(SequenceMetric):
             **batch: Those of `BatchOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
 
         Raises:
-            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples. Nothing
-                is added then.
+            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
         """
         self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
 
@@ -139,12 +123,6 @@ class MeanEstimateError(SamplesMetric):
     The vertex-wise mean of the N samples is scored as one prediction: in each frame the largest (squared)
     distance over the lip vertices, pooled over frames. Source: ProbTalk3D's script (N = 10, squared, pooled by
     frames). The number depends on N. In the vertices' unit squared, or in the unit if not ``squared``.
-
-    Args:
-        lips: Lip vertices, a `Region` or indices.
-        n_samples: N; other numbers of samples are refused.
-        squared: Whether distances are squared.
-        pooling: ``"frames"`` or ``"sequences"``.
 
     >>> import torch
     >>> samples = torch.stack([torch.ones(4, 2, 3), -torch.ones(4, 2, 3)])
@@ -171,12 +149,6 @@ class CoverageError(SamplesMetric):
     over the lip vertices is taken, and its frames are pooled. Source: ProbTalk3D's script (N = 10, squared,
     pooled by frames). The number falls with N, so errors over different N cannot be compared. In the vertices' unit
     squared, or in the unit if not ``squared``.
-
-    Args:
-        lips: Lip vertices, a `Region` or indices.
-        n_samples: N; other numbers of samples are refused.
-        squared: Whether distances are squared.
-        pooling: ``"frames"`` or ``"sequences"``.
 
     >>> import torch
     >>> samples = torch.stack([torch.ones(4, 2, 3), 2 * torch.ones(4, 2, 3)])
@@ -205,10 +177,8 @@ class Diversity(SequenceMetric):
     In the vertices' unit; a template cancels. There is no best value: noise is diverse too.
 
     Args:
-        region: Vertices to look at; None for all.
+        region: Vertices to look at, a `Region` or indices; None for all.
         definition: Which predictions are compared, in words.
-        pooling: ``"frames"`` or ``"sequences"``.
-        check_finite: Whether NaN and infinity are refused.
     """
 
     def __init__(
@@ -217,11 +187,10 @@ class Diversity(SequenceMetric):
         *,
         definition: str,
         pooling: Pooling,
-        check_finite: bool,
-        **options: Unpack[ProcessOptions],
+        **options: Unpack[FiniteOptions],
     ) -> None:
         words = f"{definition}, the mean distance over {{region}}; {{pooling}} [unit]"
-        super().__init__(definition=words, pooling=pooling, region=region, check_finite=check_finite, **options)
+        super().__init__(definition=words, pooling=pooling, region=region, **options)
 
     def pairs(self, count: int) -> list[tuple[int, int]]:
         """Which of ``count`` predictions are compared."""
@@ -253,12 +222,10 @@ class SampleDiversity(Diversity):
     vertices' unit. A template cancels. The pairs' expectation does not depend on N.
 
     Args:
-        region: Vertices to look at, a `Region` or indices; None for all.
         pairing: ``"shuffled"`` as in ProbTalk3D's script, or ``"all"``.
         n_samples: N; other numbers of samples are refused. Even for ``"shuffled"``.
         seed: Of the order; not used with ``"all"``.
         pooling: ``"sequences"`` as in the script, or ``"frames"``.
-        check_finite: Whether NaN and infinity are refused.
 
     Raises:
         ValueError: If an option is unknown, or ``n_samples`` cannot be paired.
@@ -279,8 +246,7 @@ class SampleDiversity(Diversity):
         n_samples: int = 10,
         seed: int = 1234,
         pooling: Pooling = "sequences",
-        check_finite: bool = True,
-        **options: Unpack[ProcessOptions],
+        **options: Unpack[FiniteOptions],
     ) -> None:
         check_option("pairing", pairing, Pairing)
         if n_samples < 2 or (pairing == "shuffled" and n_samples % 2):
@@ -289,7 +255,7 @@ class SampleDiversity(Diversity):
             )
         how = f"a random half with the other (seed {seed})" if pairing == "shuffled" else "all pairs"
         words = f"of {n_samples} samples, {how}"
-        super().__init__(region, definition=words, pooling=pooling, check_finite=check_finite, **options)
+        super().__init__(region, definition=words, pooling=pooling, **options)
         self.pairing: Pairing = pairing
         self.n_samples = n_samples
         self.seed = seed
@@ -313,8 +279,7 @@ class SampleDiversity(Diversity):
             clip_names: One name per sequence, for messages.
 
         Raises:
-            ValueError: If shapes or lengths do not fit, there are not ``n_samples`` samples, or a valid frame
-                holds NaN or infinity. Nothing is added then.
+            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
         """
         self.add(align_samples(samples, None, n_samples=self.n_samples, lengths=lengths, clip_names=clip_names))
 
@@ -330,9 +295,7 @@ class IdentityDiversity(Diversity):
     sequences.
 
     Args:
-        region: Vertices to look at, a `Region` or indices; None for all.
         pooling: ``"sequences"`` as in the script, or ``"frames"``.
-        check_finite: Whether NaN and infinity are refused.
     """
 
     leaves_out = "each was predicted for one identity only"
@@ -343,11 +306,10 @@ class IdentityDiversity(Diversity):
         region: RegionLike | None = None,
         *,
         pooling: Pooling = "sequences",
-        check_finite: bool = True,
-        **options: Unpack[ProcessOptions],
+        **options: Unpack[FiniteOptions],
     ) -> None:
         words = "of predictions for several identities, all pairs"
-        super().__init__(region, definition=words, pooling=pooling, check_finite=check_finite, **options)
+        super().__init__(region, definition=words, pooling=pooling, **options)
 
     def update(  # type: ignore[override]  # there is no truth
         self, predictions: Tensor, *, lengths: Lengths | None = None, clip_names: Sequence[str] | None = None
@@ -361,8 +323,7 @@ class IdentityDiversity(Diversity):
             clip_names: One name per sequence, for messages.
 
         Raises:
-            ValueError: If shapes or lengths do not fit, or a valid frame holds NaN or infinity. Nothing is
-                added then.
+            ValueError: As for `SequenceMetric.update`.
         """
         self.add(align_samples(predictions, None, n_samples=None, lengths=lengths, clip_names=clip_names))
 

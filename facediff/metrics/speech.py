@@ -122,8 +122,8 @@ class SpeechLipMetric(SequenceMetric):
             intensity: Instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
 
         Raises:
-            ValueError: As for `SequenceMetric.update`, and if the speech is missing, given twice, too short
-                or not finite. Nothing is added then.
+            ValueError: As for `SequenceMetric.update`, and if the speech is missing, given twice, too short or not
+                finite.
         """
         clips = self.align(prediction, truth, **batch)
         self.add(self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3))
@@ -176,13 +176,6 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
 
     The SLCC of "Perceptually Accurate 3D Talking Head Generation" (Chae-Yeon et al., CVPR 2025) is taken
     over clips instead: `ClipSpeechLipCorrelation`. This one asks the same within a sentence; the definition is ours.
-
-    Args:
-        lips: Lip vertices, a `Region` or indices.
-        of: ``"prediction"``, ``"truth"`` or ``"gap"``.
-        sample_rate: Samples of the speech per second; needed for waveforms, not for intensities.
-        frames_per_second: Of the motion; likewise.
-        **options: Those of `SequenceOptions`; NaN and infinity in the speech are always refused.
 
     >>> import torch
     >>> loudness = torch.tensor([0.0, 1.0, 3.0, 2.0])
@@ -241,12 +234,7 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
     Memory grows with ``n_identities``, not with clips or frames.
 
     Args:
-        lips: Lip vertices, a `Region` or indices.
         n_identities: How many identities there are; 1 standardises over all clips together.
-        of: ``"prediction"``, ``"truth"`` or ``"gap"``.
-        sample_rate: Samples of the speech per second; needed for waveforms, not for intensities.
-        frames_per_second: Of the motion; likewise.
-        **options: Those of `SequenceOptions`; NaN and infinity in the speech are always refused.
 
     >>> import torch
     >>> loudness = torch.tensor([[1.0], [2.0], [4.0]]).expand(3, 5)
@@ -296,15 +284,14 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         """Add a batch of sequences with their speech.
 
         Args:
-            prediction: As for `SpeechLipMetric.update`, like all that follow but the identities.
+            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
             truth: Likewise.
             identities: Number of each sequence's identity, below ``n_identities``; needed unless there is one.
-            waveform: The sound (batch, samples); needs the two rates.
-            intensity: Instead: intensity of the speech in each frame, (batch, frames).
+            waveform: The sound; see `SpeechLipMetric.update`.
+            intensity: Instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
 
         Raises:
             ValueError: As for `SpeechLipMetric.update`, and if the identities are missing or do not fit.
-                Nothing is added then.
         """
         clips = self.align(prediction, truth, **batch)
         clips = self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3)

@@ -90,9 +90,6 @@ class LipWarpingDistance(LipMetric):
     Time grows with the square of the frames: a clip of 600 frames and FLAME's 250 lip vertices takes about
     0.2 seconds on a CPU core, with BIWI's 4 996 some 3 seconds.
 
-    Args:
-        lips: Lip vertices, a `Region` or indices.
-
     >>> import torch
     >>> late = torch.zeros(4, 1, 3)
     >>> late[2:, 0, 0] = 1.0
@@ -123,17 +120,10 @@ class LipWarpingDistance(LipMetric):
 
 
 def smooth(series: Tensor, deviation: float) -> Tensor:
-    """A series under a Gaussian filter.
+    """A series (frames,) float64 under a Gaussian filter of this standard deviation in frames; 0 leaves it as it is.
 
     The filter reaches ⌊4 · deviation + ½⌋ frames to either side and its weights add up to 1. Beyond its ends
     the series is mirrored, the end frames included: c b a | a b c | c b a.
-
-    Args:
-        series: (frames,), float64.
-        deviation: Standard deviation in frames; 0 leaves the series as it is.
-
-    Returns:
-        (frames,), float64.
     """
     radius = int(4 * deviation + 0.5)
     if radius == 0:
@@ -176,14 +166,7 @@ def extrema(series: list[float]) -> dict[int, int]:
 def matched_lags(path: Path, truth: list[float], prediction: list[float]) -> list[int]:
     """Lags |i − j| of the pairs of a path at which both series have a maximum or both a minimum.
 
-    Args:
-        path: Pairs of a frame of the truth and a frame of the prediction.
-        truth: The series whose extrema are to be met.
-        prediction: The series that should meet them.
-
-    Returns:
-        One lag for each such pair whose frame of the prediction lies between the truth's neighbouring extrema, or
-        ends.
+    Only of pairs whose frame j of the prediction lies between the truth's neighbouring extrema, or ends.
     """
     turns, predicted_turns = extrema(truth), extrema(prediction)
     places = sorted(turns)
@@ -224,7 +207,6 @@ class TemporalMisalignment(OpeningMetric):
     ``at="path"`` is ours.
 
     Args:
-        pairs: Lip vertex pairs, `LipPairs` or pairs of indices.
         at: ``"extrema"`` as the CVPR 2025 paper's script, or ``"path"``.
         smoothing: Standard deviation of the Gaussian in frames; 0 for none. It is cut off at 4 standard
             deviations, and the series is mirrored at its ends.

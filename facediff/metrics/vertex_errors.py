@@ -42,8 +42,7 @@ class VertexError(SequenceMetric):
     Args:
         region: Vertices to look at, a `Region` or indices; None for all.
         reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
-        squared: Whether distances are squared; the score is then in the vertices' unit squared.
-        pooling: ``"frames"`` or ``"sequences"``.
+        squared: Whether distances are squared, e² instead of √e²; the score is then in the vertices' unit squared.
     """
 
     higher_is_better = False
@@ -80,11 +79,6 @@ class MeanVertexError(VertexError):
     of √e². ``reduction="max"`` is the text of the dual-path style diffusion paper: the largest √e² of each
     frame, averaged over frames. In the vertices' unit, squared if ``squared``.
 
-    Args:
-        reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
-        squared: Whether e² replaces √e².
-        pooling: ``"frames"`` or ``"sequences"``.
-
     >>> import torch
     >>> metric = MeanVertexError()
     >>> metric.update(torch.ones(2, 5, 7, 3), torch.zeros(2, 5, 7, 3), lengths=[5, 4])
@@ -112,8 +106,6 @@ class LipVertexError(VertexError):
 
     Args:
         lips: Lip vertices, a `Region` or indices.
-        squared: Whether distances are squared, e² instead of √e².
-        pooling: ``"frames"`` or ``"sequences"``.
 
     >>> import torch
     >>> metric = LipVertexError([1, 2])
@@ -144,9 +136,6 @@ class UpperFaceVertexError(VertexError):
 
     Args:
         upper: Upper-face vertices, a `Region` or indices.
-        reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
-        squared: Whether distances are squared.
-        pooling: ``"frames"`` or ``"sequences"``.
     """
 
     needs = ("upper_face",)
@@ -222,8 +211,7 @@ class FaceDynamicsDeviation(SequenceMetric):
                 template already**; absolute vertices without a template give another, meaningless number.
 
         Raises:
-            ValueError: As for `SequenceMetric.update`, and if the template does not fit. Nothing is added
-                then.
+            ValueError: As for `SequenceMetric.update`, and if the template does not fit.
         """
         self.add(self.align(prediction, truth, **batch).attach_templates(template))
 
