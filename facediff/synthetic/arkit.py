@@ -43,8 +43,7 @@ SIDED = {
 }
 """Controls that act on both sides, of which two shapes are made."""
 
-BLEND = 0.005
-"""Half the width in metres of the strip about the midline over which a side's share goes from 0 to 1."""
+BLEND = 0.005  # Half the width in metres of the strip about the midline over which a side's share goes from 0 to 1
 
 
 def puppet_shapes(speaker: str | None = None) -> tuple[Array, npt.NDArray[np.int64], dict[str, Array]]:
@@ -79,10 +78,6 @@ def puppet_shapes(speaker: str | None = None) -> tuple[Array, npt.NDArray[np.int
 
 def write_puppet_shapes(folder: Path, speaker: str | None = None) -> list[str]:
     """Write the shapes as OBJ files, and the face at rest as ``neutral.obj``; the folder appears whole or not at all.
-
-    Args:
-        folder: a new folder.
-        speaker: as :func:`puppet_shapes` takes it.
 
     Returns:
         the names of the shapes.

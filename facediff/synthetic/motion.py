@@ -33,64 +33,36 @@ _CLOSURE_SMOOTHNESS = 0.010
 
 @dataclass(frozen=True)
 class SpeakingStyle:
-    """A speaker's speaking style.
+    """A speaker's speaking style."""
 
-    Attributes:
-        jaw: Gain of the jaw.
-        rounding: Gain of pucker and funnel.
-        spreading: Gain of stretch and of the corners.
-        lips: Gain of upper and lower lip.
-        lead: Seconds by which the mouth runs ahead of the sound (negative: behind).
-        slack: How widely sounds run into one another; below 1 is crisp.
-        smoothness: Standard deviation in seconds of the final smoothing in time.
-        asymmetry: How much stronger the left side moves.
-        smile: Resting weight of the corners.
-        inner_brow: Gain of the inner brows on accents.
-        outer_brow: Gain of the outer brows on accents.
-        frown: Resting weight of the frown.
-        blinks: Blinks per second.
-        blink_length: Seconds that a blink takes.
-        squint: Resting weight of the lower lids.
-        cheeks: Gain of the cheeks with the spreading of the lips.
-    """
-
-    jaw: float = 1.0
-    rounding: float = 1.0
-    spreading: float = 1.0
-    lips: float = 1.0
-    lead: float = 0.02
-    slack: float = 1.0
-    smoothness: float = 0.014
-    asymmetry: float = 0.0
-    smile: float = 0.0
-    inner_brow: float = 0.5
-    outer_brow: float = 0.5
-    frown: float = 0.0
-    blinks: float = 0.35
-    blink_length: float = 0.26
-    squint: float = 0.0
-    cheeks: float = 0.4
+    jaw: float = 1.0  # Gain of the jaw
+    rounding: float = 1.0  # Gain of pucker and funnel
+    spreading: float = 1.0  # Gain of stretch and of the corners
+    lips: float = 1.0  # Gain of upper and lower lip
+    lead: float = 0.02  # Seconds by which the mouth runs ahead of the sound (negative: behind)
+    slack: float = 1.0  # How widely sounds run into one another; below 1 is crisp
+    smoothness: float = 0.014  # Standard deviation in seconds of the final smoothing in time
+    asymmetry: float = 0.0  # How much stronger the left side moves
+    smile: float = 0.0  # Resting weight of the corners
+    inner_brow: float = 0.5  # Gain of the inner brows on accents
+    outer_brow: float = 0.5  # Gain of the outer brows on accents
+    frown: float = 0.0  # Resting weight of the frown
+    blinks: float = 0.35  # Blinks per second
+    blink_length: float = 0.26  # Seconds that a blink takes
+    squint: float = 0.0  # Resting weight of the lower lids
+    cheeks: float = 0.4  # Gain of the cheeks with the spreading of the lips
 
 
 @dataclass(frozen=True)
 class Mood:
-    """What a mood does to every speaker.
+    """What a mood does to every speaker."""
 
-    Attributes:
-        articulation: Gain of all that speech moves.
-        brows: Gain of the brows.
-        raised: Resting weight of the brows.
-        smile: Added to the resting corners.
-        droop: Resting weight of the upper lids.
-        frown: Added to the resting frown.
-    """
-
-    articulation: float
-    brows: float
-    raised: float
-    smile: float
-    droop: float
-    frown: float
+    articulation: float  # Gain of all that speech moves
+    brows: float  # Gain of the brows
+    raised: float  # Resting weight of the brows
+    smile: float  # Added to the resting corners
+    droop: float  # Resting weight of the upper lids
+    frown: float  # Added to the resting frown
 
 
 MOOD_EFFECTS = {
@@ -118,19 +90,12 @@ def generate_weights(
     mood: str,
     random: np.random.Generator,
 ) -> Array:
-    """Turn a spoken sentence into the motion of a face.
+    """Turn a spoken sentence's mouth shapes, loudness and melody into the motion of a face.
 
-    Args:
-        segments: The sentence's mouth shapes in time.
-        prosody: Its loudness and melody.
-        frames: How many frames to make.
-        style: How the speaker moves.
-        mood: One of `MOOD_EFFECTS`.
-        random: Source of blinks and drift.
+    The mood is one of `MOOD_EFFECTS`; blinks and drift are random.
 
     Returns:
-        Weights in the order of `facediff.synthetic.rig.CONTROLS` at the middle of each frame, shape
-        (frames, controls).
+        Weights (frames, controls) in the order of `facediff.synthetic.rig.CONTROLS` at the middle of each frame.
     """
     effect = MOOD_EFFECTS[mood]
     margin = 0.2
@@ -235,24 +200,16 @@ def _blurred(values: Array, places: NDArray[np.floating]) -> Array:
 
 @dataclass(frozen=True)
 class Viseme:
-    """A mouth shape.
+    """A mouth shape."""
 
-    Attributes:
-        name: Short upper-case name.
-        targets: Rig weights aimed at; controls not named aim at 0.
-        strength: How much the sound's shape dominates its neighbours (Cohen and Massaro's magnitude of dominance);
-            weak sounds take the shape of the sounds next to them.
-        reach: How far its influence spreads in time, as a factor.
-        closes: Whether the lips meet.
-        firm: Controls on which it dominates fully, whatever its ``strength``.
-    """
-
-    name: str
-    targets: dict[str, float]
+    name: str  # Short upper-case name
+    targets: dict[str, float]  # Rig weights aimed at; controls not named aim at 0
+    # How much the sound's shape dominates its neighbours (Cohen and Massaro's magnitude of dominance); weak
+    # sounds take the shape of the sounds next to them
     strength: float = 1.0
-    reach: float = 1.0
-    closes: bool = False
-    firm: tuple[str, ...] = ()
+    reach: float = 1.0  # How far its influence spreads in time, as a factor
+    closes: bool = False  # Whether the lips meet
+    firm: tuple[str, ...] = ()  # Controls on which it dominates fully, whatever its `strength`
 
 
 _ALL = (
@@ -312,13 +269,9 @@ _MARKS = "ˈˌːˑ̩̃ʲ̯̆ "
 
 
 def visemes_of(ipa: str) -> tuple[str, ...]:
-    """The mouth shapes of a phoneme in order: a diphthong or an affricate has several.
+    """The names of a phoneme's mouth shapes in order: a diphthong or an affricate has several.
 
-    Args:
-        ipa: Phoneme as espeak-ng writes it, with stress and length marks; empty for a pause.
-
-    Returns:
-        Names found in `VISEMES`; ``("SIL",)`` for a pause, ``("UX",)`` for a sound that is not known.
+    ``("SIL",)`` stands for a pause, ``("UX",)`` for a sound that is not known.
     """
     sounds = [letter for letter in ipa if letter not in _MARKS]
     if not sounds:
@@ -333,11 +286,6 @@ def visemes_of(ipa: str) -> tuple[str, ...]:
     return tuple(names) or ("UX",)
 
 
-def is_stressed(ipa: str) -> bool:
-    """Whether the phoneme carries primary stress."""
-    return "ˈ" in ipa
-
-
 # Coarticulation: mouth shapes flow into one another by overlapping dominance functions.
 #
 # After Cohen and Massaro, "Modeling coarticulation in synthetic visual speech" (1993): each segment has, for
@@ -348,20 +296,8 @@ def is_stressed(ipa: str) -> bool:
 
 _ROUND_TOP = 0.018
 # Seconds in which dominance falls to 1/e, before and after a segment. Rounding is prepared early.
-_FALL_BEFORE = {
-    "pucker": 0.085,
-    "funnel": 0.080,
-    "stretch": 0.070,
-    "lower_lip_tuck": 0.035,
-    "lip_press": 0.035,
-}
-_FALL_AFTER = {
-    "pucker": 0.070,
-    "funnel": 0.065,
-    "stretch": 0.060,
-    "lower_lip_tuck": 0.035,
-    "lip_press": 0.035,
-}
+_FALL_BEFORE = {"pucker": 0.085, "funnel": 0.080, "stretch": 0.070, "lower_lip_tuck": 0.035, "lip_press": 0.035}
+_FALL_AFTER = {"pucker": 0.070, "funnel": 0.065, "stretch": 0.060, "lower_lip_tuck": 0.035, "lip_press": 0.035}
 _DEFAULT_FALL = 0.052
 _FIRM_STRENGTH = 3.0
 _SURELY_SHUT = 0.028
@@ -372,19 +308,12 @@ _CLOSING, _OPENING = (0.050, 0.070), (0.060, 0.085)
 
 @dataclass(frozen=True)
 class Segment:
-    """A stretch of speech with one mouth shape.
+    """A stretch of speech with one mouth shape."""
 
-    Attributes:
-        start: Where it starts, in seconds.
-        end: Where it ends, in seconds.
-        viseme: Its mouth shape.
-        stress: How much of its target is reached, about 1.
-    """
-
-    start: float
-    end: float
-    viseme: Viseme
-    stress: float
+    start: float  # Where it starts, in seconds
+    end: float  # Where it ends, in seconds
+    viseme: Viseme  # Its mouth shape
+    stress: float  # How much of its target is reached, about 1
 
 
 def segments_of(phonemes: tuple[Phoneme, ...]) -> list[Segment]:
@@ -392,7 +321,7 @@ def segments_of(phonemes: tuple[Phoneme, ...]) -> list[Segment]:
     segments: list[Segment] = []
     for phoneme in phonemes:
         names = visemes_of(phoneme.ipa)
-        stress = 1.08 if is_stressed(phoneme.ipa) else 0.95
+        stress = 1.08 if "ˈ" in phoneme.ipa else 0.95  # the mark of primary stress
         shares = np.cumsum([0.0, *([0.6] + [0.4 / (len(names) - 1)] * (len(names) - 1) if len(names) > 1 else [1.0])])
         length = phoneme.end - phoneme.start
         # A short sound does not reach its target (Lindblom's undershoot, 1963): jaws have no time for it.
@@ -405,15 +334,9 @@ def segments_of(phonemes: tuple[Phoneme, ...]) -> list[Segment]:
 
 
 def articulate(segments: list[Segment], times: Array, *, spread: float = 1.0) -> Array:
-    """Blend the segments' targets.
+    """Weights (n, controls) of `SPEECH_CONTROLS` at times (n,) in seconds: the blended targets of the segments.
 
-    Args:
-        segments: Segments in order, covering the clip.
-        times: Times, in seconds, shape (n,).
-        spread: How widely sounds influence each other; below 1 is crisp, above 1 is slack.
-
-    Returns:
-        Weights of `SPEECH_CONTROLS`, shape (n, controls).
+    ``spread`` is how widely sounds influence each other; below 1 is crisp, above 1 is slack.
     """
     start = np.array([s.start for s in segments])
     end = np.array([s.end for s in segments])
@@ -435,15 +358,7 @@ def articulate(segments: list[Segment], times: Array, *, spread: float = 1.0) ->
 
 
 def close_lips(segments: list[Segment], times: Array) -> Array:
-    """How firmly the lips are shut, 0 to 1: 1 from before the start to past the middle of every p, b and m.
-
-    Args:
-        segments: Segments in order.
-        times: Times, in seconds, shape (n,).
-
-    Returns:
-        Closure, shape (n,).
-    """
+    """How firmly the lips are shut (n,), 0 to 1: 1 from before the start to past the middle of every p, b and m."""
     apart = np.ones_like(times)
     lengths = [segment.end - segment.start for segment in segments]
     for index, (segment, length) in enumerate(zip(segments, lengths, strict=True)):
@@ -473,30 +388,16 @@ _LOWEST_PITCH, _HIGHEST_PITCH = 65.0, 420.0
 
 @dataclass(frozen=True)
 class Prosody:
-    """Slow contours of a clip, each about -1 to 2 with mean 0 over its voiced part.
+    """Slow contours of a clip, each about -1 to 2 with mean 0 over its voiced part."""
 
-    Attributes:
-        times: Middles of the analysis windows, in seconds, shape (n,).
-        loudness: Level relative to the clip's mean, in its standard deviations, shape (n,).
-        pitch: Logarithm of the fundamental frequency relative to the clip's mean, in its standard deviations,
-            shape (n,).
-    """
-
-    times: Array
-    loudness: Array
+    times: Array  # Middles of the analysis windows, in seconds, shape (n,)
+    loudness: Array  # Level relative to the clip's mean, in its standard deviations, shape (n,)
+    # Logarithm of the fundamental frequency relative to the clip's mean, in its standard deviations, shape (n,)
     pitch: Array
 
 
 def analyse(samples: NDArray[np.float32], rate: int) -> Prosody:
-    """Measure a waveform.
-
-    Args:
-        samples: Mono waveform, shape (samples,).
-        rate: Samples per second.
-
-    Returns:
-        Its contours, smoothed over about a syllable.
-    """
+    """Contours of a mono waveform (samples,), smoothed over about a syllable; ``rate`` is in samples a second."""
     hop, window = int(_HOP * rate), int(_WINDOW * rate)
     padded = np.pad(np.asarray(samples, dtype=np.float64), window)
     starts = np.arange(0, padded.size - window, hop)

@@ -14,19 +14,12 @@ from facediff.synthetic.speech import Voice
 
 @dataclass(frozen=True)
 class Speaker:
-    """One of the corpus's speakers.
+    """One of the corpus's speakers."""
 
-    Attributes:
-        name: Identity, such as ``"F1"``.
-        voice: How espeak-ng speaks for them.
-        shape: How their head differs from the neutral one.
-        style: How their face moves.
-    """
-
-    name: str
-    voice: Voice
-    shape: Shape
-    style: SpeakingStyle
+    name: str  # Identity, such as `"F1"`
+    voice: Voice  # How espeak-ng speaks for them
+    shape: Shape  # How their head differs from the neutral one
+    style: SpeakingStyle  # How their face moves
 
 
 def _read_speakers() -> dict[str, Speaker]:
