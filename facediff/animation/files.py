@@ -155,7 +155,14 @@ def read_archive(path: Path) -> Animation:
         ) from error
     regions = {name.removeprefix("region_"): arrays[name] for name in arrays if name.startswith("region_")}
     for name in ARRAYS.keys() & arrays.keys():
-        _check_array(path, name, arrays[name])
+        array, (kinds, words, lengths) = arrays[name], ARRAYS[name]
+        fits = array.ndim == len(lengths) and all(
+            wanted in (None, length) for length, wanted in zip(array.shape, lengths, strict=True)
+        )
+        if array.dtype.kind not in kinds or not (fits or not array.size):  # an empty array may have any shape
+            raise FaceDiffError(
+                f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {words}; write the file again"
+            )
     indices = regions if "inner_lip_pairs" not in arrays else {**regions, "inner_lip_pairs": arrays["inner_lip_pairs"]}
     count = len(arrays["template"])
     for name, array in indices.items():
@@ -164,33 +171,18 @@ def read_archive(path: Path) -> Animation:
     return Animation(**{name: arrays[name] for name in ARRAYS if name in arrays}, regions=regions, **facts)
 
 
-def _check_array(path: Path, name: str, array: npt.NDArray[Any]) -> None:
-    """Refuse an array of another kind or shape; an empty array may have any shape."""
-    kinds, words, lengths = ARRAYS[name]
-    fits = array.ndim == len(lengths) and all(
-        wanted in (None, length) for length, wanted in zip(array.shape, lengths, strict=True)
-    )
-    if array.dtype.kind not in kinds or not (fits or not array.size):
-        raise FaceDiffError(
-            f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {words}; write the file again"
-        )
-
-
 class MotionWriter:
     """A .npy file of (frames, V, 3) float32 that grows, so that memory does not hold a long motion.
 
     Args:
         path: the file; its header is valid after :meth:`close`.
         frame: shape of a frame, (V, 3).
-
-    Attributes:
-        frames: number of frames so far.
     """
 
     def __init__(self, path: Path, frame: tuple[int, ...]) -> None:
         self.path = path
         self.frame = frame
-        self.frames = 0
+        self.frames = 0  # written so far
         self._stream = path.open("wb")
         self._write_header()
 

@@ -73,7 +73,11 @@ def describe_run(model: AnimationModel, data: SpeechMotionDataModule) -> dict[st
         parameters[parameter.requires_grad] += parameter.numel()
     return {
         "model": type(model).__name__,
-        **{f"component/{kind}": name for kind, name in component_names(model).items()},
+        **{
+            f"component/{kind}": str(chosen["class_path"]).rpartition(".")[2]
+            for kind in registry.COMPONENTS
+            if isinstance(chosen := model.hparams.get(kind), dict) and "class_path" in chosen
+        },
         "parameters/trainable": parameters[True],
         "parameters/frozen": parameters[False],
         "data/corpus": data.corpus_name,
@@ -86,16 +90,6 @@ def describe_run(model: AnimationModel, data: SpeechMotionDataModule) -> dict[st
         "version/torch": str(torch.__version__),
         "version/lightning": lightning.__version__,
     }
-
-
-def component_names(model: AnimationModel) -> dict[str, str]:
-    """The name of every part that was chosen by name, by its kind."""
-    names = {}
-    for kind in registry.COMPONENTS:
-        chosen = model.hparams.get(kind)
-        if isinstance(chosen, dict) and "class_path" in chosen:
-            names[kind] = str(chosen["class_path"]).rpartition(".")[2]
-    return names
 
 
 def manifest_hash(folder: Path) -> str:
@@ -174,11 +168,6 @@ def measure_clips(trainer: Trainer, model: AnimationModel, rows: list[dict[str, 
 
     A clip's noise follows from its name, so this is the motion that the test has scored. Predicting it again costs less
     than keeping the motion of every clip that might be among the worst, and lets one process show the worst of all.
-
-    Args:
-        trainer: the trainer in its test.
-        model: the model tested.
-        rows: rows of the table of sequences.
     """
     data = trainer.datamodule  # type: ignore[attr-defined]
     if not isinstance(data, SpeechMotionDataModule):

@@ -60,9 +60,15 @@ class ScoreTable(Callback):
         print(describe_scores(rows, assets.corpus, synthetic=assets.synthetic, metrics=chosen))
         print(evaluation.describe())
         if self.file and folder:
-            path = Path(folder) / self.file
-            write_csv(path, rows)
-            print(f"written: {path}")
+            # Regions become the columns <region>_vertices and <region>_hash.
+            flat = []
+            for row in rows:
+                line = {key: value for key, value in row.items() if key != "regions"}
+                for part, region in row["regions"].items():
+                    line |= {f"{part}_vertices": region["count"], f"{part}_hash": region["hash"]}
+                flat.append(line)
+            write_rows(Path(folder) / self.file, flat)
+            print(f"written: {Path(folder) / self.file}")
         if self.sequences_file and folder:
             write_rows(Path(folder) / self.sequences_file, sequences)
             print(f"written: {Path(folder) / self.sequences_file}")
@@ -78,13 +84,9 @@ class ScoreTable(Callback):
 def log_sequences(
     logger: WandbLogger, sequences: list[dict[str, Any]], definition: str, media: dict[tuple[str, str], list[Any]]
 ) -> None:
-    """Give Weights & Biases the table of sequences and the words that define its numbers.
+    """Give Weights & Biases the table of sequences, a row per clip and method, and the words that define its numbers.
 
-    Args:
-        logger: the logger.
-        sequences: one row per clip and method.
-        definition: what the protocol's numbers stand for.
-        media: sound and picture by split and clip; the model's rows that have them come first, in this order.
+    Media are sound and picture by split and clip; the model's rows that have them come first, in this order.
     """
     columns = list(sequences[0])
     places = {key: place for place, key in enumerate(media)}
@@ -100,14 +102,7 @@ def log_sequences(
 
 
 def describe_scores(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool, metrics: Sequence[str] = ()) -> str:
-    """The scores as text, with what they were taken over.
-
-    Args:
-        rows: one row per split and method.
-        corpus: name of the corpus.
-        synthetic: whether it was made by a program.
-        metrics: metrics that were chosen by name.
-    """
+    """The scores as text, one row per split and method, with what they were taken over."""
     names = [name for name in ("mve", "lve", "fdd", "fdd_absolute") if name in rows[0]]
     kind = "SYNTHETIC corpus" if synthetic else "corpus"
     lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}, unseen speakers: {rows[0]['unseen_identity']}"]
@@ -124,18 +119,6 @@ def describe_scores(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool,
         values = [[name, *(None if row[name] is None else f"{row[name]:.4e}" for row in rows)] for name in metrics]
         lines += ["", format_table(["metric", *methods], values)]
     return "\n".join(lines)
-
-
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    """One line per split and method; regions as ``<region>_vertices`` and ``<region>_hash``."""
-    flat = []
-    for row in rows:
-        regions = row["regions"]
-        line = {key: value for key, value in row.items() if key != "regions"}
-        for part, region in regions.items():
-            line |= {f"{part}_vertices": region["count"], f"{part}_hash": region["hash"]}
-        flat.append(line)
-    write_rows(path, flat)
 
 
 class PredictionWriter(BasePredictionWriter):

@@ -244,12 +244,7 @@ class SamplingPreview(Callback):
 
 @contextmanager
 def averaged_weights(trainer: Trainer, model: LightningModule) -> Iterator[None]:
-    """A context with the weights in the model that a checkpoint would hold; its own are put back afterwards.
-
-    Args:
-        trainer: its callbacks are looked at; nothing happens if none of them averages weights.
-        model: the module, not wrapped by a strategy.
-    """
+    """A context with the weights in the model that a checkpoint would hold; its own are put back afterwards."""
     # At the end of training, callbacks before the averaging one see the raw weights and later ones the averaged. Saved
     # as into a checkpoint, the averaged ones are obtained in any order.
     averaging = next((found for found in trainer.callbacks if isinstance(found, WeightAveraging)), None)  # type: ignore[attr-defined]
@@ -356,15 +351,8 @@ def draw_clip(
 ) -> ClipPreview:
     """Draw truth, prediction and error of one clip, and write the video and the sheet; each whole or not at all.
 
-    Args:
-        model: gives faces, colours, unit and metrics.
-        sample: the true clip.
-        motion: predicted offsets from the template.
-        folder: where the files go, under the clip's name.
-        epochs: epochs trained so far.
-        error_scale: error that gets the last colour, in the corpus's unit.
-        size: height of a panel in pixels.
-        view: from where the face is seen.
+    The motion is offsets from the template, and the files get the clip's name; ``error_scale`` (in the corpus's unit),
+    ``size`` and ``view`` are those of :class:`SamplingPreview`.
 
     Raises:
         FaceDiffError: if the corpus has no mesh, the motion is not finite, or a file cannot be written.
@@ -427,15 +415,8 @@ def length(value: float, unit: str) -> str:
 def show(logger: Logger, clips: Sequence[ClipPreview], epochs: int, step: int, tables: dict[int, Any]) -> None:
     """Give the clips of one epoch to a logger; those without pictures leave them to the files in the run's folder.
 
-    Weights & Biases gets a video per clip and a table that grows by the clips of every epoch, TensorBoard the sheet of
-    pictures and the sound.
-
-    Args:
-        logger: any logger.
-        clips: what was drawn.
-        epochs: epochs trained so far.
-        step: optimiser steps so far.
-        tables: the growing tables of Weights & Biases, one for each logger.
+    Weights & Biases gets a video per clip and a table that grows by the clips of every epoch (``tables`` holds one for
+    each logger), TensorBoard the sheet of pictures and the sound.
     """
     if isinstance(logger, TensorBoardLogger):
         for clip in clips:

@@ -6,8 +6,9 @@ Source: Khronos Group, glTF 2.0 Specification. Metres, y up, the face looks alon
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,7 +141,7 @@ def largest_error(flat: Array, weights: Array, shapes: Array) -> float:
     return float(np.sqrt(worst))
 
 
-def normal_shapes(weights: Array, rest: Array, normals: Callable[[int], Array]) -> Array:
+def normal_shapes(weights: Array, rest: Array, normals: Iterable[Array]) -> Array:
     """Offsets of normals (M, V, 3) which, added with the shapes' weights, come nearest to the true normals.
 
     Normals are no linear function of the vertices, so that the normals of the shapes themselves would not add up. These
@@ -149,13 +150,13 @@ def normal_shapes(weights: Array, rest: Array, normals: Callable[[int], Array]) 
     Args:
         weights: (T, M).
         rest: (V, 3) normals of the rest face.
-        normals: the normals (V, 3) of a frame.
+        normals: the normals (V, 3) of every frame.
     """
     inverse = np.linalg.pinv(weights.astype(np.float64), rcond=1e-2).astype(np.float32)
     offsets = np.zeros((len(inverse), *rest.shape), np.float32)
-    step = 16
+    turned, step = iter(normals), 16
     for start in range(0, len(weights), step):
-        batch = np.stack([normals(index) - rest for index in range(start, min(start + step, len(weights)))])
+        batch = np.stack([normal - rest for normal in islice(turned, step)])
         offsets += np.tensordot(inverse[:, start : start + step], batch, axes=1)
     return offsets
 
@@ -200,16 +201,7 @@ class Binary:
 def make_document(
     animation: Animation, space: Space, rest: Array, morphs: Morphs, binary: Binary, extras: dict[str, object]
 ) -> GLTF2:
-    """The glTF document of one animated mesh; its arrays are appended to the binary chunk.
-
-    Args:
-        animation: gives triangles, colours, true normals and times.
-        space: metres, y up.
-        rest: (V, 3) the neutral face in that space.
-        morphs: the motion.
-        binary: receives the arrays.
-        extras: what the node says about the animation.
-    """
+    """The glTF document of one animated mesh at rest (V, 3); its arrays are appended to the binary chunk."""
     import pygltflib as gltf
 
     def add_vertices(positions: Array, normals: Array) -> dict[str, int]:
@@ -217,9 +209,6 @@ def make_document(
             "POSITION": binary.add(positions, target=ARRAY_BUFFER, bounds=True),
             "NORMAL": binary.add(normals, target=ARRAY_BUFFER),
         }
-
-    def true_normals(index: int) -> Array:
-        return normals_of(space.place(np.asarray(animation.vertices[index])), faces)
 
     faces = outward(animation)
     rest_normals = normals_of(rest, faces)
@@ -232,6 +221,7 @@ def make_document(
     # The largest number of a type is reserved: it restarts a strip of triangles.
     index_type = np.uint16 if len(rest) < 65_535 else np.uint32
     indices = binary.add(faces.astype(index_type).ravel(), target=ELEMENT_ARRAY_BUFFER)
+    true_normals = (normals_of(points, faces) for points in space.frames(animation))
     turned = normal_shapes(morphs.weights, rest_normals, true_normals)
     targets = [add_vertices(shape, normals) for shape, normals in zip(morphs.shapes, turned, strict=True)]
     prefix = "frame" if morphs.components is None else "shape"

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation import Animation, metres_per_unit
+from facediff.animation import Animation
 from facediff.editing.blendshapes import Weights
 from facediff.editing.correspondence import Correspondence
 from facediff.editing.shapes import ShapeSet
+from facediff.export.viewer.packing import millimetres, mouth_opening
 from facediff.render import Camera, Renderer, contact_sheet, heat_colours, save_image
 
 
@@ -27,19 +28,11 @@ class Panel:
 
 
 def draw_worst_frame(path: Path, animation: Animation, shapes: ShapeSet, weights: Weights) -> None:
-    """Draw the frame that blendshapes fit worst: the original, the sum of the weighted shapes, and their difference.
-
-    Args:
-        path: the picture (.png).
-        animation: what the weights were solved for.
-        shapes: the blendshapes.
-        weights: the solution.
-    """
+    """Draw the frame that blendshapes fit worst: the original, the sum of the weighted shapes, and their difference."""
     frame = int(weights.residual_rms_mm.argmax())
     truth = np.asarray(animation.vertices[frame], np.float64)
     built = animation.template + np.einsum("k,kvc->vc", weights.values[frame], shapes.deltas)
-    millimetres = 1000 * metres_per_unit(animation.unit)
-    label, colours = heat(np.linalg.norm(truth - built, axis=1) * millimetres, "residual")
+    label, colours = heat(np.linalg.norm(truth - built, axis=1) * millimetres(animation), "residual")
     _draw(
         path,
         [
@@ -59,13 +52,16 @@ def draw_correspondence(path: Path, animation: Animation, made: Animation, found
         made: the same on the target mesh.
         found: the correspondence between them.
     """
-    frame, millimetres = widest_frame(animation), 1000 * metres_per_unit(made.unit)
+    opening = mouth_opening(animation)
+    if opening is None:  # without known lips, the frame furthest from the neutral face
+        opening = np.array([np.square(frame - animation.template).sum() for frame in animation.vertices])
+    frame = int(opening.argmax())
     # In the source's axes and unit, so that one camera shows both.
     back = found.similarity.inverse()
     posed = back.apply(made.vertices[frame])
     source = np.asarray(animation.vertices[frame])
-    moved, moves = heat(np.linalg.norm(made.vertices[frame] - made.template, axis=1) * millimetres, "motion")
-    apart, distances = heat(found.distances * millimetres, "distance of the meshes")
+    moved, moves = heat(np.linalg.norm(made.vertices[frame] - made.template, axis=1) * millimetres(made), "motion")
+    apart, distances = heat(found.distances * millimetres(made), "distance of the meshes")
     _draw(
         path,
         [
@@ -81,18 +77,6 @@ def heat(values_mm: npt.NDArray[np.floating], label: str) -> tuple[str, npt.NDAr
     """A label with the scale, and the colours of numbers at vertices (V,) from 0 to their greatest."""
     highest = max(float(values_mm.max()), 1e-6)
     return f"{label}, 0 to {highest:.2g} mm", heat_colours(values_mm, highest)
-
-
-def widest_frame(animation: Animation) -> int:
-    """The frame in which the mouth is most open; without known lips, the frame furthest from the neutral face."""
-    pairs = animation.inner_lip_pairs
-
-    def opening(frame: npt.NDArray[np.floating]) -> float:
-        if pairs is not None and len(pairs):
-            return float(np.linalg.norm(frame[pairs[:, 0]] - frame[pairs[:, 1]], axis=1).mean())
-        return float(np.square(frame - animation.template).sum())
-
-    return int(np.argmax([opening(frame) for frame in animation.vertices]))
 
 
 def _draw(path: Path, panels: Sequence[Panel], size: int = 272) -> None:

@@ -29,7 +29,7 @@ class Usd(Format):
             MissingExtraError: if usd-core is not installed.
         """
         try:
-            from pxr import Sdf, Tf, Usd, UsdGeom
+            from pxr import Sdf, Tf, Usd, UsdGeom, UsdMedia
         except ImportError as error:
             raise MissingExtraError("pxr", "usd", "writing USD") from error
         (animation,) = animations
@@ -45,7 +45,12 @@ class Usd(Format):
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, root).GetPrim())
         data: dict[str, Any] = facts(animation, space)
         if options.speech_file is not None:
-            _add_sound(stage, root.AppendChild("speech"), options.speech_file)
+            # The speech, from the first frame on, equally loud wherever the listener stands. The start is time code 0
+            # by default. Writing it would mark the file as a newer version than old readers know.
+            sound = UsdMedia.SpatialAudio.Define(stage, root.AppendChild("speech"))
+            sound.CreateFilePathAttr(Sdf.AssetPath(f"./{options.speech_file}"))
+            sound.CreateAuralModeAttr(UsdMedia.Tokens.nonSpatial)
+            sound.CreatePlaybackModeAttr(UsdMedia.Tokens.onceFromStart)
             data["speech"] = options.speech_file
         layer = stage.GetRootLayer()
         layer.customLayerData = {"facediff": data}
@@ -90,14 +95,3 @@ def _add_face(stage: Any, path: Any, animation: Animation, space: Space) -> None
             "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
         )
         colour.Set(Vt.Vec3fArray.FromNumpy(linear_colours(animation.colours)))
-
-
-def _add_sound(stage: Any, path: Any, file: str) -> None:  # noqa: ANN401
-    """The speech, from the first frame on, equally loud wherever the listener stands."""
-    from pxr import Sdf, UsdMedia
-
-    sound = UsdMedia.SpatialAudio.Define(stage, path)
-    sound.CreateFilePathAttr(Sdf.AssetPath(f"./{file}"))
-    sound.CreateAuralModeAttr(UsdMedia.Tokens.nonSpatial)
-    # The start is time code 0 by default. Writing it would mark the file as a newer version than old readers know.
-    sound.CreatePlaybackModeAttr(UsdMedia.Tokens.onceFromStart)

@@ -79,7 +79,10 @@ def drawn_frames(animations: Sequence[Animation], options: ExportOptions) -> Ite
         for animation in animations
     ]
     frames = max(len(animation.vertices) for animation in animations)
-    motions = [_hold_last(animation.vertices, frames) for animation in animations]
+    motions = [
+        np.pad(motion, ((0, frames - len(motion)), (0, 0), (0, 0)), "edge") if len(motion) < frames else motion
+        for motion in (animation.vertices for animation in animations)
+    ]
     # A video must say that a corpus is synthetic, so that the footer names the corpora unless the user chose a text.
     corpora = dict.fromkeys(animation.metadata["corpus"] for animation in animations if "corpus" in animation.metadata)
     footer = " – ".join(part for part in (options.footer or ", ".join(corpora), procedural(animations)) if part)
@@ -93,9 +96,3 @@ def procedural(animations: Sequence[Animation]) -> str:
     )
     words = ", ".join(note.replace(";", ",") for note in notes if note)
     return f"procedural: {words}" if words else ""
-
-
-def _hold_last(motion: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:
-    """A motion (T, V, 3) that stays on its last frame until it has the given number of frames."""
-    missing = frames - len(motion)
-    return motion if not missing else np.concatenate([motion, np.repeat(motion[-1:], missing, axis=0)])

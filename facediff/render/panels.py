@@ -264,13 +264,9 @@ def _caption(picture: Frame, text: str, edge: str, colour: tuple[int, int, int],
 
 
 def draw_text(picture: Frame, text: str, *, colour: tuple[int, int, int], scale: float) -> Frame:
-    """A copy of the picture with a line of text in its middle.
+    """A copy of the picture (height, width, 3) with a line of text in its middle.
 
-    Args:
-        picture: (height, width, 3).
-        text: the line; made smaller where it is wider than the picture.
-        colour: sRGB, 0 to 255.
-        scale: height of the letters as a share of the picture's height.
+    Letters are ``scale`` times as high as the picture, and smaller where the line would be wider than it.
     """
     if not text.strip():
         return picture.copy()

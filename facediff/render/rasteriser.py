@@ -387,12 +387,7 @@ def to_srgb(linear: npt.ArrayLike) -> Float32:
 
 
 def opencv() -> ModuleType:
-    """The module cv2.
-
-    Raises:
-        MissingExtraError: if OpenCV is not installed.
-        FaceDiffError: if it is older than 5.
-    """
+    """The module cv2; refuses versions older than 5."""
     try:
         import cv2
     except ImportError as error:
@@ -460,13 +455,9 @@ class _Canvas:
         self.values[window.samples] = self._blank[window.samples]
 
     def draw(self, positions: Float32, faces: Faces, values: Floats, side: str) -> None:
-        """Interpolate values (V, 3) over the triangles where they are the nearest surface so far.
+        """Interpolate values (V, 3) from 0 to 1 over the triangles where they are the nearest surface so far.
 
-        Args:
-            positions: vertices (V, 3) in camera axes.
-            faces: triangles (F, 3).
-            values: what to interpolate, from 0 to 1.
-            side: which side of the triangles, "front", "back" or "both".
+        Positions (V, 3) are in camera axes; the side of the triangles is "front", "back" or "both".
         """
         cv2 = opencv()
         settings = cv2.TriangleRasterizeSettings()
@@ -505,16 +496,7 @@ class _Canvas:
 
 
 def check_vertices(vertices: npt.ArrayLike, name: str, n_vertices: int | None = None) -> Float64:
-    """Vertex positions (V, 3) as float64; refuses what cannot be drawn.
-
-    Args:
-        vertices: positions (V, 3) in any length unit.
-        name: what the array is called in the message.
-        n_vertices: V where it is known already.
-
-    Raises:
-        FaceDiffError: if the shape or the kind of number is wrong, or one is not finite.
-    """
+    """Vertex positions (V, 3) as float64; refuses other shapes and kinds of number, and what is not finite."""
     array = np.asarray(vertices)
     if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
         raise FaceDiffError(f"{name} must have the shape (vertices, 3), got {array.shape}: x, y, z each.")
@@ -533,11 +515,7 @@ def check_vertices(vertices: npt.ArrayLike, name: str, n_vertices: int | None = 
 
 
 def check_faces(faces: npt.ArrayLike, n_vertices: int) -> Faces:
-    """Triangles (F, 3) as int32.
-
-    Raises:
-        FaceDiffError: if the shape is wrong, or a triangle names a vertex that does not exist.
-    """
+    """Triangles (F, 3) as int32; refuses another shape, and vertices that do not exist."""
     array = np.asarray(faces)
     shaped = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
     if not shaped or not np.issubdtype(array.dtype, np.integer):

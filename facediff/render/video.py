@@ -68,7 +68,16 @@ def write_video(
     if not 0 < frame_rate <= 1000:
         raise FaceDiffError(f"frame_rate is {frame_rate}: give frames per second above 0, such as 25.")
     rate = Fraction(frame_rate).limit_denominator(1001)
-    sound = None if audio is None else _check_audio(audio, sample_rate)
+    sound = None
+    if audio is not None:
+        sound = np.asarray(audio, dtype=np.float32)
+        if sound.ndim != 1 or len(sound) == 0:
+            raise FaceDiffError(f"audio must be mono of the shape (samples,), got {sound.shape}: average the channels.")
+        if sample_rate is None or not 1000 <= sample_rate <= 384_000:
+            raise FaceDiffError(f"sample_rate is {sample_rate}: give the sound's rate in Hz, such as 16000.")
+        if not np.isfinite(sound).all():
+            raise FaceDiffError("audio holds NaN or infinity: check its source.")
+        sound = np.clip(sound, -1, 1)
     if target.is_dir():
         raise FaceDiffError(f'video file "{target}" is a folder: give the name of a file.')
     made = [folder for folder in target.parents if not folder.exists()]
@@ -91,18 +100,6 @@ def write_video(
                 folder.rmdir()
         raise
     return count
-
-
-def _check_audio(audio: npt.ArrayLike, sample_rate: int | None) -> npt.NDArray[np.float32]:
-    """Mono float32 sound, clipped to full scale."""
-    sound = np.asarray(audio, dtype=np.float32)
-    if sound.ndim != 1 or len(sound) == 0:
-        raise FaceDiffError(f"audio must be mono of the shape (samples,), got {sound.shape}: average the channels.")
-    if sample_rate is None or not 1000 <= sample_rate <= 384_000:
-        raise FaceDiffError(f"sample_rate is {sample_rate}: give the sound's rate in Hz, such as 16000.")
-    if not np.isfinite(sound).all():
-        raise FaceDiffError("audio holds NaN or infinity: check its source.")
-    return np.clip(sound, -1, 1)
 
 
 def _check_frame(frame: Frame, size: tuple[int, int] | None, index: int = 0) -> tuple[int, int]:

@@ -22,14 +22,10 @@ LARGEST_STEP = np.iinfo(np.int16).max
 
 
 class Blobs:
-    """The binary parts of a page; equal parts are kept once.
-
-    Attributes:
-        texts: the parts, deflated (zlib's format) and in base64.
-    """
+    """The binary parts of a page; equal parts are kept once."""
 
     def __init__(self) -> None:
-        self.texts: list[str] = []
+        self.texts: list[str] = []  # the parts, deflated (zlib's format) and in base64
         self._numbers: dict[bytes, int] = {}
 
     def add(self, data: bytes) -> int:
@@ -68,16 +64,13 @@ def pack_motion(animation: Animation, blobs: Blobs) -> list[int]:
                 f"{animation.name}: moves {furthest * STEP / 1000:.3g} m away from its template; give the unit of "
                 f"length (--unit) and the template (--mesh) that belong to it"
             )
-        numbers.append(blobs.add(_pack_chunk(steps.astype(np.int32))))
+        whole: npt.NDArray[np.int32] = steps.astype(np.int32)
+        differences = np.diff(whole, axis=0, prepend=np.zeros_like(whole[:1]))
+        # Modulo 2¹⁶: the sums of 16 bits that the page computes come out right, however far two frames are apart.
+        differences = differences.astype(np.int16).astype(np.int32)
+        folded = ((differences << 1) ^ (differences >> 31)).astype(np.uint16).transpose(2, 1, 0)
+        numbers.append(blobs.add((folded & 255).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()))
     return numbers
-
-
-def _pack_chunk(steps: npt.NDArray[np.int32]) -> bytes:
-    differences = np.diff(steps, axis=0, prepend=np.zeros_like(steps[:1]))
-    # Modulo 2¹⁶: the sums of 16 bits that the page computes come out right, however far two frames are apart.
-    differences = differences.astype(np.int16).astype(np.int32)
-    folded = ((differences << 1) ^ (differences >> 31)).astype(np.uint16).transpose(2, 1, 0)
-    return (folded & 255).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()
 
 
 def mouth_opening(animation: Animation) -> npt.NDArray[np.float32] | None:
@@ -98,12 +91,7 @@ def bounds(animation: Animation) -> tuple[list[float], list[float]]:
 
 
 def heat_scale_end(truth: Animation, others: Sequence[Animation]) -> float:
-    """Error in mm that gets a heat map's last colour: the worst 99th percentile, rounded up to one digit.
-
-    Args:
-        truth: what the others are compared with.
-        others: animations of the truth's topology and length.
-    """
+    """Error in mm that gets a heat map's last colour: the worst 99th percentile, rounded up to one digit."""
     # 200 frames are enough for a percentile, and few enough for memory.
     chosen = np.unique(np.linspace(0, len(truth.vertices) - 1, 200).astype(int))
     right = np.asarray(truth.vertices[chosen], np.float64) * millimetres(truth)
