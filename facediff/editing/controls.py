@@ -85,13 +85,7 @@ class AnimationControls:
         regions: Mapping[str, object],
         name: str,
     ) -> None:
-        """Refuse what cannot work on a face, before anything is sampled.
-
-        Args:
-            template: the neutral face (V, 3).
-            faces: its triangles (F, 3), if they are known.
-            regions: the face's regions by name.
-            name: what the face is called in the error.
+        """Refuse what cannot work on a face (V, 3), (F, 3), which errors call ``name``, before anything is sampled.
 
         Raises:
             FaceDiffError: if a region is unknown, or blinks or gaze are wanted and the eyes are not known.

@@ -49,23 +49,18 @@ def read_factors(words: str) -> dict[str, float]:
 
 
 def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], name: str) -> None:
-    """Refuse a region that does not exist.
-
-    Raises:
-        FaceDiffError: naming the regions that ``name`` has.
-    """
+    """Refuse a region that does not exist, naming those that ``name`` has."""
     for region in factors:
         if region != ALL and region not in regions:
             raise FaceDiffError(f'{name}: has no region "{region}" to scale: {choices(region, [*regions, ALL])}')
 
 
 def scale_regions(animation: Animation, factors: Mapping[str, float], eyes: Eyes | None = None) -> Animation:
-    """Scale how far every vertex goes from the neutral face.
+    """Scale how far every vertex goes from the neutral face; the head must not sway yet.
 
     Args:
-        animation: its head must not sway yet.
-        factors: by region of the animation; ``all`` stands for every vertex that no other name covers. 1 changes
-            nothing.
+        animation: with the regions that are named.
+        factors: by region; ``all`` stands for every vertex that no other name covers.
         eyes: where they are known, the closing of the lids is left as it is: a blink stays a blink, and lids that meet
             do not run through each other.
 
@@ -115,25 +110,21 @@ def region_factors(
     Raises:
         FaceDiffError: if a region is not there.
     """
+    from scipy.spatial import cKDTree
+
     check_factors(factors, regions, name)
     places = np.asarray(template, np.float64)
     width = FALL_OFF * float(np.linalg.norm(np.ptp(places, axis=0))) if fall_off is None else fall_off
     named = [region for region in factors if region != ALL]
     weights = np.zeros((len(named), len(places)))
     for row, region in zip(weights, named, strict=True):
-        row[:] = 1.0 - smooth_step(_distances(places, np.asarray(regions[region]), width) / max(width, 1e-12))
+        distances = np.full(len(places), np.inf)
+        if len(regions[region]):  # a face that was carried to a mesh without the region has none
+            distances = cKDTree(places[regions[region]]).query(places, distance_upper_bound=width)[0]
+        row[:] = 1.0 - smooth_step(distances / max(width, 1e-12))
     # Where regions overlap, their weights are made to sum to one; without it, two factors of 1 would scale by 2.
     total = weights.sum(axis=0)
     weights /= np.maximum(total, 1.0)
     rest = np.clip(1.0 - total, 0.0, None)
     of_regions = np.array([factors[region] for region in named]) @ weights if named else np.zeros(len(places))
     return np.asarray(of_regions + rest * factors.get(ALL, 1.0))
-
-
-def _distances(places: Array, region: npt.NDArray[np.integer], limit: float) -> Array:
-    """Distance of every vertex (V,) from the nearest one of a region; infinite from ``limit`` on."""
-    from scipy.spatial import cKDTree
-
-    if not len(region):  # as of a face that was carried to a mesh without it
-        return np.full(len(places), np.inf)
-    return np.asarray(cKDTree(places[region]).query(places, distance_upper_bound=limit)[0])

@@ -56,11 +56,7 @@ class Eyes:
             raise FaceDiffError(f"{self.source}: an eyeball of less than four vertices has no centre; name all of them")
 
     def lids(self) -> tuple[Indices, npt.NDArray[np.float32]]:
-        """The vertices (L,) that a blink moves, and their ways (L, 3).
-
-        Raises:
-            FaceDiffError: if the way is not known.
-        """
+        """The vertices (L,) that a blink moves, and their ways (L, 3); refused if the way is not known."""
         if self.closing is None:
             raise FaceDiffError(f"{self.source}: does not say how the lids shut; {GIVE}")
         way = np.linalg.norm(self.closing, axis=-1)
@@ -69,11 +65,7 @@ class Eyes:
 
 
 def eyes_for(template: Vertices, faces: npt.NDArray[np.integer] | None, file: Path | None) -> Eyes | None:
-    """The eyes of a face (V, 3): from the file if there is one, else the puppet's if it is a puppet, else None.
-
-    Raises:
-        FaceDiffError: if the file is not what it should be, or belongs to another topology.
-    """
+    """The eyes of a face (V, 3): from the file if there is one, else the puppet's if it is a puppet, else None."""
     return read_eyes(file, template) if file is not None else puppet_eyes(template, faces)
 
 
@@ -138,9 +130,19 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
         raise FaceDiffError(f"--eyes {path}: expected .json or .npz")
     if closing is None and not balls:
         raise FaceDiffError(f"--eyes {path}: says nothing of lids or eyeballs; known are {', '.join(KEYS)}")
-    if closing is not None:
-        closing = _fitted(path, np.asarray(closing), template, neutral)
-    return Eyes(closing, balls, f"--eyes {path}")
+    if closing is None:
+        return Eyes(None, balls, f"--eyes {path}")
+    size = float(np.linalg.norm(np.ptp(template, axis=0)))
+    if closing.shape != template.shape or (neutral is not None and neutral.shape != template.shape):
+        raise FaceDiffError(f"--eyes {path}: its blink has shape {closing.shape}; the face has {template.shape}")
+    scale = 1.0 if neutral is None else size / max(float(np.linalg.norm(np.ptp(neutral, axis=0))), 1e-12)
+    way = scale * float(np.linalg.norm(closing, axis=-1).max())
+    if not PLAUSIBLE[0] * size < way < PLAUSIBLE[1] * size:
+        raise FaceDiffError(
+            f"--eyes {path}: its blink moves a lid by {way:.3g} on a face of size {size:.3g}; give the shape of shut "
+            f'eyes, and as "neutral" the open face in the same unit'
+        )
+    return Eyes(np.asarray(scale * closing, np.float32), balls, f"--eyes {path}")
 
 
 def _read_json(path: Path) -> Mapping[str, Any]:
@@ -188,21 +190,6 @@ def _closing(
     return None
 
 
-def _fitted(path: Path, closing: Vertices, template: Vertices, neutral: Vertices | None) -> npt.NDArray[np.float32]:
-    """The closing in the face's unit."""
-    size = float(np.linalg.norm(np.ptp(template, axis=0)))
-    if closing.shape != template.shape or (neutral is not None and neutral.shape != template.shape):
-        raise FaceDiffError(f"--eyes {path}: its blink has shape {closing.shape}; the face has {template.shape}")
-    scale = 1.0 if neutral is None else size / max(float(np.linalg.norm(np.ptp(neutral, axis=0))), 1e-12)
-    way = scale * float(np.linalg.norm(closing, axis=-1).max())
-    if not PLAUSIBLE[0] * size < way < PLAUSIBLE[1] * size:
-        raise FaceDiffError(
-            f"--eyes {path}: its blink moves a lid by {way:.3g} on a face of size {size:.3g}; give the shape of shut "
-            f'eyes, and as "neutral" the open face in the same unit'
-        )
-    return np.asarray(scale * closing, np.float32)
-
-
 def _read_shape(path: Path, name: object) -> Vertices:
     """Vertices of a mesh, or displacements (V, 3) of a .npy file, that the eyes' file names."""
     from facediff.mesh import read_mesh
@@ -241,16 +228,11 @@ def _checked(path: Path, indices: npt.NDArray[Any], n_vertices: int) -> Indices:
 def closing_of_lids(
     template: Vertices, lids: list[tuple[Indices, Indices]], rigid: Indices | None = None
 ) -> npt.NDArray[np.float32]:
-    """How lids shut (V, 3), from the vertices of their edges alone.
+    """How the lids of a face (V, 3), y up and z to the viewer, shut: ways (V, 3) from the vertices of their edges.
 
-    Both edges run from one corner of the eye to the other. Each edge vertex goes to the line between them at its own
-    share of the way along; the skin around follows its nearest edge vertices, less and less up to 0.4 of the eye's
-    width away.
-
-    Args:
-        template: (V, 3) the neutral face with open eyes, y up and z to the viewer.
-        lids: for each eye the vertices of the upper and of the lower edge.
-        rigid: vertices that do not follow (eyeballs).
+    For each eye, the upper and the lower edge run from one corner to the other. Each edge vertex goes to the line
+    between them at its own share of the way along; the skin around follows its nearest edge vertices, less and less up
+    to 0.4 of the eye's width away. ``rigid`` vertices (eyeballs) do not follow.
 
     Raises:
         FaceDiffError: if an edge has less than two vertices.

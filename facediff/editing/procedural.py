@@ -50,13 +50,7 @@ def add_blinks(animation: Animation, eyes: Eyes, *, rate: float = RATE, seed: in
     """Let the eyes blink, in addition to any blinks of the animation.
 
     The lids' own closing a and the blink's b make a + b (1 − a): at b = 0 the animation's own, at b = 1 shut, never
-    more. An eye that is shut already stays as it is.
-
-    Args:
-        animation: its head must not sway yet.
-        eyes: of the animation's topology.
-        rate: blinks a minute, 1 to 40.
-        seed: equal seeds give equal blinks.
+    more. An eye that is shut already stays as it is. The head must not sway yet; ``rate`` is blinks a minute, 1 to 40.
 
     Raises:
         FaceDiffError: if the rate is impossible, or the eyes' lids are not known.
@@ -127,13 +121,9 @@ LIDS_PER_DEGREE = 0.012
 
 
 def add_gaze(animation: Animation, eyes: Eyes, *, degrees: float = DEGREES_GAZE, seed: int = 0) -> Animation:
-    """Let the eyes wander: eyeballs turn about their centres, lids follow slightly.
+    """Let the eyes wander: eyeballs turn about their centres, lids follow slightly where their closing is known.
 
-    Args:
-        animation: its head must not sway yet.
-        eyes: of the animation's topology; where the lids' closing is not known, they stay.
-        degrees: how far from straight ahead the eyes turn at most.
-        seed: equal seeds give equal gaze.
+    The head must not sway yet; ``degrees`` is how far from straight ahead the eyes turn at most.
 
     Raises:
         FaceDiffError: if the angle is impossible, or the eyeballs are not known.
@@ -212,10 +202,8 @@ def sphere_centre(points: npt.NDArray[np.floating]) -> Array:
     # |x − c|² = r² is linear in c and r² − |c|²: 2 x·c + (r² − |c|²) = |x|².
     middle = np.asarray(points, np.float64).mean(axis=0)
     local = np.asarray(points, np.float64) - middle
-    solution = np.linalg.lstsq(
-        np.concatenate([2.0 * local, np.ones((len(local), 1))], axis=1), (local**2).sum(axis=1), rcond=None
-    )[0]
-    return np.asarray(middle + solution[:3])
+    system = np.concatenate([2.0 * local, np.ones((len(local), 1))], axis=1)
+    return np.asarray(middle + np.linalg.lstsq(system, (local**2).sum(axis=1), rcond=None)[0][:3])
 
 
 # Head sway: slow, small rotations and shifts of the whole head.
@@ -230,12 +218,7 @@ AT_REST = 1.0  # Seconds over which the sway begins and ends
 
 
 def add_sway(animation: Animation, *, degrees: float = DEGREES_SWAY, seed: int = 0) -> Animation:
-    """Let the head sway; all vertices move as one. This must be the last change: nothing can be added after it.
-
-    Args:
-        animation: any animation.
-        degrees: largest rotation.
-        seed: equal seeds give equal sway.
+    """Let the head sway, by ``degrees`` at most; all vertices move as one. Nothing can be added after it.
 
     Raises:
         FaceDiffError: if the angle is impossible.

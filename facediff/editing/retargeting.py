@@ -74,14 +74,9 @@ def retarget(
 
 
 def carry(animation: Animation, correspondence: Correspondence, target: Mesh) -> Animation:
-    """An animation's motion on another mesh.
+    """The motion of an animation of the correspondence's source mesh, of any identity, on its target mesh.
 
     The target's vertices, triangles and colours are kept as they are; its unit follows from how large it is.
-
-    Args:
-        animation: of the correspondence's source mesh, of the same or another identity.
-        correspondence: from :func:`facediff.editing.correspondence.correspond`.
-        target: its target mesh.
 
     Raises:
         FaceDiffError: if one of the meshes is not the correspondence's, or has its vertices in another order, or a
@@ -137,8 +132,7 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
         for _ in range(ROUNDS):
             columns = known + smoothing @ columns
         made = columns.reshape(made.shape[1], made.shape[0], 3).transpose(1, 0, 2)
-    result: Array = correspondence.share[:, None] * made
-    return result
+    return np.asarray(correspondence.share[:, None] * made)
 
 
 def unit_of(unit: str, scale: float) -> str:
@@ -182,11 +176,7 @@ def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]
 
 
 def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
-    """Blendshapes of another topology, transferred to an animation's mesh.
-
-    Args:
-        path: a set of shapes, as :func:`facediff.editing.shapes.read_shape_files` takes it.
-        animation: with triangles.
+    """Blendshapes of another topology (as :func:`read_shape_files` reads them), transferred to an animation's mesh.
 
     Raises:
         FaceDiffError: if the shapes cannot be read, come without a neutral face with triangles, or do not fit.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -122,7 +122,7 @@ class ShapeSet:
     names: tuple[str, ...]
     neutral: Array
     deltas: Array
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -141,11 +141,7 @@ class ShapeSet:
         return tuple(n for n, delta in zip(self.names, self.deltas, strict=True) if np.abs(delta).max() <= least)
 
     def only(self, names: Sequence[str]) -> ShapeSet:
-        """The set without all other names.
-
-        Raises:
-            FaceDiffError: if nothing would be left.
-        """
+        """The set without all other names; refused if nothing would be left."""
         kept = [index for index, name in enumerate(self.names) if name in names]
         if not kept:
             raise FaceDiffError(f"shapes: none is named as one of {', '.join(names[:4])} …; name them so")
