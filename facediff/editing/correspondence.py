@@ -581,5 +581,4 @@ def _candidates(surface: Surface, points: Array, slack: float) -> tuple[Indices,
 
 def _unit(vectors: Array) -> Array:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    unit: Array = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
-    return unit
+    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 import tempfile
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -115,6 +114,7 @@ DEGREES_GAZE = 4.0  # Default of the largest angle from straight ahead: the eyes
 WIDEST_GAZE = 20.0
 AHEAD_SECONDS, ASIDE_SECONDS = 1.6, 0.6  # Mean duration of a fixation straight ahead, and elsewhere
 SHORTEST = 0.2  # Seconds between saccades at least
+CHUNK = 256  # Frames that are turned at a time
 UPWARDS = 0.5  # The eyes turn up and down less than sideways
 LIDS_PER_DEGREE = 0.012
 """How far the lids close with each degree that the eyes look down, as a share of a full closing (up: they open)."""
@@ -136,7 +136,8 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: float = DEGREES_GAZE,
     for ball in eyes.eyeballs:
         rest = animation.template[ball].astype(np.float64)
         centre = sphere_centre(rest)
-        for part in parts(len(vertices)):
+        for first in range(0, len(vertices), CHUNK):
+            part = slice(first, first + CHUNK)
             # An eyeball that the animation moves is turned where it is.
             moved = (vertices[part, ball] - rest).mean(axis=1)[:, None]
             arms = vertices[part, ball] - moved - centre
@@ -271,8 +272,6 @@ def _largest(vectors: Array, size: float) -> Array:
 
 # What all changes to an animation have in common: arrays that may be too large for memory, and a note in the metadata.
 
-CHUNK = 256  # Frames that are processed at a time where they are not processed one by one
-
 
 def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """An array of the same shape to write to: in memory, or on disk where the vertices are a memory map themselves.
@@ -296,16 +295,10 @@ def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return made
 
 
-def parts(frames: int) -> Iterator[slice]:
-    """Consecutive frames, some at a time."""
-    return (slice(first, first + CHUNK) for first in range(0, frames, CHUNK))
-
-
 def copied(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """A copy to work on, see :func:`room_for`."""
     made = room_for(vertices)
-    for part in parts(len(vertices)):
-        made[part] = vertices[part]
+    made[:] = vertices
     return made
 
 

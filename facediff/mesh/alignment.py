@@ -41,8 +41,7 @@ class Similarity:
 
     def apply(self, points: npt.NDArray[np.floating]) -> Array:
         """Map points (..., 3), in float64."""
-        moved: Array = self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation
-        return moved
+        return np.asarray(self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation)
 
     def inverse(self) -> Similarity:
         """The map from the target to the source."""
@@ -349,11 +348,7 @@ def median_face(frames: npt.NDArray[np.floating], stable: Indices | None = None,
 
 
 def chunks(frames: npt.NDArray[np.floating], chunk_bytes: int = CHUNK_BYTES) -> Iterator[tuple[slice, Array]]:
-    """Consecutive pieces of (T, V, 3) as float64 copies, each with its slice of frames.
-
-    Raises:
-        FaceDiffError: naming the frame, if one holds NaN or infinity.
-    """
+    """Consecutive pieces of (T, V, 3) as float64 copies, each with its slice of frames; a frame with NaN is refused."""
     step = max(1, chunk_bytes // (24 * frames.shape[1]))
     for first in range(0, len(frames), step):
         chunk = np.array(frames[first : first + step], np.float64)

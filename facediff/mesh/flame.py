@@ -76,14 +76,9 @@ class Flame:
         return len(self.template)
 
     def shaped(self, shape: npt.NDArray[np.floating]) -> Array:
-        """The face (V, 3) of shape coefficients (S,) at rest, eq. 8; S may be less than the model has.
-
-        Raises:
-            FaceDiffError: if there are too many coefficients.
-        """
+        """The face (V, 3) of shape coefficients (S,) at rest, eq. 8; S may be less than the model has, but not more."""
         given = _coefficients("shape", shape, SHAPES, 1)
-        face: Array = self.template + (self._shape_basis[:, : len(given)] @ given).reshape(-1, 3)
-        return face
+        return np.asarray(self.template + (self._shape_basis[:, : len(given)] @ given).reshape(-1, 3))
 
     def vertices(
         self,
@@ -142,8 +137,7 @@ def rotations(axis_angles: npt.NDArray[np.floating]) -> Array:
         cross[:, column, row] = -vectors[:, axis]
     # sin(a)/a and (1 − cos(a))/a², both without a division by zero.
     first, second = np.sinc(angles / np.pi), 0.5 * np.sinc(angles / (2 * np.pi)) ** 2
-    result: Array = np.eye(3) + first * cross + second * (cross @ cross)
-    return result
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
 
 
 def _coefficients(name: str, values: npt.NDArray[np.floating], most: int, dimensions: int) -> Array:
@@ -180,11 +174,7 @@ class FlameArrays:
 
 
 def read_flame_arrays(path: Path) -> FlameArrays:
-    """Read a model file, ``.pkl`` or ``.npz``.
-
-    Raises:
-        FaceDiffError: if the file is missing, is no FLAME model, or asks for code to be run; it is not run.
-    """
+    """Read a model file as :meth:`Flame.read` does."""
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; {HELP}")
     content = (
@@ -239,10 +229,7 @@ def plain_array(value: object, where: str, depth: int = 0) -> Values:
     """The numbers of an array, of a sparse matrix or of a chumpy object that only stores or reorders them.
 
     chumpy pickles an object's attributes: ``Ch`` keeps its array as ``x``; ``Reshape``, ``transpose`` and ``Select``
-    keep what they reorder as ``a``.
-
-    Raises:
-        FaceDiffError: calling the value ``where``, if it is anything else, or lies in too many objects.
+    keep what they reorder as ``a``. Anything else, or too many objects in one another, is refused.
     """
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         return value

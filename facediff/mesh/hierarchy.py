@@ -38,8 +38,7 @@ class Operator:
         """The map of values (shape[1], ...) in float64."""
         values = np.asarray(values, np.float64)
         scaled = values[self.columns] * self.weights.reshape(-1, *[1] * (values.ndim - 1)).astype(np.float64)
-        mapped: Array = np.add.reduceat(scaled, np.searchsorted(self.rows, np.arange(self.shape[0])), axis=0)
-        return mapped
+        return np.asarray(np.add.reduceat(scaled, np.searchsorted(self.rows, np.arange(self.shape[0])), axis=0))
 
 
 @dataclass(frozen=True)
@@ -272,7 +271,7 @@ class Coarse:
 
 
 def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, pooling: Pooling = "select") -> Coarse:
-    """Reduce a mesh to exactly ``n_vertices`` vertices.
+    """Reduce a mesh (V, 3), (F, 3) in any unit to exactly ``n_vertices`` vertices.
 
     Edges are collapsed by Garland and Heckbert's quadric error ("Surface simplification using quadric error metrics",
     SIGGRAPH 1997), as Ranjan et al. do for faces ("Generating 3D faces using convolutional mesh autoencoders", ECCV
@@ -282,12 +281,6 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
     it. Where the simplifier stops too early (it takes no edge that would fold the surface), the shortest edges follow.
 
     ``up`` writes each vertex as a point of the coarse face nearest to it, among those around its cluster.
-
-    Args:
-        template: (V, 3) positions in any unit.
-        faces: (F, 3) vertex indices.
-        n_vertices: vertices to keep, 1 to V.
-        pooling: what a coarse vertex takes from its cluster.
 
     Raises:
         FaceDiffError: if the template is not (V, 3) or not finite, if faces do not fit it, or if ``n_vertices`` is not

@@ -62,11 +62,7 @@ def spirals(
 
 
 def checked_faces(faces: npt.NDArray[np.integer], n_vertices: int) -> Indices:
-    """Faces as int64, without those that name a vertex twice.
-
-    Raises:
-        FaceDiffError: if the array is not (F, 3) or an index is not that of a vertex.
-    """
+    """Faces (F, 3) as int64, without those that name a vertex twice; an index that is not a vertex's is refused."""
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise FaceDiffError(f"faces: {faces.dtype} of shape {faces.shape}; expected integers of shape (F, 3)")
