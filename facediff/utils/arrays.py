@@ -62,24 +62,20 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
 
 
 def open_vertices(
-    path: Path, n_vertices: int | None = None, *, mode: Literal["r", "c"] = "r", name: str = ""
+    path: Path, n_vertices: int | None = None, *, mode: Literal["r", "c"] = "r"
 ) -> npt.NDArray[np.floating]:
     """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3), memory-mapped.
 
-    Args:
-        path: the file.
-        n_vertices: vertices of the mesh; any number if None.
-        mode: as :func:`open_array` takes it.
-        name: as :func:`open_array` takes it.
+    Any number of vertices will do if ``n_vertices`` is None; ``mode`` is that of :func:`open_array`.
 
     Raises:
         FaceDiffError: if the file is unreadable, of another shape, empty, or not of floating-point numbers.
     """
-    array, name = open_array(path, kinds="f", mode=mode, name=name), name or str(path)
+    array = open_array(path, kinds="f", mode=mode)
     found = vertices_of(array.shape)
     if found is None or n_vertices not in (None, found):
         wanted = "(frames, 3 * vertices)" if n_vertices is None else f"(frames, {3 * n_vertices})"
-        raise FaceDiffError(f"{name}: has shape {array.shape}, expected {wanted} or (frames, vertices, 3)")
+        raise FaceDiffError(f"{path}: has shape {array.shape}, expected {wanted} or (frames, vertices, 3)")
     return array.reshape(len(array), found, 3)
 
 

@@ -46,7 +46,7 @@ def run_batch(
 
     Args:
         work: does a task; picklable, such as :class:`~facediff.utils.jobs.PerWorker`.
-        tasks: what it is called with; errors name a task by its ``str()``.
+        tasks: errors name a task by its ``str()``.
         workers: number of processes; as many as processors if None.
         record: called with each task that is done and its problem, in the worker, so that also what is finished after
             Ctrl-C is recorded; picklable.

@@ -121,12 +121,9 @@ def scratch_folder(path: Path) -> Iterator[Path]:
 
 
 def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
-    """Rename a file or folder; a folder at ``target`` steps aside first and is then removed.
+    """Rename a file or folder on its disk; a folder at ``target`` steps aside first and is then removed.
 
-    Args:
-        source: what to rename.
-        target: its new name, on the same disk.
-        replace: whether a folder with content may be replaced.
+    Without ``replace``, only an empty folder may be replaced.
 
     Raises:
         OSError: if that fails; what was at ``target`` is there again.
@@ -216,9 +213,7 @@ def _new_folders(folder: Path) -> Iterator[None]:
 def locked(path: Path, command: str) -> Iterator[None]:
     """Keep a second process out of a folder while the block runs; the lock of a killed process does not count.
 
-    Args:
-        path: the lock file, in the folder that is to be locked; it is removed at the end.
-        command: how the error calls the other process, e.g. ``facediff data prepare``.
+    The lock file lies in the folder and is removed at the end; errors call the other process ``command``.
 
     Raises:
         FaceDiffError: if another process holds the lock, or the folder cannot be written.
@@ -291,16 +286,9 @@ def sha256(path: Path) -> str:
 def describe_files(
     folder: Path, names: Iterable[str] | None = None, *, workers: int = 1, progress: str = ""
 ) -> dict[str, dict[str, int | str]]:
-    """Size and SHA-256 of files, as manifests record them.
+    """Size and SHA-256 of files as manifests record them, ``{"bytes": …, "sha256": …}`` by name, sorted.
 
-    Args:
-        folder: the folder.
-        names: paths relative to it; all files in it and its subfolders if None.
-        workers: number of threads; hashing releases the interpreter's lock.
-        progress: title of a progress bar; none if empty.
-
-    Returns:
-        ``{"bytes": …, "sha256": …}`` by name, in the order of the names.
+    ``names`` are paths relative to the folder; None stands for all files in it and its subfolders.
     """
     if names is None:
         names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]

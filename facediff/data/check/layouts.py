@@ -156,7 +156,7 @@ def identify(
     ]
     if folder.names:
         vertices = "unreadable motion" if n_vertices is None else f"{number(n_vertices)} vertices"
-        corpora = dict.fromkeys(map(_corpus_name, _known()))
+        corpora = dict.fromkeys(module.corpus_name for module in _known())
         reasons.append(f"there are clips {few(folder.names)} with {vertices}, which fit none of {few(corpora)}")
     else:
         patterns = ", ".join(pattern for patterns in RAW_FILES.values() for pattern in patterns)
@@ -233,9 +233,9 @@ def by_name(name: str, n_vertices: int | None) -> Module:
     """
     if "." in name:
         return _import(name)
-    fitting = [m for m in _known() if name.lower() in (_corpus_name(m).lower(), m.__name__.lower())]
+    fitting = [m for m in _known() if name.lower() in (m.corpus_name.lower(), m.__name__.lower())]
     if not fitting:
-        names = dict.fromkeys(map(_corpus_name, _known()))
+        names = dict.fromkeys(module.corpus_name for module in _known())
         raise FaceDiffError(
             f'--corpus: there is no "{name}": {choices(name, names)}; a data module of your own is given by its import '
             f"path, package.module.Class"
@@ -251,7 +251,7 @@ def recognise(folder: Folder, recorded: object, n_vertices: int | None) -> Modul
     """
     modules = _known()
     if isinstance(recorded, str):
-        named = [m for m in modules if _corpus_name(m) in (recorded, recorded.removeprefix("facediff-"))]
+        named = [m for m in modules if m.corpus_name in (recorded, recorded.removeprefix("facediff-"))]
         if named:
             return next((module for module in named if module.n_vertices == n_vertices), named[0])
     fitting = [module for module in modules if module.n_vertices == n_vertices]
@@ -260,7 +260,7 @@ def recognise(folder: Folder, recorded: object, n_vertices: int | None) -> Modul
         return best
     if facexhubert_names(folder.names):
         return by_name("biwi", n_vertices)
-    return fitting[0] if len(set(map(_corpus_name, fitting))) == 1 else None
+    return fitting[0] if len({module.corpus_name for module in fitting}) == 1 else None
 
 
 def facexhubert_names(names: Sequence[str]) -> list[str]:
@@ -284,10 +284,6 @@ def _known() -> list[Module]:
     modules = dict.fromkeys(below(SpeechMotionDataModule))
     found = [m for m in modules if not inspect.isabstract(m) and getattr(m, "corpus_name", None)]
     return sorted(found, key=lambda module: not module.__module__.startswith("facediff."))
-
-
-def _corpus_name(module: Module) -> str:
-    return str(module.corpus_name)
 
 
 def _import(path: str) -> Module:

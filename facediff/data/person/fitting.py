@@ -24,19 +24,13 @@ RESIDUAL_LIMIT = 0.15
 
 Faces of different speakers differ by some hundredths; vertices in another order by about 1.
 """
-SAME_UNIT = 1.2
-"""A speaker's face and the corpus's mean face differ in size by less than this factor."""
+SAME_UNIT = 1.2  # a speaker's face and the corpus's mean face differ in size by less than this factor
 MIN_STABLE = 10
-STILL = 1e-6
-"""Motion whose fastest frame moves by less than this share of the face's size is none."""
-SAME_SIZE = 1.1
-"""Template and motion must agree in size to this factor."""
-SMOOTHING = 0.2
-"""Seconds over which loudness is averaged."""
-NEUTRAL_SHARE = 0.05
-"""Share of the frames that the neutral face is the median of."""
-NEUTRAL_FRAMES = (5, 50)
-"""At least and at most so many."""
+STILL = 1e-6  # motion whose fastest frame moves by less than this share of the face's size is none
+SAME_SIZE = 1.1  # template and motion must agree in size to this factor
+SMOOTHING = 0.2  # seconds over which loudness is averaged
+NEUTRAL_SHARE = 0.05  # share of the frames that the neutral face is the median of
+NEUTRAL_FRAMES = (5, 50)  # at least and at most so many
 
 
 # The corpus that the speaker is to join: its topology, coordinates and frame rate.
@@ -44,15 +38,7 @@ NEUTRAL_FRAMES = (5, 50)
 
 @dataclass(frozen=True)
 class Auxiliary:
-    """What a new speaker must match in a corpus.
-
-    Attributes:
-        root: its folder.
-        mean: (V, 3) mean of its templates.
-        faces: (F, 3) triangles; None if it has no mesh file.
-        frame_rate: motion frames per second.
-        unit: unit of length in its manifest; None if there is none.
-    """
+    """What a new speaker must match in a corpus: mean (V, 3) of its templates, triangles (F, 3), rate, unit."""
 
     root: Path
     mean: Array
@@ -200,15 +186,7 @@ class Stabilised:
 
 
 def read_stable(source: str, n_vertices: int) -> Indices:
-    """Stable vertices from a region file.
-
-    Args:
-        source: a text file of indices, or ``FLAME_masks.pkl:scalp+forehead``.
-        n_vertices: vertices of the topology.
-
-    Raises:
-        FaceDiffError: if the file is missing or unfit.
-    """
+    """Stable vertices from a text file of indices, or from ``FLAME_masks.pkl:scalp+forehead``."""
     file = Path(source.partition(".pkl:")[0] + ".pkl" if ".pkl:" in source else source)
     if not file.is_file():
         raise FaceDiffError(f"--stable {file}: no such file; expected vertex indices separated by commas")
@@ -221,13 +199,7 @@ def read_stable(source: str, n_vertices: int) -> Indices:
 
 
 def stabilise(motion: Motion, face: Array, stable: Indices, scratch: Path) -> Stabilised:
-    """Align every frame with the median face; parameters without head motion stay as they are.
-
-    Args:
-        motion: the frames.
-        face: (V, 3) their median, see :func:`facediff.mesh.median_face`.
-        stable: the vertices from which the head's motion is measured.
-        scratch: a temporary file for the frames.
+    """Align every frame with the median face (V, 3); parameters without head motion stay as they are.
 
     Raises:
         FaceDiffError: if a frame holds NaN, or if nothing moves.
@@ -289,12 +261,7 @@ def _speed(frames: npt.NDArray[np.floating]) -> Array:
 
 @dataclass(frozen=True)
 class Template:
-    """A neutral face that was given.
-
-    Attributes:
-        path: its file.
-        vertices: (V, 3).
-    """
+    """A neutral face (V, 3) that was given, and its file."""
 
     path: Path
     vertices: Array
@@ -320,18 +287,7 @@ class Neutral:
 def choose_neutral(
     motion: Motion, made: Stabilised, given: Template | None, speech: npt.NDArray[np.float32], frame_rate: float
 ) -> Neutral:
-    """The neutral face that was given, else the source's own, else one found in the frames.
-
-    Args:
-        motion: the frames as read.
-        made: the same without head motion.
-        given: a template, or None.
-        speech: (S,) at 16 kHz.
-        frame_rate: frames per second.
-
-    Raises:
-        FaceDiffError: if the template that was given does not fit the frames.
-    """
+    """The neutral face that was given, else the source's own, else one found in the frames without head motion."""
     if given is not None:
         return Neutral(given.vertices, _onto_template(made, given), str(given.path))
     unmoved = Similarity(np.eye(3), np.zeros(3))

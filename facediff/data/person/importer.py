@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,12 +40,9 @@ from facediff.utils.files import check_writable, describe_files, put_in_place, s
 
 MIN_SECONDS = 2.0
 MIN_CLIP_SECONDS = 1.0
-SILENCE = 1e-4
-"""Loudest sample below which a recording counts as silent."""
-MISMATCH = 0.1
-"""Speech and motion may differ in length by this share; more is an error."""
-SLACK = 0.25
-"""How far a cut may lie from an equal division, as a share of a clip."""
+SILENCE = 1e-4  # loudest sample below which a recording counts as silent
+MISMATCH = 0.1  # speech and motion may differ in length by this share; more is an error
+SLACK = 0.25  # how far a cut may lie from an equal division, as a share of a clip
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9-]{0,63}")
 
 
@@ -94,7 +90,9 @@ def import_person(
     _check_arguments(name, {**rates, "--scale": scale, "--clip-seconds": clip_seconds})
     _check_output(output)
     known = read_auxiliary(corpus, name=name, frame_rate=corpus_frame_rate)
-    speech = _read_speech(audio)
+    speech = read_speech(audio)
+    if float(np.abs(speech).max()) < SILENCE:
+        raise FaceDiffError(f"{audio}: holds only silence; expected the speech of the video")
     with scratch_folder(output) as scratch:
         read = read_motion(
             motion,
@@ -106,8 +104,13 @@ def import_person(
         )
         warnings = _check_lengths(motion, audio, len(speech), len(read.frames), frame_rate)
         fitted = _fit(motion, read, known, speech, frame_rate, scratch, template=template, stable=stable, scale=scale)
-        frames = _move(fitted.made.frames, fitted.neutral.placing.then(fitted.place))
-        frames = _at_rate(frames, frame_rate, known.frame_rate, scratch / "rate.npy")
+        frames, way = fitted.made.frames, fitted.neutral.placing.then(fitted.place)
+        for part, chunk in chunks(frames):
+            frames[part] = way.apply(chunk)
+        if frame_rate != known.frame_rate:
+            length = resampled_length(len(frames), frame_rate, known.frame_rate)
+            resampled = scratch_array(scratch / "rate.npy", (length, *frames.shape[1:]))
+            frames = resample_frames(frames, frame_rate, known.frame_rate, out=resampled)
         clips = _cut(name, speech, len(frames), known.frame_rate, clip_seconds)
         mismatch = len(speech) / SAMPLE_RATE - len(read.frames) / frame_rate
         report = _report(name, read, known, fitted, clips, frame_rate, stable, mismatch, warnings)
@@ -123,11 +126,9 @@ class Fitted:
 
     Attributes:
         made: frames without head motion, still in the motion's coordinates.
-        neutral: the neutral face.
         place: from the neutral face's coordinates to the corpus's.
         measured_scale: scale of the best similarity between the neutral face and the corpus's mean face.
         residual: what that similarity leaves, as a share of the face's size.
-        faces_compared: whether the triangles could be compared with the corpus's.
     """
 
     made: Stabilised
@@ -189,19 +190,8 @@ def _check_output(path: Path) -> None:
     check_writable(path.with_name(f".{path.name}.probe"))
 
 
-def _read_speech(path: Path) -> Speech:
-    speech = read_speech(path)
-    if float(np.abs(speech).max()) < SILENCE:
-        raise FaceDiffError(f"{path}: holds only silence; expected the speech of the video")
-    return speech
-
-
 def _check_lengths(motion: Path, audio: Path, samples: int, frames: int, frame_rate: float) -> list[str]:
-    """Warnings about the lengths of speech and motion.
-
-    Raises:
-        FaceDiffError: if they are too short, or differ by more than a tenth.
-    """
+    """Warnings about the lengths of speech and motion; an error if they are too short, or differ by over a tenth."""
     heard, seen = samples / SAMPLE_RATE, frames / frame_rate
     lengths = f"the motion lasts {seen:.2f} s ({frames} frames at {frame_rate:g}/s) and the sound {heard:.2f} s"
     if abs(heard - seen) > MISMATCH * max(heard, seen):
@@ -224,35 +214,12 @@ def _naming(path: Path) -> Iterator[None]:
         raise FaceDiffError(f"{path}: {error}") from error
 
 
-def _move(frames: npt.NDArray[np.floating], way: Similarity) -> npt.NDArray[np.floating]:
-    """Map frames in place, chunk by chunk."""
-    for part, chunk in chunks(frames):
-        frames[part] = way.apply(chunk)
-    return frames
-
-
-def _at_rate(
-    frames: npt.NDArray[np.floating], rate_in: float, rate_out: float, scratch: Path
-) -> npt.NDArray[np.floating]:
-    if rate_in == rate_out:
-        return frames
-    shape = (resampled_length(len(frames), rate_in, rate_out), *frames.shape[1:])
-    return resample_frames(frames, rate_in, rate_out, out=scratch_array(scratch, shape))
-
-
 # Cutting into clips.
 
 
 @dataclass(frozen=True)
 class EntryClip:
-    """One clip to write.
-
-    Attributes:
-        name: ``<identity>_s01``.
-        split: ``train``, ``val`` or ``test``.
-        start: its first frame.
-        stop: the frame after its last one.
-    """
+    """One clip to write, ``<identity>_s01``: the frames from ``start`` to before ``stop``."""
 
     name: str
     split: str
@@ -311,12 +278,8 @@ class Report:
     """What an import did. Lengths are in the unit of the corpus unless said otherwise.
 
     Attributes:
-        name: the speaker.
         frames: frames that were read.
-        seconds: how long they last.
-        frame_rate: their frames per second.
         corpus_frame_rate: frames per second that were written.
-        has_head_motion: whether there was head motion to remove; parameters without global pose have none.
         rotation_max: largest angle of the head from its mean pose, in degrees.
         rotation_rms: root mean square of these angles, in degrees.
         translation_max: largest distance of the head from its mean place.
@@ -327,13 +290,9 @@ class Report:
         scale: corpus units to a unit of the motion, as used.
         measured_scale: the same, as measured between the speaker's neutral face and the corpus's mean face.
         topology_residual: what is left between these two, as a share of the face's size.
-        faces_compared: whether the triangles were compared as well.
         template_source: how the neutral face was obtained.
         template_frames: the frames it is the median of; empty if it was given.
         mismatch: seconds by which the sound is longer than the motion (negative: shorter).
-        clips: clips that were written.
-        splits: how many of them in each split.
-        frames_written: frames that were written.
         warnings: what the user should check.
         notes: other remarks.
     """
@@ -363,10 +322,6 @@ class Report:
     frames_written: int
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-
-    def state(self) -> dict[str, Any]:
-        """Plain data, for the manifest."""
-        return asdict(self)
 
     def lines(self, unit: str | None) -> list[str]:
         """The report in words.
@@ -474,5 +429,5 @@ def _write_entry(
     ]
     write_rows(folder / "clips.csv", rows, line_end="\n")
     facts = {"frame_rate": known.frame_rate, "n_vertices": known.n_vertices, "unit": known.unit}
-    about = {"facediff": version(), "corpus": "person", "person": report.name, **facts, "report": report.state()}
+    about = {"facediff": version(), "corpus": "person", "person": report.name, **facts, "report": asdict(report)}
     write_json(folder / MANIFEST, {**about, "files": describe_files(folder, workers=2)})

@@ -9,23 +9,19 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.prepare.motion import read_parameters
+from facediff.data.prepare.motion import FLAME_WIDTH, HDF5_SUFFIXES, read_parameters
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, read_mesh
 from facediff.mesh.flame import Flame
-from facediff.utils.arrays import open_array
+from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.progress import track
 
 Array = npt.NDArray[np.float64]
 Faces = npt.NDArray[np.integer]
 
 MESHES = (".obj", ".ply")
-MAX_GAP = 0.2
-"""Longest stretch of missing frames that is filled, in seconds."""
-FLAME_WIDTH = 403
-"""Shape 300, expression 100 and jaw 3 in one row."""
-FLAME_FRAMES = 64
-"""Frames that the FLAME layer works on at a time."""
+MAX_GAP = 0.2  # longest stretch of missing frames that is filled, in seconds
+FLAME_FRAMES = 64  # frames that the FLAME layer works on at a time
 
 
 @dataclass(frozen=True)
@@ -63,14 +59,14 @@ def read_motion(
     Raises:
         FaceDiffError: if it is none of these, or damaged.
     """
-    parameters = path.suffix.lower() in (".hdf5", ".h5")
+    parameters = path.suffix.lower() in HDF5_SUFFIXES
     if path.suffix.lower() == ".npy" and path.is_file():
         array = open_array(path, kinds="f")
-        vertices = _as_vertices(array, n_vertices)
-        if vertices is not None and flame is None:
-            return Motion(vertices)
+        fits = vertices_of(array.shape) == n_vertices
+        if fits and flame is None:
+            return Motion(array.reshape(len(array), n_vertices, 3))
         parameters = array.shape[-1] == FLAME_WIDTH
-        if not parameters and vertices is None:
+        if not parameters and not fits:
             raise FaceDiffError(
                 f"{path}: has shape {array.shape}; expected (frames, {n_vertices}, 3) or (frames, {3 * n_vertices}) "
                 f"like the corpus, or FLAME parameters (1, frames, {FLAME_WIDTH})"
@@ -91,14 +87,6 @@ def read_motion(
     if flame is None:
         raise FaceDiffError(f"{path}: holds FLAME parameters; add --flame MODEL, your own FLAME model file")
     return _read_flame(path, flame, n_vertices, scratch)
-
-
-def _as_vertices(array: npt.NDArray[np.floating], n_vertices: int) -> npt.NDArray[np.floating] | None:
-    if array.ndim == 3 and array.shape[1:] == (n_vertices, 3):
-        return array
-    if array.ndim == 2 and array.shape[1] == 3 * n_vertices:
-        return array.reshape(len(array), n_vertices, 3)
-    return None
 
 
 def _read_flame(path: Path, model: Path, n_vertices: int, scratch: Path) -> Motion:
@@ -127,13 +115,6 @@ def read_frames(
     """Read the mesh files of a folder into a memory-mapped array.
 
     A few missing frames (a tracker that lost the face) are filled by straight lines between their neighbours.
-
-    Args:
-        folder: the folder.
-        n_vertices: vertices that every mesh must have.
-        frame_rate: frames per second, to measure gaps.
-        scratch: a temporary file for the array.
-        progress: whether to show a progress bar.
 
     Returns:
         vertices (T, V, 3), the faces that all files share (None if they have none), and remarks for the user.
@@ -184,13 +165,7 @@ def _check(path: Path, mesh: Mesh, first_path: Path, first: Mesh, n_vertices: in
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """The files of a folder in order.
-
-    Attributes:
-        paths: one for each frame that is there.
-        places: its place in time, from 0; a place that is skipped is a missing frame.
-        numbers: its number in the file's name.
-    """
+    """The files of a folder in order, their numbers, and places in time from 0; a skipped place is a missing frame."""
 
     paths: list[Path]
     places: list[int]
@@ -267,8 +242,8 @@ def scratch_array(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]
     return array
 
 
-def spans(places: list[int], most: int = 10) -> str:
-    """Sorted whole numbers in short: ``3-7, 12``; an ellipsis after ``most`` spans.
+def spans(places: list[int]) -> str:
+    """Sorted whole numbers in short: ``3-7, 12``; an ellipsis after ten spans.
 
     >>> spans([3, 4, 5, 12])
     '3-5, 12'
@@ -280,4 +255,4 @@ def spans(places: list[int], most: int = 10) -> str:
         else:
             parts.append([place, place])
     words = [str(a) if a == b else f"{a}-{b}" for a, b in parts]
-    return ", ".join(words if len(words) <= most else [*words[:most], "…"])
+    return ", ".join(words if len(words) <= 10 else [*words[:10], "…"])

@@ -21,6 +21,7 @@ from facediff.data.prepare.runner import (
     Plan,
     Precision,
     bases,
+    choose_subjects,
     copy_files,
     find_file,
     find_regions,
@@ -30,7 +31,7 @@ from facediff.data.prepare.runner import (
     write_mesh,
     write_templates,
 )
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import read_mesh, surface_area
 
 SUBJECTS = [*(f"F{i}" for i in range(1, 9)), *(f"M{i}" for i in range(1, 7))]
@@ -79,10 +80,7 @@ def plan(
     Raises:
         FaceDiffError: if there is no usable sequence, a subject is unknown, or the templates do not fit together.
     """
-    for subject in subjects or ():
-        if subject not in SUBJECTS:
-            raise FaceDiffError(f'--subjects: BIWI has no "{subject}": {choices(subject, SUBJECTS)}')
-    chosen = [subject for subject in SUBJECTS if subjects is None or subject in subjects]
+    chosen = choose_subjects(subjects, SUBJECTS, "BIWI")
     region_files = find_regions(raw, regions)
     missing = {
         f"regions/{name}": f"expected in a folder given by --regions; the CodeTalker repository has it as "

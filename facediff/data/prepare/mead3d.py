@@ -23,15 +23,17 @@ from facediff.data.prepare.runner import (
     Job,
     Plan,
     Precision,
+    choose_subjects,
     copy_files,
     find_file,
     find_regions,
+    folders_in,
     nothing_to_prepare,
     write_clip,
     write_mesh,
     write_templates,
 )
-from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.flame import SHAPES, Flame
 from facediff.utils.files import sha256, write_rows
 from facediff.utils.pickles import load_pickle
@@ -127,7 +129,7 @@ def plan(
     region_files = find_regions(raw, regions)
     found = find_recordings(raw)
     speakers = sorted({recording.subject for recording in found.recordings})
-    chosen = _chosen(subjects, speakers)
+    chosen = choose_subjects(subjects, speakers, "the raw folder")
     recordings = [recording for recording in found.recordings if recording.subject in chosen]
     missing = {name: text for name, text in found.missing.items() if name[:4] in chosen}
     sounds = find_sounds(raw if audio is None else audio)
@@ -215,15 +217,6 @@ def _survey(recordings: Sequence[Recording], quiet: bool) -> tuple[dict[str, int
     return lengths, {subject: total / counts[subject] for subject, total in sums.items()}, problems
 
 
-def _chosen(subjects: Sequence[str] | None, speakers: list[str]) -> list[str]:
-    if subjects is not None and not subjects:
-        raise FaceDiffError("--subjects: names nobody; expected e.g. M003,W009")
-    for subject in subjects or ():
-        if subject not in speakers:
-            raise FaceDiffError(f'--subjects: the raw folder has no "{subject}": {choices(subject, speakers)}')
-    return [subject for subject in speakers if subjects is None or subject in subjects]
-
-
 def _compare_speakers(speakers: list[str], base: Path, missing: dict[str, str]) -> list[str]:
     """Record which of the data set's speakers are missing; returns a note on those who are not the data set's."""
     from facediff.data.mead3d import TEST, TRAIN, VALIDATION
@@ -295,7 +288,11 @@ def find_recordings(raw: Path) -> Found:
     Raises:
         FaceDiffError: if there is neither, or more than one.
     """
-    bases = [folder for folder in _folders(raw) if _is_emote(folder) or _is_probtalk3d(folder)]
+    bases = [
+        folder
+        for folder in _folders(raw)
+        if _is_probtalk3d(folder) or any((speaker / "front").is_dir() for speaker in _speakers(folder))
+    ]
     if not bases:
         raise FaceDiffError(
             f"{raw}: holds no reconstructions of MEAD; expected <speaker>/front/<emotion>/level_<k>/<number>/"
@@ -348,22 +345,15 @@ def _folders(root: Path, depth: int = DEPTH) -> Iterator[Path]:
     """A folder and those in it, but neither speakers' folders nor hidden ones."""
     if not root.is_dir():
         raise FaceDiffError(f"{root}: no such folder; expected the data as it was distributed, unpacked")
-    try:
-        inner = sorted(path for path in root.iterdir() if path.is_dir())
-    except OSError as error:
-        raise FaceDiffError(f"{root}: cannot be read ({error.strerror}); check its permissions") from error
+    inner = folders_in(root)
     yield root
     for folder in inner if depth else ():
-        if not folder.name.startswith(".") and not SPEAKER.fullmatch(folder.name):
+        if not SPEAKER.fullmatch(folder.name):
             yield from _folders(folder, depth - 1)
 
 
 def _speakers(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if SPEAKER.fullmatch(path.name) and path.is_dir())
-
-
-def _is_emote(folder: Path) -> bool:
-    return any((speaker / "front").is_dir() for speaker in _speakers(folder))
 
 
 def _is_probtalk3d(folder: Path) -> bool:

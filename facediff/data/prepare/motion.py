@@ -52,9 +52,6 @@ def resample_frames(
         rate_out: frames a second of the result.
         out: where to write, shape (round(T · rate_out / rate_in), C); a new array of ``motion``'s type if None.
 
-    Returns:
-        the resampled motion.
-
     Raises:
         FaceDiffError: if a rate is not positive, or the result would have no frame.
     """
@@ -129,7 +126,7 @@ def _reflected(
 # ProbTalk3D (Wu et al. 2024) has one array (1, T, 403) with the three side by side.
 
 WIDTHS = {"shape": SHAPES, "exp": EXPRESSIONS, "jaw": 3}
-ALL = sum(WIDTHS.values())
+FLAME_WIDTH = sum(WIDTHS.values())
 MOST_FRAMES = 1_000_000
 HDF5_SUFFIXES = (".hdf5", ".h5")
 
@@ -174,11 +171,12 @@ def read_parameters(path: Path) -> Parameters:
 
 def _read_array(path: Path) -> dict[str, Array]:
     array = open_array(path, kinds="f")
-    if array.shape[-1:] != (ALL,):
+    if array.shape[-1:] != (FLAME_WIDTH,):
         raise FaceDiffError(
-            f"{path}: holds {array.dtype} {array.shape}; expected floats of shape (1, frames, {ALL}), FLAME parameters"
+            f"{path}: holds {array.dtype} {array.shape}; expected floats of shape (1, frames, {FLAME_WIDTH}), FLAME "
+            f"parameters"
         )
-    joined = _as_frames(array, ALL, f"{path}: the array")
+    joined = _as_frames(array, FLAME_WIDTH, f"{path}: the array")
     ends = np.cumsum(list(WIDTHS.values()))
     return dict(zip(WIDTHS, np.split(joined, ends[:-1], axis=1), strict=True))
 
@@ -221,7 +219,7 @@ def _dataset(holder: h5py.Group, name: str, most: int, path: Path) -> Array:
 
 def _as_frames(values: npt.NDArray[np.generic], most: int, where: str) -> Array:
     """(T, D) from (1, T, D), the way in which these projects keep a batch of one."""
-    exact = most in (WIDTHS["jaw"], ALL)  # of shape and expression, the last coefficients may be left out
+    exact = most in (WIDTHS["jaw"], FLAME_WIDTH)  # of shape and expression, the last coefficients may be left out
     frames = values[0] if values.ndim == 3 and len(values) == 1 else values
     if frames.ndim != 2 or not len(frames) or not (most if exact else 1) <= frames.shape[1] <= most:
         raise FaceDiffError(

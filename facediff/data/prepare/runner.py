@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import run_batch
 from facediff.utils.files import (
@@ -468,6 +468,16 @@ def find_regions(raw: Path, given: Path | None) -> list[Path]:
     if given is not None and not files:
         raise FaceDiffError(f"{given}: expected a folder with lists of vertices, e.g. lve.txt and fdd.txt")
     return files
+
+
+def choose_subjects(subjects: Sequence[str] | None, known: Sequence[str], holder: str) -> list[str]:
+    """The subjects that ``--subjects`` names, in the order in which they are known; all if None."""
+    if subjects is not None and not subjects:
+        raise FaceDiffError(f"--subjects: names nobody; expected e.g. {','.join(known[:2])}")
+    for subject in subjects or ():
+        if subject not in known:
+            raise FaceDiffError(f'--subjects: {holder} has no "{subject}": {choices(subject, known)}')
+    return [subject for subject in known if subjects is None or subject in subjects]
 
 
 def nothing_to_prepare(raw: Path, corpus: str, missing: Mapping[str, str]) -> FaceDiffError:
