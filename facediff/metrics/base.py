@@ -53,15 +53,7 @@ SIDE_WORDS: dict[Side, str] = {
 
 
 def check_option(name: str, value: object, known: Any) -> None:  # noqa: ANN401 - a Literal has no type of its own
-    """Refuse a value that is not among the known ones.
-
-    Args:
-        name: The option.
-        value: The value given.
-        known: A ``Literal`` type, or a sequence of strings.
-
-    Raises:
-        ValueError: If ``value`` is not known; the message lists the known values and the nearest.
+    """Refuse a value that is not among the known ones, a ``Literal`` type or strings.
 
     >>> check_option("pooling", "frame", Pooling)
     Traceback (most recent call last):
@@ -122,15 +114,7 @@ class Clips:
         return replace(self, clips=tuple(replace(clip, **{name: value}) for clip, value in pairs))
 
     def attach_templates(self, template: Tensor | None, name: str = "template") -> Clips:
-        """The same sequences with their neutral vertices.
-
-        Args:
-            template: (batch, vertices, 3), (vertices, 3) for all sequences, or None for none.
-            name: The caller's name for it.
-
-        Raises:
-            ValueError: If the shape does not fit or a template holds NaN or infinity.
-        """
+        """The same sequences with their neutral vertices: (batch, vertices, 3), or (vertices, 3) for all sequences."""
         if template is None:
             return self
         batch, vertices = len(self.clips), self.n_vertices
@@ -145,11 +129,7 @@ class Clips:
         return self.attach("template", each)
 
     def check_finite(self) -> None:
-        """Refuse NaN and infinity in the frames that are scored.
-
-        Raises:
-            ValueError: Naming the first clip concerned and the side.
-        """
+        """Refuse NaN and infinity in the frames that are scored, with the first clip concerned and the side."""
         sides = [
             (clip.name, side, motion)
             for clip in self.clips
@@ -160,7 +140,8 @@ class Clips:
             return
         # A sum is NaN or infinite if any term is, and costs a tenth of looking at every value. It can also
         # overflow by itself, so suspicion is followed by the exact test. One transfer for the whole batch.
-        sums = torch.stack([motion.sum(dtype=_wide(motion.dtype)).double() for _, _, motion in sides])
+        half = (torch.float16, torch.bfloat16)
+        sums = torch.stack([m.sum(dtype=torch.float32 if m.dtype in half else None).double() for _, _, m in sides])
         for (name, side, motion), fine in zip(sides, sums.isfinite().tolist(), strict=True):
             if not fine and not bool(motion.isfinite().all()):
                 bad = (~motion.isfinite()).flatten(1).any(1).nonzero()[0].item()
@@ -168,11 +149,6 @@ class Clips:
                     f"the {side} of {name} holds NaN or infinity, first in frame {bad}; "
                     "a score over it would mean nothing: repair or omit this clip"
                 )
-
-
-def _wide(dtype: torch.dtype) -> torch.dtype:
-    """A type in which to add up many values of ``dtype``."""
-    return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype
 
 
 def align(
@@ -519,11 +495,7 @@ class SequenceMetric(ExactMetric):
         return align(prediction, truth, rule=self.length_rule, **batch)
 
     def add(self, clips: Clips) -> None:
-        """Check aligned sequences and add their values to the sums.
-
-        Raises:
-            ValueError: If they are of another mesh or hold NaN or infinity. Nothing is added then.
-        """
+        """Check aligned sequences and add their values to the sums; nothing is added where one is refused."""
         self.check_vertices(clips.n_vertices)
         if self.check_finite:
             clips.check_finite()
@@ -555,11 +527,7 @@ class SequenceMetric(ExactMetric):
         return self.total / (frames if self.pooling == "frames" else sequences)
 
     def refuse_to_compute(self, left_out: int) -> NoReturn:
-        """Raise the error of a metric that has nothing to score.
-
-        Raises:
-            ValueError: Always; the message depends on whether sequences were left out.
-        """
+        """Raise the error of a metric that has nothing to score, or has left out all sequences."""
         self.leave_synchronised_state()
         name = type(self).__name__
         if left_out:
@@ -574,7 +542,7 @@ class SequenceMetric(ExactMetric):
             return self.covered()
 
     def covered(self) -> Coverage:
-        """What the states of this process count as scored, cut and left out."""
+        """The `coverage` of the states as they are, without reducing them over processes."""
         return Coverage(*self.counts.tolist())
 
 

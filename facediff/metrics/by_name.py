@@ -15,7 +15,7 @@ from typing import Any, cast
 from torchmetrics import Metric
 
 from facediff.errors import FaceDiffError, choices
-from facediff.metrics.regions import Region
+from facediff.registry import UnknownComponentError
 from facediff.registry import metric as metrics
 
 NEEDS: dict[str, str] = {
@@ -91,19 +91,16 @@ class Request:
         accepted = inspect.signature(implementation).parameters
         given = {key: value for need in self.needs for key, value in context.has[need].items() if key in accepted}
         options = dict(self.options)
-        if isinstance(options.get("region"), str):
-            options["region"] = self._region(options["region"], context)
+        region = options.get("region")
+        if isinstance(region, str):  # a region that is given as an option by the name of its need
+            regions = {need: value for need in ("lips", "upper_face") for value in context.has.get(need, {}).values()}
+            if region not in regions:
+                raise FaceDiffError(f"metric {self.text}: there is no region {region!r}: {choices(region, regions)}")
+            options["region"] = regions[region]
         try:
             return cast(Metric, implementation(**given | options))
         except (TypeError, ValueError) as error:
             raise FaceDiffError(f"metric {self.text}: {error}") from error
-
-    def _region(self, name: str, context: Context) -> Region:
-        """A region that is given as an option by the name of its need."""
-        regions = {need: value for need in ("lips", "upper_face") for value in context.has.get(need, {}).values()}
-        if name not in regions:
-            raise FaceDiffError(f"metric {self.text}: there is no region {name!r}: {choices(name, regions)}")
-        return cast(Region, regions[name])
 
 
 def parse(text: str) -> Request:
@@ -120,9 +117,14 @@ def parse(text: str) -> Request:
     """
     text = text.replace(" ", "")
     name, _, rest = text.partition(":")
+    try:
+        implementation = metrics.get(name)
+    except UnknownComponentError as error:
+        # It is an AttributeError too, which a torch module that parses in a property would report as one of its own.
+        raise FaceDiffError(str(error)) from error
     known = {
         option: parameter.default
-        for option, parameter in inspect.signature(metrics.get(name)).parameters.items()
+        for option, parameter in inspect.signature(implementation).parameters.items()
         if parameter.default is not inspect.Parameter.empty and option not in _NOT_CHOSEN
     }
     options = {}
@@ -141,11 +143,7 @@ def parse(text: str) -> Request:
 
 
 def _value(text: str, default: object) -> object:
-    """A word as a value of the kind of the option's default.
-
-    Raises:
-        ValueError: With the kind that was expected.
-    """
+    """A word as a value of the kind of the option's default; a ValueError says what kind was expected."""
     if isinstance(default, bool):
         if text.lower() not in ("true", "false"):
             raise ValueError("true or false")
@@ -162,20 +160,11 @@ def _value(text: str, default: object) -> object:
 
 
 def feed(metric: Metric, inputs: Mapping[str, Any]) -> None:
-    """Update a metric with those of the inputs that it takes.
-
-    Args:
-        metric: The metric.
-        inputs: By parameter of `update`: see `NEEDS`.
-    """
+    """Update a metric with those of the inputs, named as in `NEEDS`, that its `update` takes."""
     taken = inspect.signature(type(metric).update).parameters
     metric.update(**{name: value for name, value in inputs.items() if name in taken})
 
 
 def parse_all(texts: Sequence[str]) -> list[Request]:
-    """Read several metrics, each once.
-
-    Raises:
-        FaceDiffError: As `parse`.
-    """
+    """Read several metrics, each once, as `parse` does."""
     return list({request.text: request for request in map(parse, texts)}.values())

@@ -42,22 +42,16 @@ def one_pass(
     template: Tensor | None = None,
     uppers: Sequence[Tensor] = (),
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Vertex errors, and how much less the prediction varies over time than the truth.
+    """Vertex errors, and how much less the prediction varies over time than the truth; float64 scalars.
 
+    For each of ``errors`` its mean over frames, and for each of ``uppers``, (region,) int64, the signed deviation; for
+    these a ``template`` (vertices, 3) is given unless prediction and truth (frames, vertices, 3) are offsets from it.
     What is found does not depend on what else is asked for: each vertex goes through the same float64 operations.
-
-    Args:
-        prediction: (frames, vertices, 3).
-        truth: (frames, vertices, 3).
-        errors: Vertex errors wanted.
-        template: (vertices, 3), or None if prediction and truth are offsets from it already; for ``uppers``.
-        uppers: For each deviation wanted the vertices to look at, (region,) int64.
-
-    Returns:
-        For each of ``errors`` its mean over frames, and for each of ``uppers`` the signed deviation; float64 scalars.
     """
     frames, vertices, _ = truth.shape
-    step = frames_per_step(truth, vertices if len(errors) + len(uppers) > 1 else _looked_at(errors, uppers, vertices))
+    regions = [*(error.indices for error in errors), *uppers]
+    only = regions[0] if len(regions) == 1 else None
+    step = frames_per_step(truth, vertices if only is None else len(only))
     buffers = Buffers(truth.device)
     everywhere = any(error.indices is None for error in errors)
     totals = torch.zeros(len(errors), dtype=torch.float64, device=truth.device)
@@ -80,11 +74,6 @@ def one_pass(
 def frames_per_step(motion: Tensor, looked_at: int) -> int:
     """How many frames of so many vertices to widen at a time."""
     return max(1, (_CHUNK_CPU if motion.device.type == "cpu" else _CHUNK_ELSEWHERE) // (3 * looked_at))
-
-
-def _looked_at(errors: Sequence[ErrorOf], uppers: Sequence[Tensor], vertices: int) -> int:
-    regions = [*(error.indices for error in errors), *uppers]
-    return min((vertices if region is None else len(region) for region in regions), default=vertices)
 
 
 class Buffers:
@@ -145,14 +134,7 @@ class Variation:
 
     Sums of q − q₀ and of its square, q₀ being the squared offset in the first frame, are all that is kept. As q₀ is one
     of the n values, (mean − q₀)² is at most n times the variance, so that subtracting the one sum from the other loses
-    no more than log₁₀ n + 1 of float64's digits.
-
-    Args:
-        first: First frame, (vertices, 3).
-        template: (vertices, 3); None if frames are offsets from it.
-        indices: Vertices to look at, (region,) int64.
-        step: The most frames that are added in one call.
-        buffers: Memory for the work.
+    no more than log₁₀ n + 1 of float64's digits. At most ``step`` frames are added in one call.
     """
 
     def __init__(self, first: Tensor, template: Tensor | None, indices: Tensor, step: int, buffers: Buffers) -> None:

@@ -93,9 +93,6 @@ class Region:
     def check(self, n_vertices: int) -> None:
         """Refuse a mesh that this region cannot belong to.
 
-        Args:
-            n_vertices: Vertices of the mesh.
-
         Raises:
             ValueError: If the mesh has fewer vertices than an index needs, or is known to be another mesh.
         """
@@ -356,11 +353,7 @@ def as_lip_pairs(pairs: LipPairsLike) -> LipPairs:
 
 
 def read_indices(path: Path) -> list[int]:
-    """Whole numbers of a text file, separated by commas, blanks or line ends.
-
-    Raises:
-        ValueError: If the file cannot be read or holds anything else; the message names the file.
-    """
+    """Whole numbers of a text file, separated by commas, blanks or line ends; errors name the file."""
     words = [word for word in re.split(r"[,\s]+", _read_text(path, "vertex indices separated by commas")) if word]
     for place, word in enumerate(words, start=1):
         if not (word.isascii() and word.isdigit()):

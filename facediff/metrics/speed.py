@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import ClassVar, Unpack
 
 import torch
@@ -105,30 +105,18 @@ real_time_factor = functional(RealTimeFactor)
 
 
 def device_name(device: torch.device | str) -> str:
-    """What a device is called: the GPU's product name, or the processor with torch's number of threads.
-
-    Args:
-        device: The device that computes.
-    """
+    """What a device is called: the GPU's product name, or the processor with torch's number of threads."""
     device = torch.device(device)
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type != "cpu":
         return str(device)
+    processor = platform.processor() or platform.machine() or "CPU"
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
+        named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+        processor = next(named, processor)
     threads = torch.get_num_threads()
-    return f"{_processor()}, {threads} thread{'s' if threads != 1 else ''}"
-
-
-def _processor() -> str:
-    """The processor's product name where the system reports it."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:
-            for line in lines:
-                if line.startswith("model name"):
-                    return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine() or "CPU"
+    return f"{processor}, {threads} thread{'s' if threads != 1 else ''}"
 
 
 def _wait_for_gpus() -> None:

@@ -142,7 +142,12 @@ class StyleRetrievalAccuracy(ExactMetric):
             points = points / points.norm(dim=1, keepdim=True)
         right = torch.zeros((), dtype=torch.float64, device=points.device)
         for rows in torch.split(queries.nonzero().flatten(), _ROWS):
-            right += _shares(points, labels, rows).sum()
+            # Exact, so that equal embeddings are equally near: the quick way over |a|² + |b|² − 2ab ranks by rounding.
+            distances = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")
+            distances[torch.arange(len(rows), device=rows.device), rows] = torch.inf
+            nearest = distances == distances.amin(1, keepdim=True)
+            same = labels[rows][:, None] == labels[None, :]
+            right += ((nearest & same).sum(1).double() / nearest.sum(1)).sum()
         return right / queries.sum()
 
     def _gathered(self) -> tuple[Tensor, Tensor]:
@@ -157,16 +162,6 @@ def _is_query(labels: Tensor) -> Tensor:
     """Which embeddings have another of their label."""
     _, places, counts = torch.unique(labels, return_inverse=True, return_counts=True)
     return counts[places] > 1
-
-
-def _shares(points: Tensor, labels: Tensor, rows: Tensor) -> Tensor:
-    """For each of the rows, the share of its nearest others that have its label."""
-    # Exact, so that equal embeddings are equally near: the quick way over |a|² + |b|² − 2ab would rank by rounding.
-    distances = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")
-    distances[torch.arange(len(rows), device=rows.device), rows] = torch.inf
-    nearest = distances == distances.amin(1, keepdim=True)
-    same = labels[rows][:, None] == labels[None, :]
-    return (nearest & same).sum(1).double() / nearest.sum(1)
 
 
 style_retrieval_accuracy = functional(StyleRetrievalAccuracy)

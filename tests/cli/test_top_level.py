@@ -91,6 +91,13 @@ def test_components_lists_what_can_be_chosen(capsys: pytest.CaptureFixture[str])
     assert "ddim" not in text
 
 
+def test_components_describes_the_options_that_metrics_share(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["components", "metric"]) == 0
+    options = [line for line in capsys.readouterr().out.splitlines() if line.startswith("      ")]
+    assert any(line.strip().startswith("length_rule = 'min': ") for line in options)
+    assert [line for line in options if ": " not in line] == []
+
+
 def test_components_lists_every_kind(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["components"]) == 0
     text = capsys.readouterr().out
