@@ -126,8 +126,8 @@ def normalised(words: str, weights: Sequence[float | None]) -> list[float]:
     if len(given) < len(weights):
         raise FaceDiffError(f"--style {words}: give every style a weight (A:0.3,B:0.7), or none of them")
     total = math.fsum(given)
-    # Weights may be negative (to lead away from a style), so their sum may cancel to almost nothing; the mixture that is
-    # divided by it would be huge.
+    # Weights may be negative (to lead away from a style), so their sum may cancel to almost nothing; the mixture, which
+    # is divided by it, would be huge.
     if not all(map(math.isfinite, given)) or not abs(total) > CANCELLED * math.fsum(map(abs, given)):
         raise FaceDiffError(
             f"--style {words}: expected finite weights whose sum is not 0, since they are divided by it"
