@@ -6,7 +6,6 @@ They are known for the built-in puppet, and are read from the user's file for an
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,16 +115,13 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
         raise FaceDiffError(
             f"--eyes {path}: no such file; expected .json or .npz that says where lids and eyeballs are"
         )
-    count = len(template)
     if path.suffix.lower() == ".npz":
         found = read_arrays(path, name=f"--eyes {path}")
-        balls = tuple(_checked(path, found[name], count) for name in sorted(found) if name.startswith("eyeball"))
+        names = sorted(name for name in found if name.startswith("eyeball"))
+        balls = tuple(_checked(path, found[name], len(template)) for name in names)
         closing, neutral = found.get("closing"), found.get("neutral")
     elif path.suffix.lower() == ".json":
-        content = _read_json(path)
-        balls = tuple(_indices(path, listed, count) for listed in content.get("eyeballs", []))
-        neutral = _read_shape(path, content["neutral"]) if "neutral" in content else None
-        closing = _closing(path, content, template, neutral, balls)
+        closing, neutral, balls = _read_json(path, template)
     else:
         raise FaceDiffError(f"--eyes {path}: expected .json or .npz")
     if closing is None and not balls:
@@ -145,7 +141,8 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
     return Eyes(np.asarray(scale * closing, np.float32), balls, f"--eyes {path}")
 
 
-def _read_json(path: Path) -> Mapping[str, Any]:
+def _read_json(path: Path, template: Vertices) -> tuple[Vertices | None, Vertices | None, tuple[Indices, ...]]:
+    """How the lids shut, by shapes or by edges, and the open face, both None where the file does not say; eyeballs."""
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
@@ -157,18 +154,9 @@ def _read_json(path: Path) -> Mapping[str, Any]:
             f"--eyes {path}: expected an object with {', '.join(KEYS)}, the last three of them lists"
             + (f', not "{unknown[0]}"' if unknown else "")
         )
-    return content
-
-
-def _closing(
-    path: Path,
-    content: Mapping[str, Any],
-    template: Vertices,
-    neutral: Vertices | None,
-    balls: tuple[Indices, ...],
-) -> Vertices | None:
-    """How the lids shut, by shapes or by edges; None if the file does not say."""
     count = len(template)
+    balls = tuple(_indices(path, listed, count) for listed in content.get("eyeballs", []))
+    neutral = _read_shape(path, content["neutral"]) if "neutral" in content else None
     if content.get("blinks"):
         total: Vertices = np.zeros((count, 3))
         for name in content["blinks"]:
@@ -179,15 +167,15 @@ def _closing(
             if len(shape) != count or (neutral is not None and len(neutral) != count):
                 raise FaceDiffError(f'--eyes {path}: "{name}" has {len(shape)} vertices, the face {count}')
             total = total + (shape - neutral if absolute and neutral is not None else shape)
-        return total
+        return total, neutral, balls
     if content.get("lids"):
         try:
             sides = [(lid["upper"], lid["lower"]) for lid in content["lids"]]
         except (TypeError, KeyError) as error:
             raise FaceDiffError(f'--eyes {path}: expected "lids" as a list of {{"upper": …, "lower": …}}') from error
         edges = [(_indices(path, upper, count), _indices(path, lower, count)) for upper, lower in sides]
-        return closing_of_lids(template, edges, np.concatenate(balls) if balls else None)
-    return None
+        return closing_of_lids(template, edges, np.concatenate(balls) if balls else None), neutral, balls
+    return None, neutral, balls
 
 
 def _read_shape(path: Path, name: object) -> Vertices:

@@ -180,9 +180,8 @@ def mesh_hierarchy(
     key = _key(template, faces, chosen, [levels, factor, spiral_length, dilation, pooling])
     # Three levels of a dense mesh take some seconds, and every training on its corpus needs the same ones.
     path = (cache or cache_dir() / "topology") / f"{key}.npz"
-    cached = _read(path)
-    if cached is not None:
-        return cached
+    with suppress(ValueError, KeyError, FaceDiffError):  # there is no such file, or it is damaged
+        return MeshHierarchy.from_arrays(read_arrays(path))
     points, inner = template, faces
     if chosen is not None:
         place = np.full(len(template), -1)
@@ -237,14 +236,6 @@ def _key(template: Points, faces: Indices, vertices: Indices | None, options: li
     if vertices is not None:
         digest.update(vertices.astype("<i8").tobytes())
     return digest.hexdigest()
-
-
-def _read(path: Path) -> MeshHierarchy | None:
-    """The hierarchy in a file; None if there is none or the file is damaged."""
-    try:
-        return MeshHierarchy.from_arrays(read_arrays(path))
-    except (ValueError, KeyError, FaceDiffError):
-        return None
 
 
 # One step down: fewer vertices on the same surface by quadric edge collapse, and the sparse maps down and up again.

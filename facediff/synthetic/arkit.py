@@ -9,11 +9,10 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, choices
 from facediff.synthetic.face import build_face
+from facediff.synthetic.geometry import Array, rise
 from facediff.synthetic.rig import CONTROLS, Shape, build_rig
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.utils.files import atomic_folder
-
-Array = npt.NDArray[np.float64]
 
 WHOLE = {
     "jawOpen": "jaw_open",
@@ -64,8 +63,7 @@ def puppet_shapes(speaker: str | None = None) -> tuple[Array, npt.NDArray[np.int
     poses = rig.pose(np.concatenate([np.zeros((1, len(CONTROLS))), np.eye(len(CONTROLS))]))
     neutral = poses[0]
     moves = dict(zip(CONTROLS, poses[1:] - neutral, strict=True))
-    across = np.clip((mesh.vertices[:, 0] / BLEND + 1) / 2, 0, 1)
-    left = (across * across * (3 - 2 * across))[:, None]
+    left = rise(mesh.vertices[:, 0] / BLEND, -1, 1)[:, None]
     shapes = {name: neutral + moves[control] for name, control in WHOLE.items()}
     for name, control in SIDED.items():
         shapes[f"{name}Left"] = neutral + left * moves[control]
