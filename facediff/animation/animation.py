@@ -14,9 +14,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.utils import SAMPLE_RATE
 
-MAPPED_BYTES = 1 << 26
-"""How much of a memory map is read before its pages are released."""
-
+MAPPED_BYTES = 1 << 26  # How much of a memory map is read before its pages are released
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _ABOUT = re.compile(r"about ([0-9.]+) mm\b")
 

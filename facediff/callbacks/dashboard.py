@@ -26,8 +26,7 @@ from facediff.models import AnimationModel
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import sha256
 
-PICTURE_SIZE = 320
-"""Pixels of a picture's sides."""
+PICTURE_SIZE = 320  # Pixels of a picture's sides
 
 
 class RunDescription(Callback):
@@ -38,31 +37,20 @@ class RunDescription(Callback):
     """
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Describe a training run."""
-        log_description(trainer, pl_module)
+        """Give every logger the description of a run of facediff's models; other models have none."""
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        if isinstance(pl_module, AnimationModel) and isinstance(data, SpeechMotionDataModule):
+            facts = describe_run(pl_module, data)
+            facts |= {"trainer/processes": trainer.world_size, "trainer/precision": str(trainer.precision)}
+            for logger in trainer.loggers:
+                logger.log_hyperparams(facts)
+
+    on_test_start = on_predict_start = on_fit_start
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Describe a run that only validates."""
         if trainer.state.fn == TrainerFn.VALIDATING:
-            log_description(trainer, pl_module)
-
-    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Describe a test."""
-        log_description(trainer, pl_module)
-
-    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Describe a prediction."""
-        log_description(trainer, pl_module)
-
-
-def log_description(trainer: Trainer, pl_module: LightningModule) -> None:
-    """Give every logger the description of a run of facediff's models; other models have none."""
-    data = trainer.datamodule  # type: ignore[attr-defined]
-    if isinstance(pl_module, AnimationModel) and isinstance(data, SpeechMotionDataModule):
-        facts = describe_run(pl_module, data)
-        facts |= {"trainer/processes": trainer.world_size, "trainer/precision": str(trainer.precision)}
-        for logger in trainer.loggers:
-            logger.log_hyperparams(facts)
+            self.on_fit_start(trainer, pl_module)
 
 
 def describe_run(model: AnimationModel, data: SpeechMotionDataModule) -> dict[str, Any]:

@@ -40,12 +40,8 @@ from facediff.utils import SAMPLE_RATE
 
 Picture = npt.NDArray[np.uint8]
 
-PICTURES = 6
-"""Frames on a sheet of pictures."""
-
-COLUMNS = 2
-"""Pictures in a row of a sheet."""
-
+PICTURES = 6  # Frames on a sheet of pictures
+COLUMNS = 2  # Pictures in a row of a sheet
 ASPECT = 0.75
 """Width of a panel as a share of its height: heads are higher than wide, and empty ground costs as much as a face."""
 
@@ -202,7 +198,12 @@ class SamplingPreview(Callback):
         # What fails is caught inside, since the random state would not be put back after an error.
         with isolate_rng(), self._surviving(f"after epoch {epochs}"), weights:
             folder = run_folder(trainer) / "previews" / f"epoch_{epochs:04d}"
-            samples = short_samples(trainer.datamodule, self._chosen, self.seconds)  # type: ignore[attr-defined]
+            # The first seconds of the clips, read from disk without a loader.
+            data: SpeechMotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
+            dataset = data.dataset("val")
+            dataset.window = max(1, round(self.seconds * data.frame_rate))
+            places = {clip.name: place for place, clip in enumerate(dataset.clips)}
+            samples = [dataset[places[name]] for name in self._chosen]
             self._scale = self._scale or default_error_scale(samples)
             for sample in samples:
                 if not self._chosen:
@@ -306,14 +307,6 @@ def first_of_each_identity(clips: Sequence[Clip], count: int) -> list[str]:
         rounds[clip.identity] = rounds.get(clip.identity, 0) + 1
         placed.append((rounds[clip.identity], place, clip.name))
     return [name for _, _, name in sorted(placed)[:count]]
-
-
-def short_samples(data: SpeechMotionDataModule, names: Sequence[str], seconds: float) -> list[Sample]:
-    """The first seconds of validation clips, read from disk without a loader."""
-    dataset = data.dataset("val")
-    dataset.window = max(1, round(seconds * data.frame_rate))
-    places = {clip.name: place for place, clip in enumerate(dataset.clips)}
-    return [dataset[places[name]] for name in names]
 
 
 def default_error_scale(samples: Sequence[Sample]) -> float:

@@ -103,7 +103,8 @@ class CompiledTraining(Callback):
                     f'CompiledTraining.parts: the network has no part "{name}"; choose among {there}, or parts of these'
                 )
         try:
-            torch.compile(_probe, backend=self.backend)(torch.ones(8, device=pl_module.device))
+            probe = torch.ones(8, device=pl_module.device)
+            torch.compile(lambda values: (values.sin() * 2).sum(), backend=self.backend)(probe)
         except Exception as error:  # what it raises depends on what is missing
             text = str(getattr(error, "inner_exception", error)).strip()
             reason = text.splitlines()[0] if text else type(error).__name__
@@ -148,7 +149,3 @@ class CompiledTraining(Callback):
     def _undo(self) -> None:
         for part in self._compiled:
             part._compiled_call_impl = None
-
-
-def _probe(values: torch.Tensor) -> torch.Tensor:
-    return (values.sin() * 2).sum()

@@ -19,9 +19,7 @@ from facediff.utils.arrays import open_vertices
 DEFAULT_PATTERNS = ("{subject}_{sentence}_condition_{identity}", "{subject}_{sentence}")
 """How predictions are named by default; the first is that of the field's released projects."""
 
-TRUTH_PATTERN = "{subject}_{sentence}"
-"""How truths are named by default."""
-
+TRUTH_PATTERN = "{subject}_{sentence}"  # How truths are named by default
 FIELDS = ("subject", "sentence", "identity")
 
 
@@ -112,8 +110,7 @@ def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path
 
 # Pairing: which prediction belongs to which truth, and what has no counterpart.
 
-OWN = "own"
-"""Scores the prediction that was conditioned on the speaker's own identity."""
+OWN = "own"  # Scores the prediction that was conditioned on the speaker's own identity
 
 
 @dataclass(frozen=True)
@@ -290,8 +287,7 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
     return region
 
 
-PAIRS_FILE = "regions/inner_lip_pairs.txt"
-"""Where a corpus has its pairs of inner-lip vertices."""
+PAIRS_FILE = "regions/inner_lip_pairs.txt"  # Where a corpus has its pairs of inner-lip vertices
 
 
 def read_pairs(source: str | None, corpus: Path | None, n_vertices: int) -> LipPairs:

@@ -141,8 +141,7 @@ class Report:
 
 Array = npt.NDArray[np.float64]
 
-BLOCK = 2**20
-"""Counts that are held at a time while resampling: memory does not grow with the number of resamples."""
+BLOCK = 2**20  # Counts that are held at a time while resampling: memory does not grow with the number of resamples
 
 
 def pooled(values: Array, weights: Array) -> Array:
@@ -364,8 +363,7 @@ def _why_nothing(missing: Missing) -> str:
 
 # An evaluation as text for people.
 
-SHOWN = 5
-"""Names that are listed before the rest is counted."""
+SHOWN = 5  # Names that are listed before the rest is counted
 
 
 def text(report: Report) -> str:

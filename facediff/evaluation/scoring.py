@@ -22,11 +22,8 @@ from facediff.metrics.one_pass import one_pass
 from facediff.utils.arrays import open_vertices
 from facediff.utils.jobs import run_tasks
 
-METRICS = "metrics"
-"""Stands in place of a protocol's name where metrics were chosen by name."""
-
-NATIVE = (np.float16, np.float32, np.float64)
-"""Types that torch reads as they are."""
+METRICS = "metrics"  # Stands in place of a protocol's name where metrics were chosen by name
+NATIVE = (np.float16, np.float32, np.float64)  # Types that torch reads as they are
 
 
 @dataclass(frozen=True)
@@ -216,7 +213,11 @@ class Scorer:
         for column in columns:
             if column.rule not in aligned:
                 # Every rule that does not refuse the lengths leaves the same frames, those that both sides have.
-                aligned[column.rule] = self._align(column, name, prediction, truth, template)
+                try:
+                    clips = align(prediction, truth, clip_names=[name], rule=column.rule)
+                except ValueError as error:
+                    raise FaceDiffError(f"protocol {column.protocol}: {error}") from error
+                aligned[column.rule] = clips.attach("template", [template])
         first = next(iter(aligned.values()))
         found = self._values(first)
         each = [(found[column.source], column.absolute) for column in columns]
@@ -257,14 +258,6 @@ class Scorer:
                 raise FaceDiffError(f"protocol {self.columns[0].protocol}: {error}") from error
         others = self.metrics.keys() - found.keys()
         return found | {source: float(self.metrics[source].clip_value(clip)) for source in others}
-
-    @staticmethod
-    def _align(column: Column, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> Clips:
-        try:
-            clips = align(prediction, truth, clip_names=[name], rule=column.rule)
-        except ValueError as error:
-            raise FaceDiffError(f"protocol {column.protocol}: {error}") from error
-        return clips.attach("template", [template])
 
 
 def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:

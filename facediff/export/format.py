@@ -19,8 +19,7 @@ from facediff.render.rasteriser import face_outward, to_linear, vertex_normals
 
 Up = Literal["y", "z"]
 
-MARK = b"facediff"
-"""Stands near the start of every file that is written without having been named by the user."""
+MARK = b"facediff"  # Stands near the start of every file that is written without having been named by the user
 
 
 @dataclass(frozen=True)

@@ -25,13 +25,10 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float32]
 
-BLOCK = 3000
-"""Coordinates that are processed together; bounds the memory for residuals."""
-
+BLOCK = 3000  # Coordinates that are processed together; bounds the memory for residuals
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 COMPONENT_TYPES = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
-LIMIT = 2**32 - 1
-"""The most bytes that the header of a .glb can count."""
+LIMIT = 2**32 - 1  # The most bytes that the header of a .glb can count
 
 
 @export_format.register("glb")

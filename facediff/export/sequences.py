@@ -14,8 +14,7 @@ from facediff.animation import Animation
 from facediff.export.format import ExportOptions, Format, Space, facts, folder_of
 from facediff.registry import export_format
 
-RECORD = "sequence.json"
-"""The file that tells a folder of frames from any other folder."""
+RECORD = "sequence.json"  # The file that tells a folder of frames from any other folder
 
 
 class MeshSequence(Format):

@@ -23,17 +23,10 @@ Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.floating[Any]]
 
-INSIDE = 0.2
-"""Share of its light that the back of a face keeps: the inside of a head is dark."""
-
-HOLLOW_STRENGTH = 0.45
-"""How strongly hollows of the surface are darkened."""
-
-DEPTH_STRENGTH = 14.0
-"""How strongly points that lie behind their surroundings in the picture are darkened."""
-
-GAMMA_STEPS = 4095
-"""Steps of the gamma table: fine enough that the darkest step stays below one level of the picture."""
+INSIDE = 0.2  # Share of its light that the back of a face keeps: the inside of a head is dark
+HOLLOW_STRENGTH = 0.45  # How strongly hollows of the surface are darkened
+DEPTH_STRENGTH = 14.0  # How strongly points that lie behind their surroundings in the picture are darkened
+GAMMA_STEPS = 4095  # Steps of the gamma table: fine enough that the darkest step stays below one level of the picture
 
 
 class Renderer:
@@ -191,8 +184,7 @@ class Renderer:
 VIEWS: dict[str, float] = {"front": 0.0, "three_quarter": -35.0, "side": -90.0}
 """Degrees by which the head turns about the vertical axis; negative turns the face to the key light on the left."""
 
-FIELD_OF_VIEW = math.radians(18.0)
-"""That of a portrait lens: a wide angle would make the nose look large."""
+FIELD_OF_VIEW = math.radians(18.0)  # That of a portrait lens: a wide angle would make the nose look large
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def test_other_sources_and_repeated_indices(root: Path, tmp_path: Path, capsys: 
     ("spoil", "words", "printed"),
     [
         (lambda root: (root / "tiny.ply").unlink(), [], "put tiny.ply into this folder"),
-        (lambda root: (root / "regions" / "fdd.txt").unlink(), [], "which vertices are the upper face"),
+        (lambda root: (root / "regions" / "fdd.txt").unlink(), [], "vertices of the upper face"),
         (lambda root: None, ["--lips", "none.txt"], "none.txt"),
         (lambda root: (root / "regions" / "lve.txt").write_text("1, 24"), [], "24 vertices ends at 23"),
         (lambda root: None, ["-o", "regions.jpg"], "regions.jpg"),

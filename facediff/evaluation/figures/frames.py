@@ -15,8 +15,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.evaluation.figures.material import Array, Material, Painter
 from facediff.evaluation.figures.page import Grid, Heading, Paper, check_output, save, style
 
-HIGHEST = 50.0
-"""Largest height of a picture in mm."""
+HIGHEST = 50.0  # Largest height of a picture in mm
 
 
 def find_phoneme(wanted: str, phonemes: Sequence[Phoneme], clip: str) -> Phoneme:

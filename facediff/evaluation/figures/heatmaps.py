@@ -25,11 +25,8 @@ from facediff.evaluation.figures.page import (
     wrapped,
 )
 
-HIGHEST = 70.0
-"""Largest height of a picture in mm."""
-
-BAR, BAR_SPACE = 2.5, 16.0
-"""Width of a colour bar, and of the bar with its numbers and label, in mm."""
+HIGHEST = 70.0  # Largest height of a picture in mm
+BAR, BAR_SPACE = 2.5, 16.0  # Width of a colour bar, and of the bar with its numbers and label, in mm
 
 Statistic = Literal["mean", "max", "both"]
 Row = tuple[str, dict[str, Array], float | None]
@@ -165,20 +162,8 @@ def draw_error(
 ) -> list[str]:
     """Draw how far each vertex is from the truth's, mean or maximum over frames, a column for each method.
 
-    Args:
-        material: what to draw from.
-        clips: clips whose frames count.
-        output: ``.png``, ``.pdf`` or ``.svg``.
-        paper: width, resolution and font.
-        view: a name in :data:`facediff.render.VIEWS`.
-        statistic: over frames: ``mean``, ``max``, or ``both``, a row each.
-        highest: ends of the colour scales of mean and maximum, in the unit shown; the largest value if None.
-
-    Returns:
-        notes on what was left out.
-
-    Raises:
-        FaceDiffError: if there is no mesh, or a file cannot be used.
+    Arguments, result and errors are those of :func:`draw_heatmap`; ``statistic`` is ``mean``, ``max``, or ``both``, a
+    row each, and ``highest`` has the ends of the colour scales of mean and maximum.
     """
     check_output(output)
     material.mesh(clips)  # refuses before the work

@@ -27,18 +27,10 @@ from facediff.evaluation.scoring import read_vertices
 from facediff.render import EVEN, Camera, Light, Look, Renderer
 from facediff.render.rasteriser import FIELD_OF_VIEW
 
-TRUTH = "truth"
-"""Name of the truth in a figure."""
-
-CHUNK = 2**20
-"""Coordinates that are converted to float64 together: 8 MB, however long a clip is."""
-
-LISTED = 12
-"""The most clips that a message names."""
-
-SMALLEST_PICTURE = 40
-"""Fewest pixels of a picture that shows anything."""
-
+TRUTH = "truth"  # Name of the truth in a figure
+CHUNK = 2**20  # Coordinates that are converted to float64 together: 8 MB, however long a clip is
+LISTED = 12  # The most clips that a message names
+SMALLEST_PICTURE = 40  # Fewest pixels of a picture that shows anything
 WHITE = (1.0, 1.0, 1.0)
 
 SHADED = Look(lights=EVEN, background_top=WHITE, background_bottom=WHITE)

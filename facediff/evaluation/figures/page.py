@@ -24,12 +24,8 @@ if TYPE_CHECKING:
 
 
 SUFFIXES = (".png", ".pdf", ".svg")
-COLUMN, PAGE = 85.0, 175.0
-"""Widths in mm of a column and of a page of the usual journals."""
-
-SMALLEST_TEXT, TEXT = 7.0, 8.0
-"""Sizes of letters in points."""
-
+COLUMN, PAGE = 85.0, 175.0  # Widths in mm of a column and of a page of the usual journals
+SMALLEST_TEXT, TEXT = 7.0, 8.0  # Sizes of letters in points
 POINTS_PER_MM = 72 / 25.4
 FONT = "DejaVu Sans"
 """The font that comes with matplotlib: it has the letters of the IPA, and is the same on every machine."""
@@ -47,14 +43,9 @@ LINES: tuple[tuple[str, Any], ...] = (
 )
 """Colour and dashes of each line, so that lines differ without colours too."""
 
-PANEL_HEIGHT = 42.0
-"""Height in mm of axes with curves."""
-
-GAP = 1.0
-"""Millimetres between pictures, and between pictures and labels."""
-
-NAME_LINES = 2
-"""The most lines of a row's name."""
+PANEL_HEIGHT = 42.0  # Height in mm of axes with curves
+GAP = 1.0  # Millimetres between pictures, and between pictures and labels
+NAME_LINES = 2  # The most lines of a row's name
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,8 @@ from facediff.render.panels import draw_text
 COLOURS: dict[str, tuple[int, int, int]] = {"lips": (214, 40, 57), "upper_face": (38, 102, 207)}
 """Colour (sRGB) of each region; vertices of both have the last."""
 
-REST = (219, 209, 200)
-"""Colour (sRGB) of all other vertices."""
-
-VIEWS = {"front": "front", "three_quarter": "three-quarter"}
-"""Views from left to right, with the text above them."""
+REST = (219, 209, 200)  # Colour (sRGB) of all other vertices
+VIEWS = {"front": "front", "three_quarter": "three-quarter"}  # Views from left to right, with the text above them
 
 
 def draw_regions(
@@ -53,7 +50,13 @@ def draw_regions(
         FaceDiffError: if the folder is no corpus, or its mesh or a region is missing or damaged.
     """
     view = find_view(root, corpus)
-    mesh = find_mesh(root, view)
+    mesh = Corpus(root, view.n_vertices, view.frame_rate, stored_frame_rate=view.frame_rate).read_mesh(view.mesh_files)
+    if mesh is None and not view.mesh_files:
+        whose = "a person's folder" if view.data_module is None else view.corpus
+        raise FaceDiffError(f"{root}: {whose} has no mesh of its own; give a corpus folder of the same topology")
+    if mesh is None:
+        wanted = " or ".join(view.mesh_files)
+        raise FaceDiffError(f"{root}: no mesh to draw the regions on; put {wanted} into this folder")
     regions, lines = {}, {}
     for part, own in (("lips", lips), ("upper_face", upper_face)):
         sources = view.region_sources.get(part, ()) if own is None else (own,)
@@ -74,18 +77,6 @@ def find_view(root: Path, corpus: str | None) -> View:
     if view is None:
         raise FaceDiffError(f"{root}: {report.findings[-1].message}")
     return view
-
-
-def find_mesh(root: Path, view: View) -> Mesh:
-    """The corpus's mesh: its neutral vertices and its faces."""
-    mesh = Corpus(root, view.n_vertices, view.frame_rate, stored_frame_rate=view.frame_rate).read_mesh(view.mesh_files)
-    if mesh is None and not view.mesh_files:
-        whose = "a person's folder" if view.data_module is None else view.corpus
-        raise FaceDiffError(f"{root}: {whose} has no mesh of its own; give a corpus folder of the same topology")
-    if mesh is None:
-        wanted = " or ".join(view.mesh_files)
-        raise FaceDiffError(f"{root}: no mesh to draw the regions on; put {wanted} into this folder")
-    return mesh
 
 
 def legend(root: Path, sources: Sequence[str], region: Region) -> str:

@@ -33,11 +33,8 @@ Axis = Literal["step", "epoch"]
 METRICS = "metrics.csv"
 USUAL_SCALARS = ("train/loss", "val/lve")
 
-NARROW = 120.0
-"""Width in mm below which all panels are in one column."""
-
-FEW_POINTS = 12
-"""Up to this many values of a curve, each is marked and none is smoothed."""
+NARROW = 120.0  # Width in mm below which all panels are in one column
+FEW_POINTS = 12  # Up to this many values of a curve, each is marked and none is smoothed
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from facediff.errors import FaceDiffError
 
 STEP = 0.05
 """Quantisation of positions in mm. Rounding moves a coordinate by at most half of it, a vertex by √3 / 2 of it."""
-CHUNK_FRAMES = 32
-"""Frames that are unpacked together; a jump in time costs one such chunk."""
+CHUNK_FRAMES = 32  # Frames that are unpacked together; a jump in time costs one such chunk
 LARGEST_STEP = np.iinfo(np.int16).max
 
 
