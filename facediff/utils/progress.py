@@ -14,13 +14,9 @@ Item = TypeVar("Item")
 def progress_bar(
     description: str, total: int | None, *, done: int = 0, shown: bool = True
 ) -> Iterator[Callable[[], object]]:
-    """A progress bar.
+    """A progress bar of ``total`` steps (None if that is not known), ``done`` of which have been done before.
 
-    Args:
-        description: what is being done, e.g. ``clips``.
-        total: number of steps; None if it is not known.
-        done: steps that have been done before.
-        shown: False shows nothing, and nothing is shown without a terminal or without the package rich either.
+    Nothing is shown without a terminal or without the package rich.
 
     Yields:
         a function to be called after each step.

@@ -112,6 +112,8 @@ def _check_corpus(
     manifest: dict[str, Any],
     examine_all: Callable[[Rules, View, Folder], list[ClipFacts]],
 ) -> None:
+    from facediff.data.corpus import Corpus
+
     root, findings = folder.root, report.findings
     report.corpus, report.data_module = view.corpus, view.data_module
     report.frame_rate, report.n_vertices = view.frame_rate, view.n_vertices
@@ -119,7 +121,9 @@ def _check_corpus(
     # Opening the folder would fail for these reasons again.
     if not any(finding.where == MANIFEST or finding.kind == "unfinished" for finding in findings):
         with findings.guard("frame_rate", root / MANIFEST, root):
-            opened = view.open(root)
+            opened = Corpus(
+                root, view.n_vertices, view.frame_rate, stored_frame_rate=view.stored_frame_rate, parse=view.parse
+            )
     rate = manifest.get("frame_rate")
     stored = report.stored_frame_rate = rate if is_rate(rate) else view.stored_frame_rate
     templates, report.templates = check_templates(root, view, findings)

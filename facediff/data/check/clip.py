@@ -66,21 +66,15 @@ class Rules:
 
 @dataclass
 class ClipFacts:
-    """What one clip holds; None for what cannot be used.
-
-    Attributes:
-        frames: frames on disk.
-        seconds: length of the speech.
-        hashes: SHA-256 by file, relative to the corpus folder; empty where headers only are read.
-    """
+    """What one clip holds; None for what cannot be used."""
 
     name: str
-    frames: int | None = None
+    frames: int | None = None  # on disk
     n_vertices: int | None = None
-    seconds: float | None = None
+    seconds: float | None = None  # of speech
     sample_rate: int | None = None
     channels: int | None = None
-    hashes: dict[str, str] = field(default_factory=dict)
+    hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 by file; empty where headers only are read
     findings: Findings = field(default_factory=Findings)
 
 

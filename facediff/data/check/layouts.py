@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
 
     Module = type[SpeechMotionDataModule]
-    from facediff.data.corpus import Clip, Corpus
+    from facediff.data.corpus import Clip
 
 MANIFEST = "manifest.json"
 STATE = "prepare.json"
@@ -80,41 +80,21 @@ class Folder:
 
 @dataclass(frozen=True)
 class View:
-    """What the check needs to know about a corpus, from its data module or from a person's own folder.
-
-    Attributes:
-        data_module: import path of the data module; None for a person's folder.
-        frame_rate: motion frames a second that models see.
-        stored_frame_rate: those on disk where ``manifest.json`` has none.
-        parse: subject and sentence of a clip by its name; None for a name that is none of the corpus.
-        split_of: a clip's split, for each of the ways in which the corpus is split.
-        identities: speakers who are trained on.
-        expected: clips of a complete corpus by split; empty where there is no such list.
-        region_help: where the files of the regions can be obtained.
-        obtain: how the corpus can be obtained.
-    """
+    """What the check needs to know about a corpus, from its data module or from a person's own folder."""
 
     corpus: str
-    data_module: str | None
+    data_module: str | None  # import path; None for a person's folder
     n_vertices: int
-    frame_rate: float
-    stored_frame_rate: float
-    parse: Callable[[str], Clip | None]
-    split_of: dict[str | None, Callable[[Clip], str | None]]
-    identities: list[str] = field(default_factory=list)
-    expected: dict[str, list[str]] = field(default_factory=dict)
+    frame_rate: float  # motion frames a second that models see
+    stored_frame_rate: float  # those on disk where manifest.json has none
+    parse: Callable[[str], Clip | None]  # subject and sentence by a clip's name; None if that is none of the corpus
+    split_of: dict[str | None, Callable[[Clip], str | None]]  # for each of the ways in which the corpus is split
+    identities: list[str] = field(default_factory=list)  # speakers who are trained on
+    expected: dict[str, list[str]] = field(default_factory=dict)  # clips of a complete corpus by split, where known
     mesh_files: tuple[str, ...] = ()
     region_sources: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    region_help: str = ""
-    obtain: str = ""
-
-    def open(self, root: Path) -> Corpus:
-        """The folder as training reads it."""
-        from facediff.data.corpus import Corpus
-
-        return Corpus(
-            root, self.n_vertices, self.frame_rate, stored_frame_rate=self.stored_frame_rate, parse=self.parse
-        )
+    region_help: str = ""  # where the files of the regions can be obtained
+    obtain: str = ""  # how the corpus can be obtained
 
 
 def identify(
@@ -122,13 +102,8 @@ def identify(
 ) -> View | None:
     """The corpus that a folder holds; None, with a finding, if it holds none or is not recognised.
 
-    Args:
-        report: findings are added here, and the name of a raw distribution.
-        folder: the folder.
-        recorded: the corpus that ``manifest.json`` or ``prepare.json`` names, if one does.
-        corpus: the corpus that the user names; None to find out.
-        split: only this one of the ways in which the corpus is split; all if None.
-        manifest: the content of ``manifest.json``.
+    ``recorded`` is the corpus that ``manifest.json`` or ``prepare.json`` names, ``corpus`` the one that the user names,
+    ``split`` the only one of the ways in which the corpus is split that is wanted.
 
     Raises:
         FaceDiffError: if the user names a corpus or a split that there is not.

@@ -53,12 +53,7 @@ class Auxiliary:
 
 
 def read_auxiliary(root: Path, *, name: str, frame_rate: float | None) -> Auxiliary:
-    """Read what a new speaker must match.
-
-    Args:
-        root: the corpus folder.
-        name: the speaker's name, which must be new to the corpus.
-        frame_rate: the corpus's frame rate, needed where ``manifest.json`` does not record it.
+    """Read what a new speaker must match; ``frame_rate`` is needed where ``manifest.json`` does not record it.
 
     Raises:
         FaceDiffError: if the folder is no corpus, knows the name already, or its frame rate is unknown or contradicted.
@@ -145,12 +140,8 @@ def into_coordinates(face: Array, best: Similarity, given: float | None) -> Simi
 
     Its scale changes the unit and keeps the speaker's size: where the measured scale is near a power of ten
     (millimetres, centimetres, metres), it is that power; else, as with a corpus of normalised size, it is as measured.
-
-    Args:
-        face: (V, 3) the speaker's neutral face.
-        best: the similarity that lays it onto the corpus's mean face best; kept but for its scale, about the face's
-            centre.
-        given: the scale to use instead.
+    ``best`` lays the speaker's neutral face onto the corpus's mean face best, and is kept but for its scale, about the
+    face's centre; a scale that is given is used instead.
     """
     power = round(math.log10(best.scale))
     is_unit = abs(math.log10(best.scale) - power) < math.log10(SAME_UNIT)
@@ -164,25 +155,15 @@ def into_coordinates(face: Array, best: Similarity, given: float | None) -> Simi
 
 @dataclass(frozen=True)
 class Stabilised:
-    """Frames without head motion.
+    """Frames without head motion; lengths are in the motion's unit."""
 
-    Attributes:
-        frames: (T, V, 3), in the pose of ``face``.
-        face: (V, 3) their median.
-        stable: the vertices from which the head's motion was measured.
-        turns: (T,) angle of the head from its mean pose, in radians.
-        shifts: (T,) distance of the head from its mean place, in the motion's unit.
-        jitter: root-mean-square distance of the stable vertices from ``face``, in the motion's unit.
-        speed: (T,) mean step of the vertices from frame to frame, in the motion's unit.
-    """
-
-    frames: npt.NDArray[np.floating]
-    face: Array
-    stable: Indices
-    turns: Array
-    shifts: Array
-    jitter: float
-    speed: Array
+    frames: npt.NDArray[np.floating]  # (T, V, 3), in the pose of the face
+    face: Array  # (V, 3), the frames' median
+    stable: Indices  # the vertices from which the head's motion was measured
+    turns: Array  # (T,) angle of the head from its mean pose, in radians
+    shifts: Array  # (T,) distance of the head from its mean place
+    jitter: float  # root-mean-square distance of the stable vertices from the face
+    speed: Array  # (T,) mean step of the vertices from frame to frame
 
 
 def read_stable(source: str, n_vertices: int) -> Indices:
@@ -269,19 +250,12 @@ class Template:
 
 @dataclass(frozen=True)
 class Neutral:
-    """A neutral face.
-
-    Attributes:
-        face: (V, 3).
-        placing: from the stabilised frames' coordinates to those of ``face``; a rigid motion.
-        source: how the face was obtained, in words.
-        frames: the frames it is the median of, counted from 0; empty if it was not found in the motion.
-    """
+    """A neutral face (V, 3)."""
 
     face: Array
-    placing: Similarity
-    source: str
-    frames: list[int] = field(default_factory=list)
+    placing: Similarity  # from the stabilised frames' coordinates to those of the face; a rigid motion
+    source: str  # how the face was obtained, in words
+    frames: list[int] = field(default_factory=list)  # those it is the median of, counted from 0, if it was found there
 
 
 def choose_neutral(

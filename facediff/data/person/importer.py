@@ -239,11 +239,7 @@ def _cut(name: str, speech: Speech, frames: int, frame_rate: float, clip_seconds
 
 
 def cut_points(loud: Array, clip_frames: float) -> list[tuple[int, int]]:
-    """Divide frames into clips of about equal length, each cut at the quietest frame near its place.
-
-    Args:
-        loud: (T,) loudness.
-        clip_frames: wanted length of a clip, in frames.
+    """Divide frames of loudness (T,) into clips of about ``clip_frames``, each cut at the quietest frame near its end.
 
     Returns:
         first frame and frame after the last of every clip; together they are all frames.

@@ -26,21 +26,13 @@ FLAME_FRAMES = 64  # frames that the FLAME layer works on at a time
 
 @dataclass(frozen=True)
 class Motion:
-    """A sequence of faces as read.
+    """A sequence of faces as read."""
 
-    Attributes:
-        frames: (T, V, 3), usually memory-mapped.
-        faces: (F, 3) triangles; None if the source has none.
-        template: (V, 3) neutral face, where the source has one.
-        has_head_motion: whether it contains the head's rigid motion.
-        notes: remarks for the user.
-    """
-
-    frames: npt.NDArray[np.floating]
-    faces: Faces | None = None
-    template: npt.NDArray[np.float64] | None = None
+    frames: npt.NDArray[np.floating]  # (T, V, 3), usually memory-mapped
+    faces: Faces | None = None  # (F, 3) triangles
+    template: npt.NDArray[np.float64] | None = None  # (V, 3) neutral face, where the source has one
     has_head_motion: bool = True
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # for the user
 
 
 def read_motion(
@@ -48,13 +40,8 @@ def read_motion(
 ) -> Motion:
     """Read a folder of OBJ or PLY files, a .npy array of vertices, or FLAME parameters.
 
-    Args:
-        path: the folder or file.
-        n_vertices: vertices that every frame must have.
-        frame_rate: frames per second.
-        scratch: a temporary file for frames that must be put together.
-        flame: FLAME model file, needed for parameters and only for them.
-        progress: whether to show a progress bar.
+    ``flame`` is the FLAME model file, needed for parameters and only for them; ``scratch`` is a temporary file for
+    frames that must be put together.
 
     Raises:
         FaceDiffError: if it is none of these, or damaged.

@@ -112,23 +112,15 @@ class Plan:
 
 @dataclass(frozen=True)
 class Report:
-    """What preparation did.
-
-    Attributes:
-        clips: frames of every clip that is there now.
-        written: number of clips written by this run; the others were there.
-        failed: what went wrong, by clip.
-        missing: what the raw folder lacks, and what was expected where.
-        totals: counts, as in the manifest.
-    """
+    """What preparation did."""
 
     out: Path
-    clips: dict[str, int]
-    written: int
-    failed: dict[str, str] = field(default_factory=dict)
-    missing: dict[str, str] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    totals: dict[str, Any] = field(default_factory=dict)
+    clips: dict[str, int]  # frames of every clip that is there now
+    written: int  # number of clips written by this run; the others were there
+    failed: dict[str, str]  # what went wrong, by clip
+    missing: dict[str, str]  # what the raw folder lacks, and what was expected where
+    notes: list[str]
+    totals: dict[str, Any]  # counts, as in the manifest
 
     @property
     def sound(self) -> bool:
