@@ -219,13 +219,7 @@ class Bootstrap:
 class MethodTable:
     """One method's values: a row a clip, sorted by clip, so that no order of files or workers changes a digit.
 
-    Args:
-        name: what the method is called.
-        folder: where its files lie.
-        pairs: its clips.
-        missing: what of it cannot be scored for its names alone.
-        found: scores by clip, or in words why there are none.
-        columns: what the values are.
+    ``found`` has the scores by clip, or in words why there are none; ``missing`` what names alone rule out.
 
     Raises:
         FaceDiffError: if nothing can be scored.

@@ -168,18 +168,9 @@ def find_clips(
     truth_pattern: str = TRUTH_PATTERN,
     identity: str = OWN,
 ) -> tuple[dict[str, Truth], dict[str, dict[str, Path]]]:
-    """The files of truth and methods by clip, matched by their names as ``facediff evaluate`` does.
+    """Truths by clip and each method's predictions by clip, matched by their names as ``facediff evaluate`` does.
 
-    Args:
-        methods: folder of predictions by method.
-        truth: folder of truths.
-        subjects: known speakers.
-        patterns: how predictions may be named.
-        truth_pattern: how truths are named.
-        identity: ``own``, or the identity whose predictions are drawn.
-
-    Returns:
-        truths by clip, and each method's predictions by clip.
+    ``subjects`` are the known speakers; ``identity`` is ``own``, or the identity whose predictions are drawn.
 
     Raises:
         FaceDiffError: if a folder is missing or has no file whose name matches, or a method has none of a truth's clip.
@@ -241,15 +232,9 @@ def chunks(motion: Tensor, path: Path, frames: int) -> Iterator[Array]:
 
 
 class Painter:
-    """Draws one topology on white, with a camera framed once on a face at rest.
+    """Draws triangles (F, 3) on white, with a camera framed once on the face at rest, ``shape`` (V, 3).
 
-    Args:
-        faces: triangles (F, 3).
-        shape: the face at rest (V, 3).
-        view: a name in ``VIEWS``.
-        look: material and lights.
-        colours: sRGB (V, 3) of the surface; the look's material if None.
-        region: vertices to show in a close-up; the whole mesh if None.
+    Colours are sRGB (V, 3) of the surface, else the look's material shows; a region is shown in a close-up.
     """
 
     def __init__(
