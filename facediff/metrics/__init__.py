@@ -28,7 +28,7 @@ class's docstring has the formula, its source, its unit, and what about it is a 
 
 Lengths or masks say what is padding, which is never read. NaN and infinity are refused with the clip's name.
 Sums are float64 whatever comes in, and processes with unequal numbers of sequences get what one would. The options
-that all metrics share are those of `facediff.metrics.base.SequenceOptions` and `BatchOptions`.
+that all metrics share are described in `ExactMetric`, `SequenceMetric` and its `update`.
 
 A new metric is a `SequenceMetric` that defines `clip_value`, registered with ``@facediff.registry.metric.register``.
 """

@@ -57,13 +57,7 @@ class Context:
 
 @dataclass(frozen=True)
 class Request:
-    """A metric that was asked for.
-
-    Args:
-        text: As it was written; the score's name.
-        name: The registered name.
-        options: Its options.
-    """
+    """A metric that was asked for by its registered name with options; ``text`` as written is the score's name."""
 
     text: str
     name: str

@@ -367,7 +367,11 @@ def _attach_closures(clips: Clips, closures: Closures, *, padded: int, single: b
                 f"closures must be a boolean mask of shape {shape} or lists of intervals, not "
                 f"{closures.dtype} of shape {tuple(closures.shape)}"
             )
-        given: list[object] = [_runs(row) for row in closures.reshape(count, padded).tolist()]
+        given: list[object] = []
+        for row in closures.reshape(count, padded).tolist():
+            framed = [False, *row, False]
+            edges = [place for place in range(padded + 1) if framed[place] != framed[place + 1]]
+            given.append(list(zip(edges[::2], edges[1::2], strict=True)))  # runs of true values as intervals
     else:
         given = [closures] if single else list(closures)
     if len(given) != count:
@@ -393,13 +397,6 @@ def _checked(clip: Clip, intervals: object) -> tuple[Interval, ...]:
         if start < clip.frames:
             found.append((start, min(end, clip.frames)))
     return tuple(found)
-
-
-def _runs(mask: list[bool]) -> list[Interval]:
-    """Runs of true values as intervals."""
-    framed = [False, *mask, False]
-    edges = [place for place in range(len(mask) + 1) if framed[place] != framed[place + 1]]
-    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 mouth_opening_difference = functional(MouthOpeningDifference)

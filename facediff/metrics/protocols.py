@@ -158,15 +158,7 @@ def protocol(name: str = "paper", *, topology: str | None = None) -> Protocol:
 
 @dataclass(frozen=True)
 class Summary:
-    """What to print next to the scores.
-
-    Args:
-        protocol: The protocol's name.
-        lips: Lip region.
-        upper: Upper-face region, None if the protocol does not use one.
-        coverage: Frames and sequences scored, frames cut.
-        topology: The mesh's name, if the protocol was given one.
-    """
+    """What to print next to the scores; ``upper`` is None if the protocol does not use the upper face."""
 
     protocol: str
     lips: Region

@@ -395,14 +395,7 @@ Part = Literal["lips", "upper"]
 
 @dataclass(frozen=True)
 class Topology:
-    """A mesh and the regions in use on it.
-
-    Args:
-        name: The name of the data set.
-        n_vertices: Vertices of the mesh.
-        lips: What a lip region with that many distinct vertices is.
-        upper: Likewise for the upper face.
-    """
+    """The mesh of a data set, and what ``lips`` and ``upper`` face regions with so many distinct vertices are on it."""
 
     name: str
     n_vertices: int
