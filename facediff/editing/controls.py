@@ -5,24 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation import Animation
-from facediff.editing.expressiveness import check_factors, read_factors, scale_regions
-from facediff.editing.eyes import GIVE, Eyes, eyes_for
-from facediff.editing.procedural import (
-    PROCEDURAL,
-    SWAYS,
-    add_blinks,
-    add_gaze,
-    add_sway,
-    blink_curve,
-    gaze_curve,
-    sway_curve,
-)
 from facediff.errors import FaceDiffError
+
+# What edits an animation is imported where it is asked for: most animations have no controls.
+if TYPE_CHECKING:
+    from facediff.animation import Animation
+    from facediff.editing.eyes import Eyes
 
 
 @dataclass(frozen=True)
@@ -53,14 +46,17 @@ class AnimationControls:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        _ = self.factors
-        # Each of these refuses an impossible value, also for an animation without frames.
-        if self.blinks is not None:
-            blink_curve(0, 25.0, rate=self.blinks)
-        if self.gaze is not None:
-            gaze_curve(0, 25.0, degrees=self.gaze)
-        if self.sway is not None:
-            sway_curve(0, 25.0, degrees=self.sway)
+        if not self.is_off:
+            from facediff.editing.procedural import blink_curve, gaze_curve, sway_curve
+
+            _ = self.factors
+            # Each of these refuses an impossible value, also for an animation without frames.
+            if self.blinks is not None:
+                blink_curve(0, 25.0, rate=self.blinks)
+            if self.gaze is not None:
+                gaze_curve(0, 25.0, degrees=self.gaze)
+            if self.sway is not None:
+                sway_curve(0, 25.0, degrees=self.sway)
         if self.seed is not None and self.seed < 0:
             raise FaceDiffError(f"--controls-seed {self.seed}: expected 0 or more")
         if self.eyes is not None and not self.eyes.is_file():
@@ -76,7 +72,11 @@ class AnimationControls:
     @property
     def factors(self) -> dict[str, float]:
         """The factors of expressiveness by region."""
-        return {} if self.expressiveness is None else read_factors(self.expressiveness)
+        if self.expressiveness is None:
+            return {}
+        from facediff.editing.expressiveness import read_factors
+
+        return read_factors(self.expressiveness)
 
     def check(
         self,
@@ -90,7 +90,10 @@ class AnimationControls:
         Raises:
             FaceDiffError: if a region is unknown, or blinks or gaze are wanted and the eyes are not known.
         """
-        check_factors(self.factors, regions, name)
+        if self.expressiveness is not None:
+            from facediff.editing.expressiveness import check_factors
+
+            check_factors(self.factors, regions, name)
         self._needed_eyes(template, faces)
 
     def apply(self, animation: Animation, *, seed: int = 0) -> Animation:
@@ -107,6 +110,8 @@ class AnimationControls:
         """
         if self.is_off:
             return animation
+        from facediff.editing.procedural import PROCEDURAL, SWAYS, add_blinks, add_gaze, add_sway
+
         if SWAYS in animation.metadata.get(PROCEDURAL, ""):
             raise FaceDiffError(
                 f"{animation.name}: its head sways already; apply the controls to the animation as it was before"
@@ -116,6 +121,8 @@ class AnimationControls:
         # Expressiveness must not scale procedural motion, a blink must be able to shut eyes that gaze has opened, and
         # all of them need the head in the pose of the neutral face, which sway leaves.
         if self.expressiveness is not None:
+            from facediff.editing.expressiveness import scale_regions
+
             animation = scale_regions(animation, self.factors, eyes)
         if self.gaze is not None and eyes is not None:
             animation = add_gaze(animation, eyes, degrees=self.gaze, seed=seed)
@@ -130,6 +137,8 @@ class AnimationControls:
         asking = "--blinks" if self.blinks is not None else "--gaze" if self.gaze is not None else None
         if asking is None and self.expressiveness is None:
             return None
+        from facediff.editing.eyes import GIVE, eyes_for
+
         eyes = eyes_for(template, faces, self.eyes)
         if asking is None:
             return eyes

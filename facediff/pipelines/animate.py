@@ -33,27 +33,7 @@ SILENCE = 1e-4
 
 @dataclass(frozen=True)
 class AnimationOptions:
-    """How recordings are animated.
-
-    Attributes:
-        checkpoint: the trained model.
-        identity: whose face and identity; the first one trained on if None.
-        style: the speaking style: a motion, a style vector, a clip's name or a mixture, as
-            :func:`facediff.models.styles.read_styles` takes it; the identity's stored reference if None.
-        style_template: neutral face of the speaker whose motion ``style`` holds, or the word ``median``.
-        samples: how many animations of each recording, with seeds one after another.
-        sampler: name of the sampler; the checkpoint's if None.
-        steps: its denoising steps; its default if None.
-        device: ``cpu``, ``cuda`` …
-        precision: ``bf16`` multiplies in 16 bits.
-        window: seconds of a window of long speech; the model's if None.
-        overlap: seconds that neighbouring windows share; the model's if None.
-        controls: what is changed after inference.
-        target_mesh: mesh that the motion is transferred to.
-        correspondence: with ``target_mesh``, a .npz that is used if it exists, else written.
-        export: how files are written.
-        quiet: no progress bars.
-    """
+    """How recordings are animated: the options of :func:`facediff.cli.animate.animate`, which explains them."""
 
     checkpoint: Path
     identity: str | None = None
@@ -73,11 +53,7 @@ class AnimationOptions:
     quiet: bool = True
 
     def check(self, output: Path) -> None:
-        """Refuse what can be refused before a model is loaded.
-
-        Raises:
-            FaceDiffError: naming the option.
-        """
+        """Refuse what can be refused before a model is loaded."""
         if self.correspondence is not None and self.target_mesh is None:
             raise FaceDiffError("--correspondence: belongs to a mesh; give --target-mesh as well")
         if self.style_template is not None and self.style is None:
@@ -153,12 +129,10 @@ class AnimationPipeline:
     ) -> Iterator[list[Animation]]:
         """Samples of some speech as they come from the model; long ones are on disk as long as the context lasts.
 
-        Args:
-            speech: (S,) at 16 kHz.
-            name: the animations' name.
-            output: file whose disk has room for long animations.
-            seed: seed of the first sample.
+        The arguments are those of :meth:`write`; the folder of ``output`` must have room for long samples.
         """
+        import torch
+
         from facediff.data.audio import SAMPLE_RATE
 
         seeds = [seed + i for i in range(self.options.samples)]
@@ -170,7 +144,14 @@ class AnimationPipeline:
         with spool as folder:
             with self.precision():
                 if folder is None:
-                    motions, style = self._in_one_pass(speech, seeds)
+                    made = self.model.animate_samples(
+                        torch.from_numpy(speech).to(self.model.device),
+                        identity=self.identity,
+                        style=self.style,
+                        seeds=seeds,
+                        progress=None if self.options.quiet else partial(track, description="sampling"),
+                    )
+                    motions, style = [sample.vertices.numpy() for sample in made], made[0].reference_name
                 else:
                     motions, style = self._by_windows(speech, seeds, Path(folder))
             yield [
@@ -180,13 +161,13 @@ class AnimationPipeline:
 
     def finished(self, animation: Animation, seed: int) -> Animation:
         """A sample after everything that the options ask for after inference."""
-        from facediff.editing.retargeting import carry, retarget
-        from facediff.mesh import read_mesh
-
         animation = self.options.controls.apply(animation, seed=seed)
         target = self.options.target_mesh
         if target is None:
             return animation
+        from facediff.editing.retargeting import carry, retarget
+        from facediff.mesh import read_mesh
+
         if self._correspondence is not None:
             return carry(animation, self._correspondence, read_mesh(target))
         # All samples have one face, so that one correspondence serves all.
@@ -199,25 +180,10 @@ class AnimationPipeline:
 
         return torch.autocast(self.model.device.type, torch.bfloat16, enabled=self.options.precision == "bf16")
 
-    def _in_one_pass(
-        self, speech: npt.NDArray[np.float32], seeds: Sequence[int]
-    ) -> tuple[list[npt.NDArray[np.float32]], str]:
-        """Vertices (T, V, 3) of each sample, and the style's name."""
-        import torch
-
-        made = self.model.animate_samples(
-            torch.from_numpy(speech).to(self.model.device),
-            identity=self.identity,
-            style=self.style,
-            seeds=seeds,
-            progress=None if self.options.quiet else partial(track, description="sampling"),
-        )
-        return [prediction.vertices.numpy() for prediction in made], made[0].reference_name
-
     def _by_windows(
         self, speech: npt.NDArray[np.float32], seeds: Sequence[int], folder: Path
     ) -> tuple[list[npt.NDArray[np.float32]], str]:
-        """The same as memory maps: each window goes to disk as soon as it is made."""
+        """Memory maps (T, V, 3) of the samples, whose windows go to disk as they are made, and the style's name."""
         import numpy as np
         import torch
 
@@ -286,11 +252,7 @@ def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[
 
 
 def refuse_replacing(recordings: Sequence[Path], outputs: Sequence[Path]) -> None:
-    """Refuse to write an animation over a recording: a video may be both.
-
-    Raises:
-        FaceDiffError: naming the output.
-    """
+    """Refuse to write an animation over a recording: a video may be both."""
     heard = {recording.resolve() for recording in recordings}
     for output in outputs:
         if output.resolve() in heard:
@@ -300,9 +262,7 @@ def refuse_replacing(recordings: Sequence[Path], outputs: Sequence[Path]) -> Non
 def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
     """A checkpoint's assets as :class:`facediff.animation.Animation` takes them.
 
-    Args:
-        assets: of a model.
-        identity: whose neutral face; the first one trained on if None.
+    The neutral face is that of ``identity``, the first one trained on if None.
     """
     import numpy as np
 
@@ -321,11 +281,7 @@ def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
 
 
 def usable_device(name: str) -> str:
-    """The device's name.
-
-    Raises:
-        FaceDiffError: if this machine does not have it.
-    """
+    """The device's name."""
     import torch
 
     try:

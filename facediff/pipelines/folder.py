@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 
 from facediff.animation import Animation
-from facediff.editing.retargeting import retarget
 from facediff.errors import FaceDiffError, choices
 from facediff.export import FORMATS
 from facediff.models.checkpoint import read_assets
@@ -82,6 +81,8 @@ def animate_folder(
         raise FaceDiffError(f"--suffix {suffix}: a batch writes one file for each recording; choose {fit}")
     found = recordings(speech)
     if options.target_mesh is not None and options.correspondence is not None and not options.correspondence.exists():
+        from facediff.editing.retargeting import retarget
+
         # Otherwise every process would fit the mesh, and a second run would find a file that decides the outputs and
         # that the records of the first one do not know.
         facts = facts_of(read_assets(options.checkpoint), options.identity)
@@ -126,11 +127,7 @@ def _load_pipeline(options: AnimationOptions, seed: int, max_seconds: float | No
 
 
 def recordings(paths: Sequence[Path]) -> list[Path]:
-    """Recordings, and those that lie in folders (not deeper), each once.
-
-    Raises:
-        FaceDiffError: if a folder has none. A file that is missing fails later, by itself.
-    """
+    """Recordings, and those that lie in folders (not deeper), each once."""
     from facediff.data.audio import CONTAINERS, SUFFIXES
 
     known = SUFFIXES + CONTAINERS
@@ -153,9 +150,6 @@ def output_names(speeches: Sequence[Path], suffix: str) -> list[str]:
     """Names of the outputs: ``a.wav`` gives ``a.mp4``; where two would be equal, ``a.wav.mp4`` and ``a.flac.mp4``.
 
     Letters' case does not distinguish names, as on many disks.
-
-    Raises:
-        FaceDiffError: if two recordings have the same name.
     """
     stems = Counter(speech.stem.lower() for speech in speeches)
     names = [(speech.stem if stems[speech.stem.lower()] == 1 else speech.name) + suffix for speech in speeches]
@@ -189,21 +183,8 @@ def run_folder(
     is tried again only if something has changed or ``retry_failed`` is given. Each output appears whole or not at all.
     Ctrl-C waits for the recordings that are being animated; the same command continues.
 
-    Args:
-        speeches: recordings.
-        output: folder for the outputs.
-        suffix: of the outputs (``.mp4``).
-        command: the options that decide the result, without recordings, output and workers.
-        make_worker: a function of a module; called once in each process with the command.
-        files: files that the command names and that decide the result (checkpoint, styles …).
-        workers: processes; as many as processors if None.
-        retry_failed: try failed recordings again.
-
-    Returns:
-        the exit status: 0 if all outputs are there, 1 if a recording failed.
-
-    Raises:
-        FaceDiffError: if nothing can be animated at all: the folder, the options or the checkpoint cannot be used.
+    ``command`` and ``files`` are the options and the files (checkpoint, styles …) that decide the result.
+    ``make_worker``, a function of a module, is called once in each process with the command.
     """
     if workers is not None and workers < 1:
         raise FaceDiffError(f"--workers {workers}: expected 1 or more")
@@ -225,7 +206,17 @@ def run_folder(
                 remove_partial(output, task.output.stem)
         try:
             to_do = [task for task in tasks if task.source not in states]
-            _animate_all(PerWorker(partial(_set_up, make_worker, list(command))), to_do, workers, states)
+            work = PerWorker(partial(_set_up, make_worker, list(command)))
+            outcomes = run_batch(work, to_do, workers=workers, record=FileTask.record, survive_bugs=True)
+            with closing(outcomes):
+                for count, (task, outcome) in enumerate(outcomes, start=1):
+                    if outcome.problem:
+                        stale = f" ({task.output} is of an earlier run)" if task.output.exists() else ""
+                        states[task.source] = "failed", outcome.problem + stale
+                        print(f"[{count}/{len(to_do)}] failed: {outcome.problem}", flush=True)
+                    else:
+                        states[task.source] = "made", f"{outcome.seconds:.1f} s"
+                        print(f"[{count}/{len(to_do)}] {task.output}, {outcome.seconds:.1f} s", flush=True)
         finally:
             _print_states(speeches, states)
     return int(any(state == "failed" for state, _ in states.values()))
@@ -247,24 +238,6 @@ def _earlier_state(task: FileTask, retry_failed: bool) -> tuple[str, str] | None
     if problem is None or retry_failed:
         return None
     return "failed", f"{problem} (in an earlier run; --retry-failed tries again)"
-
-
-def _animate_all(
-    work: PerWorker[FileTask, None],
-    tasks: Sequence[FileTask],
-    workers: int | None,
-    states: dict[Path, tuple[str, str]],
-) -> None:
-    outcomes = run_batch(work, tasks, workers=workers, record=FileTask.record, survive_bugs=True)
-    with closing(outcomes):
-        for count, (task, outcome) in enumerate(outcomes, start=1):
-            if outcome.problem:
-                stale = f" ({task.output} is of an earlier run)" if task.output.exists() else ""
-                states[task.source] = "failed", outcome.problem + stale
-                print(f"[{count}/{len(tasks)}] failed: {outcome.problem}", flush=True)
-            else:
-                states[task.source] = "made", f"{outcome.seconds:.1f} s"
-                print(f"[{count}/{len(tasks)}] {task.output}, {outcome.seconds:.1f} s", flush=True)
 
 
 def _print_states(speeches: Sequence[Path], states: dict[Path, tuple[str, str]]) -> None:

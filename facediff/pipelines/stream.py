@@ -69,11 +69,7 @@ def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_00
 
 
 def check_stream(options: AnimationOptions, output: Path) -> None:
-    """Refuse what streaming cannot do.
-
-    Raises:
-        FaceDiffError: naming the option.
-    """
+    """Refuse what streaming cannot do."""
     if str(output) != "-" and output.suffix != ".npy":
         raise FaceDiffError(
             f"--output {output}: a stream is written as .npy, or as raw float32 to standard output with -o -; "
@@ -146,16 +142,9 @@ def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
 
 
 def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.read) -> Iterator[npt.NDArray[np.float32]]:
-    """Pieces (n,) of speech at 16 kHz as they come.
+    """Pieces (n,) of speech at 16 kHz, as 16-bit mono samples (little endian) of ``rate`` come in.
 
-    Args:
-        source: 16-bit mono samples, little endian; half a sample at the end is dropped.
-        rate: their sample rate.
-        read: as ``os.read``.
-
-    Raises:
-        FaceDiffError: if the input looks like a file and not like samples.
-        MissingExtraError: if another rate needs soxr and it is not installed.
+    ``read`` works as ``os.read``; half a sample at the end is dropped.
     """
     import numpy as np
 
@@ -181,11 +170,7 @@ def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.rea
 
 @contextmanager
 def sink(output: Path, frame: tuple[int, ...]) -> Iterator[Callable[[npt.NDArray[np.float32]], None]]:
-    """Where frames (n, V, 3) go: a .npy file that appears when it is complete, or standard output.
-
-    Raises:
-        FaceDiffError: if the file cannot be written.
-    """
+    """Where frames (n, V, 3) go: a .npy file that appears when it is complete, or standard output."""
     from facediff.animation.files import MotionWriter
 
     if str(output) == "-":

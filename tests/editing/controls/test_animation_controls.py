@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +37,19 @@ def with_controls(*, controls: ControlOptions) -> None:
 def test_nothing_is_on_by_default(make_animation: Callable[..., Animation]) -> None:
     animation = make_animation(3)
     assert parsed().apply(animation) is animation
+
+
+def test_editing_is_imported_only_where_it_is_asked_for() -> None:
+    program = (
+        "import sys, numpy, facediff.pipelines.folder, facediff.export\n"
+        "from facediff.editing.controls import AnimationControls\n"
+        "controls = AnimationControls()\n"
+        "controls.check(numpy.zeros((1, 3)), None, {}, 'a face')\n"
+        "controls.apply(None)\n"
+        "print(*(name for name in sys.modules if name.startswith('facediff.editing.')))"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
+    assert run.stdout.split() == ["facediff.editing.controls"]
 
 
 def test_all_options_in_their_order(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
