@@ -101,11 +101,7 @@ def adapt(
 def adaptation_data(
     checkpoint: Path, content: dict[str, Any], person: str, mode: Mode, data_root: Path | None
 ) -> tuple[str, SpeechMotionDataModule]:
-    """The new speaker's name, and the checkpoint's data module with that speaker put first.
-
-    Raises:
-        FaceDiffError: if the checkpoint or its data module is unknown, or the checkpoint knows the speaker already.
-    """
+    """The new speaker's name, and the checkpoint's data module with that speaker put first."""
     from facediff.data.batch import DATA_SOURCE_KEY
     from facediff.data.datamodule import person_name
     from facediff.models.checkpoint import corpus_class, corpus_options

@@ -14,13 +14,11 @@ from facediff.errors import FaceDiffError, choices
 
 @dataclass(frozen=True)
 class Command:
-    """A subcommand.
+    """A subcommand, and what the help says of it in a line.
 
-    Attributes:
-        target: ``module:function``, imported only when the command is used. The function is typed and documented; its
-            parser is made from that (:mod:`facediff.cli.parsing`). Functions called ``run`` or ``lightning`` get the
-            command's name and the words as they are.
-        help: one line.
+    The ``target``, ``module:function``, is imported only when the command is used. The function is typed and
+    documented; its parser is made from that (:mod:`facediff.cli.parsing`). Functions called ``run`` or ``lightning``
+    get the command's name and the words as they are.
     """
 
     target: str
@@ -65,18 +63,17 @@ GROUPS = {
 def usage(group: str = "") -> str:
     """The help text of the program or of a group of commands."""
     if group:
-        rows = {name.partition(" ")[2]: command.help for name, command in COMMANDS.items() if in_group(name, group)}
+        own = {name: command for name, command in COMMANDS.items() if name.startswith(f"{group} ")}
+        rows = {name.partition(" ")[2]: command.help for name, command in own.items()}
     else:
-        rows = {}
-        for name, command in COMMANDS.items():
-            first = name.partition(" ")[0]
-            rows[first] = GROUPS.get(first, command.help)
+        firsts = {name.partition(" ")[0]: command.help for name, command in COMMANDS.items()}
+        rows = {**firsts, **GROUPS}
     program = f"facediff {group}".strip()
     return "\n".join(
         [
             f"usage: {program} <command> [options]",
             "",
-            f"{GROUPS[group]}" if group else "Personalised speech-driven 3D facial animation.",
+            GROUPS[group] if group else "Personalised speech-driven 3D facial animation.",
             "",
             "commands:",
             *(f"  {name:<14}{text}" for name, text in rows.items()),
@@ -88,17 +85,8 @@ def usage(group: str = "") -> str:
     )
 
 
-def in_group(name: str, group: str) -> bool:
-    """Whether a command is one of a group's."""
-    return name.startswith(f"{group} ")
-
-
 def find(words: Sequence[str]) -> tuple[str, list[str]]:
-    """The command's name, which may have two words, and the rest.
-
-    Raises:
-        FaceDiffError: naming the nearest command.
-    """
+    """The command's name, which may have two words, and the rest."""
     first, rest = words[0], list(words[1:])
     if first in COMMANDS:
         return first, rest
@@ -107,7 +95,7 @@ def find(words: Sequence[str]) -> tuple[str, list[str]]:
         raise FaceDiffError(f'there is no command "{first}": {choices(first, known)}')
     name = f"{first} {rest[0]}"
     if name not in COMMANDS:
-        known = [each.partition(" ")[2] for each in COMMANDS if in_group(each, first)]
+        known = [each.partition(" ")[2] for each in COMMANDS if each.startswith(f"{first} ")]
         raise FaceDiffError(f'there is no command "{name}": {choices(rest[0], known)}')
     return name, rest[1:]
 
@@ -124,7 +112,8 @@ def main(args: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if args is None else args)
     name = words[0] if words else ""
     try:
-        if help_wanted(words):
+        rest = words[1:] if name in GROUPS else words
+        if not rest or rest[0] in HELP:  # no command, a group alone, or a flag for help where a command is expected
             print(usage(name if name in GROUPS else ""))
             status = 0 if words[-1:] and words[-1] in HELP else 2
         elif name == "--version":
@@ -150,12 +139,6 @@ def main(args: Sequence[str] | None = None) -> int:
             f'run  pip install "facediff[all]"'
         )
     return status
-
-
-def help_wanted(words: Sequence[str]) -> bool:
-    """Whether the words ask for the commands: none, a group alone, or a flag for help where a command is expected."""
-    rest = words[1:] if words and words[0] in GROUPS else words
-    return not rest or rest[0] in HELP
 
 
 def run(name: str, arguments: Sequence[str]) -> int:

@@ -85,14 +85,7 @@ corpora: {corpora}; `facediff data prepare <corpus> --help` lists the options of
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
-    """``facediff data prepare``: choose the corpus, whose plan has the options, and prepare it.
-
-    Returns:
-        0, or 1 if a clip could not be written.
-
-    Raises:
-        FaceDiffError: if there is no such corpus, or an option is wrong.
-    """
+    """``facediff data prepare``: choose the corpus, whose plan has the options, and prepare it."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(PREPARE.format(corpora=", ".join(CORPORA)))
         return 0 if arguments else 2
@@ -101,11 +94,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
 
 
 def read_prepare(arguments: Sequence[str]) -> tuple[Callable[[Path], Plan], dict[str, Any]]:
-    """What makes the plan of a raw folder, and the arguments of :func:`prepare`, from a command line.
-
-    Raises:
-        FaceDiffError: if there is no such corpus, or an option is wrong.
-    """
+    """What makes the plan of a raw folder, and the arguments of :func:`prepare`, from a command line."""
     corpus, *words = arguments
     if corpus not in CORPORA:
         raise FaceDiffError(f'there is no corpus "{corpus}" to prepare: {choices(corpus, CORPORA)}')

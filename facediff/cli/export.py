@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from facediff.cli.options import (
     Animations,
     ControlOptions,
@@ -49,28 +47,18 @@ def export(
 
     from facediff.export import FORMATS, check_export, write_animations
 
-    options = files.export(footer=footer(source.checkpoint) if output.suffix == ".mp4" else "", quiet=quiet)
+    footer = ""  # under a video: the corpus, and whether it is synthetic
+    if source.checkpoint is not None and output.suffix == ".mp4":
+        from facediff.models.checkpoint import read_assets
+
+        assets = read_assets(source.checkpoint)
+        footer = f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
+    options = files.export(footer=footer, quiet=quiet)
     check_export(output, options, len(animations))
     wanted = controls.controls()
     finished = [wanted.apply(source.read(path)) for path in animations]
     for written in write_animations(output, with_different_names(finished, animations), options):
-        print(f"{written}: {size_of(written)}")
+        inside = [file for file in written.iterdir() if file.is_file()] if written.is_dir() else [written]
+        counted = f"{len(inside)} files, " if written.is_dir() else ""
+        print(f"{written}: {counted}{sum(file.stat().st_size for file in inside) / 1e6:.2f} MB")
     print(FORMATS[output.suffix].next_step)
-
-
-def footer(checkpoint: Path | None) -> str:
-    """The text under a video: the corpus, and whether it is synthetic."""
-    if checkpoint is None:
-        return ""
-    from facediff.models.checkpoint import read_assets
-
-    assets = read_assets(checkpoint)
-    return f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
-
-
-def size_of(path: Path) -> str:
-    """How much was written, in words."""
-    if path.is_dir():
-        files = [file for file in path.iterdir() if file.is_file()]
-        return f"{len(files)} files, {sum(file.stat().st_size for file in files) / 1e6:.2f} MB"
-    return f"{path.stat().st_size / 1e6:.2f} MB"

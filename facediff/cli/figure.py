@@ -58,12 +58,7 @@ class FileOptions:
     unit: Annotated[str | None, Option(metavar="U")] = None
 
     def gather(self, predictions: str, truth: Path, page: PageOptions) -> tuple[Paper, Material]:
-        """The page and what is drawn on it.
-
-        Raises:
-            FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others, or the figure cannot
-                be written.
-        """
+        """The page and what is drawn on it."""
         methods = named_folders([predictions, *(self.method or [])])
         check_folders(methods)
         if not truth.is_dir() and str(truth) != "puppet":
@@ -105,11 +100,7 @@ class PageOptions:
     font: Annotated[str, Option(metavar="NAME")] = "DejaVu Sans"
 
     def paper(self) -> Paper:
-        """The page, after a check that the figure can be written.
-
-        Raises:
-            FaceDiffError: if it cannot, or the page is impossible.
-        """
+        """The page, after a check that the figure can be written."""
         from facediff.evaluation.figures import Paper
         from facediff.evaluation.figures.page import check_output, matplotlib
 

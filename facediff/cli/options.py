@@ -52,11 +52,7 @@ class SourceOptions:
     unit: Annotated[str | None, Option(metavar="U")] = None
 
     def check(self, animations: Sequence[Path]) -> None:
-        """Refuse, before anything is imported, files that do not exist.
-
-        Raises:
-            FaceDiffError: naming the file or the option.
-        """
+        """Refuse, before anything is imported, files that do not exist."""
         for path in animations:
             if not path.is_file():
                 raise FaceDiffError(f"{path}: no such file; expected an animation, .npz or .npy")
@@ -95,11 +91,7 @@ class SourceOptions:
         return cast("AnimationFacts", overrides), cast("AnimationFacts | None", defaults)
 
     def read(self, path: Path) -> Animation:
-        """The animation in a file, completed by the options; all of its frames are finite.
-
-        Raises:
-            FaceDiffError: if a file is unreadable, something needed is not said, or the parts do not fit one another.
-        """
+        """The animation in a file, completed by the options; all of its frames are finite."""
         from facediff.animation import read_animation
 
         self.check([path])
@@ -133,11 +125,7 @@ class ControlOptions:
     controls_seed: Annotated[int | None, Option(metavar="N", least=0)] = None
 
     def controls(self) -> AnimationControls:
-        """The controls that the options ask for.
-
-        Raises:
-            FaceDiffError: naming the option whose value is impossible.
-        """
+        """The controls that the options ask for."""
         from facediff.editing.controls import AnimationControls
 
         return AnimationControls(
@@ -194,11 +182,7 @@ def with_different_names(animations: Sequence[Animation], paths: Sequence[Path])
 
 
 def check_picture_path(path: Path | None) -> None:
-    """Refuse, before any work is done, a picture that could not be written.
-
-    Raises:
-        FaceDiffError: if the suffix is not .png or the folder cannot be written.
-    """
+    """Refuse, before any work is done, a picture that could not be written."""
     from facediff.utils.files import check_writable
 
     if path is None:
@@ -209,11 +193,7 @@ def check_picture_path(path: Path | None) -> None:
 
 
 def check_folders(methods: Mapping[str, Path]) -> None:
-    """Refuse, before anything is imported, folders of predictions that do not exist.
-
-    Raises:
-        FaceDiffError: naming the folder.
-    """
+    """Refuse, before anything is imported, folders of predictions that do not exist."""
     for folder in methods.values():
         if not folder.is_dir():
             raise FaceDiffError(f"{folder}: no such folder; expected the predictions of a method")
@@ -222,15 +202,7 @@ def check_folders(methods: Mapping[str, Path]) -> None:
 def named_folders(
     words: Sequence[str], name_of: Callable[[Path], str] = lambda path: path.resolve().name
 ) -> dict[str, Path]:
-    """Folders by name, from words NAME=FOLDER or FOLDER.
-
-    Args:
-        words: what the user gave.
-        name_of: names a folder that was given without a name.
-
-    Raises:
-        FaceDiffError: if a word is neither, or two folders have one name.
-    """
+    """Folders by name, from words NAME=FOLDER, or FOLDER, which ``name_of`` names."""
     found: dict[str, Path] = {}
     for word in words:
         name, equals, folder = word.partition("=")

@@ -102,11 +102,7 @@ class Parameter:
         return get_args(hint)[0] if self.is_list or self.length else hint
 
     def check(self, value: Any) -> None:  # noqa: ANN401
-        """Refuse numbers outside the range.
-
-        Raises:
-            FaceDiffError: naming the option and the range.
-        """
+        """Refuse numbers outside the range."""
         o = self.option
         for number in value if isinstance(value, list | tuple) else [value]:
             if isinstance(number, bool) or not isinstance(number, int | float):
@@ -221,13 +217,9 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 def make_parser(
     parameters: Parameters, program: str, summary: str, details: str | Callable[[], str] = ""
 ) -> argparse.ArgumentParser:
-    """The parser of a command.
+    """The parser of a command, such as ``facediff export``.
 
-    Args:
-        parameters: its options.
-        program: what is typed for it, such as ``facediff export``.
-        summary: what it does, in a sentence.
-        details: text at the end of the help; a function is called when the help is printed.
+    ``details`` is the text at the end of the help; a function is called when the help is printed.
     """
     import jsonargparse
 
@@ -288,18 +280,7 @@ def parse(
     summary: str = "",
     details: str | Callable[[], str] = "",
 ) -> dict[str, Any]:
-    """The values of a command's parameters; those of a group as an instance of its dataclass.
-
-    Args:
-        parameters: the command's options.
-        arguments: the words after its name.
-        program: as :func:`make_parser` takes it, like what follows.
-        summary: likewise.
-        details: likewise.
-
-    Raises:
-        FaceDiffError: if the words are wrong; the message names the option.
-    """
+    """The values of a command's parameters; those of a group as an instance of its dataclass."""
     values = vars(make_parser(parameters, program, summary, details).parse_args(list(arguments)))
     for parameter in flat(parameters):
         value = values[parameter.name]
@@ -308,26 +289,16 @@ def parse(
         elif parameter.length and value is not None:
             values[parameter.name] = tuple(value)
         parameter.check(value)
-    made = {}
-    for name, entry in parameters.items():
-        if isinstance(entry, Parameter):
-            made[name] = values[name]
-        else:
-            made[name] = entry.made(**{parameter.name: values[parameter.name] for parameter in entry.parameters})
-    return made
+    return {
+        name: values[name]
+        if isinstance(entry, Parameter)
+        else entry.made(**{p.name: values[p.name] for p in entry.parameters})
+        for name, entry in parameters.items()
+    }
 
 
 def arguments_of(function: Callable[..., Any], program: str, words: Sequence[str]) -> dict[str, Any]:
-    """The arguments of a command function, read from a command line.
-
-    Args:
-        function: the command.
-        program: what is typed for it.
-        words: what follows.
-
-    Raises:
-        FaceDiffError: if the words are wrong; the message names the option.
-    """
+    """The arguments of a command function, read from a command line."""
     summary, details = summary_of(function)
     late: Callable[[], str] | None = getattr(function, "more_help", None)
     whole = details if late is None else lambda: f"{details}\n\n{late()}".strip()

@@ -72,11 +72,7 @@ def view(
 
 
 def read_animations(paths: Sequence[Path], source: SourceOptions) -> list[Animation]:
-    """The animations of all files; the first archive completes arrays of as many vertices.
-
-    Raises:
-        FaceDiffError: if a file is unreadable, or something needed is not said.
-    """
+    """The animations of all files; the first archive completes arrays of as many vertices."""
     from facediff.animation import read_animation
     from facediff.animation.files import complete, facts_of
     from facediff.utils.arrays import open_vertices
