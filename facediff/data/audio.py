@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -96,9 +97,8 @@ def _decode_container(path: Path) -> tuple[npt.NDArray[np.float32], int]:
                 raise FaceDiffError(f"{path}: has no sound track; expected a video with speech")
             rate = int(container.streams.audio[0].rate)
             plain = AudioResampler(format="fltp", layout="mono", rate=rate)
-            parts = [part.to_ndarray()[0] for frame in container.decode(audio=0) for part in plain.resample(frame)] + [
-                part.to_ndarray()[0] for part in plain.resample(None)
-            ]
+            frames = chain(container.decode(audio=0), [None])  # at None, what the resampler still holds comes out
+            parts = [part.to_ndarray()[0] for frame in frames for part in plain.resample(frame)]
     except (av.FFmpegError, ValueError) as error:
         raise FaceDiffError(f"{path}: its sound cannot be read ({error}); convert it to .wav") from error
     return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate

@@ -7,7 +7,7 @@ template, in the corpus's unit of length. Tensors are padded with zeros; lengths
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -59,26 +59,9 @@ class Sample:
 class Batch:
     """Several clips, padded to the longest.
 
-    The fields are those of :class:`Sample`, where they are explained, with a batch dimension.
-
-    Attributes:
-        audio: padded waveforms.
-        audio_lengths: valid samples of each clip.
-        motion: padded offsets from the template.
-        frame_lengths: valid frames of each clip.
-        template: neutral faces.
-        identity: indices into the training identities, −1 for any other.
-        reference: padded reference motions.
-        reference_lengths: valid frames of each reference.
-        names: clip names.
-        identity_names: the speakers' names.
-        sentences: what is spoken.
-        reference_names: the clips that the references come from.
-        decoy_audio: padded speech of other sentences, with the lengths of ``audio``; evaluation only.
-        features: padded features of the frozen part of the audio encoder; None unless all clips have them.
-        feature_lengths: valid steps of the features.
-        repeated: whether other processes score these clips.
-        style: style vectors; None unless all clips have one.
+    The fields are those of :class:`Sample`, where they are explained, with a batch dimension; what only some of the
+    clips have is None. The lengths count each clip's valid samples, frames and steps; ``decoy_audio`` has those of
+    ``audio``.
     """
 
     audio: Float[Tensor, "batch samples"]
@@ -124,11 +107,9 @@ class Batch:
     def to(self, device: torch.device | str) -> Batch:
         """The same batch on another device."""
         moved: dict[str, Any] = {
-            each.name: value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
-            for each in fields(self)
-            for value in (getattr(self, each.name),)
+            name: value.to(device, non_blocking=True) for name, value in vars(self).items() if isinstance(value, Tensor)
         }
-        return Batch(**moved)
+        return replace(self, **moved)
 
     def select(self, clips: Sequence[int]) -> Batch:
         """Some of the clips, in the order given, padded to the longest of them."""
@@ -141,23 +122,19 @@ class Batch:
             "features": self.feature_lengths,
         }
         picked: dict[str, Any] = {}
-        for each in fields(self):
-            value = getattr(self, each.name)
+        for name, value in vars(self).items():
             if isinstance(value, Tensor):
-                value = value[chosen]
-                own = lengths.get(each.name)
-                value = value if own is None else value[:, : int(own[chosen].max())]
+                own = lengths.get(name)
+                picked[name] = value[chosen] if own is None else value[chosen][:, : int(own[chosen].max())]
             elif isinstance(value, list):
-                value = [value[clip] for clip in clips]
-            picked[each.name] = value
-        return Batch(**picked)
+                picked[name] = [value[clip] for clip in clips]
+        return replace(self, **picked)
 
     def pin_memory(self) -> Batch:
         """The same batch in page-locked memory; called by PyTorch's loaders."""
-        for each in fields(self):
-            value = getattr(self, each.name)
+        for name, value in vars(self).items():
             if isinstance(value, Tensor):
-                setattr(self, each.name, value.pin_memory())
+                setattr(self, name, value.pin_memory())
         return self
 
 

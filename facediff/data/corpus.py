@@ -220,11 +220,8 @@ class Corpus:
         """Speech that spans motion frames ``start`` to ``stop``, 16 kHz, filled with zeros past its end."""
         first = samples_for(start, self.frame_rate)
         length = samples_for(stop - start, self.frame_rate)
-        return torch.from_numpy(read_stretch(self.audio_path(clip), first, length, self.store))
-
-    def audio_path(self, clip: Clip) -> Path:
-        """Where a clip's speech lies."""
-        return clip.root / "wav" / f"{clip.name}.wav"
+        path = clip.root / "wav" / f"{clip.name}.wav"
+        return torch.from_numpy(read_stretch(path, first, length, self.store))
 
     def read_mesh(self, files: Sequence[str]) -> Mesh | None:
         """The first mesh file that exists, in the folder itself or in ``templates/``; None if there is none."""
@@ -236,10 +233,6 @@ class Corpus:
         if len(mesh.vertices) != self.n_vertices:
             raise FaceDiffError(f"{path}: has {len(mesh.vertices)} vertices, expected {self.n_vertices}")
         return mesh
-
-    def read_region(self, sources: Sequence[str], name: str, help_text: str = "") -> Region:
-        """The first of several region sources that exists; see :func:`facediff.data.corpus.find_region`."""
-        return find_region(self.root, sources, name, self.n_vertices, help_text)
 
     def read_pairs(self, file: str) -> Tensor | None:
         """Vertex pairs (P, 2) of a file in ``regions/``, one ``upper, lower`` a line; None if there is no such file."""

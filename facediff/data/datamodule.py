@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -17,7 +18,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from facediff.data.batch import Assets, Batch, Reference, Sample, collate
-from facediff.data.corpus import Clip, Corpus, parse_name, read_manifest
+from facediff.data.corpus import Clip, Corpus, find_region, parse_name, read_manifest
 from facediff.data.dataset import (
     BatchDataset,
     ClipBatches,
@@ -153,7 +154,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 )
         self.features = FeatureSlot()
         self.pair_sentences = False
-        self._corpus: Corpus | None = None
         self._assets: Assets | None = None
 
     def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
@@ -199,25 +199,23 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     # The clips.
 
-    @property
+    @cached_property
     def corpus(self) -> Corpus:
         """The corpus on disk.
 
         Raises:
             FaceDiffError: if the folder does not exist; the message says how to obtain the corpus.
         """
-        if self._corpus is None:
-            if not self.root.is_dir():
-                raise FaceDiffError(f"{self.root}: no such folder; set data.root to your copy. {self.obtain}".rstrip())
-            self._corpus = Corpus(
-                self.root,
-                self.n_vertices,
-                self.frame_rate,
-                stored_frame_rate=self.stored_frame_rate,
-                parse=self.parse_name,
-                people=self.people,
-            )
-        return self._corpus
+        if not self.root.is_dir():
+            raise FaceDiffError(f"{self.root}: no such folder; set data.root to your copy. {self.obtain}".rstrip())
+        return Corpus(
+            self.root,
+            self.n_vertices,
+            self.frame_rate,
+            stored_frame_rate=self.stored_frame_rate,
+            parse=self.parse_name,
+            people=self.people,
+        )
 
     @property
     def test_splits(self) -> list[str]:
@@ -297,6 +295,13 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         if self._assets is None:
             corpus = self.corpus
             mesh = corpus.read_mesh(self.mesh_files)
+            references = {}
+            for identity, clips in sorted(self.reference_policy().candidates.items()):
+                if identity in corpus.templates:
+                    clip = self.default_reference(clips)
+                    references[identity] = Reference(
+                        clip.name, corpus.read_motion(clip, 0, self.reference_frames).half()
+                    )
             self._assets = Assets(
                 corpus=self.corpus_name,
                 synthetic=self.synthetic,
@@ -307,22 +312,13 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 faces=None if mesh is None else torch.from_numpy(mesh.faces),
                 colours=None if mesh is None or mesh.colours is None else torch.from_numpy(mesh.colours),
                 regions={
-                    name: corpus.read_region(sources, name, self.region_help).tensor()
+                    name: find_region(self.root, sources, name, self.n_vertices, self.region_help).tensor()
                     for name, sources in self.regions.items()
                 },
                 inner_lip_pairs=corpus.read_pairs("inner_lip_pairs.txt"),
-                references=self._default_references(),
+                references=references,
             )
         return self._assets
-
-    def _default_references(self) -> dict[str, Reference]:
-        references = {}
-        for identity, clips in sorted(self.reference_policy().candidates.items()):
-            if identity in self.corpus.templates:
-                clip = self.default_reference(clips)
-                motion = self.corpus.read_motion(clip, 0, self.reference_frames)
-                references[identity] = Reference(clip.name, motion.half())
-        return references
 
     # What is measured on the training motion before training.
 

@@ -6,7 +6,7 @@ import hashlib
 import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -73,17 +73,11 @@ BUCKETS = 32
 
 @dataclass(frozen=True)
 class Pick:
-    """One clip of a batch.
-
-    Attributes:
-        index: which clip.
-        seed: seed of its random choices (window, style reference).
-        repeated: whether another process has the same clip, so that it must not be scored here.
-    """
+    """One clip of a batch."""
 
     index: int
-    seed: int
-    repeated: bool = False
+    seed: int  # of its random choices: window, style reference
+    repeated: bool = False  # whether another process has the same clip, so that it must not be scored here
 
 
 class ClipBatches(DistributedSampler[list[Pick]]):
@@ -186,13 +180,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
 
 
 def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generator) -> list[list[int]]:
-    """Clips in pairs of one group, in random order; always equally many pairs.
-
-    Args:
-        order: the clips, shuffled.
-        groups: the group of every clip.
-        generator: shuffles the pairs.
-    """
+    """The shuffled clips in pairs of one group (each clip has one), in random order; always equally many pairs."""
     members: dict[str, list[int]] = {}
     for index in order:
         members.setdefault(groups[index], []).append(index)
@@ -246,11 +234,7 @@ class ReferencePolicy:
     max_frames: int
 
     def check(self, targets: Sequence[Clip]) -> None:
-        """Find out before training that a clip has no style reference.
-
-        Raises:
-            FaceDiffError: as :meth:`eligible`.
-        """
+        """Find out before training that a clip has no style reference."""
         for clip in targets:
             if len(self.candidates.get(clip.identity, [])) < 2:
                 self.eligible(clip)
@@ -275,6 +259,7 @@ FeatureReader = Callable[[Clip], Tensor | None]
 """Returns the cached features (steps, channels) of a whole clip's speech, or None."""
 
 
+@dataclass(eq=False, repr=False)
 class MotionDataset(Dataset[Sample]):
     """Samples of one split.
 
@@ -292,26 +277,15 @@ class MotionDataset(Dataset[Sample]):
         features: returns cached features of the speech, if there are any.
     """
 
-    def __init__(
-        self,
-        corpus: Corpus,
-        clips: Sequence[Clip],
-        identities: Sequence[str],
-        policy: ReferencePolicy,
-        *,
-        training: bool,
-        window: int | None = None,
-        decoys: bool = False,
-        features: FeatureReader | None = None,
-    ) -> None:
-        self.corpus = corpus
-        self.clips = list(clips)
-        self.identities = list(identities)
-        self.policy = policy
-        self.training = training
-        self.window = window
-        self.decoys = decoys
-        self.features = features
+    corpus: Corpus
+    clips: list[Clip]
+    identities: list[str]
+    policy: ReferencePolicy
+    _: KW_ONLY
+    training: bool
+    window: int | None = None
+    decoys: bool = False
+    features: FeatureReader | None = None
 
     def __len__(self) -> int:
         """Number of clips."""
@@ -327,17 +301,18 @@ class MotionDataset(Dataset[Sample]):
         clip = self.clips[index]
         frames = self.corpus.frames(clip)
         start, stop = self._window(frames, self.window, random)
-        reference, reference_name = self._reference(clip, random)
+        source = self._reference(clip, random)
+        first, last = self._window(self.corpus.frames(source), self.policy.max_frames, random)
         return Sample(
             audio=self.corpus.read_audio(clip, start, stop),
             motion=self.corpus.read_motion(clip, start, stop),
             template=self.corpus.template(clip),
             identity=self.identities.index(clip.identity) if clip.identity in self.identities else UNKNOWN_IDENTITY,
-            reference=reference,
+            reference=self.corpus.read_motion(source, first, last),
             name=clip.name,
             identity_name=clip.identity,
             sentence=clip.sentence,
-            reference_name=reference_name,
+            reference_name=source.name,
             decoy_audio=self._decoy(index, stop - start) if self.decoys else None,
             features=self._features(clip, start, stop, frames),
             repeated=pick.repeated,
@@ -354,19 +329,13 @@ class MotionDataset(Dataset[Sample]):
         start = int(torch.randint(frames - longest + 1, (), generator=random)) if self.training else 0
         return start, start + longest
 
-    def _reference(self, clip: Clip, random: torch.Generator) -> tuple[Tensor, str]:
+    def _reference(self, clip: Clip, random: torch.Generator) -> Clip:
         if self.training and self.policy.choice == "self":
-            source = clip
-        else:
-            eligible = self.policy.eligible(clip)
-            pick = (
-                int(torch.randint(len(eligible), (), generator=random))
-                if self.training
-                else zlib.crc32(clip.name.encode()) % len(eligible)
-            )
-            source = eligible[pick]
-        start, stop = self._window(self.corpus.frames(source), self.policy.max_frames, random)
-        return self.corpus.read_motion(source, start, stop), source.name
+            return clip
+        eligible = self.policy.eligible(clip)
+        if self.training:
+            return eligible[int(torch.randint(len(eligible), (), generator=random))]
+        return eligible[zlib.crc32(clip.name.encode()) % len(eligible)]
 
     def _features(self, clip: Clip, start: int, stop: int, frames: int) -> Tensor | None:
         """The steps of the whole clip's features that lie in frames ``start`` to ``stop``."""

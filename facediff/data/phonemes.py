@@ -60,7 +60,13 @@ def read_phonemes(path: Path) -> list[Phoneme]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             rows = list(csv.DictReader(stream))
         found = [
-            Phoneme(float(row["start"]), float(row["end"]), row["ipa"] or "", row.get("viseme") or "", _word(row))
+            Phoneme(
+                float(row["start"]),
+                float(row["end"]),
+                row["ipa"] or "",
+                row.get("viseme") or "",
+                (row.get("word") or "").strip(),
+            )
             for row in rows
         ]
     except (OSError, UnicodeDecodeError, csv.Error, KeyError, ValueError, TypeError) as error:
@@ -70,10 +76,6 @@ def read_phonemes(path: Path) -> list[Phoneme]:
     if not found or any(not (math.isfinite(p.end) and 0 <= p.start <= p.end) for p in found):
         raise FaceDiffError(f"{path}: expected phonemes whose start is not below 0 and not after their end")
     return found
-
-
-def _word(row: dict[str, str]) -> str:
-    return (row.get("word") or "").strip()
 
 
 def closures(phonemes: Iterable[Phoneme], frame_rate: float) -> list[tuple[int, int]]:
