@@ -93,7 +93,9 @@ def test_an_unfinished_corpus_is_not_trained_on(
     vocaset.write_vocaset(tmp_path / "out")
     (tmp_path / "out" / "prepare.json").write_text("{}")
     assert main(["fit", *FIT, f"--data={MiniBiwi.__module__}.MiniVocaset", "--data.root=out"]) == 2
-    assert "was not prepared to its end" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert "prepare.json" in message
+    assert "facediff data prepare" in message
 
 
 def test_data_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
