@@ -22,20 +22,13 @@ SPLIT_NAMES = {"test_a": "test A", "test_b": "test B", "none": "(style reference
 
 @dataclass(frozen=True)
 class Finding:
-    """One remark.
+    """One remark."""
 
-    Attributes:
-        severity: ``error``: training or scores would fail or be wrong; ``warning``: it works, and something is lost;
-            ``note``: good to know.
-        kind: a word for remarks of this sort; stable, for programs.
-        where: the file or the field, relative to the corpus folder.
-        message: what is the matter, and what to do.
-    """
-
+    # error: training or scores would fail or be wrong; warning: it works, and something is lost; note: good to know
     severity: Severity
-    kind: str
-    where: str
-    message: str
+    kind: str  # a word for remarks of this sort; stable, for programs
+    where: str  # the file or the field, relative to the corpus folder
+    message: str  # what is the matter, and what to do
 
 
 class Findings(list[Finding]):
@@ -73,39 +66,30 @@ class Findings(list[Finding]):
 
 @dataclass
 class Report:
-    """What a folder is and what is wrong in it.
-
-    Attributes:
-        quick: whether headers only were read.
-        corpus: name of the corpus; None if it was not recognised.
-        data_module: import path of the data module that reads it; None for a person's folder, or if unknown.
-        raw: name of the raw distribution that the folder holds instead of a corpus; None if it does not.
-        frame_rate: motion frames a second that models see; None if unknown, as the next two.
-        stored_frame_rate: motion frames a second on disk.
-        findings: errors first, then warnings, then notes.
-        splits: one row a split: way, split, expected, present, missing, frames, seconds, missing_clips.
-        subjects: one row a subject: subject, trained_on, clips, frames, seconds, template.
-        templates: file, subjects, broken (subjects whose template cannot be used), blob (git blob id), origin (whose
-            file it is), areas.
-        mesh: the mesh file that is used; None if there is none.
-        regions: by name: source, count, hash, duplicates, circulating_count; None for one that cannot be used.
-        manifest: there, ended (whether preparation has ended), facediff (version that wrote it), changed, missing.
-    """
+    """What a folder is and what is wrong in it."""
 
     root: Path
-    quick: bool = False
-    corpus: str | None = None
+    quick: bool = False  # whether headers only were read
+    corpus: str | None = None  # name of the corpus; None if it was not recognised
+    # import path of the data module that reads it; None for a person's folder, or if unknown
     data_module: str | None = None
+    # name of the raw distribution that the folder holds instead of a corpus; None if it does not
     raw: str | None = None
-    frame_rate: float | None = None
-    stored_frame_rate: float | None = None
+    frame_rate: float | None = None  # motion frames a second that models see; None if unknown, as the next two
+    stored_frame_rate: float | None = None  # motion frames a second on disk
     n_vertices: int | None = None
-    findings: Findings = field(default_factory=Findings)
+    findings: Findings = field(default_factory=Findings)  # errors first, then warnings, then notes
+    # one row a split: way, split, expected, present, missing, frames, seconds, missing_clips
     splits: list[dict[str, Any]] = field(default_factory=list)
+    # one row a subject: subject, trained_on, clips, frames, seconds, template
     subjects: list[dict[str, Any]] = field(default_factory=list)
+    # file, subjects, broken (subjects whose template cannot be used), blob (git blob id), origin (whose file it is),
+    # areas
     templates: dict[str, Any] = field(default_factory=dict)
-    mesh: str | None = None
+    mesh: str | None = None  # the mesh file that is used; None if there is none
+    # by name: source, count, hash, duplicates, circulating_count; None for one that cannot be used
     regions: dict[str, dict[str, Any] | None] = field(default_factory=dict)
+    # there, ended (whether preparation has ended), facediff (version that wrote it), changed, missing
     manifest: dict[str, Any] = field(default_factory=dict)
 
     @property

@@ -122,20 +122,13 @@ def import_person(
 
 @dataclass(frozen=True)
 class Fitted:
-    """A speaker's frames on the way into the corpus.
+    """A speaker's frames on the way into the corpus."""
 
-    Attributes:
-        made: frames without head motion, still in the motion's coordinates.
-        place: from the neutral face's coordinates to the corpus's.
-        measured_scale: scale of the best similarity between the neutral face and the corpus's mean face.
-        residual: what that similarity leaves, as a share of the face's size.
-    """
-
-    made: Stabilised
+    made: Stabilised  # frames without head motion, still in the motion's coordinates
     neutral: Neutral
-    place: Similarity
-    measured_scale: float
-    residual: float
+    place: Similarity  # from the neutral face's coordinates to the corpus's
+    measured_scale: float  # scale of the best similarity between the neutral face and the corpus's mean face
+    residual: float  # what that similarity leaves, as a share of the face's size
     faces_compared: bool
 
 
@@ -271,53 +264,33 @@ def splits(clips: int) -> list[str]:
 
 @dataclass(frozen=True)
 class Report:
-    """What an import did. Lengths are in the unit of the corpus unless said otherwise.
-
-    Attributes:
-        frames: frames that were read.
-        corpus_frame_rate: frames per second that were written.
-        rotation_max: largest angle of the head from its mean pose, in degrees.
-        rotation_rms: root mean square of these angles, in degrees.
-        translation_max: largest distance of the head from its mean place.
-        translation_rms: root mean square of these distances.
-        stable_vertices: from how many vertices the head's motion was measured.
-        stable_source: how they were chosen.
-        jitter: root-mean-square distance of the stable vertices from their median, head motion removed.
-        scale: corpus units to a unit of the motion, as used.
-        measured_scale: the same, as measured between the speaker's neutral face and the corpus's mean face.
-        topology_residual: what is left between these two, as a share of the face's size.
-        template_source: how the neutral face was obtained.
-        template_frames: the frames it is the median of; empty if it was given.
-        mismatch: seconds by which the sound is longer than the motion (negative: shorter).
-        warnings: what the user should check.
-        notes: other remarks.
-    """
+    """What an import did. Lengths are in the unit of the corpus unless said otherwise."""
 
     name: str
-    frames: int
+    frames: int  # frames that were read
     seconds: float
     frame_rate: float
-    corpus_frame_rate: float
+    corpus_frame_rate: float  # frames per second that were written
     has_head_motion: bool
-    rotation_max: float
-    rotation_rms: float
-    translation_max: float
-    translation_rms: float
-    stable_vertices: int
-    stable_source: str
-    jitter: float
-    scale: float
-    measured_scale: float
-    topology_residual: float
+    rotation_max: float  # largest angle of the head from its mean pose, in degrees
+    rotation_rms: float  # root mean square of these angles, in degrees
+    translation_max: float  # largest distance of the head from its mean place
+    translation_rms: float  # root mean square of these distances
+    stable_vertices: int  # from how many vertices the head's motion was measured
+    stable_source: str  # how they were chosen
+    jitter: float  # root-mean-square distance of the stable vertices from their median, head motion removed
+    scale: float  # corpus units to a unit of the motion, as used
+    measured_scale: float  # the same, as measured between the speaker's neutral face and the corpus's mean face
+    topology_residual: float  # what is left between these two, as a share of the face's size
     faces_compared: bool
-    template_source: str
-    template_frames: list[int]
-    mismatch: float
+    template_source: str  # how the neutral face was obtained
+    template_frames: list[int]  # the frames it is the median of; empty if it was given
+    mismatch: float  # seconds by which the sound is longer than the motion (negative: shorter)
     clips: int
     splits: dict[str, int]
     frames_written: int
-    warnings: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)  # what the user should check
+    notes: list[str] = field(default_factory=list)  # other remarks
 
     def lines(self, unit: str | None) -> list[str]:
         """The report in words.

@@ -74,30 +74,21 @@ class Job:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be written, found by a quick scan of the raw folder.
+    """What is to be written, found by a quick scan of the raw folder."""
 
-    Attributes:
-        corpus: ``biwi``, ``vocaset`` or ``mead3d``.
-        frame_rate: motion frames a second, as written.
-        unit: unit of the written vertices.
-        n_vertices: vertices of every frame.
-        options: plain values that decide what is written, ``dtype`` among them; a resumed run must have the same.
-        jobs: one for each clip.
-        shared: writes what clips share (``templates.pkl``, mesh, ``regions/``, ``clips.csv``) and returns the paths of
-            those files, relative to the output folder. Runs in the calling process; may run again.
-        missing: what the raw folder lacks: clip or file, and what was expected where.
-        notes: other remarks for the user, one sentence each.
-    """
-
-    corpus: str
-    frame_rate: float
-    unit: str
-    n_vertices: int
+    corpus: str  # biwi, vocaset or mead3d
+    frame_rate: float  # motion frames a second, as written
+    unit: str  # unit of the written vertices
+    n_vertices: int  # vertices of every frame
+    # plain values that decide what is written, dtype among them; a resumed run must have the same
     options: dict[str, Any]
-    jobs: list[Job]
+    jobs: list[Job]  # one for each clip
+    # writes what clips share (templates.pkl, mesh, regions/, clips.csv) and returns the paths of those files, relative
+    # to the output folder. Runs in the calling process; may run again
     shared: Callable[[Path], list[str]]
+    # what the raw folder lacks: clip or file, and what was expected where
     missing: dict[str, str] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # other remarks for the user, one sentence each
 
     @property
     def dtype(self) -> np.dtype[Any]:
