@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from facediff.cli.app import COMMANDS, main
+from facediff.cli.app import COMMANDS, GROUPS, main
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -23,9 +23,11 @@ def test_the_two_commands_are_there() -> None:
 
 
 def test_every_command_exists() -> None:
-    words = [w for block in BLOCKS for w in re.findall(r"^(?:.*&& )?facediff (\w+)", block, re.MULTILINE)]
-    assert len(words) >= 6
-    assert set(words) <= COMMANDS.keys()
+    calls = [
+        call for block in BLOCKS for call in re.findall(r"^(?:.*&& )?facediff (\w+)(?: ([\w-]+))?", block, re.MULTILINE)
+    ]
+    assert len(calls) >= 6
+    assert {f"{first} {second}" if first in GROUPS else first for first, second in calls} <= COMMANDS.keys()
 
 
 @pytest.mark.parametrize("words", FITS, ids=lambda words: words[-1])
