@@ -149,7 +149,7 @@ def read_archive(path: Path) -> Animation:
             "sample_rate": int(about["sample_rate"]),
             "metadata": {str(key): str(value) for key, value in about["metadata"].items()},
         }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FaceDiffError(
             f"{path}: its entry about is not what facediff writes ({error!r}); write the file again"
         ) from error

@@ -316,7 +316,7 @@ def read_manifest(root: Path) -> dict[str, Any]:
         return {}
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:  # thousands of brackets exceed Python's depth
         raise FaceDiffError(
             f"{path}: not readable as JSON ({error}); prepare the folder again, or remove the file"
         ) from error

@@ -145,7 +145,7 @@ def _read_json(path: Path, template: Vertices) -> tuple[Vertices | None, Vertice
     """How the lids shut, by shapes or by edges, and the open face, both None where the file does not say; eyeballs."""
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise FaceDiffError(f"--eyes {path}: not a readable JSON file ({error})") from error
     fit = isinstance(content, dict) and all(isinstance(content.get(key, []), list) for key in KEYS[1:])
     unknown = [key for key in content if key not in KEYS] if fit else []

@@ -311,7 +311,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
     """The object that a JSON file holds; None if there is no such file, or it holds anything else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return content if isinstance(content, dict) else None
 

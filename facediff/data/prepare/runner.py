@@ -251,7 +251,7 @@ def _read_record(path: Path) -> dict[str, Any] | None:
         return None
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RecursionError) as error:
         raise FaceDiffError(
             f"{path}: cannot be read ({error}); remove {path.parent}, or choose another folder"
         ) from error
