@@ -26,6 +26,7 @@ from facediff.data.dataset import (
     MotionDataset,
     ReferenceChoice,
     ReferencePolicy,
+    ResumableLoader,
 )
 from facediff.errors import FaceDiffError
 from facediff.registry import defaults, keeps_arguments, plain
@@ -397,13 +398,24 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             groups=[clip.sentence for clip in samples.clips] if self.pair_sentences else None,
         )
         # The sampler yields whole batches, so the loader must not batch again.
-        return DataLoader(
+        loader = ResumableLoader(
             BatchDataset(samples), sampler=batches, batch_size=None, collate_fn=collate, **self._loader_options()
         )
+        loader.progress = self._progress
+        return loader
+
+    def _progress(self) -> tuple[int, int]:
+        """Epoch and completed batches of the training that is running."""
+        trainer = self.trainer
+        if trainer is None:
+            return 0, 0
+        return trainer.current_epoch, trainer.fit_loop.epoch_loop.batch_progress.current.completed
 
     def _loader_options(self) -> dict[str, Any]:
         return {
             "num_workers": self.num_workers,
+            # Otherwise every new iterator would draw from the global generator, and a resumed run other noise.
+            "generator": torch.Generator(),
             "pin_memory": torch.cuda.is_available(),
             "persistent_workers": self.num_workers > 0,
         }

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset, DistributedSampler
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from facediff.data.audio import samples_for
 from facediff.data.batch import UNKNOWN_IDENTITY, Sample
@@ -126,6 +126,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         self.max_frames = max_frames
         self.training = training
         self.groups = list(groups) if groups is not None and training else None
+        self.resume_epoch, self.resume_batch = 0, 0
 
     def __len__(self) -> int:
         """Number of batches of this process; the same in every epoch."""
@@ -134,10 +135,16 @@ class ClipBatches(DistributedSampler[list[Pick]]):
     def __iter__(self) -> Iterator[list[Pick]]:
         """This process's batches of the current epoch."""
         batches = self._all(torch.Generator().manual_seed(self._hash("order")))
-        for place in range(self.rank, len(batches), self.num_replicas):
+        done = self.resume_batch if self.epoch == self.resume_epoch else 0
+        for place in range(self.rank + done * self.num_replicas, len(batches), self.num_replicas):
             # Clips are repeated only where every batch is a single clip, so places past the last clip repeat one.
             repeated = not self.training and place >= len(self.lengths)
             yield [Pick(i, self._hash(i) if self.training else 0, repeated) for i in batches[place]]
+
+    def resume(self, epoch: int, batch: int) -> None:
+        """Continue in an epoch after some of its batches; later epochs are complete."""
+        self.set_epoch(epoch)  # worker processes begin to read before Lightning sets the epoch
+        self.resume_epoch, self.resume_batch = epoch, batch
 
     def _hash(self, what: object) -> int:
         return zlib.crc32(f"{self.seed}:{self.epoch}:{what}".encode())
@@ -151,7 +158,6 @@ class ClipBatches(DistributedSampler[list[Pick]]):
             return [sum(units[i : i + each], []) for i in range(0, len(units), each)]
         # Lengths are rounded up to buckets. Otherwise the number of batches would depend on which clips the shuffle
         # puts together, and the length of an epoch would change.
-
         width = max(1, self.max_frames // BUCKETS)
         rounded = [-(-max(self.lengths[i] for i in unit) // width) * width for unit in units]
         batches: list[list[int]] = []
@@ -177,6 +183,27 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         if self.max_frames is not None:
             steps = [steps[i] for i in torch.randperm(len(steps), generator=generator).tolist()]
         return [batch for step in steps for batch in step]
+
+
+class ResumableLoader(DataLoader[list[Sample]]):
+    """A loader over :class:`ClipBatches` that continues in the middle of an epoch.
+
+    Attributes:
+        progress: gives the epoch and the number of its batches that are completed.
+    """
+
+    progress: Callable[[], tuple[int, int]] = staticmethod(lambda: (0, 0))
+
+    def state_dict(self) -> dict[str, int]:
+        """What Lightning stores in a checkpoint."""
+        epoch, batches = self.progress()
+        return {"epoch": epoch, "batches": batches}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Continue there."""
+        if isinstance(self.sampler, ClipBatches):
+            complete = state["batches"] >= len(self)
+            self.sampler.resume(state["epoch"] + complete, 0 if complete else state["batches"])
 
 
 def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generator) -> list[list[int]]:

@@ -9,7 +9,10 @@ import json
 import os
 import secrets
 import shutil
+import socket
+import tempfile
 import time
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -58,11 +61,22 @@ def atomic(path: Path) -> Iterator[Path]:
         >>> path.read_text()
         'clip,lve\n'
     """
-    temporary = _partial(path, path.suffix)
-    with _writing(path), _new_folders(path.parent):
+    if path.is_symlink():
+        path = Path(os.path.realpath(path))  # the file that the link names is written, the link stays
+    device = path.exists() and not path.is_file() and not path.is_dir()
+    # A device or a pipe (/dev/stdout, /dev/null) cannot be replaced: it gets the bytes of a whole file.
+    place = Path(tempfile.gettempdir()) / path.name if device else path
+    temporary = _partial(place, path.suffix)
+    with _writing(path), _new_folders(place.parent):
+        if not device:
+            _sweep(path)
         try:
             yield temporary
-            os.replace(temporary, path)
+            if device:
+                with temporary.open("rb") as source, path.open("wb") as target:
+                    shutil.copyfileobj(source, target)
+            else:
+                os.replace(temporary, path)
         finally:
             with suppress(OSError):  # never written, or renamed
                 temporary.unlink()
@@ -151,6 +165,42 @@ def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
+def _sweep(path: Path) -> None:
+    """Remove what killed processes of this machine have left of a file; others may still be writing."""
+    start = f".{path.stem}.partial-{_host()}-"
+    for left in path.parent.glob(f"{glob.escape(start)}*{glob.escape(path.suffix)}"):
+        number = left.name.removeprefix(start).partition("-")[0]
+        if number.isdigit() and not _is_running(int(number)):
+            left.unlink(missing_ok=True)
+
+
+def _host() -> str:
+    """A short name of this machine, for folders that several machines share."""
+    return f"{zlib.crc32(socket.gethostname().encode()):08x}"
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # somebody else's process
+        return True
+    return True
+
+
+def refuse_overwriting(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
+    """Refuse outputs that are inputs, also by another name or through a link.
+
+    Raises:
+        FaceDiffError: naming the file.
+    """
+    read = {os.path.realpath(path) for path in inputs if path.exists()}
+    for path in outputs:
+        if path.is_file() and os.path.realpath(path) in read:
+            raise FaceDiffError(f"{path}: is read by this command and would be overwritten; choose another output")
+
+
 def check_writable(path: Path) -> None:
     """Make sure, before any work is done, that a file can be written; leaves nothing behind.
 
@@ -159,6 +209,8 @@ def check_writable(path: Path) -> None:
     """
     if path.is_dir():
         raise FaceDiffError(f"{path}: is a folder; expected the name of a file to write")
+    if path.exists() and not path.is_file():
+        return  # a device or a pipe
     probe = _partial(path)
     with _writing(path), _new_folders(path.parent):
         probe.touch()
@@ -178,7 +230,7 @@ def remove_partial(folder: Path, stem: str = "*", *, recursive: bool = False) ->
 def _partial(path: Path, suffix: str = "") -> Path:
     # Containers that share a folder may have equal process numbers, hence the token.
     name = path.stem if suffix else path.name
-    return path.with_name(f".{name}.partial-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
+    return path.with_name(f".{name}.partial-{_host()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
 
 
 @contextmanager

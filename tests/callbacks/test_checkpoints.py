@@ -1,0 +1,166 @@
+"""Training that was stopped anywhere continues to the very weights and curve of a run that was not."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import lightning.pytorch as pl
+import pytest
+import torch
+from lightning.pytorch.callbacks import EMAWeightAveraging
+
+from facediff import registry
+from facediff.callbacks.checkpoints import (
+    AtomicCheckpointIO,
+    LastCheckpoint,
+    ResumableCSVLogger,
+    random_states,
+    restore_random_states,
+)
+from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion
+from tests.fakes.tiny import Tiny
+
+EPOCHS = 3
+
+
+class Stop(pl.Callback):
+    """Sends a signal in the middle of a training step, or raises where a kill would strike."""
+
+    def __init__(self, step: int, number: int | None = None) -> None:
+        self.step = step
+        self.number = number
+
+    def on_before_optimizer_step(self, trainer: pl.Trainer, *_: object) -> None:
+        if trainer.global_step != self.step:
+            return
+        if self.number is None:
+            raise RuntimeError("killed")
+        os.kill(os.getpid(), self.number)
+
+
+def fit(
+    folder: Path,
+    tiny_root: Path,
+    make_model: Callable[..., DualPathDiffusion],
+    *stops: pl.Callback,
+    ckpt_path: Path | None = None,
+    every_n_steps: int = 1,
+    num_workers: int = 0,
+) -> tuple[DualPathDiffusion, list[dict[str, str]]]:
+    pl.seed_everything(7)
+    model = make_model(
+        audio_encoder=partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.1),
+        lr_schedule="cosine",
+        warmup_steps=2,
+    )
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        devices=1,
+        max_epochs=EPOCHS,
+        logger=ResumableCSVLogger(folder, name="run", version=0),
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        log_every_n_steps=1,
+        default_root_dir=folder,
+        plugins=[AtomicCheckpointIO()],
+        callbacks=[
+            EMAWeightAveraging(decay=0.9, use_buffers=False),
+            LastCheckpoint(every_n_steps=every_n_steps),
+            *stops,
+        ],
+    )
+    data = Tiny(root=str(tiny_root), batch_size=3, num_workers=num_workers)
+    trainer.fit(model, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
+    return model, rows(folder)
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "run" / "version_0" / "metrics.csv").open() as stream:
+        return [row for row in csv.DictReader(stream)]
+
+
+def last(folder: Path) -> Path:
+    return folder / "run" / "version_0" / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+    return {"folder": tmp_path_factory.mktemp("whole")}
+
+
+@pytest.fixture
+def uninterrupted(
+    whole: dict[str, object], tiny_root: Path, make_model: Callable[..., DualPathDiffusion]
+) -> tuple[dict[str, torch.Tensor], list[dict[str, str]]]:
+    if "weights" not in whole:
+        model, curve = fit(Path(str(whole["folder"])), tiny_root, make_model)
+        whole.update(weights=model.state_dict(), curve=curve)
+    return whole["weights"], whole["curve"]  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(
+    ("step", "every", "number", "workers"),
+    [
+        (1, 1, None, 0),
+        (2, 1, None, 0),
+        (3, 1, None, 0),
+        (4, 2, None, 0),
+        (5, 3, None, 0),
+        (8, 1, None, 0),
+        (4, 1, None, 1),
+        (2, 100, signal.SIGINT, 0),
+        (5, 100, signal.SIGINT, 0),
+        (4, 100, signal.SIGTERM, 0),
+    ],
+)
+def test_a_stopped_run_continues_to_the_same_weights_and_curve(
+    step: int,
+    every: int,
+    number: int | None,
+    workers: int,
+    uninterrupted: tuple[dict[str, torch.Tensor], list[dict[str, str]]],
+    tmp_path: Path,
+    tiny_root: Path,
+    make_model: Callable[..., DualPathDiffusion],
+) -> None:
+    weights, curve = uninterrupted
+    with pytest.raises((RuntimeError, SystemExit, BaseException)):
+        fit(tmp_path, tiny_root, make_model, Stop(step, number), every_n_steps=every, num_workers=workers)
+    assert last(tmp_path).is_file()
+    torch.rand(99)  # whatever happened since must not matter
+    model, continued = fit(tmp_path, tiny_root, make_model, ckpt_path=last(tmp_path), num_workers=workers)
+    assert continued == curve
+    assert {k: v.tolist() for k, v in model.state_dict().items()} == {k: v.tolist() for k, v in weights.items()}
+
+
+def test_the_state_of_every_generator_comes_back() -> None:
+    import random
+
+    import numpy as np
+
+    states = random_states()
+    first = (torch.rand(3).tolist(), random.random(), float(np.random.rand()))  # noqa: NPY002, S311
+    restore_random_states(states)
+    assert (torch.rand(3).tolist(), random.random(), float(np.random.rand())) == first  # noqa: NPY002, S311
+
+
+def test_a_full_disk_leaves_the_previous_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plugin, path = AtomicCheckpointIO(), tmp_path / "last.ckpt"
+    plugin.save_checkpoint({"a": torch.zeros(3)}, path)
+    before = path.read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(FaceDiffError, match=r"last\.ckpt"):
+        plugin.save_checkpoint({"a": torch.ones(3)}, path)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
