@@ -7,9 +7,11 @@ A file of a few kilobytes can declare sizes of terabytes. Every reader compares 
 from __future__ import annotations
 
 import math
+import numbers
 import os
+import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -77,7 +79,9 @@ class Limits:
         """
         limit = getattr(self, what)
         if not 0 <= count <= limit:
-            shown = f"{count:g}" if isinstance(count, float) else str(count)
+            # A product of declared sizes may have more digits than Python agrees to write.
+            huge = isinstance(count, int) and abs(count) > 1 << 64
+            shown = "more than 10^19" if huge else f"{count:g}" if isinstance(count, float) else str(count)
             raise FaceDiffError(
                 f"{source}: declares {shown} {what}; expected 0 to {limit:g}. If you trust the file, set "
                 f"FACEDIFF_MAX_{what.upper()} to a larger number"
@@ -85,6 +89,106 @@ class Limits:
 
 
 LIMITS = Limits.from_environment()
+
+FRAME_RATES = (0.1, 1000.0)
+"""Frames a second that motion may have."""
+
+SAMPLE_RATES = (1000, 768_000)
+"""Samples a second that speech may have; resampling multiplies the length of anything slower."""
+
+WORDS_SHOWN = 60  # characters of a file's own text that a message repeats
+
+
+def quoted(value: object) -> str:
+    """A value from a file as a message may show it: short, on one line, and whatever it is."""
+    try:
+        text = repr(value)
+    except Exception:  # a whole number of more than 4300 digits has no decimal form; other objects may raise anything
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= WORDS_SHOWN else f"{text[: WORDS_SHOWN - 1]}…"
+
+
+def check_number(
+    source: object,
+    name: str,
+    value: object,
+    low: float = -math.inf,
+    high: float = math.inf,
+    *,
+    whole: bool = False,
+    text: bool = False,
+    remedy: str = "",
+) -> float:
+    """A number that a file (or an option) gives, once it is known to be one, finite and in range.
+
+    Every number that enters from outside passes here, so that no reader forgets one of NaN, infinity, a truth value,
+    a text, or a whole number that no float holds.
+
+    Args:
+        source: the file, for the message.
+        name: the number's name in the file.
+        value: what the file holds.
+        low: smallest allowed number.
+        high: largest allowed number.
+        whole: whether it must be a whole number.
+        text: whether the file holds it as text, as tables do.
+        remedy: what the message advises.
+
+    Returns:
+        the number; ``int`` of it is exact where ``whole`` is given.
+
+    Raises:
+        FaceDiffError: naming the file, the number and its range.
+
+    Example:
+        >>> check_number("manifest.json", "frame_rate", 25, *FRAME_RATES)
+        25.0
+    """
+    number = math.nan
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if real or (text and isinstance(value, str)):
+        try:
+            number = float(value)  # type: ignore[arg-type]
+        except (ValueError, OverflowError):
+            number = math.nan
+    if not (math.isfinite(number) and low <= number <= high and (not whole or number == int(number))):
+        kind = "a whole number" if whole else "a number"
+        if math.isfinite(low) and math.isfinite(high):
+            bounds = f" from {low:.10g} to {high:.10g}"
+        elif math.isfinite(low) or math.isfinite(high):
+            bounds = f" of at least {low:.10g}" if math.isfinite(low) else f" of at most {high:.10g}"
+        else:
+            bounds = ", neither infinite nor NaN"
+        advice = f"; {remedy}" if remedy else ""
+        raise FaceDiffError(f"{source}: {name} is {quoted(value)}; expected {kind}{bounds}{advice}")
+    return number
+
+
+def check_format(source: object, found: object, expected: str | int) -> None:
+    """Refuse a file of another format than this version writes, above all a later one.
+
+    Args:
+        source: the file, for the message.
+        found: the file's mark of its format; a text that ends in a number (``facediff take 1``), or a number.
+        expected: the mark that this version writes.
+
+    Raises:
+        FaceDiffError: naming both.
+    """
+    if type(found) is type(expected) and found == expected:
+        return
+    ours, theirs = _split_format(expected), _split_format(found)
+    later = ours is not None and theirs is not None and theirs[0] == ours[0] and theirs[1] > ours[1]
+    advice = "it was written by a later version, update facediff" if later else "write the file again"
+    raise FaceDiffError(f"{source}: its format is {quoted(found)}; expected {expected!r}; {advice}")
+
+
+def _split_format(mark: object) -> tuple[str, int] | None:
+    """The words and the number of a mark of a format; None if it is no such mark."""
+    if isinstance(mark, int) and not isinstance(mark, bool):
+        return "", mark
+    match = re.fullmatch(r"(.*?) ?(\d{1,9})", mark) if isinstance(mark, str) else None
+    return (match[1], int(match[2])) if match else None
 
 
 def check_array(source: object, shape: tuple[int, ...], item_bytes: int) -> None:
@@ -94,8 +198,9 @@ def check_array(source: object, shape: tuple[int, ...], item_bytes: int) -> None
         FaceDiffError: if a size is negative, or the array is larger than :attr:`Limits.bytes`.
     """
     if any(size < 0 for size in shape):
-        raise FaceDiffError(f"{source}: declares an array of shape {shape}; the file is damaged")
-    LIMITS.check("bytes", math.prod(shape) * item_bytes, source)
+        raise FaceDiffError(f"{source}: declares an array of shape {quoted(shape)}; the file is damaged")
+    # An axis of length 0 takes no memory, but a walk along the other axes takes its time.
+    LIMITS.check("bytes", math.prod(max(1, size) for size in shape) * max(1, item_bytes), source)
 
 
 def read_npz(path: Path, stream: IO[bytes] | None = None) -> dict[str, npt.NDArray[np.generic]]:
@@ -148,8 +253,17 @@ def npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:  # noqa: A
     return shape, dtype
 
 
-def check_nesting(value: object, source: object) -> None:
+def check_nesting(
+    value: object, source: object, parts: Callable[[object], Collection[object] | None] | None = None
+) -> None:
     """Refuse plain data that is nested too deeply or has too many entries; walks without recursion.
+
+    What is shared counts as often as it is seen: that is what a walk or a conversion to an array costs.
+
+    Args:
+        value: dicts, lists, tuples and sets.
+        source: the file, for the message.
+        parts: what objects of other types hold; None for those that it does not know.
 
     Raises:
         FaceDiffError: naming the limit.
@@ -161,10 +275,14 @@ def check_nesting(value: object, source: object) -> None:
         LIMITS.check("nesting", depth - 1, source)
         inner: list[object] = []
         for item in level:
+            held = parts(item) if parts is not None else None
             if isinstance(item, Mapping):
-                inner += item.values()
-            elif isinstance(item, list | tuple | set):
-                inner += item
-            count += 1
-        LIMITS.check("entries", count, source)
+                held = item.values()
+            elif isinstance(item, list | tuple | set | frozenset):
+                held = item
+            if held is not None:
+                # Counted before it is kept: lists that share their entries multiply.
+                count += len(held)
+                LIMITS.check("entries", count, source)
+                inner += held
         level = inner
