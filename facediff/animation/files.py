@@ -14,7 +14,7 @@ import numpy.typing as npt
 from facediff.animation.animation import Animation
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import open_vertices, read_arrays
-from facediff.utils.files import atomic
+from facediff.utils.files import atomic, parse_json
 
 FORMAT = "facediff take 1"
 """Marks an archive. The word is older than the class :class:`Animation`; it stays, so that old and new files agree."""
@@ -141,7 +141,7 @@ def read_archive(path: Path) -> Animation:
     if missing:
         raise FaceDiffError(f"{path}: has no {', '.join(missing)}; {expected}")
     try:
-        about = json.loads(str(arrays["about"]))
+        about = parse_json(str(arrays["about"]), f"{path}: its entry about", remedy="write the file again")
         facts: dict[str, Any] = {
             "name": str(about["name"]),
             "frame_rate": float(about["frame_rate"]),
@@ -149,7 +149,7 @@ def read_archive(path: Path) -> Animation:
             "sample_rate": int(about["sample_rate"]),
             "metadata": {str(key): str(value) for key, value in about["metadata"].items()},
         }
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FaceDiffError(
             f"{path}: its entry about is not what facediff writes ({error!r}); write the file again"
         ) from error

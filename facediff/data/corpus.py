@@ -7,7 +7,6 @@ a mesh file with the faces, and optionally ``clips.csv`` with further columns pe
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -25,7 +24,7 @@ from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh, read_mesh
 from facediff.metrics import Region
 from facediff.utils.arrays import ArrayStore, open_vertices
-from facediff.utils.files import cache_dir
+from facediff.utils.files import cache_dir, load_json
 from facediff.utils.pickles import load_pickle
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
@@ -314,13 +313,10 @@ def read_manifest(root: Path) -> dict[str, Any]:
     path = root / "manifest.json"
     if not path.is_file():
         return {}
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # thousands of brackets exceed Python's depth
-        raise FaceDiffError(
-            f"{path}: not readable as JSON ({error}); prepare the folder again, or remove the file"
-        ) from error
-    return manifest if isinstance(manifest, dict) else {}
+    manifest = load_json(path, remedy="prepare the folder again, or remove the file")
+    if not isinstance(manifest, dict):
+        raise FaceDiffError(f"{path}: holds no JSON object; prepare the folder again, or remove the file")
+    return manifest
 
 
 def read_clip_table(root: Path) -> dict[str, dict[str, str]]:

@@ -5,7 +5,6 @@ They are known for the built-in puppet, and are read from the user's file for an
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import open_array, read_arrays
+from facediff.utils.files import load_json
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -143,10 +143,7 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
 
 def _read_json(path: Path, template: Vertices) -> tuple[Vertices | None, Vertices | None, tuple[Indices, ...]]:
     """How the lids shut, by shapes or by edges, and the open face, both None where the file does not say; eyeballs."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise FaceDiffError(f"--eyes {path}: not a readable JSON file ({error})") from error
+    content = load_json(path, name=f"--eyes {path}")
     fit = isinstance(content, dict) and all(isinstance(content.get(key, []), list) for key in KEYS[1:])
     unknown = [key for key in content if key not in KEYS] if fit else []
     if not fit or unknown or not isinstance(content.get("neutral", ""), str):

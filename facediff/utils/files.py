@@ -6,7 +6,9 @@ import csv
 import glob
 import hashlib
 import json
+import math
 import os
+import re
 import secrets
 import shutil
 import socket
@@ -20,7 +22,11 @@ from typing import IO, Any
 
 from facediff.errors import FaceDiffError
 from facediff.utils.jobs import run_tasks
+from facediff.utils.limits import LIMITS, check_nesting
 
+BYTES_OF_A_CHARACTER = 32  # memory that a character of JSON can take: "[]," makes a list of 56 bytes and a pointer
+_ESCAPES = re.compile(r"\\u(?:0000|d[89a-f])", re.IGNORECASE)
+_ZERO = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
 ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then even where the file system has no locks
 
 
@@ -359,13 +365,89 @@ def same_sizes(folder: Path, files: Mapping[str, Mapping[str, Any]]) -> bool:
         return False
 
 
+def parse_json(text: bytes | str, source: object, *, remedy: str = "expected a JSON file") -> Any:  # noqa: ANN401
+    """Plain data of a JSON text from elsewhere; no other module parses one.
+
+    Stricter than Python's parser, so that whoever reads a value need not expect the worst: numbers are finite, keys
+    are unique, text can be printed, written and used as a file's name, and all fits into the budget.
+
+    Args:
+        text: the text; of bytes, UTF-8, UTF-16 or UTF-32 with or without a mark.
+        source: what messages call it.
+        remedy: how messages end.
+
+    Raises:
+        FaceDiffError: if it is anything else.
+    """
+    LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(text), source)
+    try:
+        if isinstance(text, bytes):
+            text = text.decode(json.detect_encoding(text))
+        value = json.loads(
+            text,
+            parse_constant=_finite,
+            parse_float=_finite,
+            parse_int=_whole,
+            object_pairs_hook=_unique,
+        )
+        # Escapes can state what no text should hold: zero bytes, and halves of a character, which cannot be encoded.
+        if _ESCAPES.search(text) and _ZERO.search(json.dumps(value, ensure_ascii=False).encode()):
+            raise ValueError("a text in it has a zero byte")
+    except (ValueError, RecursionError) as error:  # thousands of brackets exceed Python's depth
+        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
+        raise FaceDiffError(f"{source}: not readable as JSON ({reason}); {remedy}") from error
+    check_nesting(value, source)
+    return value
+
+
+def load_json(path: Path, *, name: str = "", remedy: str = "expected a JSON file") -> Any:  # noqa: ANN401
+    """Plain data that a JSON file holds, as :func:`parse_json` reads it.
+
+    Args:
+        path: the file.
+        name: what messages call it; its path if empty.
+        remedy: how messages end.
+
+    Raises:
+        FaceDiffError: if there is no such file, or it cannot be read.
+    """
+    name = name or str(path)
+    try:
+        LIMITS.check("bytes", BYTES_OF_A_CHARACTER * path.stat().st_size, name)
+        if not path.is_file():
+            raise FaceDiffError(f"{name}: not a regular file; {remedy}")
+        return parse_json(path.read_bytes(), name, remedy=remedy)
+    except OSError as error:
+        raise FaceDiffError(f"{name}: cannot be read ({error.strerror or error}); {remedy}") from error
+
+
 def read_json(path: Path) -> dict[str, Any] | None:
     """The object that a JSON file holds; None if there is no such file, or it holds anything else."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        content = load_json(path)
+    except FaceDiffError:
         return None
     return content if isinstance(content, dict) else None
+
+
+def _finite(number: str) -> float:
+    value = float(number)
+    if not math.isfinite(value):
+        raise ValueError(f"the number {number[:20]} is not finite")
+    return value
+
+
+def _whole(number: str) -> int:
+    _finite(number)
+    return int(number)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f'the key "{next(key for key in keys if keys.count(key) > 1)}" occurs twice')
+    return found
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import json
 import os
 import re
 from collections import Counter
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args, get_origin,
 from facediff.data.check.report import Findings, Report, few, number
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.arrays import open_array, vertices_of
+from facediff.utils.files import load_json
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
@@ -171,12 +171,7 @@ def read_record(root: Path, name: str, findings: Findings) -> dict[str, Any]:
     path = root / name
     if path.is_file():
         with findings.guard("manifest_unreadable", path, root):
-            try:
-                record = json.loads(path.read_bytes())
-            except (ValueError, RecursionError) as error:
-                raise FaceDiffError(
-                    f"not readable as JSON ({error}); prepare the folder again, or remove the file"
-                ) from error
+            record = load_json(path, remedy="prepare the folder again, or remove the file")
             if not isinstance(record, dict):
                 raise FaceDiffError("holds no JSON object; prepare the folder again, or remove the file")
             return record

@@ -24,7 +24,9 @@ from facediff.utils.files import (
     atomic,
     check_writable,
     describe_files,
+    load_json,
     locked,
+    parse_json,
     remove_partial,
     same_sizes,
     write_json,
@@ -98,7 +100,8 @@ class Plan:
     @property
     def recipe(self) -> dict[str, Any]:
         """What decides the bytes that are written; a run may be resumed only with the same."""
-        return {"facediff": version(), "corpus": self.corpus, "options": json.loads(json.dumps(self.options))}
+        options = parse_json(json.dumps(self.options), "options")  # as the manifest will hold them: lists, no tuples
+        return {"facediff": version(), "corpus": self.corpus, "options": options}
 
 
 @dataclass(frozen=True)
@@ -249,12 +252,7 @@ def _read_record(path: Path) -> dict[str, Any] | None:
     """The manifest or the state of a run; None if there is none."""
     if not path.is_file():
         return None
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError, RecursionError) as error:
-        raise FaceDiffError(
-            f"{path}: cannot be read ({error}); remove {path.parent}, or choose another folder"
-        ) from error
+    record = load_json(path, remedy=f"remove {path.parent}, or choose another folder")
     if not isinstance(record, dict) or not {"corpus", "options"} <= set(record):
         raise FaceDiffError(f"{path}: not written by `facediff data prepare`; choose another folder to write to")
     return record

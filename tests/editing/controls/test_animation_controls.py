@@ -212,7 +212,7 @@ def test_eyes_from_the_lids_edges_alone(eyes_folder: Path, make_animation: Calla
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("no json", "not a readable JSON file"),
+        ("no json", "not readable as JSON"),
         ("[1]", "expected an object with neutral, blinks, lids, eyeballs"),
         ('{"eyes": []}', 'not "eyes"'),
         ("{}", "says nothing of lids or eyeballs"),
