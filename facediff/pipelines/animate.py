@@ -184,10 +184,10 @@ class AnimationPipeline:
         self, speech: npt.NDArray[np.float32], seeds: Sequence[int], folder: Path
     ) -> tuple[list[npt.NDArray[np.float32]], str]:
         """Memory maps (T, V, 3) of the samples, whose windows go to disk as they are made, and the style's name."""
-        import numpy as np
         import torch
 
         from facediff.animation.files import MotionWriter
+        from facediff.utils.arrays import open_array
 
         stream = self.model.stream(identity=self.identity, style=self.style, seeds=seeds)
         progress = None if self.options.quiet else partial(track, description="seconds of speech")
@@ -198,7 +198,7 @@ class AnimationPipeline:
                 writer.write((motion.cpu() + template).numpy())
         for writer in writers:
             writer.close()
-        return [np.load(writer.path, mmap_mode="r") for writer in writers], stream.clip.reference_names[0]
+        return [open_array(writer.path) for writer in writers], stream.clip.reference_names[0]
 
     def _animation(
         self, motion: npt.NDArray[np.float32], speech: npt.NDArray[np.float32], name: str, seed: int, style: str

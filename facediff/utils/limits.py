@@ -10,17 +10,10 @@ import math
 import numbers
 import os
 import re
-import zipfile
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
 
 from facediff.errors import FaceDiffError
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
 
 
 @dataclass(frozen=True)
@@ -106,6 +99,13 @@ def quoted(value: object) -> str:
     except Exception:  # a whole number of more than 4300 digits has no decimal form; other objects may raise anything
         text = f"a {type(value).__name__}"
     return text if len(text) <= WORDS_SHOWN else f"{text[: WORDS_SHOWN - 1]}…"
+
+
+def brief(error: object) -> str:
+    """What a library says of a damaged file, as a message may repeat it: short and on one line."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    text = "".join(character if character.isprintable() else "?" for character in text)
+    return text if len(text) <= 2 * WORDS_SHOWN else f"{text[: 2 * WORDS_SHOWN - 1]}…"
 
 
 def check_number(
@@ -203,54 +203,8 @@ def check_array(source: object, shape: tuple[int, ...], item_bytes: int) -> None
     LIMITS.check("bytes", math.prod(max(1, size) for size in shape) * max(1, item_bytes), source)
 
 
-def read_npz(path: Path, stream: IO[bytes] | None = None) -> dict[str, npt.NDArray[np.generic]]:
-    """All arrays of an ``.npz`` file; every header is checked before anything is decompressed.
-
-    Args:
-        path: the file, for messages.
-        stream: the open file; opened here if None.
-
-    Raises:
-        FaceDiffError: if the file is damaged, holds objects, or expands to more than the budget.
-    """
-    import numpy as np
-
-    try:
-        with zipfile.ZipFile(stream if stream is not None else path) as archive:
-            members = archive.infolist()
-            LIMITS.check("entries", len(members), path)
-            LIMITS.check("bytes", sum(member.file_size for member in members), path)
-            arrays: dict[str, npt.NDArray[np.generic]] = {}
-            for member in members:
-                with archive.open(member) as opened:
-                    shape, dtype = npy_header(opened)
-                name = member.filename.removesuffix(".npy")
-                check_array(f"{path}: {name}", shape, dtype.itemsize)
-                if dtype.hasobject or math.prod(shape) * dtype.itemsize > member.file_size:
-                    raise FaceDiffError(f"{path}: {name} holds objects or is shorter than it declares; it was not read")
-                with archive.open(member) as opened:
-                    arrays[name] = np.lib.format.read_array(opened, allow_pickle=False)
-            return arrays
-    except FaceDiffError:
-        raise
-    except Exception as error:  # zipfile, zlib and NumPy each have several exceptions for damaged files
-        raise FaceDiffError(f"{path}: not a readable .npz file ({error}); expected one that facediff wrote") from error
-
-
-def npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:  # noqa: ANN401 - anything with ``read``
-    """Shape and type that an ``.npy`` stream declares.
-
-    Raises:
-        ValueError: if there is no valid header.
-    """
-    import numpy as np
-
-    version = np.lib.format.read_magic(stream)
-    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
-    if read is None:
-        raise ValueError(f"format version {version} is not supported")
-    shape, _, dtype = read(stream)
-    return shape, dtype
+_LEAVES = {str, bytes, int, float, bool, type(None)}
+"""What holds nothing: :func:`check_nesting` passes over it quickly."""
 
 
 def check_nesting(
@@ -268,21 +222,21 @@ def check_nesting(
     Raises:
         FaceDiffError: naming the limit.
     """
-    level, count = [value], 0
-    depth = 0
+    level, count, depth = [value], 1, 0
     while level:
-        depth += 1
-        LIMITS.check("nesting", depth - 1, source)
+        LIMITS.check("nesting", depth, source)
         inner: list[object] = []
         for item in level:
             held = parts(item) if parts is not None else None
-            if isinstance(item, Mapping):
+            if isinstance(item, dict):
                 held = item.values()
             elif isinstance(item, list | tuple | set | frozenset):
                 held = item
-            if held is not None:
-                # Counted before it is kept: lists that share their entries multiply.
-                count += len(held)
+            if held is None:
+                continue
+            # Counted before it is kept: lists that share their entries multiply.
+            count += len(held)
+            if count > LIMITS.entries:
                 LIMITS.check("entries", count, source)
-                inner += held
-        level = inner
+            inner += [each for each in held if type(each) not in _LEAVES]
+        level, depth = inner, depth + 1
