@@ -20,8 +20,9 @@ from torch import Tensor
 
 from facediff.data.audio import read_stretch, samples_for
 from facediff.errors import FaceDiffError
+from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
-from facediff.mesh.mesh import Mesh, read_mesh
+from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
 from facediff.utils.arrays import ArrayStore, open_vertices
 from facediff.utils.files import cache_dir, load_json

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 from facediff.mesh import face_size, read_mesh, robust_align
-
-if TYPE_CHECKING:
-    from pygltflib import GLTF2
+from facediff.mesh.glb import POSITIONS, TRIANGLES, Glb
+from facediff.mesh.mesh import check_coordinates
+from facediff.utils.limits import LIMITS, check_array
 
 Array = npt.NDArray[np.float64]
 
@@ -259,7 +258,6 @@ def read_shape_files(path: Path) -> ShapeFiles:
 
     Raises:
         FaceDiffError: if it is missing or damaged, holds no shapes, or its meshes differ in topology or vertex order.
-        MissingExtraError: if pygltflib is not installed and the file is a .glb.
     """
     if path.suffix.lower() == ".glb":
         return _read_glb(path)
@@ -300,137 +298,57 @@ def read_shape_files(path: Path) -> ShapeFiles:
     )
 
 
-# Morph targets of binary glTF 2.0 files. pygltflib parses the container and never opens another file by itself.
-#
-# Khronos Group, "glTF 2.0 Specification": sections 3.6 (binary data, accessors, sparse accessors), 3.7.2 (meshes, morph
-# targets) and 4.4 (GLB). Names of targets are in ``mesh.extras.targetNames``, as the specification's note has it.
-
-FLOAT = 5126
-INDICES: dict[int, np.dtype[Any]] = {5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4")}
-WIDTHS = {"SCALAR": 1, "VEC3": 3}
-TRIANGLES = 4
+# Morph targets of binary glTF 2.0 files: section 3.7.2.2 of the specification. Names of targets are in
+# ``mesh.extras.targetNames``, as its note has it.
 
 
 def _read_glb(path: Path) -> ShapeFiles:
     """Read the mesh with the most targets, its primitives one after the other; nodes' transforms are not applied."""
     try:
-        from pygltflib import GLTF2
-    except ImportError as error:
-        raise MissingExtraError("pygltflib", "train", "reading a .glb") from error
-    try:
+        LIMITS.check("bytes", path.stat().st_size, path)
         data = path.read_bytes()
     except OSError as error:
         raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a .glb file") from error
     try:
-        if data[:8] != b"glTF\2\0\0\0":
-            raise _BadFileError("not a binary glTF 2.0 file; export it as .glb")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # chunks and fields that pygltflib does not know do no harm
-            gltf = GLTF2.load_from_bytes(data)
-        names, neutral, deltas, faces = _targets(gltf, gltf.binary_blob() or b"")
-    except _BadFileError as error:
-        raise FaceDiffError(f"{path}: {error}") from error
-    except Exception as error:  # the file may come from anywhere, and damage shows in many ways
-        raise FaceDiffError(f"{path}: not a readable glb ({error}); export it again") from error
+        names, neutral, deltas, faces = _targets(Glb(data, path))
+    except ValueError as error:
+        raise FaceDiffError(f"{path}: not a readable glb with shapes ({error}); export it again") from error
     return ShapeFiles(path, path, names, neutral + deltas, neutral, faces, metric=True, rest=path.name)
 
 
-class _BadFileError(Exception):
-    """What is wrong with a file, without its name."""
-
-
-def _targets(gltf: GLTF2, binary: bytes) -> tuple[tuple[str, ...], Array, Array, npt.NDArray[np.int64]]:
+def _targets(glb: Glb) -> tuple[tuple[str, ...], Array, Array, npt.NDArray[np.int64]]:
     """Names (K,) of the targets, the neutral face (V, 3) and displacements (K, V, 3) in metres, triangles (F, 3)."""
-    needed = [name for name in gltf.extensionsRequired or [] if "compression" in name or "quant" in name]
-    if needed:
-        raise _BadFileError(f"is compressed ({', '.join(map(str, needed))}); export it without compression")
-    meshes = [mesh for mesh in gltf.meshes if mesh.primitives[0].targets]
-    if not meshes:
-        raise _BadFileError("no mesh in it has targets (shape keys); export them with the mesh")
-    mesh = max(meshes, key=lambda one: len(one.primitives[0].targets))
-    count = len(mesh.primitives[0].targets)
-    names = (mesh.extras or {}).get("targetNames", [])
-    if len(names) != count or not all(isinstance(name, str) for name in names):
-        raise _BadFileError(f"has {count} targets and {len(names)} names for them; export it with targetNames")
+
+    def targets(primitive: dict[str, Any]) -> list[dict[str, Any]]:
+        return glb.entries("targets", primitive)
+
+    meshes = [parts for index in range(len(glb.entries("meshes"))) if (parts := glb.primitives(index))]
+    best = max(range(len(meshes)), key=lambda one: len(targets(meshes[one][0])), default=None)
+    if best is None or not targets(meshes[best][0]):
+        raise ValueError("no mesh in it has targets (shape keys); export them with the mesh")
+    count = len(targets(meshes[best][0]))
+    mesh = next(entry for entry in glb.entries("meshes") if entry.get("primitives") is meshes[best])
+    extras = mesh.get("extras")
+    names = extras.get("targetNames", []) if isinstance(extras, dict) else []
+    if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"has {count} targets and other names for them; export it with targetNames")
     points, moves, faces, before = [], [], [], 0
-    for primitive in mesh.primitives:
-        if primitive.mode != TRIANGLES or len(primitive.targets or []) != count:
-            raise _BadFileError("its mesh has parts that are no triangles, or have other targets; export one mesh")
-        position = _numbers(gltf, binary, primitive.attributes.POSITION, "VEC3").astype(np.float64)
+    for primitive in meshes[best]:
+        if primitive.get("mode", TRIANGLES) != TRIANGLES or len(targets(primitive)) != count:
+            raise ValueError("its mesh has parts that are no triangles, or have other targets; export one mesh")
+        position = glb.positions(primitive)
+        LIMITS.check("vertices", before + len(position), glb.source)
+        # Targets without data of their own cost a file nothing, however many they are.
+        check_array(glb.source, (2, count, before + len(position), 3), 8)
         delta = np.zeros((count, len(position), 3))
-        for row, target in zip(delta, primitive.targets, strict=True):
+        for row, target in zip(delta, targets(primitive), strict=True):
             if "POSITION" in target:
-                row[:] = _numbers(gltf, binary, target["POSITION"], "VEC3", len(position))
-        if primitive.indices is None:
-            corners = np.arange(len(position))
-        else:
-            corners = _numbers(gltf, binary, primitive.indices, "SCALAR")[:, 0].astype(np.int64)
-        if len(corners) % 3 or (len(corners) and corners.max() >= len(position)):
-            raise _BadFileError("its triangles name a vertex that does not exist; export it again")
-        faces.append(corners.reshape(-1, 3) + before)
+                row[:] = glb.numbers(target["POSITION"], "VEC3", POSITIONS, len(position))
+        faces.append(glb.triangles(primitive, len(position)) + before)
         points.append(position)
         moves.append(delta)
         before += len(position)
     neutral, deltas = np.concatenate(points), np.concatenate(moves, axis=1)
-    if not len(neutral) or not (np.isfinite(neutral).all() and np.isfinite(deltas).all()):
-        raise _BadFileError("holds no vertices, or NaN or infinity; export it again")
+    check_coordinates(neutral, glb.source)
+    check_coordinates(deltas, glb.source)
     return tuple(names), neutral, deltas, np.concatenate(faces)
-
-
-def _numbers(gltf: GLTF2, binary: bytes, index: object, form: str, count: int | None = None) -> npt.NDArray[Any]:
-    """An accessor's numbers (N, width): positions (``VEC3``) or indices (``SCALAR``).
-
-    ``count`` is how many there must be: a sparse accessor without a buffer view states no size that could be trusted.
-    """
-    accessor = _entry(gltf.accessors, index, "accessor")
-    kinds: dict[int, np.dtype[Any]] = {FLOAT: np.dtype("<f4")} if form == "VEC3" else INDICES
-    kind, stated, width = kinds.get(accessor.componentType), accessor.count, WIDTHS[form]
-    if kind is None or accessor.type != form:
-        raise _BadFileError("holds positions or indices of an unknown type; export it without compression")
-    if not isinstance(stated, int) or stated < 0 or (count is not None and stated != count):
-        raise _BadFileError(f"has a target of {stated} vertices where the mesh has {count}; export it again")
-    if accessor.bufferView is not None:
-        values = _slab(gltf, binary, accessor, kind, stated, width)
-    elif count is not None:
-        values = np.zeros((count, width), kind)
-    else:
-        raise _BadFileError("has a mesh without data, perhaps a compressed one; export it without compression")
-    if (sparse := accessor.sparse) is not None:
-        places = _slab(gltf, binary, sparse.indices, INDICES[sparse.indices.componentType], sparse.count, 1)[:, 0]
-        if len(places) and places.max() >= stated:
-            raise _BadFileError("names a vertex that does not exist; export it again")
-        values[places] = _slab(gltf, binary, sparse.values, kind, sparse.count, width)
-    return values
-
-
-def _slab(
-    gltf: GLTF2,
-    binary: bytes,
-    at: Any,  # noqa: ANN401
-    kind: np.dtype[Any],
-    count: int,
-    width: int,
-) -> npt.NDArray[Any]:
-    """Numbers (count, width) from the buffer view and offset that an object names."""
-    # pygltflib hands out what the file says: every offset and count is checked before memory is touched.
-    view = _entry(gltf.bufferViews, at.bufferView, "buffer view")
-    if view.buffer != 0 or gltf.buffers[0].uri is not None:
-        raise _BadFileError("keeps its data in another file; export it as one .glb")
-    row = kind.itemsize * width
-    start, offset = view.byteOffset or 0, at.byteOffset or 0
-    stride = row if view.byteStride is None else view.byteStride
-    numbers = (start, view.byteLength, offset, stride, count)
-    if not all(isinstance(number, int) for number in numbers) or min(numbers) < 0 or stride < row:
-        raise _BadFileError("has a negative or broken offset; export it again")
-    if not count:
-        return np.empty((0, width), kind)
-    if offset + (count - 1) * stride + row > view.byteLength or start + view.byteLength > len(binary):
-        raise _BadFileError("has data beyond its end; export it again")
-    return np.ndarray((count, width), kind, binary, start + offset, (stride, kind.itemsize)).copy()
-
-
-def _entry(listed: Sequence[Any], index: object, kind: str) -> Any:  # noqa: ANN401
-    """An object by its number; numbers from the end, which Python would accept, are refused."""
-    if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(listed):
-        raise _BadFileError(f"names {kind} {index}, which does not exist; export it again")
-    return listed[index]

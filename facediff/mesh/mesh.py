@@ -1,19 +1,18 @@
-"""Triangle meshes: the one reader of mesh files, areas, and nearest points of triangles."""
+"""Triangle meshes: areas, and nearest points of triangles; :mod:`facediff.mesh.files` reads them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 
 Array = npt.NDArray[np.float64]
 
-SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
+FARTHEST = 1e12
+"""Largest coordinate, in any unit: sums of its cubes fit into single precision."""
 
 
 @dataclass(frozen=True)
@@ -31,88 +30,16 @@ class Mesh:
     colours: npt.NDArray[np.uint8] | None = None
 
 
-def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
-    r"""Read a mesh without merging, dropping or reordering a vertex.
-
-    Args:
-        path: an ``.obj``, ``.ply``, ``.stl``, ``.off`` or ``.glb`` file.
-        points_allowed: whether an ``.obj`` without faces is accepted; its mesh has faces of shape (0, 3).
+def check_coordinates(points: npt.NDArray[np.floating], source: object) -> None:
+    """Refuse positions or displacements that are not finite, or so large that computing with them overflows.
 
     Raises:
-        FaceDiffError: if the file is missing or damaged, or holds no vertices or no triangles.
-        MissingExtraError: if trimesh is not installed.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "square.obj"
-        >>> _ = path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
-        >>> read_mesh(path).faces.tolist()
-        [[0, 1, 2], [0, 2, 3]]
+        FaceDiffError: naming the file, ``source``, and the range.
     """
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such mesh file; expected one of {', '.join(SUFFIXES)}")
-    mesh = _read_obj(path) if path.suffix.lower() == ".obj" else _read_with_trimesh(path)
-    if not len(mesh.faces) and not points_allowed:
-        raise FaceDiffError(f"{path}: holds no triangles; expected a mesh with faces")
-    return mesh
-
-
-def _read_with_trimesh(path: Path) -> Mesh:
-    try:
-        import trimesh
-    except ImportError as error:
-        raise MissingExtraError("trimesh", "train", "reading a mesh") from error
-    try:
-        mesh = trimesh.load(path, process=False, maintain_order=True, force="mesh")
-    except Exception as error:
-        raise FaceDiffError(f"{path}: not a readable mesh ({error}); expected PLY or OBJ with triangles") from error
-    coloured = mesh.visual.kind == "vertex"
-    return Mesh(
-        np.array(mesh.vertices, np.float64),
-        np.array(mesh.faces, np.int32),
-        np.array(mesh.visual.vertex_colors[:, :3], np.uint8) if coloured else None,
-    )
-
-
-def _read_obj(path: Path) -> Mesh:
-    # trimesh drops the vertices of a textured mesh that no face uses, which would shift all indices after them; for
-    # thousands of frames stored as OBJ it is also several times slower than this.
-    try:
-        lines = path.read_bytes().splitlines()
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected an OBJ mesh") from error
-    points = [line[2:] for line in lines if line[:2] in (b"v ", b"v\t")]
-    try:
-        words = b" ".join(points).split()
-        width = len(words) // max(1, len(points))  # colours may follow the coordinates
-        if width * len(points) != len(words) or any(len(point.split()) != width for point in points[::100]):
-            width, words = 3, [word for point in points for word in point.split()[:3]]
-        table = np.array([float(word) for word in words]).reshape(len(points), width)
-    except ValueError as error:
-        raise FaceDiffError(f"{path}: not a readable OBJ mesh ({error}); write it again") from error
-    if not len(table) or width < 3:
-        raise FaceDiffError(f"{path}: holds no vertices; expected an OBJ mesh with lines `v x y z`")
-    try:
-        faces = _triangles(b"\n".join(line for line in lines if line[:2] in (b"f ", b"f\t")), len(table))
-    except (ValueError, IndexError) as error:
-        raise FaceDiffError(f"{path}: not a readable OBJ mesh ({error}); write it again") from error
-    colours = np.rint(table[:, 3:6].clip(0, 1) * 255).astype(np.uint8) if width >= 6 else None
-    return Mesh(table[:, :3].copy(), faces.copy(), colours)
-
-
-# The frames of a sequence and the shapes of a set repeat the same face lines, and parsing them takes most of the time.
-@lru_cache(maxsize=2)
-def _triangles(lines: bytes, n_vertices: int) -> npt.NDArray[np.int32]:
-    """Triangles (F, 3) of an OBJ's face lines; polygons become fans; ValueError if a line is damaged."""
-    triangles = []
-    for line in lines.splitlines():
-        corners = [int(word.partition(b"/")[0]) for word in line.split()[1:]]
-        corners = [corner - 1 if corner > 0 else n_vertices + corner for corner in corners]
-        triangles += [(corners[0], b, c) for b, c in zip(corners[1:-1], corners[2:], strict=True)]
-    faces = np.array(triangles, np.int64).reshape(-1, 3)
-    if faces.size and (faces.min() < 0 or faces.max() >= n_vertices):
-        raise ValueError(f"a face names a vertex that does not exist among {n_vertices}")
-    return faces.astype(np.int32)
+    if points.size and not -FARTHEST <= points.min() <= points.max() <= FARTHEST:
+        raise FaceDiffError(
+            f"{source}: holds NaN, infinity or absurd coordinates; expected numbers from -{FARTHEST:g} to {FARTHEST:g}"
+        )
 
 
 def triangle_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:

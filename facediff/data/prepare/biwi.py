@@ -32,7 +32,8 @@ from facediff.data.prepare.runner import (
     write_templates,
 )
 from facediff.errors import FaceDiffError
-from facediff.mesh.mesh import read_mesh, surface_area
+from facediff.mesh.files import read_mesh
+from facediff.mesh.mesh import surface_area
 
 SUBJECTS = [*(f"F{i}" for i in range(1, 9)), *(f"M{i}" for i in range(1, 7))]
 TRAINING_SUBJECTS = ["F2", "F3", "F4", "M3", "M4", "M5"]

@@ -20,7 +20,8 @@ from facediff.data.puppet import built_in_mesh, cache_root
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import Material, find_clips
 from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
-from facediff.mesh.mesh import SUFFIXES, Mesh, read_mesh
+from facediff.mesh.files import SUFFIXES, read_mesh
+from facediff.mesh.mesh import Mesh
 
 Module = type[SpeechMotionDataModule]
 

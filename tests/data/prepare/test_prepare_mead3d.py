@@ -19,8 +19,8 @@ from facediff.data.prepare.mead3d import find_recordings, find_sounds
 from facediff.data.prepare.motion import read_parameters
 from facediff.data.prepare.runner import Report, prepare
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import Flame
-from facediff.mesh.mesh import read_mesh
 from facediff.utils.pickles import load_pickle
 from tests.fakes.flame import VERTICES, flame_arrays, write_flame
 from tests.fakes.mead3d import (

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from facediff.data.corpus import read_templates
 from facediff.evaluation.figures import Material, find_clips
-from facediff.mesh.mesh import read_mesh
+from facediff.mesh.files import read_mesh
 from tests.fakes.tiny import RATE, VERTICES
 
 CLIPS = ("A_e06", "A_e07", "B_e06")

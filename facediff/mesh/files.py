@@ -1,0 +1,408 @@
+"""The one reader of mesh files, which may come from anywhere: OBJ, PLY, STL, OFF and binary glTF.
+
+Every format is read by a parser of our own. Libraries for meshes drop vertices, or put zeros in their place, in files
+that are cut short, mix polygons, or hold textures or sparse data, and several open other files that a file names. Here
+a file is read exactly or refused: what it declares is compared with what it holds and with the budget
+(:data:`facediff.utils.limits.LIMITS`) before memory is allocated, and no other file is opened.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.mesh.glb import read_glb
+from facediff.mesh.mesh import Array, Mesh, check_coordinates
+from facediff.utils.limits import LIMITS
+
+BYTES_OF_A_CHARACTER = 16  # memory that a character of a text format can take while its words are numbers in the making
+HEADER = 1 << 16  # bytes within which a PLY header must end
+
+Triangles = npt.NDArray[np.int32]
+
+
+def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
+    r"""Read a mesh without merging, dropping or reordering a vertex.
+
+    Args:
+        path: an ``.obj``, ``.ply``, ``.stl``, ``.off`` or ``.glb`` file.
+        points_allowed: whether a file without faces is accepted; its mesh has faces of shape (0, 3).
+
+    Raises:
+        FaceDiffError: if the file is missing, damaged or larger than the budget, holds no vertices or no triangles, or
+            coordinates that are not finite.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "square.obj"
+        >>> _ = path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
+        >>> read_mesh(path).faces.tolist()
+        [[0, 1, 2], [0, 2, 3]]
+    """
+    if not path.is_file():
+        raise FaceDiffError(f"{path}: no such mesh file; expected one of {', '.join(SUFFIXES)}")
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise FaceDiffError(f"{path}: not a mesh format that is read; expected one of {', '.join(SUFFIXES)}")
+    try:
+        size = path.stat().st_size
+        LIMITS.check("bytes", size, path)
+        data = path.read_bytes()
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); expected a mesh") from error
+    try:
+        mesh = READERS[suffix](data, path)
+    except (ValueError, IndexError, OverflowError) as error:
+        raise FaceDiffError(f"{path}: not a readable {suffix[1:].upper()} mesh ({error}); export it again") from error
+    if not len(mesh.vertices):
+        raise FaceDiffError(f"{path}: holds no vertices; expected a mesh with vertices and faces")
+    if not len(mesh.faces) and not points_allowed:
+        raise FaceDiffError(f"{path}: holds no triangles; expected a mesh with faces")
+    check_coordinates(mesh.vertices, path)
+    return mesh
+
+
+# OBJ. For thousands of frames stored as OBJ this is several times faster than the libraries.
+
+
+def _read_obj(data: bytes, path: Path) -> Mesh:
+    LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(data), path)
+    LIMITS.check("vertices", data.count(b"\nv ") + data.count(b"\nv\t"), path)
+    lines = data.splitlines()
+    rows = [line[2:].split() for line in lines if line[:2] in (b"v ", b"v\t")]
+    if not rows:
+        raise FaceDiffError(f"{path}: holds no vertices; expected an OBJ mesh with lines `v x y z`")
+    width = min(map(len, rows))
+    if width != max(map(len, rows)):  # colours may follow the coordinates, of some vertices or of all
+        width, rows = 3, [row[:3] for row in rows]
+    table = np.array([float(word) for word in chain.from_iterable(rows)]).reshape(len(rows), width)
+    if width < 3:
+        raise ValueError("a line `v` has fewer than three coordinates")
+    listed = b"\n".join(line for line in lines if line[:2] in (b"f ", b"f\t"))
+    LIMITS.check("vertices", (listed.count(b" ") + listed.count(b"\t")) // 4, path)
+    first_face, last_vertex = max(data.find(b"\nf "), data.find(b"\nf\t")), data.rfind(b"\nv ")
+    if b" -" in listed and 0 <= first_face < last_vertex:
+        raise ValueError("faces between its vertices count backwards from where they stand")
+    colours = np.rint(table[:, 3:6].clip(0, 1) * 255).astype(np.uint8) if width >= 6 else None
+    return Mesh(table[:, :3].copy(), _triangles(listed, len(table)).copy(), colours)
+
+
+# The frames of a sequence and the shapes of a set repeat the same face lines, and parsing them takes most of the time.
+@lru_cache(maxsize=2)
+def _triangles(lines: bytes, n_vertices: int) -> Triangles:
+    """Triangles (F, 3) of an OBJ's face lines; polygons become fans; ValueError if a line is damaged."""
+    triangles = []
+    for line in lines.splitlines():
+        corners = [int(word.partition(b"/")[0]) for word in line.split()[1:]]
+        if len(corners) < 3:
+            raise ValueError("a face has fewer than three corners")
+        corners = [corner - 1 if corner > 0 else n_vertices + corner for corner in corners]
+        triangles += [(corners[0], b, c) for b, c in zip(corners[1:-1], corners[2:], strict=True)]
+    return _checked(np.array(triangles, np.int64), n_vertices)
+
+
+def _checked(faces: npt.NDArray[np.int64], n_vertices: int) -> Triangles:
+    """Triangles whose vertices exist."""
+    if faces.size and (faces.min() < 0 or faces.max() >= n_vertices):
+        raise ValueError(f"a face names a vertex that does not exist among {n_vertices}")
+    return faces.reshape(-1, 3).astype(np.int32)
+
+
+def _cut(polygons: npt.NDArray[Any] | Sequence[Sequence[int]], n_vertices: int, source: object) -> Triangles:
+    """Triangles of polygons: those of triangles first, then both halves of quadrangles, then fans of larger ones."""
+    if isinstance(polygons, np.ndarray):  # all of one length
+        lengths = np.full(len(polygons), polygons.shape[1], np.int64)
+    else:
+        lengths = np.array([len(polygon) for polygon in polygons], np.int64)
+    if lengths.size and lengths.min() < 3:
+        raise ValueError("a face has fewer than three corners")
+    LIMITS.check("vertices", int((lengths - 2).sum()), source)
+    parts = [np.zeros((0, 3), np.int64)]
+    for length in (3, 4):
+        places = np.flatnonzero(lengths == length)
+        if len(places):
+            chosen = polygons[places] if isinstance(polygons, np.ndarray) else [polygons[int(i)] for i in places]
+            table = np.asarray(chosen, np.int64)
+            parts += [table[:, :3]] if length == 3 else [table[:, :3], table[:, [2, 3, 0]]]
+    for i in np.flatnonzero(lengths > 4):
+        corners = np.asarray(polygons[int(i)], np.int64)
+        parts.append(np.stack([np.broadcast_to(corners[0], len(corners) - 2), corners[1:-1], corners[2:]], 1))
+    return _checked(np.concatenate(parts), n_vertices)
+
+
+# PLY.
+
+_PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float16": "f2", "float32": "f4", "float64": "f8"},
+}
+
+
+@dataclass
+class _Element:
+    """A kind of rows in a PLY file: how many there are, and their columns."""
+
+    name: str
+    count: int
+    # Of each property its name, the type of its values, and for a list the type of its length.
+    properties: list[tuple[str, str, str | None]] = field(default_factory=list)
+
+    @property
+    def least(self) -> int:
+        """Bytes of a row whose lists are empty."""
+        return sum(np.dtype(length or kind).itemsize for _, kind, length in self.properties)
+
+
+def _read_ply(data: bytes, path: Path) -> Mesh:
+    end = re.search(rb"^end_header[ \t]*\r?\n", data[:HEADER], re.MULTILINE)
+    if not data.startswith(b"ply") or end is None:
+        raise ValueError("its header is not that of a PLY file, or does not end")
+    elements, form = _ply_header(data[: end.start()].decode("utf-8").splitlines(), path)
+    body = memoryview(data)[end.end() :]
+    if form == "ascii":
+        LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(body), path)
+        columns = _ply_text(elements, bytes(body).split())
+    else:
+        columns = _ply_binary(elements, body)
+    vertex = columns.get("vertex", {})
+    if not {"x", "y", "z"} <= vertex.keys():
+        raise ValueError("its vertices have no x, y and z")
+    points: Array = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], 1)
+    faces = columns.get("face", {})
+    names = [name for name in faces if name in ("vertex_index", "vertex_indices") or len(faces) == 1]
+    if faces and not names:
+        raise ValueError("its faces have no vertex_indices")
+    types = {name: kind for element in elements if element.name == "vertex" for name, kind, _ in element.properties}
+    colours = None
+    if {"red", "green", "blue"} <= vertex.keys():
+        scale = {"f": 255.0, "u2": 255 / 65535}.get(types["red"][0] if types["red"][0] == "f" else types["red"], 1.0)
+        table = scale * np.stack([np.asarray(vertex[name], np.float64) for name in ("red", "green", "blue")], 1)
+        if table.size and not (table.min() >= 0 and table.max() <= 255):
+            raise ValueError("its colours are out of range")
+        colours = np.rint(table).astype(np.uint8)
+    return Mesh(points, _cut(faces[names[0]] if names else [], len(points), path), colours)
+
+
+def _ply_header(lines: list[str], path: Path) -> tuple[list[_Element], str]:
+    elements: list[_Element] = []
+    form = ""
+    for line in lines[1:]:
+        match line.split():
+            case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as form, *_]:
+                pass
+            case ["element", name, count]:
+                if not count.isdecimal():
+                    raise ValueError(f"its element {name} has no valid number of rows")
+                LIMITS.check("vertices", int(count), path)
+                if any(element.name == name for element in elements):
+                    raise ValueError(f"its element {name} occurs twice")
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", length, kind, name] if elements and length in _PLY_TYPES and kind in _PLY_TYPES:
+                elements[-1].properties.append((name, _PLY_TYPES[kind], _PLY_TYPES[length]))
+            case ["property", kind, name] if elements and kind in _PLY_TYPES:
+                elements[-1].properties.append((name, _PLY_TYPES[kind], None))
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"its header has the line {line[:60]!r}")
+    if not form:
+        raise ValueError("its header names no format that is known")
+    for element in elements:
+        names = [name for name, _, _ in element.properties]
+        if len(set(names)) < len(names):
+            raise ValueError(f"a property of its element {element.name} occurs twice")
+        if any(length is not None and length[0] == "f" for _, _, length in element.properties):
+            raise ValueError(f"a list of its element {element.name} has a length that is no whole number")
+        # A row without a property takes no bytes, so that a file of any size could have any number of them.
+        if element.count and not element.properties:
+            raise ValueError(f"its element {element.name} has no properties")
+    order = ">" if form == "binary_big_endian" else "<"
+    for element in elements:
+        element.properties = [
+            (name, order + kind, length and order + length) for name, kind, length in element.properties
+        ]
+    return elements, form
+
+
+Columns = dict[str, Any]  # by property: an array of numbers, or a sequence of lists
+
+
+def _ply_binary(elements: list[_Element], body: memoryview) -> dict[str, Columns]:
+    found: dict[str, Columns] = {}
+    at = 0
+    for element in elements:
+        if element.count * element.least > len(body) - at:
+            raise ValueError(f"it is cut short: its {element.count} rows of {element.name} are not all there")
+        rows, at = _ply_rows(element, body, at)
+        found[element.name] = rows
+    if at != len(body):
+        raise ValueError(f"it holds {len(body) - at} bytes more than its header declares")
+    return found
+
+
+def _ply_rows(element: _Element, body: memoryview, at: int) -> tuple[Columns, int]:
+    """The columns of an element that starts at byte ``at``, and where it ends."""
+    if not element.count:
+        return {}, at
+    # Nearly all files have lists of one length, triangles, so that the first row tells the size of all.
+    first, _ = _ply_row(element, body, at)
+    fields: list[tuple[str, Any]] = []
+    for number, ((_, kind, length), value) in enumerate(zip(element.properties, first, strict=True)):
+        if length is not None:
+            fields.append((f"length{number}", length))
+        fields.append((f"value{number}", kind if length is None else (kind, (len(value),))))
+    row = np.dtype(fields)
+    if element.count * row.itemsize <= len(body) - at:
+        table = np.frombuffer(body, row, element.count, at)
+        if all(
+            (table[f"length{i}"] == len(first[i])).all()
+            for i, (_, _, length) in enumerate(element.properties)
+            if length is not None
+        ):
+            columns = {name: table[f"value{number}"] for number, (name, _, _) in enumerate(element.properties)}
+            return columns, at + element.count * row.itemsize
+    lists: Columns = {name: [] for name, _, _ in element.properties}
+    for _ in range(element.count):
+        values, at = _ply_row(element, body, at)
+        for (name, _, _), value in zip(element.properties, values, strict=True):
+            lists[name].append(value)
+    return lists, at
+
+
+def _ply_row(element: _Element, body: memoryview, at: int) -> tuple[list[Any], int]:
+    values: list[Any] = []
+    for _, kind, length in element.properties:
+        count = 1
+        if length is not None:
+            count, at = int(np.frombuffer(body, length, 1, at)[0]), at + np.dtype(length).itemsize
+        size = count * np.dtype(kind).itemsize
+        if count < 0 or at + size > len(body):
+            raise ValueError(f"it is cut short: a list of {element.name} is not all there")
+        value = np.frombuffer(body, kind, count, at) if count else np.empty(0, kind)
+        values.append(value[0] if length is None else value)
+        at += size
+    return values, at
+
+
+def _ply_text(elements: list[_Element], words: list[bytes]) -> dict[str, Columns]:
+    found: dict[str, Columns] = {}
+    at = 0
+    for element in elements:
+        width = len(element.properties)
+        if element.count * width > len(words) - at:
+            raise ValueError(f"it is cut short: its {element.count} rows of {element.name} are not all there")
+        if all(length is None for _, _, length in element.properties):
+            flat = [float(word) for word in words[at : at + element.count * width]]
+            table = np.array(flat).reshape(element.count, width) if width else np.zeros((element.count, 0))
+            with np.errstate(over="ignore"):  # what a float cannot hold becomes infinite, and is refused as that
+                found[element.name] = {
+                    name: table[:, i].astype(kind) if kind[1] == "f" else table[:, i]
+                    for i, (name, kind, _) in enumerate(element.properties)
+                }
+            at += element.count * width
+            continue
+        lists: Columns = {name: [] for name, _, _ in element.properties}
+        for _ in range(element.count):
+            for name, kind, length in element.properties:
+                count = 1
+                if length is not None:
+                    count, at = int(words[at]), at + 1
+                if not 0 <= count <= len(words) - at:
+                    raise ValueError(f"it is cut short: a list of {element.name} is not all there")
+                number = float if length is None or kind[1] == "f" else int
+                values = [number(word) for word in words[at : at + count]]
+                lists[name].append(values if length is not None else values[0])
+                at += count
+        found[element.name] = lists if element.count else {}
+    if at != len(words):
+        raise ValueError(f"it holds {len(words) - at} numbers more than its header declares")
+    return found
+
+
+# STL: triangles without shared vertices; they stay as the file has them.
+
+_STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def _read_stl(data: bytes, path: Path) -> Mesh:
+    stated = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else -1
+    if len(data) == 84 + stated * _STL_ROW.itemsize:
+        LIMITS.check("vertices", 3 * stated, path)
+        points = np.frombuffer(data, _STL_ROW, stated, 84)["corners"].reshape(-1, 3).astype(np.float64)
+    elif data.lstrip()[:5].lower() == b"solid":
+        points = _stl_text(data, path)
+    else:
+        raise ValueError(f"its {len(data)} bytes are not those of the {max(0, stated)} triangles that it declares")
+    return Mesh(points, np.arange(len(points), dtype=np.int32).reshape(-1, 3))
+
+
+def _stl_text(data: bytes, path: Path) -> Array:
+    LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(data), path)
+    LIMITS.check("vertices", data.lower().count(b"vertex"), path)
+    numbers: list[float] = []
+    facet, solid = 0, False
+    for line in data.lower().splitlines():
+        match line.split():
+            case [b"vertex", *words] if len(words) == 3:
+                numbers += [float(word) for word in words]
+                facet += 1
+            case [b"endfacet", *_] if facet == 3:
+                facet = 0
+            case [b"solid", *_]:
+                solid = True
+            case [b"endsolid", *_] if solid and not facet:
+                solid = False
+            case [] | [b"facet" | b"outer" | b"endloop", *_]:
+                pass
+            case _:
+                raise ValueError(f"it has the line {line[:60]!r}")
+    if solid or facet:
+        raise ValueError("it is cut short: its last solid does not end")
+    return np.array(numbers).reshape(-1, 3)
+
+
+# OFF.
+
+
+def _read_off(data: bytes, path: Path) -> Mesh:
+    LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(data), path)
+    head = re.match(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?C?N?OFF\b", data)
+    if head is None:
+        raise ValueError("it does not begin with OFF")
+    lines = [words for line in data[head.end() :].splitlines() if (words := line.partition(b"#")[0].split())]
+    if not lines or len(lines[0]) < 2:
+        raise ValueError("it does not say how many vertices and faces it has")
+    n_vertices, n_faces = int(lines[0][0]), int(lines[0][1])
+    LIMITS.check("vertices", n_vertices, path)
+    LIMITS.check("vertices", n_faces, path)
+    if len(lines) < 1 + n_vertices + n_faces:
+        raise ValueError(f"it is cut short: its {n_vertices} vertices and {n_faces} faces are not all there")
+    points = np.array([[float(word) for word in line[:3]] for line in lines[1 : 1 + n_vertices]]).reshape(-1, 3)
+    polygons = []
+    for line in lines[1 + n_vertices : 1 + n_vertices + n_faces]:
+        corners = [int(word) for word in line[1 : 1 + max(0, int(line[0]))]]
+        if len(corners) != int(line[0]):
+            raise ValueError("a face has fewer corners than it declares")
+        polygons.append(corners)
+    return Mesh(points, _cut(polygons, n_vertices, path))
+
+
+READERS: dict[str, Callable[[bytes, Path], Mesh]] = {
+    ".ply": _read_ply,
+    ".obj": _read_obj,
+    ".stl": _read_stl,
+    ".off": _read_off,
+    ".glb": read_glb,
+}
+SUFFIXES = tuple(READERS)

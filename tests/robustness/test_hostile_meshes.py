@@ -1,0 +1,316 @@
+"""Mesh files built to deceive: headers that lie, sizes without data, numbers that are none, names of other files."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from facediff.errors import FaceDiffError
+from facediff.mesh import read_mesh
+from facediff.utils.limits import Limits
+
+XYZ = ["property float x", "property float y", "property float z"]
+LIST = "property list uchar int vertex_indices"
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
+SQUARE = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n"
+
+
+def ply(*lines: str, body: bytes = b"", form: str = "binary_little_endian") -> bytes:
+    return "\n".join(["ply", f"format {form} 1.0", *lines, "end_header", ""]).encode() + body
+
+
+def ascii_ply(body: str, vertices: object = 4, faces: object = 1) -> bytes:
+    return ply(f"element vertex {vertices}", *XYZ, f"element face {faces}", LIST, body=body.encode(), form="ascii")
+
+
+def binary_ply(faces: bytes, n_faces: int = 1) -> bytes:
+    return ply("element vertex 4", *XYZ, f"element face {n_faces}", LIST, body=CORNERS.tobytes() + faces)
+
+
+def stl(triangles: int, body: bytes) -> bytes:
+    return bytes(80) + struct.pack("<I", triangles) + body
+
+
+GOOD: dict[str, Any] = {
+    "asset": {"version": "2.0"},
+    "scene": 0,
+    "scenes": [{"nodes": [0]}],
+    "nodes": [{"mesh": 0}],
+    "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    "accessors": [
+        {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+        {"bufferView": 1, "componentType": 5121, "count": 6, "type": "SCALAR"},
+    ],
+    "bufferViews": [
+        {"buffer": 0, "byteLength": 48},
+        {"buffer": 0, "byteOffset": 48, "byteLength": 6},
+    ],
+    "buffers": [{"byteLength": 56}],
+}
+DATA = CORNERS.tobytes() + bytes([0, 1, 2, 0, 2, 3, 0, 0])
+
+
+def glb(content: object, binary: bytes = DATA) -> bytes:
+    text = content if isinstance(content, bytes) else json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+def changed(path: str, value: object) -> bytes:
+    """The good file with one entry replaced, such as ``accessors.0.count``."""
+    content = json.loads(json.dumps(GOOD))
+    *outer, last = path.split(".")
+    holder = content
+    for key in outer:
+        holder = holder[int(key) if key.isdigit() else key]
+    holder[int(last) if last.isdigit() else last] = value
+    return glb(content)
+
+
+REFUSED: dict[str, tuple[str, bytes]] = {
+    # OBJ
+    "obj of 1e999": (".obj", b"v 0 0 1e999\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    "obj of nan": (".obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    "obj of 1e308": (".obj", b"v 0 0 1e308\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    "obj with vertex 0": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n"),
+    "obj with vertex 4": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n"),
+    "obj with vertex -4": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -4\n"),
+    "obj with a huge vertex": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 " + b"9" * 30 + b"\n"),
+    "obj with a longer number": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 " + b"9" * 9999 + b"\n"),
+    "obj with a point as face": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1\n"),
+    "obj with two coordinates": (".obj", b"v 0 0 0\nv 1 0\nv 0 1 0 1\nf 1 2 3\n"),
+    "obj with relative faces in between": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 5 5 5\nf -3 -2 -1\n"),
+    "obj of zero bytes": (".obj", bytes(1000)),
+    # PLY
+    "ply of 1e12 vertices": (".ply", ply("element vertex 1000000000000", *XYZ)),
+    "ply of -1 vertices": (".ply", ply("element vertex -1", *XYZ)),
+    "ply of 10^5 digits": (".ply", ply(f"element vertex {'9' * 50_000}", *XYZ)),
+    "ply of one more vertex": (".ply", ply("element vertex 5", *XYZ, body=CORNERS.tobytes())),
+    "ply of one vertex less": (".ply", ply("element vertex 3", *XYZ, body=CORNERS.tobytes())),
+    "ply of rows without columns": (".ply", ply("element vertex 2000000", "element face 0", LIST)),
+    "ply without an end": (".ply", b"ply\nformat ascii 1.0\nelement vertex 3\n" + b"comment x\n" * 9999),
+    "ply of an unknown type": (".ply", ply("element vertex 1", "property quad x")),
+    "ply with a property before elements": (".ply", ply("property float x")),
+    "ply with two x": (".ply", ply("element vertex 1", *XYZ, "property float x", body=bytes(16))),
+    "ply whose list is cut": (".ply", binary_ply(b"\x03" + struct.pack("<2i", 0, 1))),
+    "ply whose list is huge": (".ply", binary_ply(b"\xff" + struct.pack("<3i", 0, 1, 2))),
+    "ply whose list is negative": (
+        ".ply",
+        ply("element vertex 4", *XYZ, "element face 1", "property list char int vertex_indices")
+        + CORNERS.tobytes()
+        + b"\xff",
+    ),
+    "ply with vertex -1": (".ply", binary_ply(b"\x03" + struct.pack("<3i", 0, 1, -1))),
+    "ply with vertex 4": (".ply", binary_ply(b"\x03" + struct.pack("<3i", 0, 1, 4))),
+    "ply with an edge as face": (".ply", binary_ply(b"\x02" + struct.pack("<2i", 0, 1))),
+    "ply cut in its faces": (".ply", ascii_ply(SQUARE + "3 0 1 2\n", faces=2)),
+    "ply with a word": (".ply", ascii_ply(SQUARE.replace("1 1 0", "1 one 0") + "3 0 1 2\n")),
+    "ply of nan": (".ply", ascii_ply(SQUARE.replace("1 1 0", "1 nan 0") + "3 0 1 2\n")),
+    "ply of 1e39": (".ply", ascii_ply(SQUARE.replace("1 1 0", "1 1e39 0") + "3 0 1 2\n")),
+    # STL
+    "stl of 2^32 triangles": (".stl", stl(0xFFFFFFFF, bytes(50))),
+    "stl of one more triangle": (".stl", stl(2, bytes(50))),
+    "stl that is cut": (".stl", b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"),
+    "stl of two corners": (
+        ".stl",
+        b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nendloop\nendfacet\nendsolid\n",
+    ),
+    # OFF
+    "off of 1e12 vertices": (".off", b"OFF\n1000000000000 1 0\n0 0 0\n"),
+    "off of -1 faces": (".off", b"OFF\n3 -1 0\n0 0 0\n1 0 0\n0 1 0\n"),
+    "off cut in its faces": (".off", b"OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
+    "off with vertex 3": (".off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n"),
+    "off with a short face": (".off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2\n"),
+    # Binary glTF
+    "glb of 1e9 vertices": (".glb", changed("accessors.0.count", 10**9)),
+    "glb of a million vertices": (".glb", changed("accessors.0.count", 10**6)),
+    "glb of -1 vertices": (".glb", changed("accessors.0.count", -1)),
+    "glb of 4.0 vertices": (".glb", changed("accessors.0.count", 4.5)),
+    "glb of true vertices": (".glb", changed("accessors.0.count", True)),
+    "glb beyond its view": (".glb", changed("bufferViews.0.byteLength", 47)),
+    "glb beyond its data": (".glb", changed("bufferViews.1.byteOffset", 1 << 40)),
+    "glb before its data": (".glb", changed("accessors.0.byteOffset", -4)),
+    "glb with stride 0": (".glb", changed("bufferViews.0.byteStride", 0)),
+    "glb with view -1": (".glb", changed("accessors.0.bufferView", -1)),
+    "glb with accessor -1": (".glb", changed("meshes.0.primitives.0.attributes.POSITION", -1)),
+    "glb of another file": (".glb", changed("buffers.0", {"byteLength": 56, "uri": "/etc/passwd"})),
+    "glb of a page": (".glb", changed("buffers.0", {"byteLength": 56, "uri": "http://localhost/x"})),
+    "glb of data in a name": (".glb", changed("buffers.0", {"byteLength": 56, "uri": "data:;base64,AAAA"})),
+    "glb compressed": (".glb", changed("extensionsRequired", ["KHR_draco_mesh_compression"])),
+    "glb without data": (".glb", changed("accessors.0", {"componentType": 5126, "count": 4, "type": "VEC3"})),
+    "glb of a cycle": (".glb", changed("nodes.0", {"mesh": 0, "children": [0]})),
+    "glb of two parents": (".glb", changed("nodes", [{"children": [1, 1]}, {"mesh": 0}])),
+    "glb of mesh 7": (".glb", changed("nodes.0", {"mesh": 7})),
+    "glb of a huge scale": (".glb", changed("nodes.0", {"mesh": 0, "scale": [1e300, 1, 1]})),
+    "glb of a word as scale": (".glb", changed("nodes.0", {"mesh": 0, "scale": ["1", 1, 1]})),
+    "glb of a short matrix": (".glb", changed("nodes.0", {"mesh": 0, "matrix": [1, 2, 3]})),
+    "glb with vertex 9": (".glb", glb(GOOD, DATA.replace(bytes([0, 2, 3, 0, 0]), bytes([0, 2, 9, 0, 0])))),
+    "glb whose chunk is longer": (".glb", glb(GOOD)[:-8]),
+    "glb of nan in json": (".glb", glb(b'{"asset": NaN}')),
+    "glb of brackets": (".glb", glb(b"[" * 100_000)),
+    "glb of a list": (".glb", glb([])),
+    "glb of no json": (".glb", b"glTF" + struct.pack("<II", 2, 12)),
+    "glb that is sparse without data": (
+        ".glb",
+        changed(
+            "accessors.0.sparse",
+            {
+                "count": 1,
+                "indices": {"bufferView": 1, "componentType": 5121, "byteOffset": 9},
+                "values": {"bufferView": 0},
+            },
+        ),
+    ),
+    # Others
+    "a format that is not read": (".gltf", json.dumps(GOOD).encode()),
+    "an archive": (".zip", b"PK\x05\x06" + bytes(18)),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_mesh_that_lies_is_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
+    suffix, content = REFUSED[name]
+    path = tmp_path / f"face{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(FaceDiffError, match=r"face\.\w+: ") as error:
+        read_mesh(path)
+    assert "\n" not in str(error.value)
+
+
+ICO = trimesh.creation.icosphere(subdivisions=1)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".off", ".stl", ".glb"])
+def test_a_mesh_is_read_as_it_was_written(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"ball{suffix}"
+    ICO.export(path)
+    mesh = read_mesh(path)
+    corners = ICO.vertices[ICO.faces]
+    np.testing.assert_allclose(mesh.vertices[mesh.faces], corners, atol=1e-6)
+    assert len(mesh.vertices) == (3 * len(ICO.faces) if suffix == ".stl" else len(ICO.vertices))
+
+
+MIXED = [[0, 1, 2, 3], [0, 1, 4], [4, 3, 2, 1, 0]]
+CUT = [[0, 1, 4], [0, 1, 2], [2, 3, 0], [4, 3, 2], [4, 2, 1], [4, 1, 0]]
+POINTS = np.vstack([CORNERS, [[0, 0, 1]]]).astype("<f4")
+
+
+def test_polygons_of_several_sizes_are_cut_alike_in_all_formats(tmp_path: Path) -> None:
+    rows = "".join(f"{len(face)} {' '.join(map(str, face))}\n" for face in MIXED)
+    points = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in POINTS)
+    head = ["element vertex 5", *XYZ, "element face 3", LIST]
+    faces = b"".join(bytes([len(face)]) + struct.pack(f"<{len(face)}i", *face) for face in MIXED)
+    swapped = b"".join(bytes([len(face)]) + struct.pack(f">{len(face)}i", *face) for face in MIXED)
+    files = {
+        "text.ply": ply(*head, body=(points + rows).encode(), form="ascii"),
+        "little.ply": ply(*head, body=POINTS.tobytes() + faces),
+        "big.ply": ply(*head, body=POINTS.astype(">f4").tobytes() + swapped, form="binary_big_endian"),
+        "windows.ply": ply(*head, body=(points + rows).encode(), form="ascii").replace(b"\n", b"\r\n"),
+        "text.off": f"OFF # five points\n5 3 0\n\n{points}{rows}".encode(),
+    }
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+        mesh = read_mesh(tmp_path / name)
+        assert mesh.faces.tolist() == CUT, name
+        assert mesh.vertices.tolist() == POINTS.tolist(), name
+
+
+def test_a_textured_ply_keeps_its_vertices(tmp_path: Path) -> None:
+    head = ["element vertex 4", *XYZ, "element face 2", LIST, "property list uchar float texcoord"]
+    body = SQUARE + "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 .5 .5 0 0 1 0\n"
+    (tmp_path / "a.ply").write_bytes(ply("comment TextureFile /etc/passwd", *head, body=body.encode(), form="ascii"))
+    mesh = read_mesh(tmp_path / "a.ply")
+    assert mesh.vertices.tolist() == CORNERS.tolist()
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+def test_sparse_changes_of_a_glb_are_made(tmp_path: Path) -> None:
+    content = json.loads(json.dumps(GOOD))
+    content["bufferViews"] += [
+        {"buffer": 0, "byteOffset": 56, "byteLength": 1},
+        {"buffer": 0, "byteOffset": 60, "byteLength": 12},
+    ]
+    content["accessors"][0]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": 2, "componentType": 5121},
+        "values": {"bufferView": 3},
+    }
+    moved = np.array([[7, 8, 9]], "<f4")
+    (tmp_path / "a.glb").write_bytes(glb(content, DATA + bytes([2, 0, 0, 0]) + moved.tobytes()))
+    assert read_mesh(tmp_path / "a.glb").vertices.tolist() == [[0, 0, 0], [1, 0, 0], [7, 8, 9], [0, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("node", "expected"),
+    [
+        ({"translation": [1, 2, 3]}, [2, 2, 3]),
+        ({"scale": [2, 1, 1]}, [2, 0, 0]),
+        ({"rotation": [0, 0, 0.5**0.5, 0.5**0.5]}, [0, 1, 0]),
+        ({"matrix": [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]}, [5, 7, 7]),
+    ],
+)
+def test_nodes_place_the_meshes_of_a_glb(node: dict[str, Any], expected: list[float], tmp_path: Path) -> None:
+    (tmp_path / "a.glb").write_bytes(changed("nodes", [{"children": [1], **node}, {"mesh": 0}]))
+    np.testing.assert_allclose(read_mesh(tmp_path / "a.glb").vertices[1], expected, atol=1e-6)
+
+
+def test_a_mirrored_mesh_keeps_its_outside(tmp_path: Path) -> None:
+    (tmp_path / "a.glb").write_bytes(changed("nodes", [{"mesh": 0, "scale": [-1, 1, 1]}]))
+    assert read_mesh(tmp_path / "a.glb").faces.tolist() == [[2, 1, 0], [3, 2, 0]]
+
+
+def shared(content: dict[str, Any]) -> None:
+    content["nodes"] = [{"children": [*range(1, 40)]}, *({"mesh": 0} for _ in range(39))]
+
+
+def parts(content: dict[str, Any]) -> None:
+    content["meshes"][0]["primitives"] *= 40
+
+
+@pytest.mark.parametrize("grow", [shared, parts])
+def test_data_that_is_used_often_counts_as_often(grow: Callable[[dict[str, Any]], None], tmp_path: Path) -> None:
+    """A few bytes, named by many nodes or parts, would fill any memory."""
+    content = json.loads(json.dumps(GOOD))
+    grow(content)
+    (tmp_path / "a.glb").write_bytes(glb(content))
+    assert len(read_mesh(tmp_path / "a.glb").vertices) >= 39 * 4
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("facediff.mesh.glb.LIMITS", Limits(vertices=100))
+        with pytest.raises(FaceDiffError, match="vertices"):
+            read_mesh(tmp_path / "a.glb")
+
+
+def test_meshes_that_declare_gigabytes_are_refused_in_little_memory(tmp_path: Path) -> None:
+    bombs = {name: REFUSED[name] for name in REFUSED if "1e12" in name or "1e9" in name or "2^32" in name}
+    assert len(bombs) >= 4
+    paths = []
+    for number, (suffix, content) in enumerate(bombs.values()):
+        paths.append(tmp_path / f"{number}{suffix}")
+        paths[-1].write_bytes(content)
+    code = """
+import resource, sys
+from pathlib import Path
+from facediff.errors import FaceDiffError
+from facediff.mesh import read_mesh
+size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (size + (64 << 20),) * 2)
+for name in sys.argv[1:]:
+    try:
+        read_mesh(Path(name))
+    except FaceDiffError:
+        print("refused")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, paths)], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stdout.split() == ["refused"] * len(paths), done.stderr
