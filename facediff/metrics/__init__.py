@@ -23,6 +23,7 @@ class's docstring has the formula, its source, its unit, and what about it is a 
   `LipSpeedCorrelation` (lip PCC)
 - loudness: `ClipSpeechLipCorrelation` and `FrameSpeechLipCorrelation` (SLCC)
 - several samples: `MeanEstimateError`, `CoverageError`, `SampleDiversity`
+- does it generate: `MotionLiveliness`, `SpreadErrorRatio`, `EnergyScore`
 - several identities: `IdentityDiversity`, `StyleRetrievalAccuracy`
 - speed: `RealTimeFactor`
 
@@ -45,6 +46,13 @@ from facediff.metrics.by_name import Context as Context
 from facediff.metrics.by_name import Request as Request
 from facediff.metrics.by_name import feed as feed
 from facediff.metrics.by_name import parse as parse
+from facediff.metrics.generation import EnergyScore as EnergyScore
+from facediff.metrics.generation import MotionLiveliness as MotionLiveliness
+from facediff.metrics.generation import RatioMetric as RatioMetric
+from facediff.metrics.generation import SpreadErrorRatio as SpreadErrorRatio
+from facediff.metrics.generation import energy_score as energy_score
+from facediff.metrics.generation import motion_liveliness as motion_liveliness
+from facediff.metrics.generation import spread_error_ratio as spread_error_ratio
 from facediff.metrics.mouth import BilabialClosureRate as BilabialClosureRate
 from facediff.metrics.mouth import Closures as Closures
 from facediff.metrics.mouth import LipOpeningCorrelation as LipOpeningCorrelation

@@ -66,7 +66,8 @@ def align_samples(
     return clips if truth is not None else clips.attach("truth", predictions)
 
 
-_INFERRED: Inferred = {"n_samples": lambda given: given["samples"].shape[-4] if given["samples"].ndim > 3 else 2}
+SAMPLES_GIVEN: Inferred = {"n_samples": lambda given: given["samples"].shape[-4] if given["samples"].ndim > 3 else 2}
+"""How a function reads the number of samples from what it is given."""
 
 
 class SamplesMetric(SequenceMetric):
@@ -80,7 +81,7 @@ class SamplesMetric(SequenceMetric):
 
     higher_is_better = False
     needs = ("lips", "samples")
-    inferred: ClassVar[Inferred] = _INFERRED
+    inferred: ClassVar[Inferred] = SAMPLES_GIVEN
     indices: Tensor
 
     def __init__(
@@ -236,7 +237,7 @@ class SampleDiversity(Diversity):
     """
 
     needs = ("samples",)
-    inferred: ClassVar[Inferred] = _INFERRED
+    inferred: ClassVar[Inferred] = SAMPLES_GIVEN
 
     def __init__(
         self,

@@ -17,7 +17,7 @@ import facediff.metrics as fm
 DOCS = Path(__file__).parents[2] / "docs"
 METRICS, WHICH = (DOCS / name for name in ("metrics.md", "which_lve.md"))
 BASES = {"ExactMetric", "LipMetric", "OpeningMetric", "SamplesMetric", "SequenceMetric", "SpeechLipMetric"}
-BASES |= {"VertexError"}
+BASES |= {"RatioMetric", "VertexError"}
 Array = NDArray[np.float64]
 
 

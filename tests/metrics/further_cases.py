@@ -334,6 +334,38 @@ def diversity(
     return float(np.mean([np.linalg.norm(x[a] - x[b], axis=-1).mean() for a, b in pairs])), x.shape[1]
 
 
+def liveliness(corpus: Corpus, *, region: Sequence[int]) -> float:
+    def moved(x: Array) -> float:
+        x = x[:, list(region)]
+        return float(((x - x.mean(0)) ** 2).sum())
+
+    both = [sides(corpus, place) for place in range(len(corpus.truths))]
+    return float(np.sqrt(sum(moved(p) for p, _ in both) / sum(moved(g) for _, g in both)))
+
+
+def spread_over_error(corpus: Corpus, *, region: Sequence[int]) -> float:
+    spread = error = 0.0
+    for place in range(len(corpus.truths)):
+        x = several(corpus, place).astype(np.float64)[:, :, list(region)]
+        g = corpus.truths[place].astype(np.float64)[:, list(region)]
+        pairs = list(combinations(range(SAMPLES), 2))
+        spread += np.mean([np.linalg.norm(x[a] - x[b], axis=-1).mean(1).sum() for a, b in pairs])
+        error += np.mean([np.linalg.norm(one - g, axis=-1).mean(1).sum() for one in x])
+    return spread / error
+
+
+def energy(corpus: Corpus, place: int, *, of: str, region: Sequence[int]) -> tuple[float, float]:
+    x = several(corpus, place).astype(np.float64)[:, :, list(region)]
+    g = corpus.truths[place].astype(np.float64)[:, list(region)]
+
+    def distance(a: Array, b: Array) -> float:
+        squares = ((a - b) ** 2).sum((1, 2)) / len(region)
+        return float(np.sqrt(squares).mean() if of == "frames" else np.sqrt(squares.mean()))
+
+    off = np.mean([distance(one, g) for one in x])
+    return float(off - 0.5 * np.mean([distance(x[a], x[b]) for a, b in combinations(range(SAMPLES), 2)])), len(g)
+
+
 # --- the table --------------------------------------------------------------------------------------------
 
 
@@ -426,6 +458,19 @@ def _cases() -> list[Case]:
         twin = partial(fm.identity_diversity, pooling=pooling)
         batch = partial(lone_samples_batch, name="predictions")
         add(fm.IdentityDiversity, twin, (), {"pooling": pooling}, batch, pooled(formula, pooling))
+    for region in (None, LIPS):
+        twin = partial(fm.motion_liveliness, region=region)
+        expected = partial(liveliness, region=region or range(40))
+        word, only = "region" if region else "", {"n_samples": SAMPLES}
+        add(fm.MotionLiveliness, twin, (region,), {}, pair_batch, expected, word)
+        twin = partial(fm.spread_error_ratio, region=region)
+        expected = partial(spread_over_error, region=region or range(40))
+        add(fm.SpreadErrorRatio, twin, (region,), {}, samples_batch, expected, word, only)
+        for of, pooling in product(("frames", "sequences"), poolings):
+            options = {"of": of, "pooling": pooling}
+            twin = partial(fm.energy_score, region=region, **options)
+            expected = pooled(partial(energy, of=of, region=region or range(40)), pooling)
+            add(fm.EnergyScore, twin, (region,), options, samples_batch, expected, word, only)
     return cases
 
 

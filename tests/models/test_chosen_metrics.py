@@ -20,7 +20,7 @@ from facediff.models.evaluation import with_identity
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., Any]
-SEVERAL = {"sample_diversity", "mean_estimate_error", "coverage_error"}
+SEVERAL = {"sample_diversity", "mean_estimate_error", "coverage_error", "spread_error_ratio", "energy_score"}
 
 
 @pytest.fixture

@@ -1,0 +1,265 @@
+"""Does a model generate? How lively motion is, whether samples scatter as much as they err, and a proper score of both.
+
+A model that predicts the mean of all that speech leaves open scores well in every distance from the truth, and moves
+the upper face hardly at all. These metrics see that. All but :class:`MotionLiveliness` compare several samples of each
+sequence with the one recorded truth.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import ClassVar, Literal, Unpack
+
+import torch
+from torch import Tensor
+
+from facediff.metrics.base import (
+    BatchOptions,
+    Clip,
+    Clips,
+    Inferred,
+    Pooling,
+    SequenceMetric,
+    SequenceOptions,
+    check_option,
+    functional,
+)
+from facediff.metrics.regions import RegionLike
+from facediff.metrics.samples import SAMPLES_GIVEN, align_samples
+from facediff.registry import metric
+
+
+class RatioMetric(SequenceMetric):
+    """Base of metrics that divide one sum over all sequences by another; a subclass defines `clip_parts`.
+
+    The mean of each sequence's own ratio would be ruled by the sequences in which hardly anything happens.
+    """
+
+    parts: Tensor
+
+    def __init__(
+        self, region: RegionLike | None = None, *, definition: str, **options: Unpack[SequenceOptions]
+    ) -> None:
+        super().__init__(definition=f"{definition}; ratio of sums over all sequences [1]", region=region, **options)
+        self.add_state("parts", torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
+        self._latest_parts: list[Tensor] = []
+
+    def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        """Numerator and denominator of one sequence, float64 scalars."""
+        raise NotImplementedError
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The ratio of one sequence; infinity where its denominator is zero."""
+        above, below = self.clip_parts(clip)
+        self._latest_parts.append(torch.stack([above, below]))
+        return above / below
+
+    def add(self, clips: Clips) -> None:
+        """Check aligned sequences and add their parts to the sums; nothing is added where one is refused."""
+        self._latest_parts = []
+        super().add(clips)
+        if self._latest_parts:
+            self.parts = self.parts + torch.stack(self._latest_parts).sum(0)
+        # The score is no mean of the sequences' values; whoever combines sequences must add up states instead.
+        self.latest = None
+
+    def finish(self, ratio: Tensor) -> Tensor:
+        """From the ratio of the sums to the score."""
+        return ratio
+
+    def compute(self) -> Tensor:
+        """The score over all sequences so far, a float64 scalar.
+
+        Raises:
+            ValueError: If no process had any sequence, or the denominator is zero on all of them.
+        """
+        if int(self.counts[1]) == 0:
+            self.refuse_to_compute(0)
+        if float(self.parts[1]) == 0:
+            self.leave_synchronised_state()
+            raise ValueError(f"{type(self).__name__} would divide by zero: {self.divides_by}")
+        return self.finish(self.parts[0] / self.parts[1])
+
+    divides_by: ClassVar[str] = "the denominator is zero on every sequence"
+
+
+@metric.register("motion_liveliness")
+class MotionLiveliness(RatioMetric):
+    r"""Liveliness: how much a region moves over time, as a share of how much the truth's does.
+
+    With the variance over the frames t of a sequence, σ²(x) = Σ_v ‖x_v[t] − mean_t x_v‖² averaged over t:
+    √(Σ σ²(prediction) / Σ σ²(truth)), sums over sequences weighted by their frames. 1 is as lively as the truth, 0 a
+    face that never moves. Unlike FDD it cannot be met by moving too much in one place and too little in another.
+
+    >>> import torch
+    >>> truth = torch.randn(9, 4, 3, generator=torch.Generator().manual_seed(0))
+    >>> round(motion_liveliness(0.5 * truth, truth).item(), 6)
+    0.5
+    """
+
+    divides_by = "the truth does not move in any sequence"
+
+    def __init__(self, region: RegionLike | None = None, **options: Unpack[SequenceOptions]) -> None:
+        words = "root of the prediction's variance over time, over that of the truth, over {region}"
+        super().__init__(region, definition=words, **options)
+
+    def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        """Summed squared distance of each side from its own mean over time."""
+        regions = [_of(side, self.indices) for side in (clip.prediction, clip.truth)]
+        above, below = (region.sub_(region.mean(0)).square_().sum() for region in regions)
+        return above, below
+
+    def finish(self, ratio: Tensor) -> Tensor:
+        """A ratio of variances becomes one of deviations."""
+        return ratio.sqrt()
+
+
+class _SamplesRatio(RatioMetric):
+    needs: ClassVar[tuple[str, ...]] = ("samples",)
+    inferred: ClassVar[Inferred] = SAMPLES_GIVEN
+
+    def __init__(
+        self, region: RegionLike | None, *, definition: str, n_samples: int, **options: Unpack[SequenceOptions]
+    ) -> None:
+        if n_samples < 2:
+            raise ValueError(f"n_samples is {n_samples}; expected at least 2")
+        super().__init__(region, definition=f"of {n_samples} samples, {definition}", **options)
+        self.n_samples = n_samples
+
+    def update(self, samples: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> None:
+        """Add a batch of sequences.
+
+        Args:
+            samples: Predictions (batch, samples, frames, vertices, 3), or of one sequence (samples, frames,
+                vertices, 3), floating point.
+            truth: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
+            **batch: Those of `BatchOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
+
+        Raises:
+            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
+        """
+        self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
+
+
+@metric.register("spread_error_ratio")
+class SpreadErrorRatio(_SamplesRatio):
+    """Spread over error: how far two samples are apart, as a share of how far a sample is from the truth.
+
+    Σ mean_{i<j} d(x_i, x_j) / Σ mean_i d(x_i, y), with d(a, b) = Σ_t mean_v ‖a_v[t] − b_v[t]‖₂ and sums over sequences.
+    If samples are drawn from the distribution that the truth was drawn from, the truth is one more sample, and the
+    ratio is 1: the model is calibrated. 0 is a model without any choice, below 1 one that is too sure, above 1 one that
+    scatters more than it knows.
+
+    Args:
+        n_samples: How many samples there are of each sequence; other numbers are refused.
+
+    >>> import torch
+    >>> random = torch.Generator().manual_seed(0)
+    >>> samples, truth = torch.randn(8, 50, 30, 3, generator=random), torch.randn(50, 30, 3, generator=random)
+    >>> round(spread_error_ratio(samples, truth).item(), 2)
+    1.0
+    """
+
+    divides_by = "every sample equals the truth"
+
+    def __init__(
+        self, region: RegionLike | None = None, *, n_samples: int = 4, **options: Unpack[SequenceOptions]
+    ) -> None:
+        words = "mean distance between two of them, over that between one and the truth, over {region}"
+        super().__init__(region, definition=words, n_samples=n_samples, **options)
+
+    def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        """Distances between samples, and between samples and truth, summed over frames."""
+        several, truth = _of(clip.prediction, self.indices), _of(clip.truth, self.indices)
+        between = [_apart(several[:, i], several[:, j]) for i, j in combinations(range(several.shape[1]), 2)]
+        off = [_apart(sample, truth) for sample in several.unbind(1)]
+        return torch.stack(between).mean(), torch.stack(off).mean()
+
+
+Unit = Literal["frames", "sequences"]
+"""What the energy score takes as one vector: all coordinates of a frame, or of a whole sequence."""
+
+
+@metric.register("energy_score")
+class EnergyScore(SequenceMetric):
+    """Energy score: a proper score of samples against the truth; no collapsed or over-dispersed model can win it.
+
+    ES = mean_i ‖x_i − y‖ − ½ mean_{i≠j} ‖x_i − x_j‖, the multivariate form of the continuous ranked probability score
+    (Gneiting and Raftery 2007, eq. 22), unbiased in the number of samples. Vectors are all coordinates of a region in
+    one frame, divided by the square root of the number of vertices so that regions compare; or with ``of="sequences"``
+    those of all frames, which also sees whether samples move as the truth does over time. In the vertices' unit; lower
+    is better. With a single sample of a deterministic model it is the distance itself.
+
+    Args:
+        n_samples: How many samples there are of each sequence; other numbers are refused.
+        of: ``"frames"`` or ``"sequences"``.
+        pooling: ``"frames"`` or ``"sequences"``.
+
+    >>> import torch
+    >>> samples = torch.stack([torch.ones(4, 1, 3), -torch.ones(4, 1, 3)])
+    >>> round(energy_score(samples, torch.zeros(4, 1, 3)).item(), 6)  # √3 − ½ · 2√3
+    0.0
+    """
+
+    higher_is_better = False
+    needs: ClassVar[tuple[str, ...]] = ("samples",)
+    inferred: ClassVar[Inferred] = SAMPLES_GIVEN
+
+    def __init__(
+        self,
+        region: RegionLike | None = None,
+        *,
+        n_samples: int = 4,
+        of: Unit = "frames",
+        pooling: Pooling = "frames",
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        check_option("of", of, Unit)
+        if n_samples < 2:
+            raise ValueError(f"n_samples is {n_samples}; expected at least 2")
+        words = f"energy score of {n_samples} samples, vectors being {of} of {{region}}; {{pooling}} [unit]"
+        super().__init__(definition=words, pooling=pooling, region=region, **options)
+        self.n_samples = n_samples
+        self.of: Unit = of
+
+    def update(self, samples: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> None:
+        """Add a batch of sequences.
+
+        Args:
+            samples: Predictions (batch, samples, frames, vertices, 3), or of one sequence (samples, frames,
+                vertices, 3), floating point.
+            truth: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
+            **batch: Those of `BatchOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
+
+        Raises:
+            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
+        """
+        self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The score of one sequence, mean over its frames."""
+        several, truth = _of(clip.prediction, self.indices), _of(clip.truth, self.indices)
+        count = several.shape[1]
+
+        def distance(one: Tensor, other: Tensor) -> Tensor:
+            squared = (one - other).square().sum((-2, -1)) / one.shape[-2]
+            return squared.sqrt().mean() if self.of == "frames" else squared.mean().sqrt()
+
+        off = torch.stack([distance(sample, truth) for sample in several.unbind(1)]).mean()
+        between = [distance(several[:, i], several[:, j]) for i, j in combinations(range(count), 2)]
+        return off - 0.5 * torch.stack(between).mean()
+
+
+def _of(motion: Tensor, indices: Tensor | None) -> Tensor:
+    """A region of motion (frames, …, vertices, 3) in float64, in memory of its own."""
+    return motion.to(torch.float64, copy=True) if indices is None else motion.index_select(-2, indices).double()
+
+
+def _apart(one: Tensor, other: Tensor) -> Tensor:
+    """The mean distance of the vertices, summed over frames."""
+    return torch.linalg.vector_norm(one - other, dim=-1).mean(-1).sum()
+
+
+motion_liveliness = functional(MotionLiveliness)
+spread_error_ratio = functional(SpreadErrorRatio)
+energy_score = functional(EnergyScore)
