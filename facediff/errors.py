@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 
 def choices(name: str, known: Iterable[str]) -> str:
@@ -20,6 +20,47 @@ class FaceDiffError(Exception):
     The message names the file or the field, says what was expected and what to do next. The command line
     prints it without a traceback and exits with code 2.
     """
+
+
+class ArgumentError(FaceDiffError, ValueError):
+    """A constructor's argument has an impossible value, or one that does not go with another argument's.
+
+    Where it is raised, only the argument's own name is known. Whoever called that constructor knows which option it is,
+    and replaces the name by a path such as ``model.decoder.num_heads``; the command line writes it as an option.
+
+    Args:
+        values: the arguments with their values.
+        problem: what was expected, and what to do.
+        located: whether the names are paths already.
+    """
+
+    def __init__(self, values: Mapping[str, object], problem: str, *, located: bool = False) -> None:
+        self.values = dict(values)
+        self.problem = problem
+        self.located = located
+        super().__init__(self.sentence())
+
+    def sentence(self, prefix: str = "") -> str:
+        """The message with a prefix before every name; ``--`` makes options of them."""
+
+        def shown(value: object) -> str:
+            text = str(value) if value not in ("", None) else {"": '""', None: "null"}[value]  # type: ignore[index]
+            return text if len(text) <= 60 else f"{text[:60]}…"
+
+        named = " with ".join(f"{prefix}{name} {shown(value)}" for name, value in self.values.items())
+        return f"{named}: {self.problem}"
+
+    def at(self, path: Callable[[str], str]) -> ArgumentError:
+        """The same error with a path in place of each name."""
+        return type(self)({path(name): value for name, value in self.values.items()}, self.problem, located=True)
+
+    def __reduce__(self) -> tuple[Callable[..., ArgumentError], tuple[Mapping[str, object], str, bool]]:
+        """Pickling, by which worker processes hand errors over."""
+        return _argument_error, ({name: str(value) for name, value in self.values.items()}, self.problem, self.located)
+
+
+def _argument_error(values: Mapping[str, object], problem: str, located: bool) -> ArgumentError:
+    return ArgumentError(values, problem, located=located)
 
 
 class MissingExtraError(FaceDiffError):

@@ -15,20 +15,25 @@ This module depends on the standard library only.
 
 from __future__ import annotations
 
+import collections.abc
 import importlib
 import inspect
 import keyword
+import math
+import numbers
 import types
+import typing
 import warnings
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from enum import Enum
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from importlib.metadata import entry_points
+from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import ArgumentError, FaceDiffError, choices
 
 T = TypeVar("T", bound=type)
 
@@ -114,6 +119,9 @@ class Kind:
             raise RegistrationError(
                 f'{self.kind} name "{name}" is wanted by {owner} but belongs to {taken.owner}: rename one of them'
             )
+        if self._aliases and "__init__" in vars(implementation) and taken is None:
+            own: Any = implementation
+            own.__init__ = checks_arguments(own.__init__, f"model.{self.kind}", sizes="model")
         alias = self._make_alias(name, implementation) if self._aliases else implementation
         self._entries[name] = Entry(name, implementation, alias)
 
@@ -228,6 +236,131 @@ def alias_path(component: type) -> str:
     return f"{component.__module__}.{component.__qualname__}"
 
 
+# Constructor arguments are checked where they enter: against their type, and against the range that it states.
+
+
+@dataclass(frozen=True, repr=False)
+class Range:
+    """The numbers that an argument accepts: ``dim: Annotated[int, Range(1, 512)]``. Infinity and NaN are never allowed.
+
+    Attributes:
+        least: smallest number.
+        most: largest number.
+        above: number that the value must exceed.
+        below: number that the value must not reach.
+        items: for lists, whose every item must lie in the range, the fewest and the most items.
+    """
+
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+    items: tuple[int, int] = (0, 1000)
+
+    def __contains__(self, number: float) -> bool:
+        """Whether a number lies in the range."""
+        return (
+            (not isinstance(number, float) or math.isfinite(number))
+            and (self.least is None or number >= self.least)
+            and (self.most is None or number <= self.most)
+            and (self.above is None or number > self.above)
+            and (self.below is None or number < self.below)
+        )
+
+    def __repr__(self) -> str:
+        """The range in words, as the command line's help shows it."""
+        words = {"above": self.above, "of at least": self.least, "below": self.below, "of at most": self.most}
+        return " and ".join(f"{word} {limit:.15g}" for word, limit in words.items() if limit is not None)
+
+
+def mismatch(hint: Any, value: Any, limits: Range = Range()) -> str | None:  # noqa: ANN401, B008 - a frozen dataclass
+    """What was expected of a value that does not fit its type hint; None if it fits, or if the hint is no plain type.
+
+    >>> mismatch(Annotated[int, Range(1, 8)], 9)
+    'a whole number of at least 1 and of at most 8'
+    """
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return mismatch(inner[0], value, next((extra for extra in inner[1:] if isinstance(extra, Range)), limits))
+    if origin in (Union, types.UnionType):
+        expected = [mismatch(part, value, limits) for part in inner]
+        return None if None in expected else " or ".join(word for word in expected if word)
+    if origin is Literal:
+        fits = any(type(value) is type(known) and value == known for known in inner)
+        return None if fits else f"one of {', '.join(map(str, inner))}"
+    if hint in (int, float):
+        kind = numbers.Integral if hint is int else numbers.Real
+        fits = isinstance(value, kind) and not isinstance(value, bool) and value in limits
+        return None if fits else f"{'a whole' if hint is int else 'a finite'} number {limits}".strip()
+    if origin in (list, tuple, collections.abc.Sequence):
+        fits = hasattr(value, "__iter__") and hasattr(value, "__len__") and not isinstance(value, str | bytes | Mapping)
+        expected = [mismatch(inner[0], item, limits) for item in value] if fits and inner else []
+        fits = fits and limits.items[0] <= len(value) <= limits.items[1]
+        wrong = [word for word in expected if word]
+        return (
+            None
+            if fits and not wrong
+            else f"a list of {limits.items[0]} to {limits.items[1]} items" + (f", each {wrong[0]}" if wrong else "")
+        )
+    if getattr(hint, "_is_protocol", False):  # of what makes a component
+        return None if callable(value) else "a component's class"
+    plain_types = {bool: (bool,), str: (str, PathLike), types.NoneType: (types.NoneType,)}
+    words = {bool: "true or false", str: "text", types.NoneType: "null"}
+    return None if hint not in words or isinstance(value, plain_types[hint]) else words[hint]
+
+
+def checks_arguments(init: Callable[..., None], path: str = "", *, sizes: str = "") -> Callable[..., None]:
+    """Let a constructor refuse values that do not fit the types and ranges of its signature.
+
+    Whatever else it raises because of a value is reported in the same way: as one sentence that names the arguments
+    as the user wrote them.
+
+    Args:
+        init: the constructor; its numbers state their ranges as ``Annotated[int, Range(...)]``.
+        path: what comes before the argument's name in an option; the object's ``options_path``, or else its class's
+            name, if empty.
+        sizes: the same for arguments without a default, which are options of the owner.
+    """
+
+    @cache
+    def hints() -> dict[str, Any]:
+        try:
+            return typing.get_type_hints(init, include_extras=True)
+        except (NameError, TypeError):  # a third party's, with names that only a type checker sees
+            return {}
+
+    @cache
+    def parameters() -> Mapping[str, inspect.Parameter]:
+        return inspect.signature(init).parameters
+
+    @wraps(init)
+    def wrapped(self: Any, *values: Any, **options: Any) -> None:  # noqa: ANN401
+        own = path or getattr(self, "options_path", "") or type(self).__name__
+
+        def located(name: str) -> str:
+            given_by_owner = name not in parameters() or parameters()[name].default is inspect.Parameter.empty
+            return f"{sizes if sizes and given_by_owner else own}.{name}"
+
+        given = inspect.signature(init).bind_partial(self, *values, **options).arguments
+        given = {name: value for name, value in given.items() if name in hints()}
+        for name, value in given.items():
+            expected = mismatch(hints()[name], value)
+            if expected is not None:
+                raise ArgumentError({located(name): value}, f"expected {expected}", located=True)
+        try:
+            init(self, *values, **options)
+        except ArgumentError as error:
+            raise error if error.located else error.at(located) from error.__cause__
+        except (ValueError, RuntimeError, ArithmeticError, MemoryError) as error:
+            reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
+            named = {located(name): value for name, value in given.items() if isinstance(value, int | float | str)}
+            raise ArgumentError(
+                named or {own: type(self).__name__}, f"{type(self).__name__} cannot be made ({reason})", located=True
+            ) from error
+
+    return wrapped
+
+
 # Constructor arguments as plain data, so that a checkpoint loads with ``weights_only=True`` however it was made.
 
 
@@ -300,12 +433,13 @@ def keeps_arguments(init: Callable[..., None]) -> Callable[..., None]:
     """Let a constructor pass its arguments to the object's ``keep_hyperparameters`` once it has run.
 
     Of the constructors that run on the way, only that of the object's own class does so: a base class's constructor
-    sees only some of the arguments.
+    sees only some of the arguments. Each of them checks those that it names.
     """
+    checked = checks_arguments(init)
 
     @wraps(init)
     def wrapped(self: Any, *values: Any, **options: Any) -> None:  # noqa: ANN401
-        init(self, *values, **options)
+        checked(self, *values, **options)
         if type(self).__init__ is wrapped:
             bound = inspect.signature(init).bind_partial(self, *values).arguments
             bound.pop("self", None)

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from facediff.errors import FaceDiffError
+from facediff.registry import Range, checks_arguments
 from facediff.utils.files import atomic
 
 RANDOM_KEY = "facediff_random_states"
@@ -74,14 +75,14 @@ class LastCheckpoint(Checkpoint):
         dirpath: folder of ``last.ckpt``; ``checkpoints`` in the run's folder if None.
     """
 
+    @checks_arguments
     def __init__(
-        self, every_minutes: float = 2.0, every_n_steps: int | None = None, dirpath: str | None = None
+        self,
+        every_minutes: Annotated[float, Range(above=0)] = 2.0,
+        every_n_steps: Annotated[int, Range(1)] | None = None,
+        dirpath: str | None = None,
     ) -> None:
         super().__init__()
-        if not 0 < every_minutes < float("inf"):
-            raise FaceDiffError(f"LastCheckpoint: every_minutes={every_minutes}; expected a positive number of minutes")
-        if every_n_steps is not None and every_n_steps < 1:
-            raise FaceDiffError(f"LastCheckpoint: every_n_steps={every_n_steps}; expected 1 or more")
         self.every_seconds = every_minutes * 60
         self.every_n_steps = every_n_steps
         self.dirpath = dirpath

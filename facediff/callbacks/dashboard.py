@@ -23,6 +23,7 @@ from facediff import registry
 from facediff.data import SpeechMotionDataModule, collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
+from facediff.registry import checks_arguments
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import sha256
 
@@ -98,6 +99,7 @@ class GradientNorm(Callback):
             to the square of ``gradient/norm``.
     """
 
+    @checks_arguments
     def __init__(self, components: bool = False) -> None:
         self.components = components
 

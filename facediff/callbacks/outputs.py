@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import WandbLogger
 from facediff.callbacks.dashboard import measure_clips, wandb_media, worst_clips
 from facediff.models import AnimationModel
 from facediff.models.inference import Prediction
+from facediff.registry import Range, checks_arguments
 from facediff.utils.files import atomic, write_rows
 from facediff.utils.tables import format_table
 
@@ -35,11 +36,12 @@ class ScoreTable(Callback):
             more, by the first process alone, one at a time; nothing is kept in memory during the test.
     """
 
+    @checks_arguments
     def __init__(
         self,
         file: str | None = "test_scores.csv",
         sequences_file: str | None = "test_sequences.csv",
-        media_clips: int = 8,
+        media_clips: Annotated[int, Range(0, 10_000)] = 8,
     ) -> None:
         self.file = file
         self.sequences_file = sequences_file
@@ -130,6 +132,7 @@ class PredictionWriter(BasePredictionWriter):
         output_dir: the folder; ``predictions`` in the run's folder if None.
     """
 
+    @checks_arguments
     def __init__(self, output_dir: str | None = None) -> None:
         super().__init__(write_interval="batch")
         self.output_dir = output_dir

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -30,11 +30,12 @@ from facediff import registry
 from facediff.data import Sample, SpeechMotionDataModule, collate
 from facediff.data.audio import fit_length, samples_for
 from facediff.data.corpus import Clip
-from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
 from facediff.metrics import SequenceMetric
 from facediff.metrics.base import align
 from facediff.models import AnimationModel
 from facediff.models.evaluation import regions_of
+from facediff.registry import Range, checks_arguments
 from facediff.render import VIEWS, Renderer, comparison, contact_sheet, save_image, write_video
 from facediff.utils import SAMPLE_RATE
 
@@ -73,26 +74,23 @@ class SamplingPreview(Callback):
         FaceDiffError: if an option is impossible, or a named clip is no validation clip.
     """
 
+    @checks_arguments
     def __init__(
         self,
-        every_n_epochs: int | None = 10,
+        every_n_epochs: Annotated[int, Range(1, 10**9)] | None = 10,
         at_end: bool = True,
-        clips: int = 2,
+        clips: Annotated[int, Range(1, 10_000)] = 2,
         names: list[str] | None = None,
-        seconds: float = 4.0,
+        seconds: Annotated[float, Range(above=0, most=3600)] = 4.0,
         sampler: str | None = "dpm_solver",
-        steps: int | None = 10,
-        seed: int = 0,
-        size: int = 256,
+        steps: Annotated[int, Range(1, 100_000)] | None = 10,
+        seed: Annotated[int, Range(0, 2**64 - 1)] = 0,
+        size: Annotated[int, Range(16, 4096)] = 256,
         view: str = "front",
-        error_scale: float | None = None,
+        error_scale: Annotated[float, Range(above=0)] | None = None,
     ) -> None:
-        positive = {"every_n_epochs": every_n_epochs, "clips": clips, "seconds": seconds}
-        for option, value in {**positive, "steps": steps, "size": size, "error_scale": error_scale}.items():
-            if value is not None and not value > 0:
-                raise FaceDiffError(f"SamplingPreview: {option} is {value}, expected a number above zero")
         if view not in VIEWS:
-            raise FaceDiffError(f'SamplingPreview: there is no view "{view}": {choices(view, VIEWS)}')
+            raise ArgumentError({"view": view}, f"there is no such view: {choices(view, VIEWS)}")
         if sampler is not None:
             registry.sampler.get(sampler)  # a wrong name is an error here, not after hours of training
         self.every_n_epochs = every_n_epochs

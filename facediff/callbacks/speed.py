@@ -13,6 +13,7 @@ from facediff.data import SpeechMotionDataModule
 from facediff.data.dataset import CachedFeatures
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
+from facediff.registry import checks_arguments
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
 from facediff.utils.progress import track
@@ -29,6 +30,7 @@ class SpeechFeatureCache(Callback):
         folder: where the features are kept; ``speech_features`` in the user's cache folder if None.
     """
 
+    @checks_arguments
     def __init__(self, folder: str | None = None) -> None:
         self.folder = Path(folder).expanduser() if folder is not None else cache_dir() / "speech_features"
 
@@ -78,6 +80,7 @@ class CompiledTraining(Callback):
             Triton and a C compiler on a GPU.
     """
 
+    @checks_arguments
     def __init__(self, parts: Sequence[str] = ("fusion", "decoder"), backend: str = "inductor") -> None:
         self.parts = list(parts)
         self.backend = backend

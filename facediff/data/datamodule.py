@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -29,13 +29,16 @@ from facediff.data.dataset import (
     ResumableLoader,
 )
 from facediff.errors import FaceDiffError
-from facediff.registry import defaults, keeps_arguments, plain
+from facediff.registry import Range, defaults, keeps_arguments, plain
 
 FRAMES = 16
 """Frames of each training clip, evenly spread, from which size and principal components of motion are measured."""
 
 PRINCIPAL_NUMBERS = 30_000_000
 """Coordinates from which principal components are computed, about; bounds the memory (8 bytes each, twice)."""
+
+Count = Annotated[int, Range(1, 10**9)]
+"""Clips or frames."""
 
 Split = Literal["train", "val", "test_a", "test_b"]
 
@@ -113,23 +116,19 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self,
         *,
         root: str,
-        batch_size: int = 1,
-        max_frames_per_batch: int | None = None,
-        num_workers: int = 0,
-        window: int | None = None,
+        batch_size: Count = 1,
+        max_frames_per_batch: Count | None = None,
+        num_workers: Annotated[int, Range(0, 256)] = 0,
+        window: Count | None = None,
         reference: ReferenceChoice = "same_subject",
-        reference_frames: int = 100,
+        reference_frames: Count = 100,
         predict_split: Split | None = None,
         people: list[str] | None = None,
         extra_identities: list[str] | None = None,
-        train_identities: list[str] | None = None,
+        train_identities: Annotated[list[str], Range(items=(1, 1_000_000))] | None = None,
         lips: str | None = None,
         upper_face: str | None = None,
     ) -> None:
-        numbers = {"batch_size": batch_size, "window": window, "reference_frames": reference_frames}
-        for name, value in {**numbers, "max_frames_per_batch": max_frames_per_batch}.items():
-            if value is not None and value < 1:
-                raise FaceDiffError(f"data.{name}: is {value}, expected a whole number above zero")
         super().__init__()
         self.root = Path(root).expanduser()
         self.batch_size = batch_size
@@ -156,6 +155,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.features = FeatureSlot()
         self.pair_sentences = False
         self._assets: Assets | None = None
+
+    options_path = "data"
 
     def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
         """Let every corpus keep its constructor's arguments."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from facediff import registry
 from facediff import synthetic as puppet
 from facediff.data.corpus import Clip
-from facediff.data.datamodule import SpeechMotionDataModule
+from facediff.data.datamodule import Count, SpeechMotionDataModule
 from facediff.mesh import Mesh
+from facediff.registry import Range
 from facediff.synthetic.face import build_face
 from facediff.utils.files import cache_dir
 
@@ -48,7 +49,14 @@ class Puppet(SpeechMotionDataModule):
     mesh_files: ClassVar[tuple[str, ...]] = ("PUPPET.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
 
-    def __init__(self, *, root: str | None = None, seed: int = 0, batch_size: int = 8, **options: Any) -> None:  # noqa: ANN401
+    def __init__(
+        self,
+        *,
+        root: str | None = None,
+        seed: Annotated[int, Range(0, 2**32 - 1)] = 0,
+        batch_size: Count = 8,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
         super().__init__(root=str(cache_root(seed)) if root is None else root, batch_size=batch_size, **options)
         self.seed = seed
 

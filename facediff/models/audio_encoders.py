@@ -10,15 +10,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.models.layers import Frames, frame_mask, interpolate_frames
-from facediff.registry import audio_encoder
+from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
+from facediff.models.layers import Frames, Share, Width, frame_mask, interpolate_frames
+from facediff.registry import Range, audio_encoder
 from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:
@@ -131,7 +131,13 @@ class MelEncoder(AudioEncoder):
     hop = 160
 
     def __init__(
-        self, *, dim: int, n_mels: int = 64, hidden_dim: int = 128, num_layers: int = 4, dropout: float = 0.1
+        self,
+        *,
+        dim: Width,
+        n_mels: Annotated[int, Range(1, 256)] = 64,
+        hidden_dim: Width = 128,
+        num_layers: Annotated[int, Range(0, 256)] = 4,
+        dropout: Share = 0.1,
     ) -> None:
         super().__init__()
         self.register_buffer("filters", mel_filters(n_mels, self.n_fft, 60.0, 7600.0), persistent=False)
@@ -235,18 +241,21 @@ class HubertEncoder(AudioEncoder):
     def __init__(
         self,
         *,
-        dim: int,
+        dim: Width,
         source: str = "facebook/hubert-base-ls960",
-        frozen_layers: int = 2,
+        frozen_layers: Annotated[int, Range(-1, 256)] = 2,
         spec_augment: bool = False,
-        layer_drop: float = 0.0,
+        layer_drop: Share = 0.0,
         config: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.hubert = load_hubert(source, config)
         self.hubert.config.apply_spec_augment = spec_augment
         self.hubert.config.layerdrop = layer_drop
-        self.frozen_layers = len(self.hubert.encoder.layers) if frozen_layers < 0 else frozen_layers
+        depth = len(self.hubert.encoder.layers)
+        if frozen_layers > depth:
+            raise ArgumentError({"frozen_layers": frozen_layers}, f"this network has {depth} layers; −1 freezes all")
+        self.frozen_layers = depth if frozen_layers < 0 else frozen_layers
         self._frozen = self._freeze(self.frozen_layers)
         self.train()
         self.out = nn.Linear(self.hubert.config.hidden_size, dim)

@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -26,10 +26,11 @@ from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
 from facediff.models.inference import Inference, Prediction, WindowPlan
 from facediff.models.mesh_encoders import MeshEncoder
-from facediff.registry import COMPONENTS, component_class, defaults, describe, keeps_arguments, plain
+from facediff.registry import COMPONENTS, Range, component_class, defaults, describe, keeps_arguments, plain
 
 Schedule = Literal["constant", "cosine"]
 MotionScale = Literal["unit", "none"]
+Decay = Annotated[float, Range(0, 1000)]
 
 
 def lr_factor(step: int, *, total: int, warmup_steps: int, schedule: Schedule) -> float:
@@ -81,14 +82,14 @@ class AnimationModel(LightningModule, Inference, ABC):
     def __init__(
         self,
         *,
-        n_vertices: int,
-        identities: list[str],
-        frame_rate: float,
+        n_vertices: Annotated[int, Range(1, 2_000_000)],
+        identities: Annotated[list[str], Range(items=(1, 1_000_000))],
+        frame_rate: Annotated[float, Range(above=0, most=1000)],
         motion_scale: MotionScale = "unit",
-        learning_rate: float = 1e-4,
-        weight_decay: float = 0.05,
+        learning_rate: Annotated[float, Range(0, 1000)] = 1e-4,
+        weight_decay: Decay = 0.05,
         lr_schedule: Schedule = "constant",
-        warmup_steps: int = 0,
+        warmup_steps: Annotated[int, Range(0, 10**9)] = 0,
         protocol: str = "paper",
         metrics: Sequence[str] = (),
         unseen_identity: IdentityPolicy = "style_only",
@@ -118,6 +119,8 @@ class AnimationModel(LightningModule, Inference, ABC):
             FaceDiffError: if there is no such protocol, metric or option.
         """
         return Evaluation(self.protocol, self.unseen_identity, self.metrics)
+
+    options_path = "model"
 
     def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
         """Let every model keep its constructor's arguments."""

@@ -5,15 +5,28 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, cast
+from typing import Annotated, NamedTuple, Protocol, cast
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
-from facediff.models.layers import Attention, FeedForward, FrameMask, Frames, KeysValues, Rotation, needed_mask
-from facediff.registry import decoder
+from facediff.errors import ArgumentError
+from facediff.models.layers import (
+    Attention,
+    FeedForward,
+    FrameMask,
+    Frames,
+    Heads,
+    KeysValues,
+    Layers,
+    Rotation,
+    Share,
+    Width,
+    needed_mask,
+)
+from facediff.registry import Range, decoder
 
 Tokens = Float[Tensor, "batch tokens style_dim"]
 """The style condition F_s."""
@@ -73,12 +86,12 @@ class StyleTransformer(Decoder):
     def __init__(
         self,
         *,
-        dim: int,
-        style_dim: int,
-        num_layers: int = 4,
-        num_heads: int = 4,
-        feed_forward_factor: int = 4,
-        dropout: float = 0.1,
+        dim: Width,
+        style_dim: Width,
+        num_layers: Annotated[int, Range(0, 256)] = 4,
+        num_heads: Heads = 4,
+        feed_forward_factor: Annotated[int, Range(1, 64)] = 4,
+        dropout: Share = 0.1,
     ) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(
@@ -223,11 +236,17 @@ class GruDecoder(Decoder):
     """
 
     def __init__(
-        self, *, dim: int, style_dim: int, num_layers: int = 2, bidirectional: bool = True, dropout: float = 0.1
+        self,
+        *,
+        dim: Width,
+        style_dim: Width,
+        num_layers: Layers = 2,
+        bidirectional: bool = True,
+        dropout: Share = 0.1,
     ) -> None:
         super().__init__()
         if bidirectional and dim % 2:
-            raise ValueError(f"dim must be even for a bidirectional gru decoder, got {dim}")
+            raise ArgumentError({"dim": dim, "bidirectional": True}, "dim must be even for a bidirectional decoder")
         self.gru = nn.GRU(
             dim,
             dim // 2 if bidirectional else dim,

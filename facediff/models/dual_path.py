@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -34,7 +34,7 @@ from facediff.models.folding import (
 )
 from facediff.models.fusions import BidirectionalCrossAttention, Fusion, FusionFactory
 from facediff.models.inference import ClipNoise, Progress, Window, WindowNoise, WindowOverlap
-from facediff.models.layers import frame_mask
+from facediff.models.layers import Share, Weight, Width, frame_mask
 from facediff.models.losses_fused import fused_losses
 from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoder, MeshEncoderFactory
 from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, SamplerFactory, unit_noise
@@ -46,6 +46,7 @@ from facediff.models.speaker_encoders import (
     StyleEncoderFactory,
     TcnGruTransformer,
 )
+from facediff.registry import Range
 
 TokenForm = Literal["levels", "single"]
 
@@ -85,7 +86,7 @@ class DualPathDiffusion(AnimationModel):
     def __init__(
         self,
         *,
-        dim: int = 256,
+        dim: Width = 256,
         audio_encoder: AudioEncoderFactory = MelEncoder,
         identity_encoder: IdentityEncoderFactory = HierarchicalIdentity,
         mesh_encoder: MeshEncoderFactory = LinearMeshEncoder,
@@ -94,13 +95,13 @@ class DualPathDiffusion(AnimationModel):
         decoder: DecoderFactory = StyleTransformer,
         sampler: SamplerFactory = DpmSolverSampler,
         sampling_space: SamplingSpace = "folded",
-        diffusion_steps: int = 1000,
+        diffusion_steps: Annotated[int, Range(1, 100_000)] = 1000,
         noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
         style_tokens: TokenForm = "levels",
-        identity_dropout: float = 0.1,
-        velocity_weight: float = 0.003,
-        acceleration_weight: float = 0.003,
-        face_weight: float = 0.0005,
+        identity_dropout: Share = 0.1,
+        velocity_weight: Weight = 0.003,
+        acceleration_weight: Weight = 0.003,
+        face_weight: Weight = 0.0005,
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(**options)

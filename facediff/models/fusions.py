@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor, nn
 
-from facediff.models.layers import Attention, FrameMask, Frames, Rotation, needed_mask
+from facediff.models.layers import Attention, FrameMask, Frames, Heads, Rotation, Share, Width, needed_mask
 from facediff.registry import fusion
 
 
@@ -64,7 +64,7 @@ class BidirectionalCrossAttention(Fusion):
         dropout: dropout on each attention's result.
     """
 
-    def __init__(self, *, dim: int, num_heads: int = 4, rotary: bool = True, dropout: float = 0.1) -> None:
+    def __init__(self, *, dim: Width, num_heads: Heads = 4, rotary: bool = True, dropout: Share = 0.1) -> None:
         super().__init__()
         self.audio_norm = nn.LayerNorm(dim)
         self.motion_norm = nn.LayerNorm(dim)
@@ -112,7 +112,7 @@ class AddFusion(Fusion):
         dim: channels; given by the model.
     """
 
-    def __init__(self, *, dim: int) -> None:
+    def __init__(self, *, dim: Width) -> None:
         super().__init__()
 
     def forward(self, audio: Frames, motion: Frames, mask: FrameMask) -> Frames:

@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from facediff.errors import ArgumentError
+from facediff.registry import Range
+
 Frames = Float[Tensor, "batch frames dim"]
 """One feature per frame of motion."""
 
 FrameMask = Bool[Tensor, "batch frames"]
 """True on valid frames, False on padding."""
+
+Width = Annotated[int, Range(1, 16_384)]
+"""Channels of a layer."""
+
+Layers = Annotated[int, Range(1, 256)]
+"""How often a layer is repeated."""
+
+Heads = Annotated[int, Range(1, 256)]
+"""Attention heads."""
+
+Share = Annotated[float, Range(0, 1)]
+"""A probability, such as dropout's."""
+
+Weight = Annotated[float, Range(0, 1e6)]
+"""What a loss term is multiplied by."""
 
 Rotation = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary embedding, both (frames, head_dim)."""
@@ -78,7 +96,7 @@ class RotaryEmbedding(nn.Module):
     def __init__(self, head_dim: int, base: float = 10_000.0) -> None:
         super().__init__()
         if head_dim % 2:
-            raise ValueError(f"rotary embedding needs an even number of channels per head, got {head_dim}")
+            raise ArgumentError({"head_dim": head_dim}, "rotary positions need an even number of channels per head")
         exponent = torch.arange(0, head_dim, 2, dtype=torch.float32) / head_dim
         self.register_buffer("frequencies", base**-exponent, persistent=False)
 
@@ -124,7 +142,11 @@ class Attention(nn.Module):
     ) -> None:
         super().__init__()
         if dim % num_heads:
-            raise ValueError(f"dim {dim} is not a multiple of num_heads {num_heads}")
+            raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be a multiple of the number of heads")
+        if rotary and dim // num_heads % 2:
+            raise ArgumentError(
+                {"dim": dim, "num_heads": num_heads}, "rotary positions need dim / num_heads to be even"
+            )
         self.num_heads = num_heads
         self.dropout = dropout
         self.query = nn.Linear(dim, dim)

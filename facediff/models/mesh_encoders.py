@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -13,8 +13,11 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from facediff.errors import FaceDiffError
-from facediff.models.layers import Frames
-from facediff.registry import mesh_encoder
+from facediff.models.layers import Frames, Share, Width
+from facediff.registry import Range, mesh_encoder
+
+Vertices = Annotated[int, Range(1, 2_000_000)]
+"""Vertices of a mesh."""
 
 Motion = Float[Tensor, "batch frames vertices 3"]
 """Offsets from the template."""
@@ -78,7 +81,7 @@ class LinearMeshEncoder(MeshEncoder):
         n_vertices: vertices of the mesh; given by the model.
     """
 
-    def __init__(self, *, dim: int, n_vertices: int) -> None:
+    def __init__(self, *, dim: Width, n_vertices: Vertices) -> None:
         super().__init__()
         self.n_vertices = n_vertices
         self.map = nn.Linear(3 * n_vertices, dim)
@@ -161,22 +164,17 @@ class SpiralMeshEncoder(MeshEncoder):
     def __init__(
         self,
         *,
-        dim: int,
-        n_vertices: int,
-        channels: tuple[int, ...] = (16, 32, 32),
-        factor: int = 4,
-        spiral_length: int = 12,
-        dilation: int = 1,
+        dim: Width,
+        n_vertices: Vertices,
+        channels: Annotated[tuple[int, ...], Range(1, 4096, items=(0, 16))] = (16, 32, 32),
+        factor: Annotated[int, Range(1, 1000)] = 4,
+        spiral_length: Annotated[int, Range(1, 1000)] = 12,
+        dilation: Annotated[int, Range(1, 1000)] = 1,
         pooling: Literal["select", "mean"] = "select",
-        negative_slope: float = 0.2,
-        max_frames: int | None = None,
+        negative_slope: Share = 0.2,
+        max_frames: Annotated[int, Range(1, 10**9)] | None = None,
     ) -> None:
         super().__init__()
-        for name, value in {"factor": factor, "spiral_length": spiral_length, "dilation": dilation}.items():
-            if value < 1:
-                raise ValueError(f"{name} {value}; expected at least 1")
-        if max_frames is not None and max_frames < 1:
-            raise ValueError(f"max_frames {max_frames}; expected at least 1, or None")
         self.n_vertices = n_vertices
         self.factor = factor
         self.spiral_length = spiral_length

@@ -10,14 +10,18 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import ClassVar, Protocol
+from typing import Annotated, ClassVar, Literal, Protocol
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from facediff.errors import FaceDiffError, choices
-from facediff.registry import sampler
+from facediff.errors import ArgumentError, FaceDiffError, choices
+from facediff.models.layers import Share
+from facediff.registry import Range, sampler
+
+Steps = Annotated[int, Range(1, 100_000)]
+"""Steps of a process."""
 
 Denoiser = Callable[[Tensor, int], Tensor]
 """(noisy motion, step counted from 0) to predicted clean motion of the same shape."""
@@ -74,6 +78,11 @@ class NoiseProcess:
         self.schedule = schedule
         self.variances: Tensor = SCHEDULES[schedule](steps)
         self.signal = torch.cumprod(1.0 - self.variances, dim=0)
+        if not 0 < float(self.signal[-1]) < 1:
+            raise ArgumentError(
+                {"diffusion_steps": steps, "noise_schedule": schedule},
+                "the schedule leaves no signal after so many steps; choose fewer steps or squaredcos_cap_v2",
+            )
 
     def add_noise(
         self,
@@ -159,9 +168,8 @@ class Sampler(ABC):
 
     def __init__(self, process: NoiseProcess, steps: int) -> None:
         if not 1 <= steps <= process.steps:
-            raise FaceDiffError(
-                f"sampler.steps: {steps} is impossible with {process.steps} diffusion steps; "
-                f"choose 1 to {process.steps}"
+            raise ArgumentError(
+                {"steps": steps, "diffusion_steps": process.steps}, f"expected 1 to {process.steps} sampling steps"
             )
         self.process = process
         self.steps = steps
@@ -227,10 +235,8 @@ class DdimSampler(Sampler):
 
     linear: ClassVar[bool] = True
 
-    def __init__(self, *, process: NoiseProcess, steps: int = 25, eta: float = 0.0) -> None:
+    def __init__(self, *, process: NoiseProcess, steps: Steps = 25, eta: Share = 0.0) -> None:
         super().__init__(process, steps)
-        if not 0 <= eta <= 1:
-            raise FaceDiffError(f"sampler.eta: {eta} is impossible; choose 0 (deterministic) to 1 (ancestral)")
         self.eta = eta
 
     def update(self, i: int, noisy: Tensor, predictions: Sequence[Tensor], noise: NoiseSource) -> Tensor:
@@ -259,7 +265,7 @@ class DdpmSampler(DdimSampler):
         steps: denoising steps; all of the process's if None.
     """
 
-    def __init__(self, *, process: NoiseProcess, steps: int | None = None) -> None:
+    def __init__(self, *, process: NoiseProcess, steps: Steps | None = None) -> None:
         super().__init__(process=process, steps=process.steps if steps is None else steps, eta=1.0)
 
 
@@ -279,10 +285,8 @@ class DpmSolverSampler(Sampler):
     linear: ClassVar[bool] = True
     memory: ClassVar[int] = 3
 
-    def __init__(self, *, process: NoiseProcess, steps: int = 5, order: int = 2) -> None:
+    def __init__(self, *, process: NoiseProcess, steps: Steps = 5, order: Literal[1, 2, 3] = 2) -> None:
         super().__init__(process, steps)
-        if order not in (1, 2, 3):
-            raise FaceDiffError(f"sampler.order: {order} is impossible; choose 1, 2 or 3")
         self.order = order
         signal = self.signal[:-1]
         self.signal_rate = [math.sqrt(kept) for kept in signal]

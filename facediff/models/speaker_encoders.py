@@ -7,7 +7,7 @@ dynamic feature F_dyn. The ablation ``none`` of either contributes nothing.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -15,8 +15,22 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
-from facediff.models.layers import Attention, FeedForward, FrameMask, Frames, interpolate_frames
-from facediff.registry import identity_encoder, style_encoder
+from facediff.errors import ArgumentError
+from facediff.models.layers import (
+    Attention,
+    FeedForward,
+    FrameMask,
+    Frames,
+    Heads,
+    Layers,
+    Share,
+    Width,
+    interpolate_frames,
+)
+from facediff.registry import Range, identity_encoder, style_encoder
+
+Count = Annotated[int, Range(1, 1_000_000)]
+"""Identities of a model."""
 
 StyleVectors = Float[Tensor, "batch style_dim"]
 """F_dyn of each clip."""
@@ -63,9 +77,9 @@ class HierarchicalIdentity(IdentityEncoder):
         level_dim: channels of each level; ``dim`` if None.
     """
 
-    def __init__(self, *, dim: int, n_identities: int, level_dim: int | None = None) -> None:
+    def __init__(self, *, dim: Width, n_identities: Count, level_dim: Width | None = None) -> None:
         super().__init__()
-        width = level_dim or dim
+        width = dim if level_dim is None else level_dim
         self.coarse = nn.Embedding(n_identities, width)
         self.mid = nn.Embedding(n_identities, width)
         self.fine = nn.Embedding(n_identities, width)
@@ -98,7 +112,7 @@ class NoIdentity(IdentityEncoder):
         n_identities: number of training identities; given by the model.
     """
 
-    def __init__(self, *, dim: int, n_identities: int) -> None:
+    def __init__(self, *, dim: Width, n_identities: Count) -> None:
         super().__init__()
         self.token_dims = ()
 
@@ -151,18 +165,18 @@ class TcnGruTransformer(StyleEncoder):
     def __init__(
         self,
         *,
-        dim: int,
-        dilations: tuple[int, ...] = (1, 2, 4, 8, 16),
-        kernel_size: int = 3,
+        dim: Width,
+        dilations: Annotated[tuple[int, ...], Range(1, 1000, items=(1, 32))] = (1, 2, 4, 8, 16),
+        kernel_size: Annotated[int, Range(1, 100)] = 3,
         causal: bool = True,
-        num_layers: int = 2,
-        num_heads: int = 4,
-        n_positions: int = 64,
-        dropout: float = 0.1,
+        num_layers: Annotated[int, Range(0, 256)] = 2,
+        num_heads: Heads = 4,
+        n_positions: Annotated[int, Range(1, 16_384)] = 64,
+        dropout: Share = 0.1,
     ) -> None:
         super().__init__()
         if dim % 2:
-            raise ValueError(f"dim must be even for the bidirectional GRU, got {dim}")
+            raise ArgumentError({"dim": dim}, "dim must be even for the style encoder's bidirectional GRU")
         self.branches = nn.ModuleList(
             TemporalBlock(dim, d, kernel_size, causal=causal, dropout=dropout) for d in dilations
         )
@@ -275,7 +289,7 @@ class LstmStyle(StyleEncoder):
     """
 
     def __init__(
-        self, *, dim: int, style_dim: int = 32, num_layers: int = 1, pooling: Literal["last", "mean"] = "last"
+        self, *, dim: Width, style_dim: Width = 32, num_layers: Layers = 1, pooling: Literal["last", "mean"] = "last"
     ) -> None:
         super().__init__()
         self.lstm = nn.LSTM(dim, style_dim, num_layers, batch_first=True)
@@ -305,7 +319,7 @@ class NoStyle(StyleEncoder):
         dim: the model's channels; given by the model.
     """
 
-    def __init__(self, *, dim: int) -> None:
+    def __init__(self, *, dim: Width) -> None:
         super().__init__()
         self.token_dims = ()
 

@@ -289,7 +289,7 @@ def test_a_missing_folder_says_how_the_corpus_is_had(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["batch_size", "window", "max_frames_per_batch", "reference_frames"])
 def test_numbers_below_one_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(FaceDiffError, match=f"data.{name}: is 0"):
+    with pytest.raises(FaceDiffError, match=rf"data\.{name} 0"):
         Biwi(root=str(tmp_path), **{name: 0})  # type: ignore[arg-type]
 
 

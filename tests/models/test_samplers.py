@@ -198,7 +198,7 @@ def test_sampler_repeats_a_seed_bit_for_bit_whatever_the_global_state(name: str)
 @every_sampler
 @pytest.mark.parametrize("steps", [0, -1, 21])
 def test_sampler_refuses_impossible_numbers_of_steps(name: str, steps: int) -> None:
-    with pytest.raises(FaceDiffError, match=rf"steps: {steps} .* 1 to 20"):
+    with pytest.raises(FaceDiffError, match=rf"model\.sampler\.steps {steps}\b"):
         make(name, NoiseProcess(20), steps=steps)
 
 
@@ -217,7 +217,7 @@ def test_sampler_progress_wraps_the_steps(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "option"), [("ddim", {"eta": 1.5}), ("dpm_solver", {"order": 4})])
 def test_impossible_options_are_refused(name: str, option: dict[str, float]) -> None:
-    with pytest.raises(FaceDiffError, match="choose"):
+    with pytest.raises(FaceDiffError, match=rf"model\.sampler\.{next(iter(option))}\b"):
         make(name, NoiseProcess(20), steps=5, **option)
 
 

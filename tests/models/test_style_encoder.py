@@ -106,5 +106,5 @@ def test_both_ends_of_the_reference_count() -> None:
 
 
 def test_odd_widths_are_refused() -> None:
-    with pytest.raises(ValueError, match="dim must be even .* got 5"):
+    with pytest.raises(ValueError, match=r"model\.dim 5: .*even"):
         TcnGruTransformer(dim=5)

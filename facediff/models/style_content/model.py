@@ -8,7 +8,7 @@ D turns both into motion again, whether the content comes from motion or from sp
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,10 +16,11 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
-from facediff.models.base import AnimationModel
+from facediff.models.base import AnimationModel, Decay
 from facediff.models.inference import Progress
+from facediff.models.layers import Heads, Weight, Width
 from facediff.models.mesh_encoders import MeshEncoderFactory, SpiralMeshEncoder
 from facediff.models.speaker_encoders import LstmStyle, StyleEncoderFactory
 from facediff.models.style_content.losses import (
@@ -32,6 +33,7 @@ from facediff.models.style_content.losses import (
     style_contrast,
 )
 from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
+from facediff.registry import Range
 
 SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
 """Terms that the speech network has as well, by the name ``speech_<term>``."""
@@ -85,38 +87,45 @@ class StyleContentDisentanglement(AnimationModel):
     def __init__(
         self,
         *,
-        dim: int = 64,
-        content_dim: int = 64,
+        dim: Width = 64,
+        content_dim: Width = 64,
         audio_encoder: AudioEncoderFactory = MelEncoder,
         mesh_encoder: MeshEncoderFactory = SpiralMeshEncoder,
         style_encoder: StyleEncoderFactory = LstmStyle,
-        window_seconds: float = 0.64,
-        speech_layers: int = 3,
-        speech_heads: int = 4,
-        decoder_channels: Sequence[int] = (64, 128, 256),
-        decoder_kernels: Sequence[int] = (5, 3, 3),
-        decoder_hidden: Sequence[int] = (256, 256, 128),
-        basis_size: int = 50,
+        window_seconds: Annotated[float, Range(0, 10)] = 0.64,
+        speech_layers: Annotated[int, Range(0, 256)] = 3,
+        speech_heads: Heads = 4,
+        decoder_channels: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (64, 128, 256),
+        decoder_kernels: Annotated[Sequence[int], Range(1, 1000, items=(0, 32))] = (5, 3, 3),
+        decoder_hidden: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (256, 256, 128),
+        basis_size: Width = 50,
         basis_start: Literal["pca", "random"] = "pca",
         content_scale: Literal["clip", "free"] = "clip",
         aligned_pairs: bool = True,
         swap_region: Literal["lower_face", "face"] = "lower_face",
-        reconstruction_weight: float = 1.0,
-        swap_weight: float = 3.0,
-        cycle_weight: float = 1.0,
-        swap_dynamics_weight: float = 3.0,
-        speech_weight: float = 2.0,
-        recording_content_weight: float = 5.0,
-        identity_style_weight: float = 10.0,
-        speech_content_weight: float = 5.0,
-        position_weight: float = 1.0,
-        velocity_weight: float = 5.0,
-        lip_gap_weight: float = 1.0,
-        upper_face_weight: float = 0.0,
-        weight_decay: float = 0.0,
+        reconstruction_weight: Weight = 1.0,
+        swap_weight: Weight = 3.0,
+        cycle_weight: Weight = 1.0,
+        swap_dynamics_weight: Weight = 3.0,
+        speech_weight: Weight = 2.0,
+        recording_content_weight: Weight = 5.0,
+        identity_style_weight: Weight = 10.0,
+        speech_content_weight: Weight = 5.0,
+        position_weight: Weight = 1.0,
+        velocity_weight: Weight = 5.0,
+        lip_gap_weight: Weight = 1.0,
+        upper_face_weight: Weight = 0.0,
+        weight_decay: Decay = 0.0,
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(weight_decay=weight_decay, **options)
+        if dim % speech_heads:
+            raise ArgumentError({"dim": dim, "speech_heads": speech_heads}, "dim must be a multiple of the heads")
+        if len(decoder_channels) != len(decoder_kernels):
+            raise ArgumentError(
+                {"decoder_channels": list(decoder_channels), "decoder_kernels": list(decoder_kernels)},
+                "expected one number of channels and one of taps for each convolution",
+            )
         self.basis_start = basis_start
         self.aligned_pairs = aligned_pairs
         self.swap_region = swap_region

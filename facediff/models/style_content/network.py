@@ -108,8 +108,6 @@ class MotionDecoder(nn.Module):
         basis_size: int = 50,
     ) -> None:
         super().__init__()
-        if len(channels) != len(kernels):
-            raise ValueError(f"{len(channels)} channels but {len(kernels)} kernels: give one of each per convolution")
         widths = [content_dim, *channels]
         self.kernels = list(kernels)
         self.convolutions = nn.ModuleList(
@@ -192,8 +190,6 @@ class WindowedTransformer(nn.Module):
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        if window < 1:
-            raise ValueError(f"a window of {window} frames holds nothing; expected at least 1")
         self.window = window
         self.before = window // 2
         self.embed = nn.Linear(in_dim, dim)

@@ -1,0 +1,244 @@
+"""Every number that a constructor takes states its range; whatever is built can be used, and all else is one sentence.
+
+The catalogue is the registry itself: a new component, model, corpus or callback is drawn without a line here.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import pickle
+import typing
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Annotated, Any, get_args, get_origin
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+from lightning.pytorch import Callback, LightningDataModule
+
+import facediff.callbacks
+import facediff.callbacks.checkpoints
+from facediff import registry
+from facediff.data import SpeechMotionDataModule
+from facediff.errors import ArgumentError, FaceDiffError
+from facediff.models import AnimationModel
+from facediff.models.samplers import NoiseProcess
+from facediff.registry import Range, mismatch
+from tests.fakes.tiny import SEEN, VERTICES, Tiny
+
+for kind in registry.KINDS.values():
+    kind.load()
+
+WILD = (math.nan, math.inf, -math.inf, -1, -0.5, 0, 1.5, 2**40, 1e-320, 1e300, 2**2000, "", "x", None, [], [-1], 1j)
+NAMED_OTHERWISE = (
+    *("root", "people", "lips", "upper_face", "extra_identities", "protocol", "metrics", "identities", "source"),
+    *("sampler", "frame_rate", "n_vertices"),
+)
+"""Arguments that stand for files, folders or names: the sentence names these."""
+
+SIZES: dict[str, Any] = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": 25.0}
+CALLBACKS = sorted(
+    (
+        made
+        for module in (facediff.callbacks, facediff.callbacks.checkpoints)
+        for made in vars(module).values()
+        if inspect.isclass(made) and issubclass(made, Callback) and made.__module__.startswith("facediff")
+    ),
+    key=lambda made: made.__name__,
+)
+COMPONENTS = [entry for kind in registry.COMPONENTS.values() for entry in kind]
+OWNED = [*(entry.implementation for entry in [*COMPONENTS, *registry.model, *registry.corpus]), *CALLBACKS]
+
+
+def constructors(made: type) -> Iterator[Callable[..., None]]:
+    """The constructors of a class and of those of its bases that are facediff's."""
+    for cls in made.__mro__:
+        if "__init__" in vars(cls) and cls.__module__.startswith("facediff"):
+            yield vars(cls)["__init__"]
+
+
+def arguments(made: type) -> dict[str, Any]:
+    """The options of a class, with their type hints."""
+    found: dict[str, Any] = {}
+    for init in constructors(made):
+        hints = typing.get_type_hints(init, include_extras=True)
+        for name, parameter in inspect.signature(init).parameters.items():
+            if name != "self" and parameter.kind is not parameter.VAR_KEYWORD:
+                found.setdefault(name, hints[name])
+    return found
+
+
+def unbounded(hint: Any) -> bool:  # noqa: ANN401
+    """Whether a hint lets any number pass."""
+    if get_origin(hint) is Annotated:
+        return not any(isinstance(extra, Range) for extra in get_args(hint))
+    if get_origin(hint) is typing.Literal:
+        return False
+    return hint in (int, float) or any(map(unbounded, get_args(hint)))
+
+
+@pytest.mark.parametrize("made", dict.fromkeys(OWNED), ids=lambda made: made.__name__)
+def test_every_number_states_its_range(made: type) -> None:
+    if made.__module__.split(".")[0] != "facediff":
+        pytest.skip("optional for a third party")
+    assert [name for name, hint in arguments(made).items() if unbounded(hint)] == []
+
+
+def batch_of(tiny: Tiny) -> Any:  # noqa: ANN401
+    from facediff.data import collate
+
+    dataset = tiny.dataset("train")
+    return collate([dataset[0], dataset[5]])
+
+
+def draw(
+    made: type, build: Callable[..., Any], use: Callable[[Any], None], path: str, names: Iterable[str] = ()
+) -> list[str]:
+    """Give every argument every wild value; what neither works nor is refused by name."""
+    wrong = []
+    for name in names or arguments(made):
+        for value in WILD:
+            given = f"{name}={str(value)[:20]}"
+            try:
+                use(build(**{name: value}))
+            except FaceDiffError as error:
+                if f"{path}.{name}" not in str(error) and name not in NAMED_OTHERWISE:
+                    wrong.append(f"{given}: {error}")
+            except TypeCheckError as error:
+                # The tests' import hook takes no whole number for a decimal one and no list for a tuple.
+                if value not in (0, []):
+                    wrong.append(f"{given}: {error}")
+            except Exception as error:
+                wrong.append(f"{given}: {type(error).__name__}: {error}")
+    return wrong
+
+
+TINY: dict[str, Any] = {
+    "dim": 8,
+    "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=8, num_layers=1, n_mels=8),
+}
+MODELS: dict[str, dict[str, Any]] = {
+    "DualPathDiffusion": {
+        "style_encoder": partial(registry.style_encoder.tcn_gru_transformer, num_layers=1, dilations=(1,)),
+        "decoder": partial(registry.decoder.style_transformer, num_layers=1),
+        "diffusion_steps": 20,
+        "sampler": partial(registry.sampler.ddim, steps=2),
+    },
+    "StyleContentDisentanglement": {
+        "content_dim": 8,
+        "mesh_encoder": registry.mesh_encoder.linear,
+        "speech_layers": 1,
+        "decoder_channels": (8,),
+        "decoder_kernels": (3,),
+        "decoder_hidden": (8,),
+        "basis_size": 4,
+        "basis_start": "random",
+    },
+}
+
+
+@pytest.fixture
+def use_model(tiny: Tiny) -> Callable[[AnimationModel], None]:
+    """A step of training, and inference."""
+    batch, assets = batch_of(tiny), tiny.assets().with_motion_scale(1.0)
+
+    def use(model: AnimationModel) -> None:
+        model.adopt(assets)
+        model.attach_mesh()
+        model.train().losses(batch)["loss"].backward()
+        model.configure_optimizers() if not model.warmup_steps and model.lr_schedule == "constant" else None
+        assert torch.isfinite(model.eval().generate(batch, seed=0)).all()
+        _ = model.evaluation
+
+    return use
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_wild_arguments_of_a_model(name: str, use_model: Callable[[AnimationModel], None]) -> None:
+    made = registry.model.get(name)
+
+    def build(**options: object) -> AnimationModel:
+        model: AnimationModel = made(**{**SIZES, **TINY, **MODELS[name], **options})
+        return model
+
+    use_model(build())
+    assert draw(made, build, use_model, "model") == []
+
+
+@pytest.mark.parametrize("entry", COMPONENTS, ids=lambda entry: f"{entry.alias.__qualname__}")
+def test_wild_arguments_of_a_component(
+    entry: registry.Entry, use_model: Callable[[AnimationModel], None], hubert_source: object
+) -> None:
+    kind = entry.alias.__qualname__.partition(".")[0]
+    base: dict[str, Any] = {"source": str(hubert_source)} if entry.name == "hubert" else {}
+    if entry.name == "spiral":
+        base = {"channels": (4,), "spiral_length": 4}
+    if kind == "sampler":
+        base = {"steps": 2}
+    name = "StyleContentDisentanglement" if kind == "mesh_encoder" else "DualPathDiffusion"
+
+    def build(**options: object) -> AnimationModel:
+        chosen = {kind: partial(entry.alias, **{**base, **options})}
+        model: AnimationModel = registry.model.get(name)(**{**SIZES, **TINY, **MODELS[name], **chosen})
+        return model
+
+    options = [name for name in registry.defaults(entry.implementation) if name != "config"]
+    assert not options or draw(entry.implementation, build, use_model, f"model.{kind}", options) == []
+
+
+@pytest.mark.parametrize("made", [Tiny, *(e.implementation for e in registry.corpus)], ids=lambda made: made.__name__)
+def test_wild_arguments_of_a_corpus(made: type[SpeechMotionDataModule], tiny_root: object) -> None:
+    def use(data: LightningDataModule) -> None:
+        if isinstance(data, Tiny) and data.num_workers == 0:
+            next(iter(data.train_dataloader()))
+            next(iter(data.predict_dataloader()))
+            data.assets()
+
+    assert draw(made, lambda **options: made(**{"root": str(tiny_root), **options}), use, "data") == []
+
+
+@pytest.mark.parametrize("made", CALLBACKS, ids=lambda made: made.__name__)
+def test_wild_arguments_of_a_callback(made: type[Callback]) -> None:
+    assert draw(made, made, lambda callback: None, made.__name__) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"dim": 33}, "model.dim 33"),
+        ({"dim": 10}, "model.decoder.num_heads 4"),
+        (
+            {"decoder": partial(registry.decoder.gru), "dim": 7, "style_encoder": registry.style_encoder.none},
+            "model.dim 7",
+        ),
+        ({"sampler": partial(registry.sampler.ddim, steps=21)}, "model.diffusion_steps 20"),
+        ({"diffusion_steps": 90_000, "noise_schedule": "linear"}, "model.noise_schedule linear"),
+        ({"frame_rate": math.nan}, "model.frame_rate nan"),
+        ({"identities": []}, "model.identities"),
+        ({"learning_rate": np.float32("inf")}, "model.learning_rate inf"),
+    ],
+)
+def test_arguments_that_do_not_go_together(options: dict[str, object], named: str) -> None:
+    fixed = {"fusion": registry.fusion.add} if "style_encoder" in options or named.endswith("num_heads 4") else {}
+    if named.endswith("num_heads 4"):
+        fixed["style_encoder"] = registry.style_encoder.none
+    with pytest.raises(ArgumentError, match=named.replace(".", r"\.")) as caught:
+        registry.model.get("DualPathDiffusion")(**{**SIZES, **TINY, **MODELS["DualPathDiffusion"], **fixed, **options})
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301 - own bytes
+    assert caught.value.sentence("--").startswith("--model.")
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    assert mismatch(Annotated[int, Range(1, 3)], np.int64(3)) is None
+    assert mismatch(float, np.float32(0.5)) is None
+    assert mismatch(int | None, True) is not None
+    assert mismatch(int, np.float64(3)) is not None
+    assert mismatch(Annotated[list[int], Range(1)], np.array([1, 2])) is None
+
+
+def test_a_schedule_that_loses_the_signal_is_refused() -> None:
+    with pytest.raises(FaceDiffError, match="diffusion_steps 100000"):
+        NoiseProcess(100_000, "linear")
