@@ -33,6 +33,10 @@ MotionScale = Literal["unit", "none"]
 Decay = Annotated[float, Range(0, 1000)]
 
 
+DIVERGENCE_INTERVAL = 50
+"""Steps between two looks at the loss on an accelerator."""
+
+
 def lr_factor(step: int, *, total: int, warmup_steps: int, schedule: Schedule) -> float:
     """What the learning rate is multiplied by at an optimiser step.
 
@@ -193,10 +197,27 @@ class AnimationModel(LightningModule, Inference, ABC):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted loss; every term is logged as ``train/<term>``."""
         losses = self.losses(batch)
+        self.stop_if_diverged(losses["loss"].detach())
         logged = {f"train/{name}": value.detach() for name, value in losses.items()}
         self.log_dict(logged, batch_size=len(batch), prog_bar=False)
         self.log("loss", losses["loss"].detach(), batch_size=len(batch), prog_bar=True, logger=False)
         return losses["loss"]
+
+    def stop_if_diverged(self, loss: Tensor) -> None:
+        """Stop training whose loss is no number any more: no further step can mend its weights.
+
+        Raises:
+            FaceDiffError: with what to change.
+        """
+        # On an accelerator, looking at every loss would wait for the device. In 16-bit mixed precision an overflow is
+        # usual, and the step is skipped.
+        looked_at = loss.device.type == "cpu" or self.trainer.global_step % DIVERGENCE_INTERVAL == 0
+        if looked_at and str(self.trainer.precision) != "16-mixed" and not bool(torch.isfinite(loss)):
+            raise FaceDiffError(
+                f"training has diverged: the loss is {float(loss)} at step {self.trainer.global_step}. Lower "
+                f"model.learning_rate (it is {self.learning_rate:g}), set trainer.gradient_clip_val, or check the "
+                f"corpus with `facediff data check`"
+            )
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss with fixed random numbers, so that epochs compare, and the protocol's metrics of generated motion."""
@@ -216,11 +237,11 @@ class AnimationModel(LightningModule, Inference, ABC):
         split = self.evaluation.splits[dataloader_idx]
         for name, view in conditioned(batch, self.unseen_identity, self.identities, self.assets.references):
             self.evaluation.score(self, split, view, name)
-        # Two yardsticks: a face that does not move, and the model with speech that does not belong to the clip.
+            if view.decoy_audio is not None:
+                decoy = replace(view, audio=view.decoy_audio, features=None)
+                self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), view, name)
+        # Two yardsticks: the model with speech that does not belong to the clip, and a face that does not move.
         self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
-        if batch.decoy_audio is not None:
-            decoy = replace(batch, audio=batch.decoy_audio, features=None)
-            self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), batch)
 
     def on_test_epoch_end(self) -> None:
         """Log ``<split>/lve`` and so on; the table is printed by the callback ``ScoreTable``."""

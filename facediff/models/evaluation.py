@@ -17,7 +17,7 @@ from facediff.data import Assets, Batch, Reference
 from facediff.data.audio import SAMPLE_RATE
 from facediff.data.batch import pad
 from facediff.data.phonemes import closures, phonemes_file, read_phonemes
-from facediff.errors import FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.metrics import Context, LipPairs, ProtocolMetrics, Region, SequenceMetric, device_name, feed, protocol
 from facediff.metrics.by_name import parse_all
 from facediff.models.inference import Inference
@@ -97,7 +97,10 @@ class Evaluation:
     """
 
     def __init__(self, protocol_name: str, unseen_identity: str, metrics: Sequence[str] = ()) -> None:
-        self.protocol = protocol(protocol_name)
+        try:
+            self.protocol = protocol(protocol_name)
+        except ValueError as error:
+            raise ArgumentError({"model.protocol": protocol_name}, str(error), located=True) from error
         self.unseen_identity = unseen_identity
         self.requests = parse_all(metrics)
         self.needs = {need for request in self.requests for need in request.needs}

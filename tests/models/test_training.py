@@ -307,3 +307,10 @@ def test_a_corpus_that_does_not_fit_the_checkpoint_is_refused(
 
 def test_models_are_animation_models() -> None:
     assert issubclass(DualPathDiffusion, AnimationModel)
+
+
+def test_training_stops_when_the_loss_is_no_number(
+    make_model: Callable[..., DualPathDiffusion], tiny: Tiny, make_trainer: Callable[..., pl.Trainer]
+) -> None:
+    with pytest.raises(FaceDiffError, match=r"model\.learning_rate"):
+        make_trainer(max_epochs=50).fit(make_model(learning_rate=1e3, weight_decay=900.0), datamodule=tiny)
