@@ -44,7 +44,7 @@ class ArgumentError(FaceDiffError, ValueError):
         """The message with a prefix before every name; ``--`` makes options of them."""
 
         def shown(value: object) -> str:
-            text = str(value) if value not in ("", None) else {"": '""', None: "null"}[value]  # type: ignore[index]
+            text = "null" if value is None else str(value) or '""'
             return text if len(text) <= 60 else f"{text[:60]}…"
 
         named = " with ".join(f"{prefix}{name} {shown(value)}" for name, value in self.values.items())

@@ -257,7 +257,7 @@ class Range:
     below: float | None = None
     items: tuple[int, int] = (0, 1000)
 
-    def __contains__(self, number: float) -> bool:
+    def holds(self, number: Any) -> bool:  # noqa: ANN401 - of any numeric type
         """Whether a number lies in the range."""
         return (
             (not isinstance(number, float) or math.isfinite(number))
@@ -290,7 +290,7 @@ def mismatch(hint: Any, value: Any, limits: Range = Range()) -> str | None:  # n
         return None if fits else f"one of {', '.join(map(str, inner))}"
     if hint in (int, float):
         kind = numbers.Integral if hint is int else numbers.Real
-        fits = isinstance(value, kind) and not isinstance(value, bool) and value in limits
+        fits = not isinstance(value, bool) and isinstance(value, kind) and limits.holds(value)
         return None if fits else f"{'a whole' if hint is int else 'a finite'} number {limits}".strip()
     if origin in (list, tuple, collections.abc.Sequence):
         fits = hasattr(value, "__iter__") and hasattr(value, "__len__") and not isinstance(value, str | bytes | Mapping)
