@@ -238,14 +238,10 @@ def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[
 
     from facediff.data.audio import SAMPLE_RATE, read_speech
 
-    speech = read_speech(path)
+    speech = read_speech(path, max_seconds=max_seconds)
     seconds = len(speech) / SAMPLE_RATE
     if seconds < MIN_SECONDS:
         raise FaceDiffError(f"{path}: lasts {seconds:.2f} s; expected speech of at least {MIN_SECONDS} s")
-    if max_seconds is not None and seconds > max_seconds:
-        raise FaceDiffError(
-            f"{path}: lasts {seconds:.0f} s, more than --max-seconds {max_seconds:g}; cut it or raise the limit"
-        )
     if float(np.abs(speech).max()) < SILENCE:
         raise FaceDiffError(f"{path}: holds only silence; expected a recording of speech")
     return speech

@@ -5,7 +5,6 @@ Worker processes import this, so it imports nothing heavy.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,10 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.audio import open_sound
 from facediff.data.check.report import Findings, relative
+from facediff.data.cut_short import CUT, cut_short
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.files import sha256
+from facediff.utils.limits import LIMITS
 
 CHUNK = 16  # frames that are read at a time
 SAMPLED = 16  # frames, evenly spread, whose distance from the template is measured
@@ -31,9 +33,6 @@ NEARER = 0.5
 """Motion belongs to another subject if that subject's template is nearer than this share of the own distance."""
 
 BLOCK = 1 << 16  # samples of all channels together that are decoded at a time
-OPEN_END = 0xFFFF0000
-"""Programs that write to a pipe put a size like this into the header, because they do not know it yet."""
-
 SLIGHT = 0.1  # seconds by which the lengths of speech and motion may differ without a remark
 MUCH = (0.5, 0.1)
 """Speech and motion that differ by more than so many seconds and by more than this share do not belong together."""
@@ -212,19 +211,20 @@ def _check_sound(facts: ClipFacts, rules: Rules, path: Path) -> None:
         if not path.stat().st_size:
             findings.error("sound_empty", where, "the file is empty; get the recording again")
             return
-        import soundfile
-
-        with soundfile.SoundFile(path) as file:
+        if (missing := cut_short(path)) is not None:
+            findings.error("sound_truncated", where, f"{CUT}: {missing}; copy it again")
+            return
+        with open_sound(path) as file:
             frames, rate, channels = file.frames, file.samplerate, file.channels
-            if (missing := shortfall(path)) is not None:
-                message = f"is cut short: {missing} bytes are missing at its end; copy it again"
-                findings.error("sound_truncated", where, message)
-                return
-            if not frames or not rate:
+            if not frames:
                 findings.error("sound_empty", where, "holds no samples; get the recording again")
                 return
+            LIMITS.check("seconds", frames / rate, path)
             if not rules.quick:
                 _decode(findings, file, where)
+    except FaceDiffError as error:
+        findings.error("sound_unreadable", where, str(error).removeprefix(f"{path}: "))
+        return
     except Exception as error:  # the decoder raises its own errors and others on damaged files
         message = f"not a readable sound file ({error}); expected a .wav recording, copy it again"
         findings.error("sound_unreadable", where, message)
@@ -247,27 +247,6 @@ def _decode(findings: Findings, file: Any, where: str) -> None:  # noqa: ANN401 
         findings.error("sound_not_finite", where, "holds samples that are not finite numbers; convert it again")
     elif loudest == 0:
         findings.error("sound_silent", where, "is silent throughout; get the recording again or remove the clip")
-
-
-def shortfall(path: Path) -> int | None:
-    """Bytes by which a wav file is shorter than its header says; None if it is whole, or no wav file.
-
-    Decoders do not report this, and return the samples that there are.
-    """
-    size = path.stat().st_size
-    with path.open("rb") as stream:
-        head = stream.read(12)
-        if len(head) < 12 or head[:4] != b"RIFF" or head[8:] != b"WAVE":
-            return None
-        while len(chunk := stream.read(8)) == 8:
-            name, length = struct.unpack("<4sI", chunk)
-            end = stream.tell() + length
-            if name == b"data":
-                return end - size if end > size and length < OPEN_END else None
-            if end >= size:
-                return None
-            stream.seek(end + length % 2)
-    return None
 
 
 # Both together.
