@@ -7,31 +7,35 @@ schedules, averages and log files, so that weights and curves equal those of a r
 
 from __future__ import annotations
 
-import csv
 import os
 import random
 import signal
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
 
 import numpy as np
 import torch
-from lightning.pytorch import LightningModule, Trainer
-from lightning.pytorch.callbacks import Checkpoint
-from lightning.pytorch.loggers import CSVLogger
-from lightning.pytorch.loggers.csv_logs import ExperimentWriter
+from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, ThroughputMonitor
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.trainer.states import RunningStage
 
+from facediff.callbacks.runs import JOB_FILE, LAST, STATE_KEY, ResumableCSVLogger, logger_versions, run_folder
 from facediff.errors import FaceDiffError
 from facediff.registry import Range, checks_arguments
 from facediff.utils.files import atomic
 
-RANDOM_KEY = "facediff_random_states"
-ROWS_KEY = "facediff_logged_rows"
+TRAIN = RunningStage.TRAINING
+
+SHARE_OF_TIME = 0.05
+"""The largest share of the training time that saving may take."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -43,7 +47,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: object = None
-    ) -> None:  # noqa: ANN401
+    ) -> None:
         """Write the file whole or not at all; the previous one stays until then.
 
         Raises:
@@ -58,21 +62,29 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         except RuntimeError as error:  # torch's zip writer reports a full disk this way
             raise FaceDiffError(
                 f"{target}: cannot be written ({str(error).splitlines()[0]}); the previous file, if any, is unchanged. "
-                f"Free some disk space and continue with --ckpt_path last"
+                f"Free some disk space and repeat the command; `facediff fit` continues with --ckpt_path last"
             ) from error
 
 
-class LastCheckpoint(Checkpoint):
+class Stopped(SystemExit):
+    """Training was stopped by a signal, at a point from which it continues."""
+
+
+class LastCheckpoint(Callback):
     """Keeps ``last.ckpt`` up to date, and stops training at the end of a step when a signal asks for it.
 
-    A checkpoint is written between two steps, when the first step is complete, logged and averaged, and nothing of the
-    second has happened yet. In addition to what Lightning stores it holds the states of all random-number generators
-    and the number of rows in the CSV log.
+    A checkpoint is written between two steps, when the first step is complete, logged, averaged and validated, and
+    nothing of the second has happened yet. In addition to what Lightning stores it holds the states of all
+    random-number generators and the positions of the loggers. It is the first of all callbacks, whatever its place in
+    the list: the others have then finished the step before, and not begun the next.
+
+    A signal waits for the end of the step, where a checkpoint is written; during validation, which may be long, it
+    stops training after the current batch, and validation is repeated.
 
     Args:
-        every_minutes: time between two checkpoints; a kill -9 costs at most that much.
+        every_minutes: time between two checkpoints; a kill -9 costs at most that much. It is longer where saving would
+            take more than a twentieth of the time.
         every_n_steps: training steps between two checkpoints, in place of the time.
-        dirpath: folder of ``last.ckpt``; ``checkpoints`` in the run's folder if None.
     """
 
     @checks_arguments
@@ -80,19 +92,21 @@ class LastCheckpoint(Checkpoint):
         self,
         every_minutes: Annotated[float, Range(above=0)] = 2.0,
         every_n_steps: Annotated[int, Range(1)] | None = None,
-        dirpath: str | None = None,
     ) -> None:
         super().__init__()
         self.every_seconds = every_minutes * 60
         self.every_n_steps = every_n_steps
-        self.dirpath = dirpath
+        self._signals = DeferredSignals()
         self._saved_at = time.monotonic()
         self._saved_step = -1
-        self._random_states: list[Mapping[str, Any]] | None = None
-        self._loader_states: list[dict[str, int]] = []
-        self._signals = DeferredSignals()
+        self._seconds = 0.0  # that the last save took
+        self._place: str | None = None  # where a checkpoint of this callback is being saved
+        self._resumed: dict[str, Any] = {}
 
-    # Saving
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Become the first callback."""
+        others = [callback for callback in trainer.callbacks if callback is not self]  # type: ignore[attr-defined]
+        trainer.callbacks = [self, *others]  # type: ignore[attr-defined]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock, let signals wait, and continue with the batch after the last one that was trained on.
@@ -100,113 +114,215 @@ class LastCheckpoint(Checkpoint):
         Lightning restores the loaders' states only where nothing has asked for a loader before. A learning-rate
         schedule has, to learn the number of steps, and worker processes then hold batches of the wrong epoch.
         """
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return
         self._saved_at = time.monotonic()
-        self._saved_step = trainer.global_step
         # Not before: Lightning notes and restores the handlers that it finds when it starts to train.
         self._signals.install()
-        states, self._loader_states = self._loader_states, []
-        loaders = trainer.fit_loop._combined_loader
+        states, loaders = self._resumed.get("loaders"), trainer.fit_loop._combined_loader
         if states and loaders is not None:
             loaders._load_state_dicts(states)
             iter(trainer.fit_loop._data_fetcher)  # type: ignore[arg-type]
+        if self._resumed.get("place") in ("epoch", "end"):
+            # Lightning would take the counters of complete epochs for a stop at a validation, and skip a batch.
+            trainer.fit_loop.epoch_loop.restarting = False
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:  # noqa: ANN401
         """Save if it is time or if a signal waits; restore the random states at the first step after a resume."""
-        if self._random_states is not None:
-            restore_random_states(self._random_states[min(trainer.global_rank, len(self._random_states) - 1)])
-            self._random_states = None
-        # At the start of an epoch, Lightning's counters of epochs and steps do not describe one complete state.
-        if batch_idx and self.is_due(trainer):
-            self.save(trainer, between_steps=True)
-        if batch_idx:
-            self._signals.deliver()
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return
+        if self._resumed:
+            states = self._resumed.get("random", [])
+            if states:
+                restore_random_states(states[min(trainer.global_rank, len(states) - 1)])
+            continue_counting(trainer, self._resumed.get("throughput", []))
+            trainer.fit_loop.restarting = False  # schedules that follow a metric would miss the first epoch's end
+            self._resumed = {}
+        if batch_idx % trainer.accumulate_grad_batches:
+            return  # gradients of earlier batches are in no checkpoint
+        due, number = agreed(trainer, self.is_due(trainer), self._signals.waiting)
+        if due or (number and trainer.global_step > self._saved_step):
+            self.save(trainer, "step" if batch_idx else "epoch")
+        if number:
+            self.stop(trainer, number)
 
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save if it is time, and at the end of training, before averaged weights replace the trained ones."""
-        finished = trainer.should_stop or trainer.global_step == trainer.max_steps
-        finished |= trainer.max_epochs == trainer.current_epoch + 1
-        if self.is_due(trainer) or finished:
-            self.save(trainer)
-        self._signals.deliver()
+    def on_validation_batch_start(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        batch: Any,  # noqa: ANN401
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Stop if a signal waits: the checkpoint before validation is there."""
+        if self._signals.installed:
+            _, number = agreed(trainer, False, self._signals.waiting)
+            if number:
+                self.stop(trainer, number)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save the state from which more epochs may follow, before averaged weights replace the trained ones."""
+        if not trainer.fast_dev_run:  # type: ignore[attr-defined]
+            self.save(trainer, "end")
+        self._signals.remove()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Give the signals back."""
         self._signals.remove()
 
-    def is_due(self, trainer: Trainer) -> bool:
-        """Whether to save now; all processes get the answer of the first one."""
-        if trainer.fast_dev_run:  # type: ignore[attr-defined]
-            return False
-        new = trainer.global_step > self._saved_step
-        if self.every_n_steps is not None:
-            due = new and trainer.global_step % self.every_n_steps == 0
-        else:
-            due = new and time.monotonic() - self._saved_at >= self.every_seconds
-        due |= new and self._signals.waiting is not None
-        return bool(trainer.strategy.broadcast(due))
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Give the signals back."""
+        self._signals.remove()
 
-    def save(self, trainer: Trainer, *, between_steps: bool = False) -> None:
-        """Write ``last.ckpt``."""
-        if trainer.fast_dev_run:  # type: ignore[attr-defined]
-            return
-        self._between_steps = between_steps
-        trainer.save_checkpoint(self.path(trainer))
+    def is_due(self, trainer: Trainer) -> bool:
+        """Whether to save now; before the first step too, so that a full disk is found then."""
+        if self._saved_step < 0:
+            return True
+        if trainer.global_step <= self._saved_step:
+            return False
+        if self.every_n_steps is not None:
+            return trainer.global_step % self.every_n_steps == 0
+        return time.monotonic() - self._saved_at >= max(self.every_seconds, self._seconds / SHARE_OF_TIME)
+
+    def save(self, trainer: Trainer, place: str) -> None:
+        """Write ``last.ckpt``; the place is ``step`` (within an epoch), ``epoch`` (at its first batch) or ``end``."""
+        started = time.monotonic()
+        self._place = place
+        try:
+            trainer.save_checkpoint(trainer.strategy.broadcast(str(self.path(trainer))), weights_only=False)
+        finally:
+            self._place = None
         self._saved_at = time.monotonic()
+        self._seconds = self._saved_at - started
         self._saved_step = trainer.global_step
 
-    _between_steps = False
-
     def path(self, trainer: Trainer) -> Path:
-        """Where ``last.ckpt`` of a run lies."""
-        folder = self.dirpath or os.path.join(trainer.log_dir or trainer.default_root_dir, "checkpoints")
-        return Path(trainer.strategy.broadcast(folder)) / "last.ckpt"
+        """Where ``last.ckpt`` of a run lies; right on the first process."""
+        return run_folder(trainer) / LAST
+
+    def stop(self, trainer: Trainer, number: int) -> None:
+        """End training on all processes; the exit status is that of a process which the signal has ended."""
+        self._signals.remove()
+        # A process that was started by the first one must not look as if it had failed, or all others are killed.
+        status = 0
+        if trainer.is_global_zero:
+            status = 128 + number
+            path, name = self.path(trainer), signal.Signals(number).name
+            print(
+                f"facediff fit: stopped by {name}; {path} holds the state after step {self._saved_step}, continue with "
+                f"the same command and --ckpt_path last",
+                file=sys.stderr,
+                flush=True,
+            )
+            cluster = trainer._accelerator_connector.cluster_environment
+            if name == "SIGUSR1" and isinstance(cluster, SLURMEnvironment) and cluster.auto_requeue:
+                requeue(path.parents[1])
+        raise Stopped(status)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """Add random states and log positions; called on every process and for every checkpoint."""
-        checkpoint[RANDOM_KEY] = gathered(trainer, random_states())
-        checkpoint[ROWS_KEY] = [
-            logger.rows() if isinstance(logger, ResumableCSVLogger) else -1 for logger in trainer.loggers
+        rows = [
+            logger.rows() if isinstance(logger, ResumableCSVLogger) and trainer.is_global_zero else -1
+            for logger in trainer.loggers
         ]
-        if self._between_steps:
-            self._between_steps = False
-            # Lightning has counted the batch that is about to be trained as "ready". Without it, its counters say that
-            # a step is complete, with validation and logging, and it continues after that step.
-            progress = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
+        checkpoint[STATE_KEY] = {
+            "place": self._place,
+            "random": gathered(trainer, random_states()),
+            "rows": rows,
+            "versions": logger_versions(trainer) if trainer.is_global_zero else [],
+            "throughput": [
+                [m._samples.get(TRAIN, 0), m._batches.get(TRAIN, 0), m._lengths.get(TRAIN, 0), elapsed(m)]
+                for m in throughput_monitors(trainer)
+            ],
+        }
+        # Lightning has counted the batch that is about to be trained as "ready", and would take it for trained.
+        loop = checkpoint["loops"]["fit_loop"]
+        progress = loop["epoch_loop.batch_progress"]
+        if self._place in ("step", "epoch"):
+            progress["is_last_batch"] = False
             for counter in (progress["total"], progress["current"]):
                 counter["ready"] = counter["completed"]
+        if self._place == "step":
+            # A stop right after a step is one that Lightning knows: it counts the batch as completed when it restarts.
+            for counter in (progress["total"], progress["current"]):
+                counter["completed"] -= 1
+            loop["epoch_loop.state_dict"]["_batches_that_stepped"] -= 1
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """Take the random states for the first step, and drop log rows of steps that will be repeated."""
-        self._random_states = checkpoint.get(RANDOM_KEY)
-        self._loader_states = checkpoint["loops"]["fit_loop"]["state_dict"].get("combined_loader", [])
-        for logger, rows in zip(trainer.loggers, checkpoint.get(ROWS_KEY, ()), strict=False):
+        loaders = checkpoint["loops"]["fit_loop"]["state_dict"].get("combined_loader", [])
+        self._resumed = {**checkpoint.get(STATE_KEY, {}), "loaders": loaders}
+        for logger, rows in zip(trainer.loggers, self._resumed.get("rows", ()), strict=False):
             if isinstance(logger, ResumableCSVLogger) and trainer.is_global_zero and rows >= 0:
                 logger.keep(rows)
+        path = Path(trainer.ckpt_path) if trainer.ckpt_path else None
+        here = path is not None and path.is_file() and os.path.realpath(path) == os.path.realpath(self.path(trainer))
+        if here:
+            self._saved_step = checkpoint["global_step"]
+        for callback in trainer.checkpoint_callbacks:
+            if isinstance(callback, ModelCheckpoint):
+                continue_bookkeeping(callback, checkpoint, path if here else None)
+
+
+def continue_bookkeeping(callback: ModelCheckpoint, checkpoint: dict[str, Any], last: Path | None) -> None:
+    """Let a callback that keeps the best models go on with those that are there.
+
+    Args:
+        callback: it is set up, and its state has not been loaded yet.
+        checkpoint: what is being loaded; the callback's state in it is changed.
+        last: the ``last.ckpt`` that is being loaded, if its run is continued in its folder.
+    """
+    state, folder = checkpoint.get("callbacks", {}).get(callback.state_key), str(callback.dirpath)
+    if state is None:
+        return
+    before = str(state.get("dirpath", folder))
+    if last is not None:  # the folder may have another name by now
+        state["dirpath"] = folder
+
+    def moved(path: str) -> str:
+        # The callback removes files of these names: none may lie outside its folder.
+        name = os.path.normpath(path[len(before) :].lstrip("/\\")) if path.startswith(before) else ".."
+        return "" if name.startswith("..") or os.path.isabs(name) else os.path.join(str(state["dirpath"]), name)
+
+    for name in ("best_model_path", "kth_best_model_path", "last_model_path"):
+        state[name] = moved(str(state.get(name, "")))
+    known = {moved(str(path)): score for path, score in state.get("best_k_models", {}).items()}
+    state["best_k_models"] = {path: score for path, score in known.items() if path}
+    if last is not None:
+        # Files that were written after it are written again, under the same names.
+        since = last.stat().st_mtime
+        again = {str(path) for path in Path(folder).rglob("*.ckpt") if path.stat().st_mtime > since} - set(known)
+        exists = callback.file_exists
+        callback.file_exists = lambda filepath, trainer: filepath not in again and exists(filepath, trainer)  # type: ignore
 
 
 class DeferredSignals:
     """Lets SIGINT, SIGTERM and SIGUSR1 wait until the training step is complete.
 
-    A signal in the middle of a step would leave half-updated weights and optimiser states behind. The handlers that
-    were installed before (Python's for Ctrl-C, Lightning's for SIGTERM and for a SLURM requeue) are called afterwards.
-    A second Ctrl-C does not wait.
+    A signal in the middle of a step would leave half-updated weights and optimiser states behind. The same signal once
+    more does not wait.
 
     Attributes:
-        waiting: the signal that came first, if any.
+        waiting: number of the signal that came first; 0 if none has.
     """
 
     def __init__(self) -> None:
-        self.waiting: int | None = None
+        self.waiting = 0
         self._before: dict[int, Any] = {}
 
+    @property
+    def installed(self) -> bool:
+        """Whether signals wait."""
+        return bool(self._before)
+
     def install(self) -> None:
-        """Take over the signals that somebody handles."""
+        """Take over the signals that are not ignored."""
         if threading.current_thread() is not threading.main_thread():
             return
-        for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)):
-            before = signal.getsignal(number)
-            if callable(before) and number not in self._before:
-                self._before[number] = before
+        for name in ("SIGINT", "SIGTERM", "SIGUSR1"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) not in (None, signal.SIG_IGN):
+                self._before.setdefault(number, signal.getsignal(number))
                 signal.signal(number, self._note)
 
     def remove(self) -> None:
@@ -214,22 +330,59 @@ class DeferredSignals:
         for number, before in self._before.items():
             if signal.getsignal(number) == self._note:
                 signal.signal(number, before)
-        self._before = {}
-
-    def deliver(self) -> None:
-        """Call the handler of the signal that waits, if one does."""
-        if self.waiting is not None:
-            number, self.waiting = self.waiting, None
-            handler: Callable[[int, FrameType | None], Any] = self._before[number]
-            handler(number, None)
+        self._before, self.waiting = {}, 0
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGINT and self.waiting == signal.SIGINT:
-            self.deliver()
-        elif self.waiting is None:
-            self.waiting = number
+        if self.waiting == number:
+            self.remove()
             if number == signal.SIGINT:
-                os.write(2, b"\nfinishing the step (or the validation) and saving; Ctrl-C again stops immediately\n")
+                raise KeyboardInterrupt
+            raise Stopped(128 + number)
+        self.waiting = self.waiting or number
+        if number == signal.SIGINT:
+            os.write(2, b"\nfinishing the step and saving; Ctrl-C again stops immediately\n")
+
+
+def requeue(run: Path) -> None:
+    """Ask SLURM to start this job again; it then continues the run."""
+    array = os.environ.get("SLURM_ARRAY_JOB_ID")
+    job = f"{array}_{os.environ.get('SLURM_ARRAY_TASK_ID')}" if array else os.environ.get("SLURM_JOB_ID", "")
+    with atomic(run / JOB_FILE) as temporary:
+        temporary.write_text(os.environ.get("SLURM_JOB_ID", ""), encoding="utf-8")
+    try:
+        failed = subprocess.run(["scontrol", "requeue", job], check=False).returncode  # noqa: S603, S607
+    except OSError as error:
+        failed = error.errno or 1
+    if failed:
+        print(f"facediff fit: `scontrol requeue {job}` failed; start the job again", file=sys.stderr, flush=True)
+
+
+def throughput_monitors(trainer: Trainer) -> list[ThroughputMonitor]:
+    """The callbacks that count batches and samples, and keep no state."""
+    return [found for found in trainer.callbacks if isinstance(found, ThroughputMonitor)]  # type: ignore[attr-defined]
+
+
+def elapsed(monitor: ThroughputMonitor) -> float:
+    """The training time that a monitor has measured, in seconds."""
+    return time.perf_counter() - monitor._t0s[TRAIN] if TRAIN in monitor._t0s else 0.0
+
+
+def continue_counting(trainer: Trainer, counts: list[list[float]]) -> None:
+    """Let the monitors count on from what they had counted when the checkpoint was written."""
+    for monitor, (samples, batches, lengths, seconds) in zip(throughput_monitors(trainer), counts, strict=False):
+        if TRAIN in monitor._t0s:
+            monitor._samples[TRAIN], monitor._batches[TRAIN] = int(samples), int(batches)
+            monitor._lengths[TRAIN] = int(lengths)
+            monitor._t0s[TRAIN] -= seconds
+
+
+def agreed(trainer: Trainer, due: bool, number: int) -> tuple[bool, int]:
+    """What at least one process wants, known to all: whether to save, and the signal that has come."""
+    if trainer.world_size == 1:
+        return due, number
+    wanted = torch.tensor([int(due), number], device=trainer.strategy.root_device)
+    torch.distributed.all_reduce(wanted, op=torch.distributed.ReduceOp.MAX)
+    return bool(wanted[0]), int(wanted[1])
 
 
 def random_states() -> dict[str, Any]:
@@ -268,52 +421,3 @@ def gathered(trainer: Trainer, value: Any) -> list[Any]:  # noqa: ANN401
     values: list[Any] = [None] * trainer.world_size
     torch.distributed.all_gather_object(values, value)
     return values
-
-
-class ResumableCSVLogger(CSVLogger):
-    """Lightning's CSV logger, except that it continues a file that is there already.
-
-    Lightning's deletes the file of a folder that it is given a second time, and with it the curve of a run up to the
-    point where it was stopped.
-    """
-
-    def rows(self) -> int:
-        """Rows written so far; whatever is pending is written first."""
-        self.save()
-        path = Path(self.experiment.metrics_file_path)
-        return len(read_rows(path)[1]) if path.is_file() else 0
-
-    def keep(self, rows: int) -> None:
-        """Keep the first rows only: the steps after them will be repeated."""
-        path = Path(self.experiment.metrics_file_path)
-        if not path.is_file():
-            return
-        header, found = read_rows(path)
-        if len(found) > rows:
-            with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-                writer = csv.DictWriter(stream, header)
-                writer.writeheader()
-                writer.writerows(found[:rows])
-
-    @property
-    def experiment(self) -> Any:  # noqa: ANN401 - as in Lightning's logger
-        """The writer; it continues the file."""
-        if self._experiment is None:
-            os.makedirs(self.root_dir, exist_ok=True)
-            self._experiment = _ContinuedWriter(log_dir=self.log_dir)
-        return self._experiment
-
-
-class _ContinuedWriter(ExperimentWriter):
-    def _check_log_dir_exists(self) -> None:
-        path = Path(self.metrics_file_path)
-        if path.is_file():
-            self.metrics_keys = read_rows(path)[0]
-
-
-def read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    """Header and rows of a CSV file; a row that was cut off by a kill is dropped."""
-    with path.open(newline="", encoding="utf-8") as stream:
-        reader = csv.DictReader(stream)
-        rows = [row for row in reader if None not in row.values()]
-    return list(reader.fieldnames or []), rows

@@ -27,6 +27,7 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor
 
 from facediff import registry
+from facediff.callbacks.runs import run_folder
 from facediff.data import Sample, SpeechMotionDataModule, collate
 from facediff.data.audio import fit_length, samples_for
 from facediff.data.corpus import Clip
@@ -281,20 +282,6 @@ def borrowed(model: AnimationModel, sampler: str | None, steps: int | None) -> I
         vars(model).update(kept)
         for module, training in modes:
             module.training = training
-
-
-def run_folder(trainer: Trainer) -> Path:
-    """The run's folder, where Lightning keeps its checkpoints too.
-
-    Unlike ``trainer.log_dir``, which every process must ask for, this may be asked for by the first one alone.
-    """
-    logger = trainer.logger
-    if logger is None:
-        return Path(trainer.default_root_dir)
-    if logger.log_dir:
-        return Path(logger.log_dir)
-    version = logger.version if isinstance(logger.version, str) else f"version_{logger.version}"
-    return Path(logger.save_dir or trainer.default_root_dir) / str(logger.name) / version
 
 
 def first_of_each_identity(clips: Sequence[Clip], count: int) -> list[str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import sys
 import threading
 import urllib.error
@@ -22,12 +23,18 @@ from jsonargparse import set_parsing_settings
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import WandbLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from facediff import registry
-from facediff.callbacks import GradientNorm, PredictionWriter, RunDescription, ScoreTable
+from facediff.callbacks import GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
+from facediff.callbacks.checkpoints import AtomicCheckpointIO
+from facediff.callbacks.runs import continue_run, find_checkpoint
 from facediff.data import SpeechMotionDataModule
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.models import AnimationModel
+from facediff.models.checkpoint import read_checkpoint
+from facediff.utils.files import atomic
 
 LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a model that the data module knows."""
@@ -39,6 +46,7 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
     logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
     # Lightning starts the other processes of a distributed run with the words of this one.
     argv, sys.argv = sys.argv, [sys.argv[0], name, *words]
+    interrupt = signal.getsignal(signal.SIGINT)
     try:
         with warnings.catch_warnings():
             for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, *RESUME_WARNINGS):
@@ -55,6 +63,12 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
                 save_config_callback=RunConfig,
                 save_config_kwargs={"overwrite": True},
             )
+    except SIGTERMException as error:
+        raise SystemExit(128 + signal.SIGTERM) from error
+    except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning ends with status 1
+            raise KeyboardInterrupt from stop
+        raise
     except Exception as error:
         # jsonargparse wraps what a constructor raises; our own sentence is the useful one.
         ours = next((cause for cause in causes(error) if isinstance(cause, FaceDiffError)), None)
@@ -68,13 +82,15 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
         raise ours from error
     finally:
         sys.argv = argv
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # Lightning ignores all further ones
+            signal.signal(signal.SIGINT, interrupt)
 
 
 def built_in_callbacks(name: str) -> list[Callback]:
     """The callbacks that every run of a subcommand has in addition to those of its config."""
     callbacks: list[Callback] = [ScoreTable(), RunDescription()]
     if name == "fit":
-        callbacks.append(GradientNorm())
+        callbacks += [GradientNorm(), LastCheckpoint()]
     if name == "predict":
         callbacks.append(PredictionWriter())
     return callbacks
@@ -187,8 +203,25 @@ class FaceDiffCLI(LightningCLI):
         built_in = self.trainer_defaults["callbacks"]
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         named = {type(callback) for callback in callbacks if callback not in built_in}
+        if self._get(self.config_init, "trainer").get("enable_checkpointing") is False:
+            named.add(LastCheckpoint)
         callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in named]
         return trainer
+
+    def before_fit(self) -> None:
+        """Let checkpoints be written whole, and a run that was stopped continue in its folder."""
+        trainer: Trainer = self.trainer
+        if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:
+            trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return
+        path = find_checkpoint(trainer, self._get(self.config_init, "ckpt_path"))
+        content = read_checkpoint(path) if path is not None and path.is_file() else {}
+        if continue_run(trainer, path, content, sys.argv):
+            warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
+            self.config[str(self.subcommand)].ckpt_path = None  # the config that is saved describes the whole run
+        if path is not None:
+            self.config_init[str(self.subcommand)].ckpt_path = str(path) if content else None
 
     def _parse_ckpt_path(self) -> None:
         """Do nothing: upstream would let a checkpoint override the flags; ``words_of_checkpoint`` does the opposite."""
@@ -203,12 +236,18 @@ class RunConfig(SaveConfigCallback):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Save the config where the run's files lie, unless that is merely the working folder."""
-        if not trainer.loggers and Path(trainer.default_root_dir).resolve() == Path.cwd():
-            self.save_to_log_dir = False
+        self.save_to_log_dir = False  # Lightning would write it in place, where a kill leaves half of it
+        if trainer.loggers or Path(trainer.default_root_dir).resolve() != Path.cwd():
+            self.folder = trainer.log_dir  # asked for on every process: the answer is broadcast
         super().setup(trainer, pl_module, stage)
 
+    folder: str | None = None
+
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Give wandb the config; called on one process only."""
+        """Write the file, and give wandb the config; called on one process only."""
+        if self.folder is not None:
+            with atomic(Path(self.folder) / self.config_filename) as temporary:
+                self.parser.save(self.config, temporary, skip_none=False, overwrite=True, multifile=False)
         for logger in trainer.loggers:
             if isinstance(logger, WandbLogger):
                 config = yaml.safe_load(self.parser.dump(self.config, skip_none=False))

@@ -410,7 +410,12 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         trainer = self.trainer
         if trainer is None:
             return 0, 0
-        return trainer.current_epoch, trainer.fit_loop.epoch_loop.batch_progress.current.completed
+        epochs: Any = trainer.fit_loop.epoch_progress.current
+        batches = trainer.fit_loop.epoch_loop.batch_progress.current
+        if epochs.started <= epochs.processed:  # between two epochs
+            return epochs.processed, 0
+        done = batches.completed >= trainer.num_training_batches
+        return (epochs.processed + 1, 0) if done else (epochs.processed, batches.completed)
 
     def _loader_options(self) -> dict[str, Any]:
         return {

@@ -197,13 +197,13 @@ class ResumableLoader(DataLoader[list[Sample]]):
     def state_dict(self) -> dict[str, int]:
         """What Lightning stores in a checkpoint."""
         epoch, batches = self.progress()
-        return {"epoch": epoch, "batches": batches}
+        return {"epoch": epoch, "batches": batches, "seed": getattr(self.sampler, "seed", 0)}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Continue there."""
         if isinstance(self.sampler, ClipBatches):
-            complete = state["batches"] >= len(self)
-            self.sampler.resume(state["epoch"] + complete, 0 if complete else state["batches"])
+            self.sampler.seed = state["seed"]  # a config may leave the seed to chance
+            self.sampler.resume(state["epoch"], state["batches"])
 
 
 def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generator) -> list[list[int]]:

@@ -15,13 +15,8 @@ import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging
 
 from facediff import registry
-from facediff.callbacks.checkpoints import (
-    AtomicCheckpointIO,
-    LastCheckpoint,
-    ResumableCSVLogger,
-    random_states,
-    restore_random_states,
-)
+from facediff.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint, random_states, restore_random_states
+from facediff.callbacks.runs import ResumableCSVLogger
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import Tiny
@@ -59,11 +54,13 @@ def fit(
         lr_schedule="cosine",
         warmup_steps=2,
     )
+    logger = ResumableCSVLogger(folder, name="run", version=0)
+    logger.continues = ckpt_path is not None
     trainer = pl.Trainer(
         accelerator="cpu",
         devices=1,
         max_epochs=EPOCHS,
-        logger=ResumableCSVLogger(folder, name="run", version=0),
+        logger=logger,
         enable_progress_bar=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
@@ -105,6 +102,7 @@ def uninterrupted(
     return whole["weights"], whole["curve"]  # type: ignore[return-value]
 
 
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")
 @pytest.mark.parametrize(
     ("step", "every", "number", "workers"),
     [

@@ -277,7 +277,6 @@ def test_an_interruption_leaves_the_best_checkpoint_alone(
     with pytest.raises(RuntimeError, match="pulled the plug"):
         make_trainer(max_epochs=3, callbacks=keepers, enable_checkpointing=True).fit(model, datamodule=tiny)
     assert seen == [(tmp_path / "best.ckpt").read_bytes()]
-    assert (tmp_path / "interrupted.ckpt").exists()
 
 
 def test_scores_do_not_depend_on_the_batch_size(trained: Path, tiny_root: Path, make_trainer: MakeTrainer) -> None:

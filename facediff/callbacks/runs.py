@@ -1,0 +1,242 @@
+"""The folder of a run: where it is, and how loggers continue in it when training is resumed."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning.fabric.loggers.logger import rank_zero_experiment
+from lightning.pytorch import Trainer
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers.csv_logs import ExperimentWriter
+
+from facediff.errors import FaceDiffError
+from facediff.utils.files import atomic
+
+STATE_KEY = "facediff_training_state"
+"""Where a checkpoint holds what Lightning does not keep."""
+
+JOB_FILE = "slurm_job_id"
+"""In the folder of a run that SLURM was asked to start again."""
+
+LAST = Path("checkpoints", "last.ckpt")
+"""The newest state of a run, in its folder."""
+
+
+def run_folder(trainer: Trainer) -> Path:
+    """The run's folder, where Lightning keeps its checkpoints too.
+
+    Unlike ``trainer.log_dir``, which every process must ask for, this may be asked for by the first one alone.
+    """
+    logger = trainer.logger
+    if logger is None:
+        return Path(trainer.default_root_dir)
+    if logger.log_dir:
+        return Path(logger.log_dir)
+    version = logger.version if isinstance(logger.version, str) else f"version_{logger.version}"
+    return Path(logger.save_dir or trainer.default_root_dir) / str(logger.name) / version
+
+
+# Which run is continued.
+
+
+def run_of(checkpoint: Path) -> Path | None:
+    """The folder of the run whose ``last.ckpt`` a file is; None for every other file."""
+    return checkpoint.parents[1] if checkpoint.parts[-2:] == LAST.parts else None
+
+
+def runs_folder(trainer: Trainer) -> Path:
+    """The folder to which the trainer's first logger adds a folder for every run."""
+    logger = trainer.logger
+    if logger is None:
+        return Path(trainer.default_root_dir)
+    return Path(logger.save_dir or trainer.default_root_dir) / str(logger.name or "")
+
+
+def newest_run(trainer: Trainer) -> Path:
+    """The run that was written to last, among those that the trainer's first logger would add one to.
+
+    A run that has no ``last.ckpt`` was stopped before its first step, and begins again.
+
+    Raises:
+        FaceDiffError: if there is no run, or if the newest has no checkpoint while an older one has.
+    """
+    logger, folder = trainer.logger, runs_folder(trainer)
+    runs = [path for path in folder.glob("*") if (path / LAST).is_file() or (path / "config.yaml").is_file()]
+    if logger is None or (getattr(logger, "_version", None) is not None and not isinstance(logger, WandbLogger)):
+        folder = run_folder(trainer)  # there is one only
+        runs = [folder] if (folder / LAST).is_file() or (logger and folder.is_dir()) else []
+    if not runs:
+        raise FaceDiffError(
+            f"--ckpt_path last: there is no run to continue in {folder}; give the config and the options of the run, "
+            f"or omit --ckpt_path to start one"
+        )
+
+    def written(run: Path) -> float:
+        return (run / LAST if (run / LAST).is_file() else run).stat().st_mtime
+
+    newest = max(runs, key=written)
+    saved = [run for run in runs if (run / LAST).is_file()]
+    if not (newest / LAST).is_file() and saved:
+        other = max(saved, key=written)
+        raise FaceDiffError(
+            f"--ckpt_path last: the newest run, {newest}, was stopped before its first step; give --ckpt_path "
+            f"{other / LAST} to continue the one before, or omit --ckpt_path to start again"
+        )
+    return newest
+
+
+def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
+    """The checkpoint to continue from, which may not be there yet; None for a new run.
+
+    Args:
+        trainer: its loggers say where the runs are.
+        asked: a path, ``last``, or None; a job that SLURM has started again continues its run then.
+
+    Raises:
+        FaceDiffError: if ``last`` is asked for, and there is none.
+    """
+    if asked == "last":
+        return newest_run(trainer) / LAST
+    if asked is None and int(os.environ.get("SLURM_RESTART_COUNT") or 0):
+        job = os.environ.get("SLURM_JOB_ID", "")
+        for run in runs_folder(trainer).glob("*"):
+            if (run / JOB_FILE).is_file() and (run / JOB_FILE).read_text(encoding="utf-8") == job:
+                return run / LAST
+    return None if asked is None else Path(asked)
+
+
+def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any], words: Sequence[str]) -> bool:
+    """Prepare the trainer's loggers; whether a run is continued in its folder.
+
+    Training that begins from any other file than a ``last.ckpt``, or with a place for its run on the command line, is
+    a new run.
+
+    Args:
+        trainer: with loggers that have not been used yet.
+        path: the checkpoint that training begins from.
+        content: what is in it; empty if it is not there.
+        words: the command line.
+    """
+    run = None if path is None or trainer.logger is None else run_of(path)
+    place = re.compile(r"--trainer\.logger\.(init_args\.)?(save_dir|name|version)\b")
+    if run is not None and any(place.match(word) for word in words):
+        run = run if os.path.realpath(run.parent) == os.path.realpath(runs_folder(trainer)) else None
+    if run is not None and not content:
+        print(f"{run}: was stopped before its first step; training starts from the beginning", flush=True)
+    state = content.get(STATE_KEY, {})
+    trainer.loggers = resumable(trainer.loggers, run, state.get("versions", ()), content.get("global_step", 0))
+    return run is not None
+
+
+# The loggers of a run that is continued.
+
+
+def resumable(
+    loggers: Sequence[Logger], run: Path | None = None, versions: Sequence[Any] = (), step: int = 0
+) -> list[Logger]:
+    """The loggers of a run, such that they continue what they have logged.
+
+    Args:
+        loggers: as the config describes them, with nothing logged yet.
+        run: the folder of the run that is continued; None for a new run.
+        versions: what :func:`logger_versions` was when the run was saved.
+        step: optimiser steps that had been taken then; TensorBoard hides what it was shown of later ones.
+    """
+    ready: list[Logger] = []
+    for place, logger in enumerate(loggers):
+        version = versions[place] if place < len(versions) else None
+        if type(logger) is CSVLogger:
+            logger = ResumableCSVLogger(  # noqa: PLW2901
+                logger.save_dir,
+                name=logger.name,
+                version=logger._version,
+                prefix=logger._prefix,
+                flush_logs_every_n_steps=logger._flush_logs_every_n_steps,
+            )
+        if run is not None and isinstance(logger, ResumableCSVLogger | TensorBoardLogger):
+            if place == 0:
+                logger._root_dir, logger._name, version = str(run.parent), "", run.name
+                if isinstance(logger, ResumableCSVLogger):
+                    logger._save_dir = logger._root_dir
+            logger._version = version if version is not None else logger._version
+            if isinstance(logger, ResumableCSVLogger):
+                logger.continues = version is not None
+            else:
+                logger._kwargs.setdefault("purge_step", step)
+        if run is not None and isinstance(logger, WandbLogger):
+            logger._id = logger._wandb_init["id"] = version or (run.name if place == 0 else None)
+        ready.append(logger)
+    return ready
+
+
+def logger_versions(trainer: Trainer) -> list[Any]:
+    """What tells the runs of each logger apart: a number, a name, an identifier of Weights & Biases."""
+    return [logger.version if isinstance(logger.version, int | str) else None for logger in trainer.loggers]
+
+
+class ResumableCSVLogger(CSVLogger):
+    """Lightning's CSV logger, except that it can continue a file, and that a kill cannot cut the file.
+
+    Lightning's deletes the file of a folder that it is given a second time, and with it the curve of a run up to the
+    point where it was stopped.
+
+    Attributes:
+        continues: keep the file that is there.
+    """
+
+    continues = False
+
+    def rows(self) -> int:
+        """Rows written so far; whatever is pending is written first."""
+        self.save()
+        path = Path(self.experiment.metrics_file_path)
+        return len(read_rows(path)[1]) if path.is_file() else 0
+
+    def keep(self, rows: int) -> None:
+        """Keep the first rows only: the steps after them will be repeated."""
+        path = Path(self.experiment.metrics_file_path)
+        if self.continues and path.is_file():
+            header, found = read_rows(path)
+            write_table(path, header, found[:rows])
+
+    @property
+    @rank_zero_experiment
+    def experiment(self) -> Any:  # noqa: ANN401 - as in Lightning's logger
+        """The writer."""
+        if self._experiment is None:
+            os.makedirs(self.root_dir, exist_ok=True)
+            self._experiment = (_ContinuedWriter if self.continues else _Writer)(log_dir=self.log_dir)
+        return self._experiment
+
+
+class _Writer(ExperimentWriter):
+    def _rewrite_with_new_header(self, fieldnames: list[str]) -> None:
+        path = Path(self.metrics_file_path)
+        write_table(path, fieldnames, read_rows(path)[1])
+
+
+class _ContinuedWriter(_Writer):
+    def _check_log_dir_exists(self) -> None:
+        path = Path(self.metrics_file_path)
+        if path.is_file():
+            self.metrics_keys = read_rows(path)[0]
+
+
+def read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Header and rows of a CSV file; a last row that was cut off by a kill is dropped."""
+    text = path.read_text(encoding="utf-8")
+    reader = csv.DictReader(text[: text.rfind("\n") + 1].splitlines())
+    return list(reader.fieldnames or []), list(reader)
+
+
+def write_table(path: Path, header: Sequence[str], rows: Sequence[Mapping[str, str]]) -> None:
+    """Write a CSV file whole or not at all."""
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, header)
+        writer.writeheader()
+        writer.writerows(rows)
