@@ -19,7 +19,7 @@ Mode = Literal["finetune", "joint"]
 def adapt(
     *,
     checkpoint: Checkpoint,
-    person: Annotated[str, Option(metavar="DIR")],
+    person: Annotated[str, Option(metavar="DIR", reads=True)],
     output: Output,
     mode: Mode = "finetune",
     train: Literal["all", "person"] = "all",
@@ -52,13 +52,11 @@ def adapt(
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
     if not checkpoint.is_file():
         raise FaceDiffError(f"--checkpoint {checkpoint}: no such file")
-    from facediff.utils.files import atomic, check_writable
-
-    check_writable(output)
     from lightning.pytorch import Trainer, seed_everything
 
     from facediff.models.adaptation import train_only, with_extra_identities
     from facediff.models.checkpoint import build_model, read_checkpoint
+    from facediff.utils.files import atomic
 
     started = time.monotonic()
     content = read_checkpoint(checkpoint)

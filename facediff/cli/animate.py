@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from facediff.cli.options import Checkpoint, ControlOptions, File, Identity, Output, OutputOptions, Seed, Workers
+from facediff.cli.options import Checkpoint, ControlOptions, File, Identity, Map, OutputOptions, Seed, Workers
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 
@@ -46,13 +46,13 @@ class BatchOptions:
 
 
 def animate(
-    speech: Annotated[list[Path], Option(metavar="SPEECH")],
+    speech: Annotated[list[Path], Option(metavar="SPEECH", reads=True, dash=True)],
     *,
     checkpoint: Checkpoint,
-    output: Output,
+    output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file or folder", dash=True)],
     identity: Identity = None,
-    style: Annotated[str | None, Option(metavar="STYLE")] = None,
-    style_template: Annotated[str | None, Option(metavar="FACE")] = None,
+    style: Annotated[str | None, Option(metavar="STYLE", reads=True)] = None,
+    style_template: Annotated[str | None, Option(metavar="FACE", reads=True)] = None,
     samples: Annotated[int, Option(metavar="N", least=1)] = 1,
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
     steps: Annotated[int | None, Option(metavar="N")] = None,
@@ -60,7 +60,7 @@ def animate(
     device: str = "cpu",
     precision: Literal["32", "bf16"] = "32",
     target_mesh: File = None,
-    correspondence: Annotated[Path | None, Option(metavar="MAP")] = None,
+    correspondence: Map = None,
     quiet: bool = False,
     files: OutputOptions,
     windows: WindowOptions,
@@ -116,7 +116,7 @@ def animate(
             f"{checkpoint}: no such checkpoint; expected a .ckpt file that `facediff fit` has written, or "
             f"demo/puppet.ckpt of `facediff demo`"
         )
-    from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, read_recording, refuse_replacing
+    from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, read_recording
 
     options = AnimationOptions(
         checkpoint=checkpoint,
@@ -155,7 +155,6 @@ def animate(
             retry_failed=batch.retry_failed,
         )
     options.check(output)
-    refuse_replacing(speech, [output])
     samples_of_speech = read_recording(speech[0], windows.max_seconds)  # before the model, which takes longer to load
     written, animation = AnimationPipeline(options).write(samples_of_speech, speech[0].stem, output, seed=seed)
     metadata = animation.metadata

@@ -143,12 +143,15 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def run(name: str, arguments: Sequence[str]) -> int:
     """Import a command and run it with its arguments."""
-    function = load(name)
-    if function.__name__ in ("run", "lightning"):  # reads its words by a parser of its own
-        return int(function(name, arguments) or 0)
-    from facediff.cli.parsing import arguments_of
+    from facediff.utils.destinations import reading
 
-    return int(function(**arguments_of(function, f"facediff {name}", arguments)) or 0)
+    function = load(name)
+    with reading():  # what the parser finds to be an input is not overwritten until the command has ended
+        if function.__name__ in ("run", "lightning"):  # reads its words by a parser of its own
+            return int(function(name, arguments) or 0)
+        from facediff.cli.parsing import arguments_of
+
+        return int(function(**arguments_of(function, f"facediff {name}", arguments)) or 0)
 
 
 def load(name: str) -> Callable[..., int | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.options import SourceOptions, check_picture_path
+from facediff.cli.options import Picture, SourceOptions, check_picture_path
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 def blendshapes(
-    animation: Annotated[Path | None, Option(metavar="ANIMATION")] = None,
+    animation: Annotated[Path | None, Option(metavar="ANIMATION", reads=True)] = None,
     *,
-    output: Annotated[Path | None, Option(also="-o", metavar="CSV")] = None,
-    shapes: Annotated[Path | None, Option(metavar="SHAPES")] = None,
+    output: Annotated[Path | None, Option(also="-o", metavar="CSV", writes="file")] = None,
+    shapes: Annotated[Path | None, Option(metavar="SHAPES", reads=True)] = None,
     carry: bool = False,
     smoothness: Annotated[float, Option(metavar="S")] = 0.02,
     symmetry: Annotated[float, Option(metavar="S")] = 0.0,
@@ -25,8 +25,8 @@ def blendshapes(
     region: Annotated[str | None, Option(metavar="NAME")] = None,
     only_arkit: bool = False,
     plain: bool = False,
-    show: Annotated[Path | None, Option(metavar="PNG")] = None,
-    write_puppet_shapes: Annotated[Path | None, Option(metavar="DIR")] = None,
+    show: Picture = None,
+    write_puppet_shapes: Annotated[Path | None, Option(metavar="DIR", writes="folder")] = None,
     source: SourceOptions,
 ) -> None:
     """Solve for the weights of blendshapes (ARKit's 52 names) that come nearest to an animation.
@@ -74,8 +74,7 @@ def blendshapes(
     from facediff.export.writing import check_free
     from facediff.utils.files import check_writable
 
-    for path in (output, output.with_suffix(".json")):
-        check_writable(path)
+    check_writable(output.with_suffix(".json"))
     check_free(output.with_suffix(".json"))
     lower, upper = bounds
     options = SolveOptions(smoothness=smoothness, symmetry=symmetry, lower=lower, upper=upper, region=region)

@@ -12,18 +12,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from facediff.cli.options import Corpus, File, Output, Size, Workers
+from facediff.cli.options import Corpus, File, FileOrList, Output, OutputFolder, Size, Workers
 from facediff.cli.parsing import Group, Option, Parameter, Parameters, parameters_of, parse
 from facediff.errors import FaceDiffError, choices
 
 if TYPE_CHECKING:
     from facediff.data.prepare.runner import Plan, Report
 
+Root = Annotated[Path, Option(reads=True)]
+
 # ``facediff data check``
 
 
 def check(
-    root: Path,
+    root: Root,
     *,
     corpus: Corpus = None,
     split: Annotated[str | None, Option(metavar="NAME")] = None,
@@ -115,7 +117,9 @@ def plan_options(plan: Callable[..., Plan]) -> dict[str, Parameter | Group]:
 def options_of(plan: Callable[..., Plan]) -> Parameters:
     """The options of ``facediff data prepare`` for a corpus."""
 
-    def common(raw: Path, out: Path, *, workers: Workers = None, quiet: bool = False) -> None:
+    def common(
+        raw: Root, out: Annotated[Path, Option(writes="folder")], *, workers: Workers = None, quiet: bool = False
+    ) -> None:
         """Prepare.
 
         Args:
@@ -183,17 +187,17 @@ def grouped(entries: dict[str, str]) -> list[str]:
 
 
 def import_person(
-    motion: Annotated[Path, Option(metavar="MOTION")],
+    motion: Annotated[Path, Option(metavar="MOTION", reads=True)],
     *,
-    audio: Annotated[Path, Option(metavar="FILE")],
+    audio: Annotated[Path, Option(metavar="FILE", reads=True)],
     name: str,
-    corpus: Annotated[Path, Option(metavar="ROOT")],
-    output: Output,
+    corpus: Annotated[Path, Option(metavar="ROOT", reads=True)],
+    output: OutputFolder,
     frame_rate: Annotated[float, Option(metavar="F", above=0)],
     corpus_frame_rate: Annotated[float | None, Option(metavar="F", above=0)] = None,
     template: File = None,
-    stable: Annotated[str | None, Option(metavar="FILE")] = None,
-    flame: Annotated[Path | None, Option(metavar="MODEL")] = None,
+    stable: FileOrList = None,
+    flame: Annotated[Path | None, Option(metavar="MODEL", reads=True)] = None,
     scale: Annotated[float | None, Option(metavar="FACTOR")] = None,
     clip_seconds: Annotated[float, Option(metavar="S")] = 8.0,
     quiet: bool = False,
@@ -250,12 +254,12 @@ def import_person(
 
 
 def regions(
-    root: Path,
+    root: Root,
     *,
     output: Output = Path("regions.png"),
     corpus: Corpus = None,
-    lips: Annotated[str | None, Option(metavar="FILE")] = None,
-    upper_face: Annotated[str | None, Option(metavar="FILE")] = None,
+    lips: FileOrList = None,
+    upper_face: FileOrList = None,
     size: Size = 640,
 ) -> None:
     """Draw a corpus's lips and upper face, the vertices that LVE and FDD look at, on its mesh.

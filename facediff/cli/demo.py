@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.options import Folder, Output
+from facediff.cli.options import OutputFolder
 from facediff.cli.parsing import Option
 
 if TYPE_CHECKING:
@@ -22,9 +22,9 @@ SHEET = 12
 
 def demo(
     *,
-    output: Output = Path("demo"),
+    output: OutputFolder = Path("demo"),
     epochs: Annotated[int | None, Option(metavar="N", least=1)] = None,
-    data_root: Folder = None,
+    data_root: Annotated[Path | None, Option(metavar="FOLDER", writes="folder")] = None,
 ) -> None:
     """Make a corpus, train, test and render a talking face.
 

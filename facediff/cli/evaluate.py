@@ -7,23 +7,23 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-from facediff.cli.options import File, Folder, FrameRate, Seed, Workers, check_folders, named_folders
+from facediff.cli.options import File, FileOrList, Folder, FrameRate, Seed, Workers, check_folders, named_folders
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 
 
 def evaluate(
-    predictions: Annotated[str, Option(metavar="PREDICTIONS")],
-    truth: Annotated[Path, Option(metavar="TRUTH")],
+    predictions: Annotated[str, Option(metavar="PREDICTIONS", reads=True)],
+    truth: Annotated[Path, Option(metavar="TRUTH", reads=True)],
     *,
-    method: Annotated[list[str] | None, Option(metavar="NAME=FOLDER")] = None,
+    method: Annotated[list[str] | None, Option(metavar="NAME=FOLDER", reads=True)] = None,
     protocol: Annotated[list[str] | None, Option(metavar="NAME")] = None,
     metric: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     templates: File = None,
     regions: Folder = None,
-    lips: Annotated[str | None, Option(metavar="FILE")] = None,
-    upper_face: Annotated[str | None, Option(metavar="FILE")] = None,
-    lip_pairs: Annotated[str | None, Option(metavar="FILE")] = None,
+    lips: FileOrList = None,
+    upper_face: FileOrList = None,
+    lip_pairs: FileOrList = None,
     frame_rate: FrameRate = None,
     topology: Annotated[str | None, Option(metavar="NAME")] = None,
     n_vertices: Annotated[int | None, Option(metavar="V", least=1)] = None,
@@ -35,8 +35,8 @@ def evaluate(
     level: Annotated[float, Option(metavar="P", above=0, below=1)] = 0.95,
     seed: Seed = 0,
     workers: Workers = None,
-    json: Annotated[str | None, Option(metavar="FILE")] = None,
-    csv: File = None,
+    json: Annotated[str | None, Option(metavar="FILE", writes="file", dash=True)] = None,
+    csv: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
     quiet: bool = False,
 ) -> None:
     """Score predictions against the truth by one or several protocols and metrics, with confidence intervals.
@@ -75,13 +75,9 @@ def evaluate(
     check_folders(methods)
     if not truth.is_dir():
         raise FaceDiffError(f"{truth}: no such folder; expected truths, or a corpus folder")
-    from facediff.utils.files import atomic, check_writable, write_rows
+    from facediff.utils.files import atomic, write_rows
 
     json_file = Path(json) if json and json != "-" else None
-    for path in (json_file, csv):
-        if path is not None:
-            check_writable(path)
-
     from facediff.data.corpus import read_templates
     from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN, read_region, text
     from facediff.evaluation import evaluate as score

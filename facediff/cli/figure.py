@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from facediff.cli.options import File, Folder, FrameRate, Output, View, check_folders, named_folders
+from facediff.cli.options import File, FileOrList, Folder, FrameRate, Output, View, check_folders, named_folders
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 NOTES = 3
 """Notes that are printed at most."""
 
-Predictions = Annotated[str, Option(metavar="PREDICTIONS")]
-Truth = Annotated[Path, Option(metavar="TRUTH")]
+Predictions = Annotated[str, Option(metavar="PREDICTIONS", reads=True)]
+Truth = Annotated[Path, Option(metavar="TRUTH", reads=True)]
 Clip = Annotated[str | None, Option(metavar="CLIP")]
 Clips = Annotated[list[str] | None, Option(metavar="CLIP", many=True)]
 Highest = Annotated[float | None, Option(metavar="VALUE")]
@@ -46,7 +46,7 @@ class FileOptions:
         unit: unit of the vertices, such as m (default: the corpus's)
     """
 
-    method: Annotated[list[str] | None, Option(metavar="NAME=FOLDER")] = None
+    method: Annotated[list[str] | None, Option(metavar="NAME=FOLDER", reads=True)] = None
     pattern: Annotated[list[str] | None, Option(metavar="PATTERN")] = None
     truth_pattern: Annotated[str | None, Option(metavar="PATTERN")] = None
     identity: Annotated[str, Option(metavar="NAME")] = "own"
@@ -116,10 +116,10 @@ def frames(
     clip: Clip = None,
     times: Annotated[list[float] | None, Option(metavar="SECONDS", many=True)] = None,
     phonemes: Annotated[list[str] | None, Option(metavar="IPA", many=True)] = None,
-    phoneme_file: Annotated[Path | None, Option(metavar="CSV")] = None,
+    phoneme_file: Annotated[Path | None, Option(metavar="CSV", reads=True)] = None,
     close_up: bool = False,
     regions: Folder = None,
-    lips: Annotated[str | None, Option(metavar="FILE")] = None,
+    lips: FileOrList = None,
     view: View = "front",
     files: FileOptions,
     page: PageOptions,
@@ -243,9 +243,9 @@ def lips(
     truth: Truth,
     *,
     clip: Clip = None,
-    lip_pairs: Annotated[str | None, Option(metavar="FILE")] = None,
+    lip_pairs: FileOrList = None,
     audio: File = None,
-    phoneme_file: Annotated[Path | None, Option(metavar="CSV")] = None,
+    phoneme_file: Annotated[Path | None, Option(metavar="CSV", reads=True)] = None,
     span: Annotated[tuple[float, float] | None, Option(metavar=("FROM", "TO"))] = None,
     files: FileOptions,
     page: PageOptions,
@@ -280,7 +280,7 @@ def lips(
 
 
 def training(
-    runs: Annotated[list[str], Option(metavar="RUN")],
+    runs: Annotated[list[str], Option(metavar="RUN", reads=True)],
     *,
     scalar: Annotated[list[str] | None, Option(metavar="NAME")] = None,
     smooth: Annotated[float, Option(metavar="W")] = 0.0,

@@ -16,12 +16,16 @@ if TYPE_CHECKING:
     from facediff.editing.controls import AnimationControls
     from facediff.export import ExportOptions
 
-Output = Annotated[Path, Option(also="-o", metavar="OUT")]
-Checkpoint = Annotated[Path, Option(metavar="C")]
-Animations = Annotated[list[Path], Option(metavar="ANIMATION")]
+Output = Annotated[Path, Option(also="-o", metavar="OUT", writes="file")]
+OutputFolder = Annotated[Path, Option(also="-o", metavar="OUT", writes="folder")]
+Picture = Annotated[Path | None, Option(metavar="PNG", writes="file")]
+Checkpoint = Annotated[Path, Option(metavar="C", reads=True)]
+Animations = Annotated[list[Path], Option(metavar="ANIMATION", reads=True)]
 Corpus = Annotated[str | None, Option(metavar="NAME")]
-File = Annotated[Path | None, Option(metavar="FILE")]
-Folder = Annotated[Path | None, Option(metavar="FOLDER")]
+File = Annotated[Path | None, Option(metavar="FILE", reads=True)]
+FileOrList = Annotated[str | None, Option(metavar="FILE", reads=True)]
+Folder = Annotated[Path | None, Option(metavar="FOLDER", reads=True)]
+Map = Annotated[Path | None, Option(metavar="MAP", reads=True, writes="file")]
 Identity = Annotated[str | None, Option(metavar="NAME")]
 FrameRate = Annotated[float | None, Option(metavar="F", above=0)]
 # The generators of random numbers take 64 bits, and the numbers of clips and samples are added to the seed.
@@ -45,9 +49,9 @@ class SourceOptions:
     """
 
     mesh: File = None
-    checkpoint: Annotated[Path | None, Option(metavar="C")] = None
+    checkpoint: Annotated[Path | None, Option(metavar="C", reads=True)] = None
     identity: Identity = None
-    speech: Annotated[Path | None, Option(metavar="WAV")] = None
+    speech: Annotated[Path | None, Option(metavar="WAV", reads=True)] = None
     frame_rate: FrameRate = None
     unit: Annotated[str | None, Option(metavar="U")] = None
 
@@ -150,7 +154,7 @@ class OutputOptions:
     output_unit: Annotated[str | None, Option(metavar="U")] = None
     up: Literal["y", "z"] | None = None
     no_speech: bool = False
-    shapes: Annotated[Path | None, Option(metavar="SHAPES")] = None
+    shapes: Annotated[Path | None, Option(metavar="SHAPES", reads=True)] = None
     tolerance: Annotated[float, Option(metavar="MM", above=0)] = 0.05
     view: View = "front"
     size: Size = 512
@@ -182,14 +186,9 @@ def with_different_names(animations: Sequence[Animation], paths: Sequence[Path])
 
 
 def check_picture_path(path: Path | None) -> None:
-    """Refuse, before any work is done, a picture that could not be written."""
-    from facediff.utils.files import check_writable
-
-    if path is None:
-        return
-    if path.suffix != ".png":
+    """Refuse, before any work is done, a picture of another format."""
+    if path is not None and path.suffix != ".png":
         raise FaceDiffError(f'--show {path}: unknown suffix "{path.suffix}"; expected a picture .png')
-    check_writable(path)
 
 
 def check_folders(methods: Mapping[str, Path]) -> None:

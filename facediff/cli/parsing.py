@@ -21,8 +21,10 @@ import types
 import typing
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
+from facediff.cli.paths import check_paths, refuse_empty
 from facediff.errors import FaceDiffError, choices
 
 MISSING = inspect.Parameter.empty
@@ -44,6 +46,9 @@ class Option:
         most: largest number allowed.
         above: number that the value must exceed.
         below: number that the value must not reach.
+        reads: for paths, and texts that hold paths: whether the file or folder is read.
+        writes: for paths: what is written; with ``reads``, what exists is read instead.
+        dash: for paths: whether ``-`` stands for standard input or output.
     """
 
     also: str = ""
@@ -54,6 +59,9 @@ class Option:
     most: float | None = None
     above: float | None = None
     below: float | None = None
+    reads: bool = False
+    writes: Literal["", "file", "folder", "file or folder"] = ""
+    dash: bool = False
 
 
 @dataclass(frozen=True)
@@ -73,6 +81,16 @@ class Parameter:
         if self.positional:
             return self.name
         return f"--{'no-' if self.is_switch and self.default is True else ''}{self.name.replace('_', '-')}"
+
+    @property
+    def shown(self) -> str:
+        """The name as errors show it."""
+        return f"{self.name}:" if self.positional else self.flag
+
+    @property
+    def is_path(self) -> bool:
+        """Whether a value is a path; texts may hold one as well."""
+        return self.value_type is Path
 
     @property
     def is_switch(self) -> bool:
@@ -281,6 +299,7 @@ def parse(
     details: str | Callable[[], str] = "",
 ) -> dict[str, Any]:
     """The values of a command's parameters; those of a group as an instance of its dataclass."""
+    refuse_empty(arguments, program)
     values = vars(make_parser(parameters, program, summary, details).parse_args(list(arguments)))
     for parameter in flat(parameters):
         value = values[parameter.name]
@@ -289,6 +308,7 @@ def parse(
         elif parameter.length and value is not None:
             values[parameter.name] = tuple(value)
         parameter.check(value)
+    check_paths(flat(parameters), values)
     return {
         name: values[name]
         if isinstance(entry, Parameter)

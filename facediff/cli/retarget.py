@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.options import Output, SourceOptions, check_picture_path
+from facediff.cli.options import Map, Output, Picture, SourceOptions, check_picture_path
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 
@@ -18,13 +18,13 @@ TURNED = 0.7
 
 
 def retarget(
-    animation: Annotated[Path, Option(metavar="ANIMATION")],
+    animation: Annotated[Path, Option(metavar="ANIMATION", reads=True)],
     *,
-    target_mesh: Annotated[Path, Option(metavar="FILE")],
+    target_mesh: Annotated[Path, Option(metavar="FILE", reads=True)],
     output: Output,
-    correspondence: Annotated[Path | None, Option(metavar="MAP")] = None,
-    landmarks: Annotated[Path | None, Option(metavar="CSV")] = None,
-    show: Annotated[Path | None, Option(metavar="PNG")] = None,
+    correspondence: Map = None,
+    landmarks: Annotated[Path | None, Option(metavar="CSV", reads=True)] = None,
+    show: Picture = None,
     source: SourceOptions,
 ) -> None:
     """Transfer an animation to another mesh. The suffix of OUT chooses the format, as in `facediff export`.

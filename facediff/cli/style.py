@@ -10,7 +10,7 @@ from facediff.errors import FaceDiffError
 
 
 def extract(
-    clips: Annotated[list[str], Option(metavar="CLIP")],
+    clips: Annotated[list[str], Option(metavar="CLIP", reads=True)],
     *,
     checkpoint: Checkpoint,
     output: Output,
@@ -31,9 +31,8 @@ def extract(
 
     from facediff.models import load_model
     from facediff.models.styles import extract_style
-    from facediff.utils.files import atomic, check_writable
+    from facediff.utils.files import atomic
 
-    check_writable(output)
     model = load_model(checkpoint)
     vector = extract_style(clips, identity or model.identities[0], model)
     if not len(vector):

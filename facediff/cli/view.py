@@ -52,9 +52,7 @@ def view(
         )
 
     from facediff.export.viewer import write_page
-    from facediff.utils.files import check_writable
 
-    check_writable(output)
     shown = with_different_names(read_animations(paths, source), paths)
     if labels is not None:
         shown = [replace(animation, name=label) for animation, label in zip(shown, labels, strict=True)]

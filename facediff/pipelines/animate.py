@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from facediff.editing.controls import AnimationControls
 from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, check_export
+from facediff.utils.files import scratch_folder
 from facediff.utils.progress import track
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ class AnimationPipeline:
         # by windows here and in one pass there.
         rate = self.model.frame_rate
         short = self.model.windows.in_one_pass(round(len(speech) * rate / SAMPLE_RATE), rate)
-        spool: AbstractContextManager[str | None] = nullcontext() if short else _folder_for(output)
+        spool: AbstractContextManager[Path | None] = nullcontext() if short else scratch_folder(output)
         with spool as folder:
             with self.precision():
                 if folder is None:
@@ -153,7 +153,7 @@ class AnimationPipeline:
                     )
                     motions, style = [sample.vertices.numpy() for sample in made], made[0].reference_name
                 else:
-                    motions, style = self._by_windows(speech, seeds, Path(folder))
+                    motions, style = self._by_windows(speech, seeds, folder)
             yield [
                 self._animation(motion, speech, name if len(seeds) == 1 else f"{name}, sample {i + 1}", each, style)
                 for i, (motion, each) in enumerate(zip(motions, seeds, strict=True))
@@ -247,14 +247,6 @@ def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[
     return speech
 
 
-def refuse_replacing(recordings: Sequence[Path], outputs: Sequence[Path]) -> None:
-    """Refuse to write an animation over a recording: a video may be both."""
-    heard = {recording.resolve() for recording in recordings}
-    for output in outputs:
-        if output.resolve() in heard:
-            raise FaceDiffError(f"--output: {output} is itself a recording and would be replaced; choose another place")
-
-
 def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
     """A checkpoint's assets as :class:`facediff.animation.Animation` takes them.
 
@@ -286,21 +278,3 @@ def usable_device(name: str) -> str:
         reason = next(iter(str(error).splitlines()), "")
         raise FaceDiffError(f"--device {name}: not usable on this machine ({reason}); try --device cpu") from error
     return name
-
-
-@contextmanager
-def _folder_for(output: Path) -> Iterator[str]:
-    """A temporary folder next to an output, so that it is on the disk that has room for the output."""
-    made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{output.stem}.partial-", dir=output.parent) as folder:
-            yield folder
-    except OSError as error:
-        raise FaceDiffError(
-            f"{output}: cannot be written ({error.strerror or error}); make room, or choose another folder"
-        ) from error
-    finally:
-        for parent in made:
-            if parent.is_dir() and not any(parent.iterdir()):
-                parent.rmdir()

@@ -16,14 +16,9 @@ from facediff.errors import FaceDiffError, choices
 from facediff.export import FORMATS
 from facediff.models.checkpoint import read_assets
 from facediff.models.styles import style_paths
-from facediff.pipelines.animate import (
-    AnimationOptions,
-    AnimationPipeline,
-    facts_of,
-    read_recording,
-    refuse_replacing,
-)
+from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, facts_of, read_recording
 from facediff.utils.batch import FileTask, Recipe, run_batch
+from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
 from facediff.utils.jobs import PerWorker
 from facediff.utils.tables import print_table
@@ -162,7 +157,7 @@ def output_names(speeches: Sequence[Path], suffix: str) -> list[str]:
 
 def seed_of_recording(speech: Path, seed: int) -> int:
     """The seed of a recording in a batch: it follows from the file's name, not from its folder or its worker."""
-    digest = hashlib.sha256(f"{seed}/{speech.name}".encode()).digest()
+    digest = hashlib.sha256(f"{seed}/{speech.name}".encode(errors="surrogateescape")).digest()
     return int.from_bytes(digest[:4], "big") >> 1
 
 
@@ -193,7 +188,7 @@ def run_folder(
     if not speeches:
         raise FaceDiffError("speech: no recording; give some, or a folder of them")
     names = output_names(speeches, suffix)
-    refuse_replacing(speeches, [output / name for name in names])
+    refuse_overwriting(speeches, [output / name for name in names])
     recipe = Recipe.of(command, files)
     check_writable(output / names[0])
     states: dict[Path, tuple[str, str]] = {}  # by recording: "made", "up to date" or "failed", and a remark

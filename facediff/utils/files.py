@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import glob
 import hashlib
 import json
@@ -12,15 +13,18 @@ import re
 import secrets
 import shutil
 import socket
+import sys
 import tempfile
 import time
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
 from facediff.errors import FaceDiffError
+from facediff.utils.destinations import destination, refuse_protected
 from facediff.utils.jobs import run_tasks
 from facediff.utils.limits import LIMITS, check_nesting
 
@@ -52,12 +56,16 @@ def config_dir() -> Path:
 def atomic(path: Path) -> Iterator[Path]:
     r"""Write a file whole or not at all.
 
+    Where ``path`` is a link, the file that it leads to is written and the link stays. A device, a pipe or a descriptor
+    (``/dev/stdout``) gets the bytes of the whole file. A file that is replaced hands its owner and its permissions on.
+
     Yields:
-        a temporary path next to ``path``, which is renamed to ``path`` at the end and removed if anything fails. Its
-        suffix is that of ``path``, since many writers choose the format by it.
+        a temporary path next to the file, which is renamed at the end and removed if anything fails. Its suffix is that
+        of ``path``, since many writers choose the format by it.
 
     Raises:
-        FaceDiffError: if the folder cannot be made or the file cannot be written.
+        FaceDiffError: if the folder cannot be made, the file cannot be written, is protected against writing, or is an
+            input of the running command.
 
     Example:
         >>> import tempfile
@@ -67,25 +75,26 @@ def atomic(path: Path) -> Iterator[Path]:
         >>> path.read_text()
         'clip,lve\n'
     """
-    if path.is_symlink():
-        path = Path(os.path.realpath(path))  # the file that the link names is written, the link stays
-    device = path.exists() and not path.is_file() and not path.is_dir()
-    # A device or a pipe (/dev/stdout, /dev/null) cannot be replaced: it gets the bytes of a whole file.
-    place = Path(tempfile.gettempdir()) / path.name if device else path
-    temporary = _partial(place, path.suffix)
-    with _writing(path), _new_folders(place.parent):
-        if not device:
-            _sweep(path)
-        try:
-            yield temporary
-            if device:
-                with temporary.open("rb") as source, path.open("wb") as target:
-                    shutil.copyfileobj(source, target)
-            else:
-                os.replace(temporary, path)
-        finally:
-            with suppress(OSError):  # never written, or renamed
-                temporary.unlink()
+    with _writing(path):
+        where = destination(path)
+        if where.special:
+            with scratch_folder(Path(tempfile.gettempdir()) / f"facediff-{path.name}", private=True) as folder:
+                temporary = folder / f"whole{_short_suffix(path.suffix)}"
+                yield temporary
+                where.receive(temporary)
+            return
+        _refuse_unwritable(path, where.path)
+        temporary = _partial(where.path, path.suffix)
+        with _new_folders(where.path.parent):
+            _sweep(where.path.parent)
+            try:
+                yield temporary
+                _hand_on(where.path, temporary)
+                os.replace(temporary, where.path)
+                _note_swept(where.path.parent)
+            finally:
+                with suppress(OSError):  # never written, or renamed
+                    temporary.unlink()
 
 
 @contextmanager
@@ -120,34 +129,65 @@ def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 @contextmanager
-def scratch_folder(path: Path) -> Iterator[Path]:
-    """A hidden folder next to ``path``, on the same disk, which is removed at the end.
+def scratch_folder(path: Path, *, private: bool = False) -> Iterator[Path]:
+    """A hidden folder next to ``path`` (after its links), on the same disk, which is removed at the end.
 
-    What killed processes have left under the same name is removed first. An :class:`OSError` in the block is raised as
-    a :class:`FaceDiffError` that names ``path``.
+    What killed processes have left there is removed first. An :class:`OSError` in the block is raised as a
+    :class:`FaceDiffError` that names ``path``. Nobody else may look into a ``private`` folder.
     """
-    with _writing(path), _new_folders(path.parent):
-        _remove_abandoned(path)
-        folder = _partial(path)
-        # The folder is locked before it gets its name, so that no other process removes it as abandoned.
-        unnamed = folder.with_name(f"{folder.name}.new")
-        unnamed.mkdir()
-        with _locked_folder(unnamed):
-            unnamed.rename(folder)
-            try:
-                yield folder
-            finally:
-                shutil.rmtree(folder, ignore_errors=True)
+    with _writing(path):
+        where = destination(path)
+        place = Path(tempfile.gettempdir()) / path.name if where.special else where.path
+        with _new_folders(place.parent):
+            _sweep(place.parent)
+            folder = _partial(place)
+            # The folder is locked before it gets its name, so that no other process removes it as abandoned.
+            unnamed = folder.with_name(f"{folder.name}{UNLOCKED}")
+            unnamed.mkdir(mode=0o700 if private or where.special else 0o777)
+            with _locked_folder(unnamed):
+                unnamed.rename(folder)
+                try:
+                    yield folder
+                finally:
+                    shutil.rmtree(folder, ignore_errors=True)
 
 
 def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
-    """Rename a file or folder on its disk; a folder at ``target`` steps aside first and is then removed.
+    """Move a finished file or folder to its name; a folder at ``target`` steps aside first and is then removed.
 
-    Without ``replace``, only an empty folder may be replaced.
+    As in :func:`atomic`, links are followed, devices get the bytes, and owner and permissions of a file stay. Without
+    ``replace``, only an empty folder may be replaced.
 
     Raises:
         OSError: if that fails; what was at ``target`` is there again.
+        FaceDiffError: if ``target`` is, or holds, an input of the running command.
     """
+    where = destination(target)
+    if where.special:
+        where.receive(source)
+        source.unlink()
+        return
+    place = where.path
+    if place.is_dir():
+        refuse_protected(target, folder=True)
+    else:
+        _refuse_unwritable(target, place)
+        _hand_on(place, source)
+    try:
+        _rename(source, place, replace=replace)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        copy = _copied_next_to(place, source)  # a link leads to another disk
+        try:
+            _rename(copy, place, replace=replace)
+        finally:
+            _remove(copy)
+        _remove(source)
+    _note_swept(place.parent)
+
+
+def _rename(source: Path, target: Path, *, replace: bool) -> None:
     if not target.is_dir():
         try:
             os.replace(source, target)
@@ -158,6 +198,9 @@ def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
     if not replace:
         target.rmdir()  # fails if it is not empty
         os.rename(source, target)
+        return
+    if _exchange(source, target):
+        shutil.rmtree(source, ignore_errors=True)
         return
     aside = source.with_name(f"{source.name}.replaced-{secrets.token_hex(4)}")
     with suppress(FileNotFoundError):  # another process has just moved it away
@@ -171,18 +214,188 @@ def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def _sweep(path: Path) -> None:
-    """Remove what killed processes of this machine have left of a file; others may still be writing."""
-    start = f".{path.stem}.partial-{_host()}-"
-    for left in path.parent.glob(f"{glob.escape(start)}*{glob.escape(path.suffix)}"):
-        number = left.name.removeprefix(start).partition("-")[0]
-        if number.isdigit() and not _is_running(int(number)):
-            left.unlink(missing_ok=True)
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two folders change their names in one step, which no kill can interrupt; False where that is impossible."""
+    import ctypes
+
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
+    here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE
+    return rename is not None and rename(here, os.fsencode(one), here, os.fsencode(other), exchange) == 0
 
 
+def _copied_next_to(place: Path, source: Path) -> Path:
+    copy = _partial(place)
+    copy = copy.with_name(f"{copy.name}{UNLOCKED}")
+    try:
+        if source.is_dir():
+            shutil.copytree(source, copy)
+        else:
+            shutil.copy2(source, copy)
+    except BaseException:
+        _remove(copy)
+        raise
+    return copy
+
+
+def _hand_on(old: Path, new: Path) -> None:
+    """Give a new file the owner and the permissions of the one that it replaces."""
+    try:
+        before, now = old.stat(), new.stat()
+    except OSError:
+        return
+    if (before.st_uid, before.st_gid) != (now.st_uid, now.st_gid):
+        with suppress(OSError):
+            os.chown(new, before.st_uid, before.st_gid)
+    with suppress(OSError):
+        os.chmod(new, before.st_mode & 0o777)
+
+
+def _refuse_unwritable(path: Path, place: Path) -> None:
+    """Refuse to replace an input, or a file that is protected against writing: renaming would not ask.
+
+    Raises:
+        FaceDiffError: if the file is an input of the running command.
+        OSError: if it is protected.
+    """
+    refuse_protected(path)
+    with suppress(FileNotFoundError, NotADirectoryError):
+        if not place.stat().st_mode & 0o222:  # root may write to everything, but not against somebody's wish
+            raise PermissionError(errno.EACCES, "the file is write-protected", str(path))
+        os.close(os.open(place, os.O_WRONLY))  # changes nothing; fails where permissions or the disk forbid to write
+
+
+def check_writable(path: Path) -> None:
+    """Make sure, before any work is done, that a file can be written; changes nothing and leaves nothing behind.
+
+    Raises:
+        FaceDiffError: if the folder cannot be made or written, if the path is a folder, or an input of the command.
+    """
+    with _writing(path):
+        where = destination(path)
+        if where.path.is_dir():
+            raise FaceDiffError(f"{path}: is a folder; expected the name of a file to write")
+        if where.special:
+            if where.descriptor is None and not os.access(where.path, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+            return
+        _refuse_unwritable(path, where.path)
+        _try_to_write(where.path)
+
+
+def check_folder_writable(path: Path) -> None:
+    """Make sure, before any work is done, that files can be written into a folder, which need not exist.
+
+    Raises:
+        FaceDiffError: if it is a file, or cannot be made or written.
+    """
+    with _writing(path):
+        where = destination(path)
+        if where.special or (where.path.exists() and not where.path.is_dir()):
+            raise FaceDiffError(f"{path}: is a file; expected a folder to write to")
+        _try_to_write(where.path / "file")
+
+
+def _try_to_write(path: Path) -> None:
+    """Make and remove a file in the nearest folder that exists: making folders would race with other processes."""
+    folder = path.parent
+    while not os.path.lexists(folder) and folder != folder.parent:
+        folder = folder.parent
+    longest = os.pathconf(folder, "PC_NAME_MAX") if hasattr(os, "pathconf") and folder.is_dir() else 255
+    if any(len(os.fsencode(part)) > longest for part in path.parts):
+        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(path))
+    probe = folder / _partial(path).name
+    probe.touch()
+    probe.unlink()
+
+
+# What killed processes leave. A partial file is named  .NAME.partial-HOST-PROCESS-START-TOKEN.SUFFIX
+
+PARTIAL = re.compile(r"\..*\.partial-(?P<host>[0-9a-f]{8})-(?P<process>\d+)-(?P<start>\d+)-[0-9a-f]{8}", re.DOTALL)
+UNLOCKED = ".new"
+"""How the names of folders end that are not locked although their process may be at work."""
+LONGEST = 60
+"""Bytes of a name that the name of its partial file repeats; a valid name must not become too long by that."""
+_swept: dict[str, int] = {}
+"""Folders without leftovers, and their time of change when this process looked last."""
+
+
+def _partial(path: Path, suffix: str = "") -> Path:
+    # Containers that share a folder may have equal process numbers, hence the token.
+    name = path.name.removesuffix(path.suffix) if suffix else path.name
+    owner = f"{_host()}-{os.getpid()}-{_start_of(os.getpid())}-{secrets.token_hex(4)}"
+    return path.with_name(f".{short_name(name, LONGEST)}.partial-{owner}{_short_suffix(suffix)}")
+
+
+def short_name(name: str, most: int) -> str:
+    """A name of at most ``most`` bytes: itself, or its beginning with a checksum of the whole."""
+    whole = os.fsencode(name)
+    if len(whole) <= most:
+        return name
+    mark = f"~{zlib.crc32(whole):08x}"
+    while len(os.fsencode(name)) + len(mark) > most:
+        name = name[:-1]
+    return name + mark
+
+
+def _short_suffix(suffix: str) -> str:
+    return suffix if len(os.fsencode(suffix)) <= 24 else ""  # no format has a longer one
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what killed processes have left of files and folders; others may still be writing theirs."""
+    try:
+        if _swept.get(str(folder)) == folder.stat().st_mtime_ns:  # else each of many files would cost a look at all
+            return
+        entries = [entry for entry in os.scandir(folder) if ".partial-" in entry.name]
+    except OSError:
+        return
+    for entry in entries:
+        left = Path(entry.path)
+        with suppress(OSError):
+            if entry.is_dir(follow_symlinks=False):
+                with _locked_folder(left) as free:
+                    unlocked = free is None or left.name.endswith(UNLOCKED)
+                    if free is not False and (not unlocked or _is_abandoned(left)):
+                        shutil.rmtree(left, ignore_errors=True)
+            elif _is_abandoned(left):
+                left.unlink(missing_ok=True)
+
+
+def _note_swept(folder: Path) -> None:
+    with suppress(OSError):
+        _swept[str(folder)] = folder.stat().st_mtime_ns
+
+
+def _is_abandoned(left: Path) -> bool:
+    owner = PARTIAL.match(left.name)
+    if owner is None:
+        return False
+    if owner["host"] != _host():
+        return _is_old(left)
+    process = int(owner["process"])
+    return not _is_running(process) or owner["start"] != _start_of(process)
+
+
+def _is_old(left: Path) -> bool:
+    return time.time() - left.stat().st_mtime > ABANDONED_AFTER
+
+
+@cache
 def _host() -> str:
-    """A short name of this machine, for folders that several machines share."""
-    return f"{zlib.crc32(socket.gethostname().encode()):08x}"
+    """A short name of this machine, or of this container, for folders that several share."""
+    try:
+        space = os.readlink("/proc/self/ns/pid")  # process numbers mean something within it only
+    except OSError:
+        space = ""
+    return f"{zlib.crc32(f'{socket.gethostname()} {space}'.encode()):08x}"
+
+
+def _start_of(process: int) -> str:
+    """When a process started, in the system's own count, since numbers of processes are used again; 0 if unknown."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        return "0"
 
 
 def _is_running(process: int) -> bool:
@@ -190,53 +403,24 @@ def _is_running(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:  # somebody else's process
+    except (OSError, OverflowError):  # somebody else's process
         return True
     return True
 
 
-def refuse_overwriting(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
-    """Refuse outputs that are inputs, also by another name or through a link.
-
-    Raises:
-        FaceDiffError: naming the file.
-    """
-    read = {os.path.realpath(path) for path in inputs if path.exists()}
-    for path in outputs:
-        if path.is_file() and os.path.realpath(path) in read:
-            raise FaceDiffError(f"{path}: is read by this command and would be overwritten; choose another output")
-
-
-def check_writable(path: Path) -> None:
-    """Make sure, before any work is done, that a file can be written; leaves nothing behind.
-
-    Raises:
-        FaceDiffError: if the folder cannot be made or written, or if the path is a folder.
-    """
+def _remove(path: Path) -> None:
     if path.is_dir():
-        raise FaceDiffError(f"{path}: is a folder; expected the name of a file to write")
-    if path.exists() and not path.is_file():
-        return  # a device or a pipe
-    probe = _partial(path)
-    with _writing(path), _new_folders(path.parent):
-        probe.touch()
-        probe.unlink()
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def remove_partial(folder: Path, stem: str = "*", *, recursive: bool = False) -> None:
     """Remove what killed processes have left of files named ``stem``; no other process may be writing there."""
-    pattern = f".{stem if stem == '*' else glob.escape(stem)}.partial-*"
+    pattern = f".{stem if stem == '*' else glob.escape(short_name(stem, LONGEST))}.partial-*"
     for left in list(folder.rglob(pattern) if recursive else folder.glob(pattern)):
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
-        else:
-            left.unlink(missing_ok=True)
-
-
-def _partial(path: Path, suffix: str = "") -> Path:
-    # Containers that share a folder may have equal process numbers, hence the token.
-    name = path.stem if suffix else path.name
-    return path.with_name(f".{name}.partial-{_host()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
+        _remove(left)
 
 
 @contextmanager
@@ -254,7 +438,7 @@ def _writing(path: Path) -> Iterator[None]:
 @contextmanager
 def _new_folders(folder: Path) -> Iterator[None]:
     """Make a folder and its parents; those that are still empty at the end are removed."""
-    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    made = [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         yield
@@ -286,7 +470,8 @@ def locked(path: Path, command: str) -> Iterator[None]:
 
 def _lock_file(path: Path, command: str) -> IO[str]:
     while True:
-        stream = path.open("w")
+        # Neither emptied nor followed as a link: a name in the folder must not destroy a file elsewhere.
+        stream = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666), "w")
         locked = _lock(stream.fileno())
         if locked is False:
             stream.close()
@@ -314,7 +499,7 @@ def _lock(descriptor: int) -> bool | None:
 def _locked_folder(folder: Path) -> Iterator[bool | None]:
     """Hold a lock on a folder itself, which ends with the process at the latest; yields as :func:`_lock`."""
     try:
-        descriptor = os.open(folder, os.O_RDONLY)
+        descriptor = os.open(folder, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
     except OSError:  # Windows cannot open folders; or the folder has just been removed
         yield None
         return
@@ -322,14 +507,6 @@ def _locked_folder(folder: Path) -> Iterator[bool | None]:
         yield _lock(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _remove_abandoned(path: Path) -> None:
-    """Remove the scratch folders of processes that have ended without removing them."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.partial-*"):
-        with suppress(OSError), _locked_folder(left) as free:
-            if free or (free is None and time.time() - left.stat().st_mtime > ABANDONED_AFTER):
-                shutil.rmtree(left, ignore_errors=True)
 
 
 # What files hold: checksums, manifests, tables.
@@ -453,12 +630,17 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write an object as JSON, whole or not at all; equal objects give equal bytes."""
     with atomic(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        # Bytes of a file name that are no UTF-8 become the escapes by which JSON names them; they come back on reading.
+        text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], *, line_end: str = "\r\n") -> None:
     """Write rows with equal keys as CSV, whole or not at all."""
-    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+    with (
+        atomic(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream,
+    ):
         writer = csv.DictWriter(stream, fieldnames=list(rows[0]), lineterminator=line_end)
         writer.writeheader()
         writer.writerows(rows)

@@ -1,0 +1,131 @@
+"""Files and folders of a command line: which are read, which are written, and what is refused before any work.
+
+Every option and argument that is a path says so (:class:`facediff.cli.parsing.Option`); the checks here are the same
+for all commands. What a command finds out later, such as the names of further files, is checked by the same rules where
+it is written (:mod:`facediff.utils.files`).
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import stat
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from facediff.errors import FaceDiffError
+from facediff.utils.destinations import protect, refuse_equal, refuse_overwriting
+from facediff.utils.files import check_folder_writable, check_writable
+
+if TYPE_CHECKING:
+    from facediff.cli.parsing import Parameter
+
+
+def check_paths(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> None:
+    """Refuse, before any work is done, files that cannot be read or written, and outputs that are inputs.
+
+    The inputs are protected from then on: nothing that the command writes replaces one of them.
+
+    Args:
+        parameters: of the command.
+        values: what was given for them, by name.
+
+    Raises:
+        FaceDiffError: naming the option and the file.
+    """
+    inputs: list[Path] = []
+    outputs: list[Path] = []
+    for parameter in parameters:
+        for path in given_paths(parameter, values.get(parameter.name)):
+            written = parameter.option.writes and not (parameter.option.reads and path.exists())
+            if str(path) == "-" and (written or parameter.option.dash):
+                check_dash(parameter)
+            elif written:
+                check_output(parameter, path)
+                outputs.append(path)
+            elif parameter.is_path or path.exists():  # a text may be a name, or a path
+                check_input(parameter, path)
+                inputs.append(path)
+    refuse_equal(outputs)
+    refuse_overwriting(inputs, outputs)
+    protect(inputs)
+
+
+def given_paths(parameter: Parameter, value: Any) -> Iterator[Path]:  # noqa: ANN401
+    """The paths in a value; in a text, such as ``NAME=FOLDER`` or ``a.npy:0.3,b.npy:0.7``, all that may be one."""
+    option = parameter.option
+    if value is None or not (parameter.is_path or option.reads or option.writes):
+        return
+    for each in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(each, Path):
+            yield each
+        elif isinstance(each, str) and option.writes:
+            yield Path(each)
+        elif isinstance(each, str):
+            parts = [each, *each.split(",")]
+            parts += [part.partition("=")[2] for part in parts]
+            parts += [re.split(r"[:>]", part)[0] for part in parts]
+            yield from (Path(part) for part in dict.fromkeys(parts) if part and exists(part))
+
+
+def exists(text: str) -> bool:
+    """Whether a text is the path of something; no text is too long for that."""
+    try:
+        return os.path.lexists(text)
+    except (OSError, ValueError):
+        return False
+
+
+def check_dash(parameter: Parameter) -> None:
+    """Refuse ``-`` for standard output where a command does not write to it."""
+    if not parameter.option.dash:
+        raise FaceDiffError(
+            f"{parameter.shown} -: is standard output elsewhere, but not here; expected the name of a file"
+        )
+
+
+def check_output(parameter: Parameter, path: Path) -> None:
+    """Refuse a file or a folder that cannot be written."""
+    kind = parameter.option.writes
+    try:
+        if kind == "folder" or (kind == "file or folder" and path.is_dir()):
+            check_folder_writable(path)
+        else:
+            check_writable(path)
+    except (FaceDiffError, OSError) as error:
+        reason = f"{path}: {error.strerror}" if isinstance(error, OSError) else error
+        raise FaceDiffError(f"{parameter.shown} {reason}") from error
+
+
+def check_input(parameter: Parameter, path: Path) -> None:
+    """Refuse a name that no file can have, and what is neither file nor folder; missing files are reported later."""
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:
+        what = "links lead to each other" if error.errno == errno.ELOOP else error.strerror
+        raise FaceDiffError(f"{parameter.shown} {path}: cannot be read ({what})") from error
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise FaceDiffError(f"{parameter.shown} {path}: is a device or a pipe; expected a file, or a folder of files")
+    if not os.access(path, os.R_OK):
+        raise FaceDiffError(f"{parameter.shown} {path}: cannot be read (permission denied)")
+
+
+def refuse_empty(words: Sequence[str], program: str) -> None:
+    """Refuse empty words, as an unset variable of a shell gives: as a path they would stand for the working folder.
+
+    Raises:
+        FaceDiffError: naming the option.
+    """
+    before = ""
+    for word in words:
+        name, equals, value = word.partition("=")
+        option = name if equals and name.startswith("-") else before if before.startswith("-") else "an argument"
+        if not word or (equals and not value and name.startswith("-")):
+            raise FaceDiffError(f"{option}: is empty; expected a value (see `{program} --help`)")
+        if "\0" in word:
+            raise FaceDiffError(f"{option}: holds a zero byte; expected text (see `{program} --help`)")
+        before = word

@@ -1,0 +1,208 @@
+"""Inputs and outputs of every command: declared, checked before any work, and never one and the same file."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal, get_origin
+
+import pytest
+
+from facediff.cli.app import COMMANDS, load, main
+from facediff.cli.data import CORPORA, options_of
+from facediff.cli.options import FileOrList, Folder, Map, Output
+from facediff.cli.parsing import Option, Parameters, flat, parameters_of, parse
+from facediff.cli.paths import check_paths
+from facediff.errors import FaceDiffError
+from facediff.utils.destinations import reading
+from facediff.utils.files import atomic, atomic_folder, put_in_place
+
+# Its outputs lie in folders of runs with numbers of their own, and `--ckpt_path last` replaces what it reads.
+LIGHTNING = {"fit", "validate", "test", "predict"}
+
+NO_PATHS = {
+    *("accelerator", "clip", "clips", "corpus", "device", "expressiveness", "font", "identity", "kind", "labels"),
+    *("metric", "name", "output_unit", "pattern", "phonemes", "protocol", "region", "sampler", "scalar", "split"),
+    *("subjects", "suffix", "topology", "truth_pattern", "unit"),
+}
+"""Texts that are no paths; a new option of type text either joins them or declares that it is read or written."""
+
+
+def commands() -> Iterator[tuple[str, Parameters]]:
+    for name in COMMANDS:
+        function = load(name)
+        if function.__name__ not in ("run", "lightning"):
+            yield name, parameters_of(function)
+    for corpus in CORPORA:
+        plan = importlib.import_module(f"facediff.data.prepare.{corpus}").plan
+        yield f"data prepare {corpus}", options_of(plan)
+
+
+OWN = dict(commands())
+DECLARED = {(name, parameter.name): parameter for name, parameters in OWN.items() for parameter in flat(parameters)}
+
+
+def test_every_command_is_known_here() -> None:
+    assert set(COMMANDS) == {*(n for n in OWN if "prepare" not in n), "data prepare", *LIGHTNING}
+
+
+@pytest.mark.parametrize("key", DECLARED, ids=" ".join)
+def test_every_path_declares_whether_it_is_read_or_written(key: tuple[str, str]) -> None:
+    parameter = DECLARED[key]
+    option = parameter.option
+    if parameter.is_path and not key[0].startswith("data prepare"):  # what a plan takes is read
+        assert option.reads or option.writes
+    if parameter.value_type is str and get_origin(parameter.value_type) is not Literal:
+        assert parameter.name in NO_PATHS or option.reads or option.writes
+
+
+def test_every_command_writes_somewhere_or_prints() -> None:
+    printing = {name for name, parameters in OWN.items() if not any(p.option.writes for p in flat(parameters))}
+    assert printing == {"data check", "components"}
+
+
+WRITING = [key for key, parameter in DECLARED.items() if parameter.option.writes and not parameter.option.reads]
+PAIRS = [
+    (name, source, target)
+    for name, target in WRITING
+    for (other, source), parameter in DECLARED.items()
+    if other == name and (parameter.option.reads or (parameter.is_path and not parameter.option.writes))
+]
+
+
+def typed(name: str, parameter: str, path: Path) -> object:
+    """A path as the parser gives it."""
+    found = DECLARED[name, parameter]
+    value = path if found.is_path else str(path)
+    return [value] if found.is_list else value
+
+
+@pytest.mark.parametrize(("name", "source", "target"), PAIRS)
+def test_an_output_that_is_an_input_is_refused_and_stays(name: str, source: str, target: str, tmp_path: Path) -> None:
+    """Under the same name, another one, through a link or as a hard link."""
+    file = tmp_path / "precious.bin"
+    file.write_text("precious")
+    (tmp_path / "soft").symlink_to(file)
+    (tmp_path / "hard").hardlink_to(file)
+    for output in (file, tmp_path / ".." / tmp_path.name / file.name, tmp_path / "soft", tmp_path / "hard"):
+        with pytest.raises(FaceDiffError) as caught, reading():
+            check_paths(flat(OWN[name]), {source: typed(name, source, file), target: typed(name, target, output)})
+        assert str(output) in str(caught.value)
+    assert file.read_text() == "precious"
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+@pytest.mark.parametrize(("name", "target"), WRITING)
+def test_an_output_that_cannot_be_written_is_refused_by_its_option(name: str, target: str, tmp_path: Path) -> None:
+    parameter = DECLARED[name, target]
+    (tmp_path / "file").touch()
+    long = "x" * 300
+    for output in (tmp_path / "file" / "a.b", tmp_path / long, tmp_path / "new" / long / "a.b"):
+        with pytest.raises(FaceDiffError) as caught:
+            check_paths(flat(OWN[name]), {target: typed(name, target, output)})
+        assert str(output) in str(caught.value)
+        assert parameter.name.replace("_", "-") in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def example(
+    source: Annotated[Path, Option(reads=True)],
+    *,
+    method: FileOrList = None,
+    folder: Folder = None,
+    output: Output,
+    second: Annotated[Path | None, Option(writes="file")] = None,
+    correspondence: Map = None,
+) -> None:
+    """Nothing."""
+
+
+def check(*words: object) -> None:
+    with reading():
+        parse(parameters_of(example), [str(word) for word in words], "facediff example")
+
+
+def test_an_input_within_a_text_is_found(tmp_path: Path) -> None:
+    file = tmp_path / "a.npy"
+    file.touch()
+    for text in (f"NAME={file}", f"{file}:0.3,x:0.7", f"x:0.3,{file}:0.7", f"{file}:lips", f"{file}>0.1"):
+        with pytest.raises(FaceDiffError, match="is read by this command"):
+            check("x", "--method", text, "-o", file)
+
+
+def test_two_outputs_are_two_files(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "a.csv")
+    for other in (tmp_path / "a.csv", tmp_path / "link"):
+        with pytest.raises(FaceDiffError, match="named for two outputs"):
+            check("x", "-o", tmp_path / "a.csv", "--second", other)
+    check("x", "-o", "/dev/null", "--second", "/dev/null")
+    with pytest.raises(FaceDiffError, match="named for two outputs"):
+        check("x", "-o", tmp_path / "a.npz", "--correspondence", tmp_path / "a.npz")
+
+
+def test_data_of_a_folder_that_is_read_is_not_replaced_but_results_in_it_are(tmp_path: Path) -> None:
+    for name in ("a.npy", "manifest.json", "scores.csv"):
+        (tmp_path / name).touch()
+    for name in ("a.npy", "manifest.json"):
+        with pytest.raises(FaceDiffError, match="which is read by this command"):
+            check("x", "--folder", tmp_path, "-o", tmp_path / name)
+    check("x", "--folder", tmp_path, "-o", tmp_path / "scores.csv")
+    check("x", "--folder", tmp_path, "-o", tmp_path / "new.npy")
+
+
+@pytest.mark.parametrize("kind", ["fifo", "/dev/zero", "/dev/null", "loop", "long"])
+def test_an_input_that_is_no_file_is_refused(kind: str, tmp_path: Path) -> None:
+    path = Path(kind)
+    if kind == "fifo":
+        path = tmp_path / "fifo"
+        os.mkfifo(path)
+    elif kind == "loop":
+        path = tmp_path / "loop"
+        path.symlink_to(path)
+    elif kind == "long":
+        path = tmp_path / ("x" * 300)
+    with pytest.raises(FaceDiffError) as caught:
+        check(path, "-o", tmp_path / "out")
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("words", [["", "-o", "a"], ["a", "-o", ""], ["a", "--output="], ["a", "-oa", "--folder", ""]])
+def test_an_empty_word_is_not_the_working_folder(words: list[str]) -> None:
+    with pytest.raises(FaceDiffError, match="is empty"):
+        check(*words)
+
+
+def test_standard_output_is_named_only_where_it_is_meant() -> None:
+    with pytest.raises(FaceDiffError, match="--output -"):
+        check("x", "-o", "-")
+
+
+def test_what_is_read_stays_under_every_later_name(tmp_path: Path) -> None:
+    """Names that a command makes up by itself, such as those of further samples, are checked when they are written."""
+    file = tmp_path / "folder" / "a.npy"
+    file.parent.mkdir()
+    file.write_text("precious")
+    with reading([file]):
+        with pytest.raises(FaceDiffError, match="is read"), atomic(file) as temporary:
+            temporary.touch()
+        (tmp_path / "new").touch()
+        with pytest.raises(FaceDiffError, match="is read"):
+            put_in_place(tmp_path / "new", file)
+        with pytest.raises(FaceDiffError, match="is read"), atomic_folder(file.parent, replace=True):
+            pass
+    assert file.read_text() == "precious"
+    with atomic(file) as temporary:
+        temporary.write_text("new")
+    assert file.read_text() == "new"
+
+
+def test_a_style_is_not_written_over_the_motion_that_it_comes_from(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    motion = tmp_path / "F1_e01.npy"
+    motion.write_bytes(b"motion")
+    assert main(["style", "extract", str(motion), "--checkpoint", str(checkpoint), "-o", str(motion)]) == 2
+    assert str(motion) in capsys.readouterr().err
+    assert motion.read_bytes() == b"motion"
