@@ -14,12 +14,28 @@ def choices(name: str, known: Iterable[str]) -> str:
     return f"{hint}known are {', '.join(names)}"
 
 
+def printable(text: object) -> str:
+    r"""Text for a terminal: names of files may hold anything, so that what does not print is escaped.
+
+    Example:
+        >>> printable("clip\x1b[2J\n")
+        'clip\\x1b[2J\\n'
+    """
+    found = str(text)
+    if found.isprintable():
+        return found
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in found)
+
+
 class FaceDiffError(Exception):
     """Something that the user can put right: a file, an argument or an installation.
 
     The message names the file or the field, says what was expected and what to do next. The command line
     prints it without a traceback and exits with code 2.
     """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(printable(message))
 
 
 class ArgumentError(FaceDiffError, ValueError):

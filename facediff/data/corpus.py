@@ -6,7 +6,6 @@ a mesh file with the faces, and optionally ``clips.csv`` with further columns pe
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -25,7 +24,7 @@ from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
 from facediff.utils.arrays import ArrayStore, open_vertices
-from facediff.utils.files import cache_dir, load_json
+from facediff.utils.files import cache_dir, load_json, read_rows, read_table
 from facediff.utils.pickles import load_pickle
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
@@ -240,9 +239,9 @@ class Corpus:
         if not path.is_file():
             return None
         try:
-            with path.open(newline="") as stream:
-                pairs = torch.tensor([[int(a), int(b)] for a, b in csv.reader(stream)])
-        except ValueError as error:
+            table = read_table(path, remedy="expected one pair of vertex indices a line")
+            pairs = torch.tensor([[int(a), int(b)] for a, b in table])
+        except (ValueError, OverflowError, RuntimeError) as error:
             raise FaceDiffError(f"{path}: {error}; expected one pair of vertex indices a line") from error
         if pairs.numel() == 0 or int(pairs.min()) < 0 or int(pairs.max()) >= self.n_vertices:
             raise FaceDiffError(f"{path}: expected pairs of vertex indices 0 to {self.n_vertices - 1}")
@@ -329,11 +328,8 @@ def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
     path = root / "clips.csv"
     if not path.is_file():
         return {}
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets put a mark at the beginning
-            rows = [{key: value for key, value in row.items() if key} for row in csv.DictReader(stream)]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FaceDiffError(f"{path}: not readable as a UTF-8 table ({error}); save it as CSV UTF-8") from error
+    found = read_rows(path, remedy="save it as CSV UTF-8, with one row a clip")
+    rows = [{key: value for key, value in row.items() if key} for row in found]
     if rows and "clip" not in rows[0]:
         raise FaceDiffError(f"{path}: has no column clip; expected clip and further columns, one row a clip")
     return {str(row.pop("clip")): {key: (value or "").strip() for key, value in row.items()} for row in rows}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
+from facediff.utils.files import read_rows
 
 STRESS, LENGTH = "ˈˌ", "ː"
 BILABIALS = ("p", "b", "m")
@@ -56,23 +56,20 @@ def read_phonemes(path: Path) -> list[Phoneme]:
     Raises:
         FaceDiffError: if the file is not that.
     """
+    expected = "expected a table with the columns start, end (seconds), ipa"
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = list(csv.DictReader(stream))
         found = [
             Phoneme(
                 float(row["start"]),
                 float(row["end"]),
-                row["ipa"] or "",
-                row.get("viseme") or "",
-                (row.get("word") or "").strip(),
+                row["ipa"],
+                row.get("viseme", ""),
+                row.get("word", "").strip(),
             )
-            for row in rows
+            for row in read_rows(path, remedy=expected)
         ]
-    except (OSError, UnicodeDecodeError, csv.Error, KeyError, ValueError, TypeError) as error:
-        raise FaceDiffError(
-            f"{path}: not readable as phonemes ({error}); expected a table with the columns start, end (seconds), ipa"
-        ) from error
+    except (KeyError, ValueError) as error:
+        raise FaceDiffError(f"{path}: not readable as phonemes ({error}); {expected}") from error
     if not found or any(not (math.isfinite(p.end) and 0 <= p.start <= p.end) for p in found):
         raise FaceDiffError(f"{path}: expected phonemes whose start is not below 0 and not after their end")
     return found

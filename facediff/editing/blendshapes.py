@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,7 +15,7 @@ from facediff.animation import Animation, metres_per_unit
 from facediff.editing.shapes import ARKIT, ROTATIONS, ShapeSet, absent_from, beyond_arkit, live_link_name, mirror_pairs
 from facediff.errors import FaceDiffError, choices
 from facediff.mesh.mesh import triangle_areas
-from facediff.utils.files import atomic, check_writable
+from facediff.utils.files import atomic, check_writable, write_table
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -447,8 +446,5 @@ def _write_both(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]
     for file in (path, path.with_suffix(".json")):
         check_writable(file)
     with atomic(path.with_suffix(".json")) as companion, atomic(path) as temporary:
-        with temporary.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(header)
-            writer.writerows(rows)
+        write_table(temporary, [header, *rows])
         companion.write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.utils.arrays import read_arrays
-from facediff.utils.files import atomic, check_writable
+from facediff.utils.files import atomic, check_writable, read_table
 
 ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20
@@ -282,22 +281,21 @@ def _consistent(made: Correspondence) -> bool:
     )
 
 
+DIGITS = 18  # of a whole number that fits into 64 bits
+
+
 def read_landmarks(path: Path) -> npt.NDArray[np.int64]:
     """Pairs (L, 2) of a source and a target vertex from a CSV of two columns, with or without a header.
 
     Raises:
         FaceDiffError: if the file is missing, or a line does not hold two numbers.
     """
-    try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error}); expected a CSV of vertex pairs") from error
     pairs = []
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_table(path, remedy="expected a CSV of vertex pairs"), 1):
         words = [word.strip() for word in line if word.strip()]
-        if not words or (number == 1 and not words[0].isdigit()):
+        if not words or (number == 1 and not words[0].isdecimal()):
             continue
-        if len(words) != 2 or not all(word.isdigit() for word in words):
+        if len(words) != 2 or not all(word.isdecimal() and len(word) <= DIGITS for word in words):
             raise FaceDiffError(
                 f"{path}: line {number} is {','.join(line)}; expected two vertices, source and target, counted from 0"
             )

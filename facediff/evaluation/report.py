@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, printable
 from facediff.evaluation.files import Missing, Pair
 from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
@@ -382,6 +382,7 @@ def text(report: Report) -> str:
             f"seed {report.seed}",
         ]
     lines += ["", *(_left_out(report) or ["everything there was scored; nothing was cut, skipped or missing"])]
+    lines = [printable(line) for line in lines]
     for definition in report.protocols.values():
         lines += ["", definition]
     return "\n".join(lines)

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from facediff.animation import Animation
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, printable
 from facediff.export import FORMATS
 from facediff.models.checkpoint import read_assets
 from facediff.models.styles import style_paths
@@ -208,10 +208,10 @@ def run_folder(
                     if outcome.problem:
                         stale = f" ({task.output} is of an earlier run)" if task.output.exists() else ""
                         states[task.source] = "failed", outcome.problem + stale
-                        print(f"[{count}/{len(to_do)}] failed: {outcome.problem}", flush=True)
+                        print(f"[{count}/{len(to_do)}] failed: {printable(outcome.problem)}", flush=True)
                     else:
                         states[task.source] = "made", f"{outcome.seconds:.1f} s"
-                        print(f"[{count}/{len(to_do)}] {task.output}, {outcome.seconds:.1f} s", flush=True)
+                        print(f"[{count}/{len(to_do)}] {printable(task.output)}, {outcome.seconds:.1f} s", flush=True)
         finally:
             _print_states(speeches, states)
     return int(any(state == "failed" for state, _ in states.values()))
@@ -225,7 +225,7 @@ def _set_up(make_worker: MakeWorker, command: list[str]) -> Callable[[FileTask],
 def _earlier_state(task: FileTask, retry_failed: bool) -> tuple[str, str] | None:
     """What an earlier run has left of a recording; None if it is to be animated."""
     if reason := task.change():
-        print(f"note: {task.output}: is made again, since {reason}")
+        print(printable(f"note: {task.output}: is made again, since {reason}"))
         return None
     problem = task.earlier_problem()
     if problem == "":

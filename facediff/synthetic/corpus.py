@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import pickle
 from collections.abc import Sequence
 from contextlib import closing
@@ -21,7 +20,7 @@ from facediff.synthetic.rig import Rig, build_rig, lip_pairs
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.synthetic.speech import SENTENCES, Phoneme, speak
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.files import atomic_folder, describe_files, read_json, same_sizes, write_json
+from facediff.utils.files import atomic_folder, describe_files, read_json, same_sizes, write_json, write_table
 from facediff.utils.jobs import WorkerDied, run_tasks
 
 FORMAT = 1
@@ -216,12 +215,11 @@ def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
     pairs = zip(*(side.tolist() for side in lip_pairs(mesh)), strict=True)
     lines = [f"{upper}, {lower}\n" for upper, lower in pairs]
     (folder / "regions" / "inner_lip_pairs.txt").write_text("".join(lines))
-    with (folder / "clips.csv").open("w", newline="", encoding="utf-8") as stream:
-        table = csv.writer(stream, lineterminator="\n")
-        table.writerow(["clip", "subject", "sentence", "mood", "voice", "text"])
-        for clip in chosen:
-            voice, text = SPEAKERS[clip.identity].voice.name, SENTENCES[clip.number - 1]
-            table.writerow([clip.name, clip.identity, clip.sentence, clip.mood, voice, text])
+    table = [["clip", "subject", "sentence", "mood", "voice", "text"]]
+    for clip in chosen:
+        voice, text = SPEAKERS[clip.identity].voice.name, SENTENCES[clip.number - 1]
+        table.append([clip.name, clip.identity, clip.sentence, clip.mood, voice, text])
+    write_table(folder / "clips.csv", table)
 
 
 def _write_clips(folder: Path, chosen: Sequence[Clip], seed: int, workers: int | None, progress: bool) -> int:
@@ -249,13 +247,11 @@ def _write_clip(folder: Path, clip: Clip, seed: int) -> int:
     soundfile.write(folder / "wav" / f"{clip.name}.wav", samples, SAMPLE_RATE, subtype="PCM_16")
     vertices = rig_of(clip.identity).pose(weights).astype(np.float32)
     np.save(folder / "vertices_npy" / f"{clip.name}.npy", vertices.reshape(len(vertices), -1))
-    with (folder / "phonemes" / f"{clip.name}.csv").open("w", newline="", encoding="utf-8") as stream:
-        table = csv.writer(stream, lineterminator="\n")
-        table.writerow(["start", "end", "ipa", "viseme"])
-        for phoneme in phonemes:
-            table.writerow(
-                [f"{phoneme.start:.4f}", f"{phoneme.end:.4f}", phoneme.ipa, "+".join(visemes_of(phoneme.ipa))]
-            )
+    table = [["start", "end", "ipa", "viseme"]]
+    for phoneme in phonemes:
+        visemes = "+".join(visemes_of(phoneme.ipa))
+        table.append([f"{phoneme.start:.4f}", f"{phoneme.end:.4f}", phoneme.ipa, visemes])
+    write_table(folder / "phonemes" / f"{clip.name}.csv", table)
     return len(vertices)
 
 

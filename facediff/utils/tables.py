@@ -6,7 +6,7 @@ import io
 from collections.abc import Iterable, Sequence
 from typing import TextIO
 
-from facediff.errors import MissingExtraError
+from facediff.errors import MissingExtraError, printable
 
 UNLIMITED = 100_000  # width of a table that nothing cuts, in characters
 
@@ -51,11 +51,11 @@ def print_table(
     if not console.is_terminal:
         console = Console(file=stream, highlight=False, width=UNLIMITED, color_system=None)
     # Text and not str: brackets in a file's name are no markup.
-    cells = [[Text("-" if cell is None else str(cell)) for cell in row] for row in rows]
+    cells = [[Text("-" if cell is None else printable(cell)) for cell in row] for row in rows]
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=bool(head), header_style="bold")
     columns = head or [""] * max(map(len, cells), default=0)
     for place, title in enumerate(columns):
-        table.add_column(Text(title), justify="left" if place < left else "right", overflow="fold")
+        table.add_column(Text(printable(title)), justify="left" if place < left else "right", overflow="fold")
     for row in cells:
         table.add_row(*row)
     console.print(table)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import csv
 import os
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +28,7 @@ from facediff.utils.files import (
     locked,
     parse_json,
     read_json,
+    read_rows,
     same_sizes,
     scratch_folder,
     sha256,
@@ -34,6 +37,7 @@ from facediff.utils.files import (
 )
 from facediff.utils.limits import Limits
 from facediff.utils.pickles import load_pickle
+from facediff.utils.tables import format_table
 
 ROOT = Path(__file__).parents[2]
 
@@ -255,7 +259,7 @@ def test_described_files_are_compared_by_size(tmp_path: Path) -> None:
         b'{"rate": 25, "rate": 30}',
         b'"\\u0000"',
         b'"\\ud800"',
-        b'{"a\\udc80": 1}',
+        b'{"a\\udc7f": 1}',
         b"[" * 100_000,
         b"[" * 100 + b"]" * 100,
         b"[" + b"[]," * 3_000 + b"[]]",
@@ -305,3 +309,72 @@ def test_json_is_parsed_in_one_place() -> None:
         and (node.value.id, node.attr) in {("json", "load"), ("json", "loads"), ("json", "JSONDecoder")}
     }
     assert found <= own
+
+
+NAMES = [
+    "=cmd()",
+    "+1",
+    "-2+3",
+    "-clip",
+    "@SUM(A1)",
+    "\t=1",
+    "\r=1",
+    " =1",
+    "'=1",
+    "''=1",
+    "'plain",
+    "plain",
+    "-0.5",
+    "\uff1d1",
+]
+
+
+def test_names_in_tables_are_no_formulas_and_are_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "clips.csv"
+    write_rows(path, [{"clip": name, "=head": -0.5} for name in NAMES])
+    with path.open(newline="", encoding="utf-8") as stream:
+        raw = list(csv.reader(stream))
+    for cell in [cell for row in raw for cell in row]:
+        assert cell[:1] not in tuple("=@\t\r")
+        assert cell[:1] not in tuple("+-") or np.isfinite(float(cell))
+    assert list(read_rows(path, remedy="")) == [{"clip": name, "=head": "-0.5"} for name in NAMES]
+
+
+def test_tables_are_written_and_read_in_one_place() -> None:
+    # Lightning's logger writes its own columns, which a resumed run continues.
+    own = {"facediff/utils/files.py", "facediff/callbacks/runs.py"}
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "facediff").rglob("*.py")
+        if re.search(r"\bcsv\.(reader|writer|DictReader|DictWriter)\b", path.read_text(encoding="utf-8"))
+    }
+    assert found <= own
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"clip\n" + b'"' + b"x" * 200_000,  # beyond what a cell may hold
+        b"clip,clip\na,b\n",
+        b"clip\ncaf\xe9\n",
+        b"\xff\xfec\x00l\x00",
+        b"clip," + b"," * 20_000 + b"\n",
+        b"clip\n" + b"a\n" * 2_000,
+        b"clip" + b",x" * 900 + b"\n" + b"a\n" * 900,
+    ],
+    ids=lambda content: repr(content[:12]),
+)
+def test_tables_that_cannot_be_read_or_expand_are_refused(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facediff.utils.files.LIMITS", Limits(entries=1000, bytes=128 * 100_000))
+    (tmp_path / "clips.csv").write_bytes(content)
+    with pytest.raises(FaceDiffError, match=r"clips\.csv: "):
+        list(read_rows(tmp_path / "clips.csv", remedy="save it again"))
+
+
+def test_names_do_nothing_to_a_terminal() -> None:
+    name = "clip\x1b]0;x\x07\x1b[2J\r\n\u202egpj\udcff\x9b"
+    shown = "\n".join([str(FaceDiffError(f"{name}: no such file")), format_table([name], [[name], [name]])])
+    assert len(shown.splitlines()) == 4
+    assert all(letter.isprintable() for line in shown.splitlines() for letter in line)

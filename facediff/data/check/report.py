@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, MissingExtraError, printable
 from facediff.utils.tables import format_table
 
 Severity = Literal["error", "warning", "note"]
@@ -159,15 +159,6 @@ def text(report: Report) -> str:
         blocks.append("\n".join(line for group in groups.values() for line in _remark(group)))
     blocks.append(_verdict(report))
     return "\n".join(printable(line) for line in "\n\n".join(blocks).split("\n"))
-
-
-def printable(line: str) -> str:
-    r"""A line in which characters that do not print are escaped: names of files may hold anything.
-
-    >>> printable("a\x1b[2Jb")
-    'a\\x1b[2Jb'
-    """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
 
 
 def _heading(report: Report) -> str:

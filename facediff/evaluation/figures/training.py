@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from facediff.evaluation.figures.page import (
     save,
     style,
 )
+from facediff.utils.files import read_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,15 +76,14 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
     # The inner dictionaries are by step or epoch: a run that was resumed may repeat steps, and the later one counts.
     columns: dict[str, dict[float, float]] = {}
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            place: str | None = None
-            for row in csv.DictReader(stream):
-                # Rows of the learning rate have no epoch: they belong to the epoch of the row before.
-                place = row.get(axis) or (place if axis == "epoch" else None)
-                for name, text in row.items():
-                    if name not in ("step", "epoch", None) and text not in ("", None) and place:
-                        columns.setdefault(name, {})[float(place)] = float(text)
-    except (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError) as error:
+        place: str | None = None
+        for row in read_rows(path, remedy="expected what CSVLogger writes during training"):
+            # Rows of the learning rate have no epoch: they belong to the epoch of the row before.
+            place = row.get(axis) or (place if axis == "epoch" else None)
+            for name, text in row.items():
+                if name not in ("step", "epoch", "") and text and place and np.isfinite(float(place)):
+                    columns.setdefault(name, {})[float(place)] = float(text)
+    except ValueError as error:
         raise FaceDiffError(f"{path}: not readable as a table of numbers ({error})") from error
     if not columns:
         raise FaceDiffError(f"{path}: holds no scalar over {axis}s; expected what CSVLogger writes during training")

@@ -150,7 +150,7 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         {"template_broken"},
         "no array of numbers",
     ),
-    ("mesh of text", lambda r: (r / "tiny.ply").write_text("ply\n"), {"mesh_broken"}, "not a readable mesh"),
+    ("mesh of text", lambda r: (r / "tiny.ply").write_text("ply\n"), {"mesh_broken"}, "not a readable PLY mesh"),
     (
         "mesh of another topology",
         lambda r: trimesh.creation.box().export(r / "tiny.ply"),
