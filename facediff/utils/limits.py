@@ -89,6 +89,9 @@ FRAME_RATES = (0.1, 1000.0)
 SAMPLE_RATES = (1000, 768_000)
 """Samples a second that speech may have; resampling multiplies the length of anything slower."""
 
+COORDINATE = 1e12
+"""Largest absolute coordinate, in any unit; squares and sums of larger ones leave the range of float32."""
+
 WORDS_SHOWN = 60  # characters of a file's own text that a message repeats
 
 
