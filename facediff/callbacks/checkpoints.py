@@ -29,8 +29,8 @@ from lightning.pytorch.trainer.states import RunningStage
 
 from facediff.callbacks.runs import JOB_FILE, LAST, STATE_KEY, ResumableCSVLogger, logger_versions, run_folder
 from facediff.errors import FaceDiffError
-from facediff.registry import Range, checks_arguments
 from facediff.models.checkpoint import read_checkpoint
+from facediff.registry import Range, checks_arguments
 from facediff.utils.files import atomic
 
 TRAIN = RunningStage.TRAINING

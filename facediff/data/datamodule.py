@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, IO, Literal, Self
+from typing import IO, Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -174,7 +174,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def load_from_checkpoint(
         cls,
         checkpoint_path: str | Path | IO[bytes],
-        *arguments: Any,
+        *arguments: Any,  # noqa: ANN401
         **options: Any,  # noqa: ANN401
     ) -> Self:
         """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's.
@@ -187,7 +187,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             given = content.get("datamodule_hyper_parameters") if isinstance(content, dict) else None
             if not isinstance(given, dict):
                 raise FaceDiffError(f"{path}: holds no options of a data module; expected a file of `facediff fit`")
-            read_options(str(path), cls, given, lambda kind, name: None)
+            read_options(str(path), cls, given, {})
             stream.seek(0)
             made: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
         return made

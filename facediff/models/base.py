@@ -10,8 +10,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any, IO, Literal, Self
 from pathlib import Path
+from typing import IO, Annotated, Any, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -379,7 +379,7 @@ class AnimationModel(LightningModule, Inference, ABC):
     def load_from_checkpoint(
         cls,
         checkpoint_path: str | Path | IO[bytes],
-        *arguments: Any,
+        *arguments: Any,  # noqa: ANN401
         **options: Any,  # noqa: ANN401
     ) -> Self:
         """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's.

@@ -24,6 +24,7 @@ import types
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -32,9 +33,9 @@ import torch
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, Assets
 from facediff.errors import FaceDiffError
 from facediff.models.allocation import allocation_budget
-from facediff.registry import Kind, corpus, model
+from facediff.registry import COMPONENTS, Kind, corpus, model
 from facediff.utils.limits import LIMITS, quoted
-from facediff.utils.plain_options import is_name, is_path, is_plain_text, read_options, unknown_class
+from facediff.utils.plain_options import Components, is_name, is_path, is_plain_text, read_options, unknown_class
 from facediff.utils.torch_files import EXPECTED, load_tensors, open_checkpoint
 
 if TYPE_CHECKING:
@@ -170,7 +171,7 @@ def model_of(path: Path | str, hparams: Mapping[str, Any]) -> tuple[type[Animati
     LIMITS.check("identities", len(identities), path)
     kept = ("_class_path", "_instantiator", "identities")
     arguments = read_options(
-        str(path), found, {name: value for name, value in hparams.items() if name not in kept}, find_component
+        str(path), found, {name: value for name, value in hparams.items() if name not in kept}, component_finders()
     )
     for name in ("n_vertices", "frame_rate"):
         if not arguments.get(name, 0) > 0:
@@ -262,18 +263,12 @@ def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[Spe
     found = corpus_class(path, source)
     given = checkpoint.get("datamodule_hyper_parameters") or {"root": source.get("root")}
     options = {name: value for name, value in given.items() if not name.startswith("_")}
-    read_options(str(path), found, options, find_component)
+    read_options(str(path), found, options, component_finders())
     return found, options
 
 
-def find_component(kind: Kind, path: str) -> type | None:
-    """The class of a component, as :func:`find_class` finds it."""
-    found: type | None = find_class(kind, path, component_base(kind))
-    return found
-
-
-def component_base(kind: Kind) -> type:
-    """What a component that is not registered must be a subclass of."""
+def component_finders() -> Components:
+    """What finds the classes of components, by kind; those that are not registered must be of the kind's base class."""
     from facediff.models import audio_encoders, decoders, fusions, mesh_encoders, samplers, speaker_encoders
 
     bases: dict[str, type] = {
@@ -285,7 +280,7 @@ def component_base(kind: Kind) -> type:
         "decoder": decoders.Decoder,
         "sampler": samplers.Sampler,
     }
-    return bases[kind.kind]
+    return {name: partial(find_class, kind, base=bases[name]) for name, kind in COMPONENTS.items()}
 
 
 def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``

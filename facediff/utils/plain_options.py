@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from facediff.errors import FaceDiffError
-from facediff.registry import COMPONENTS, Kind
 from facediff.utils.limits import LIMITS, quoted
 
 LONGEST_TEXT = 4096
@@ -31,18 +30,18 @@ LONGEST_NAME = 200
 RESERVED = {"class_path", "init_args", "dict_kwargs", "_class_path", "_instantiator", "__path__"}
 """Keys by which Lightning and jsonargparse recognise something to import or to open."""
 
-FindComponent = Callable[[Kind, str], type | None]
-"""Finds a component's class by its import path; None if it is not known."""
+Components = Mapping[str, Callable[[str], type | None]]
+"""For each kind of component, what finds a class by its import path; None if it is not known."""
 
 
-def read_options(source: str, owner: type, options: Mapping[str, Any], find: FindComponent) -> dict[str, Any]:
+def read_options(source: str, owner: type, options: Mapping[str, Any], components: Components) -> dict[str, Any]:
     """The arguments of a constructor from what a file states, or an error where they are anything but plain values.
 
     Args:
         source: the file, for messages.
         owner: the class, which is known to be registered.
         options: its constructor's arguments as plain data.
-        find: finds the classes of components.
+        components: the kinds of components; an option of a kind's name takes one.
 
     Returns:
         the arguments as the constructor takes them: a component as ``functools.partial`` of its class.
@@ -58,8 +57,8 @@ def read_options(source: str, owner: type, options: Mapping[str, Any], find: Fin
                 f"{source}: its {owner.__name__} has an option {quoted(name)} that this version does not know; it was "
                 f"not loaded. Use the version of the package that wrote it"
             )
-        if name in COMPONENTS:
-            arguments[name] = read_component(source, name, value, find)
+        if name in components:
+            arguments[name] = read_component(source, name, value, components)
         elif fits(value, hints[name]):
             if isinstance(value, int) and "seed" not in name:
                 # Sizes and counts, over which a constructor may loop; below zero, each class has its own opinion.
@@ -78,7 +77,7 @@ def read_options(source: str, owner: type, options: Mapping[str, Any], find: Fin
     return arguments
 
 
-def read_component(source: str, name: str, value: object, find: FindComponent) -> partial[Any] | None:
+def read_component(source: str, name: str, value: object, components: Components) -> partial[Any] | None:
     """A component that a file states; None where a model leaves it out.
 
     Raises:
@@ -91,13 +90,13 @@ def read_component(source: str, name: str, value: object, find: FindComponent) -
             f"{source}: its {name} is {quoted(value)}; expected a component with its class and options; it was not "
             f"loaded"
         )
-    found = find(COMPONENTS[name], value["class_path"]) if is_path(value["class_path"]) else None
+    found = components[name](value["class_path"]) if is_path(value["class_path"]) else None
     if found is None:
         raise unknown_class(source, name, value["class_path"])
     options = value.get("init_args", {})
     if not isinstance(options, dict):
         raise FaceDiffError(f"{source}: the options of its {name} are {quoted(options)}; expected a dict")
-    return partial(found, **read_options(source, found, options, find))
+    return partial(found, **read_options(source, found, options, components))
 
 
 def unknown_class(source: object, role: str, named: object) -> FaceDiffError:
@@ -239,6 +238,8 @@ def is_name(text: object) -> bool:
 
 def in_words(hint: Any) -> str:  # noqa: ANN401 - a type hint
     """A type hint for a message."""
+    if get_origin(hint) is Annotated:
+        return in_words(get_args(hint)[0])
     if isinstance(hint, type) and not get_args(hint):
         return {int: "a whole number", float: "a number", bool: "true or false", str: "plain text"}.get(
             hint, hint.__name__
