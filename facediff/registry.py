@@ -188,6 +188,7 @@ class Kind:
 
 audio_encoder = Kind("audio_encoder", "facediff.models.audio_encoders", "speech to one feature per frame")
 identity_encoder = Kind("identity_encoder", "facediff.models.speaker_encoders", "a speaker's label to a vector")
+motion_space = Kind("motion_space", "facediff.models.motion_space", "the numbers of a frame that are noised")
 mesh_encoder = Kind("mesh_encoder", "facediff.models.mesh_encoders", "a mesh's motion to one feature per frame")
 style_encoder = Kind("style_encoder", "facediff.models.speaker_encoders", "a reference motion to its speaking style")
 fusion = Kind("fusion", "facediff.models.fusions", "speech features meet the noisy motion")
@@ -215,7 +216,17 @@ export_format = Kind(
 )
 
 COMPONENTS: dict[str, Kind] = {
-    kind.kind: kind for kind in (audio_encoder, identity_encoder, mesh_encoder, style_encoder, fusion, decoder, sampler)
+    kind.kind: kind
+    for kind in (
+        motion_space,
+        audio_encoder,
+        identity_encoder,
+        mesh_encoder,
+        style_encoder,
+        fusion,
+        decoder,
+        sampler,
+    )
 }
 """The kinds of which models are made; a model's option of the kind's name chooses one."""
 

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -30,8 +30,6 @@ from facediff.data.dataset import (
 )
 from facediff.errors import FaceDiffError
 from facediff.registry import Range, defaults, keeps_arguments, plain
-from facediff.utils.plain_options import read_options
-from facediff.utils.torch_files import load_tensors, open_checkpoint
 
 FRAMES = 16
 """Frames of each training clip, evenly spread, from which size and principal components of motion are measured."""
@@ -169,28 +167,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def keep_hyperparameters(self, given: dict[str, Any]) -> None:
         """Save the constructor's arguments as plain data, so that checkpoints load with ``weights_only=True``."""
         self.save_hyperparameters(plain({**defaults(type(self)), **given}))
-
-    @classmethod
-    def load_from_checkpoint(
-        cls,
-        checkpoint_path: str | Path | IO[bytes],
-        *arguments: Any,  # noqa: ANN401
-        **options: Any,  # noqa: ANN401
-    ) -> Self:
-        """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's.
-
-        Raises:
-            FaceDiffError: if the file is no checkpoint, or its options are not plain values of this class's.
-        """
-        with open_checkpoint(checkpoint_path) as (stream, path):
-            content = load_tensors(stream, path)
-            given = content.get("datamodule_hyper_parameters") if isinstance(content, dict) else None
-            if not isinstance(given, dict):
-                raise FaceDiffError(f"{path}: holds no options of a data module; expected a file of `facediff fit`")
-            read_options(str(path), cls, given, {})
-            stream.seek(0)
-            made: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
-        return made
 
     # What a corpus adds.
 
@@ -364,8 +340,12 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             raise FaceDiffError(f"{self.root}: the training split holds no motion at all; check vertices_npy/")
         return float((count / total) ** 0.5)
 
-    def principal_motion(self, count: int) -> tuple[Tensor, Tensor]:
+    def principal_motion(self, count: int, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Mean and principal components of the training motion, in the corpus's unit.
+
+        Args:
+            count: components.
+            weights: factors on the coordinates (3V,) whose components are taken; None for all alike.
 
         Returns:
             the mean (3V,), and components (at most ``count``, 3V), each as long as its standard deviation, the largest
@@ -376,6 +356,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         frames = torch.cat([motion.flatten(1) for motion in self._spread_frames(clips, min(most, FRAMES))]).double()
         mean = frames.mean(0)
         frames -= mean
+        if weights is not None:
+            frames *= weights
         # The eigenvectors of the frames' products with one another give the same components as those of the
         # covariance, a matrix of (3V, 3V) that would not fit into memory.
         values, vectors = torch.linalg.eigh(frames @ frames.T)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff import registry
-from facediff.data import Batch
+from facediff.data import Batch, SpeechMotionDataModule
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.decoders import Decoder, DecoderFactory, StyleTransformer
@@ -25,6 +26,7 @@ from facediff.models.folding import (
     Blend,
     Fold,
     FoldedSpace,
+    PreconditionedSpace,
     SamplingSpace,
     Space,
     VertexSpace,
@@ -35,9 +37,18 @@ from facediff.models.folding import (
 from facediff.models.fusions import BidirectionalCrossAttention, Fusion, FusionFactory
 from facediff.models.inference import ClipNoise, Progress, Window, WindowNoise, WindowOverlap
 from facediff.models.layers import Share, Weight, Width, frame_mask
+from facediff.models.losses import preconditioned_losses
 from facediff.models.losses_fused import fused_losses
 from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoder, MeshEncoderFactory
-from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, SamplerFactory, unit_noise
+from facediff.models.motion_space import MotionSpaceFactory, Preconditioning, VertexMotion
+from facediff.models.samplers import (
+    DpmSolverSampler,
+    NoiseProcess,
+    NoiseSource,
+    SamplerFactory,
+    half_hidden,
+    unit_noise,
+)
 from facediff.models.speaker_encoders import (
     HierarchicalIdentity,
     IdentityEncoder,
@@ -49,6 +60,11 @@ from facediff.models.speaker_encoders import (
 from facediff.registry import Range
 
 TokenForm = Literal["levels", "single"]
+NoiseScale = Annotated[float, Range(1e-6, 1e6)] | Literal["auto"]
+
+NOISE_SCALE_KEY = "facediff_noise_scale"
+PRINCIPAL = 64
+"""Components by which the noise scale is measured."""
 
 
 @registry.model.register("DualPathDiffusion")
@@ -63,6 +79,8 @@ class DualPathDiffusion(AnimationModel):
         dim: model width C.
         audio_encoder: speech to features.
         identity_encoder: a speaker's label to the static identity.
+        motion_space: the numbers of a frame that are noised: all vertices, or principal components with a
+            preconditioned network (docs/generation.md).
         mesh_encoder: reference motion to one feature per frame, in front of the style encoder.
         style_encoder: these features to the dynamic style.
         fusion: speech features and noisy motion to one sequence.
@@ -73,6 +91,8 @@ class DualPathDiffusion(AnimationModel):
             sampler or a network that cannot be folded runs on the vertices anyway.
         diffusion_steps: noising steps N.
         noise_schedule: ``squaredcos_cap_v2`` (the cosine schedule), ``linear`` or ``scaled_linear``.
+        noise_scale: what motion is multiplied by before it is noised; ``auto`` measures on the training split at which
+            scale half of its variance shows in the schedule's middle.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
         identity_dropout: share of training clips whose identity is hidden, so that unseen speakers can be animated.
         velocity_weight: λ_vel.
@@ -89,6 +109,7 @@ class DualPathDiffusion(AnimationModel):
         dim: Width = 256,
         audio_encoder: AudioEncoderFactory = MelEncoder,
         identity_encoder: IdentityEncoderFactory = HierarchicalIdentity,
+        motion_space: MotionSpaceFactory = VertexMotion,
         mesh_encoder: MeshEncoderFactory = LinearMeshEncoder,
         style_encoder: StyleEncoderFactory = TcnGruTransformer,
         fusion: FusionFactory = BidirectionalCrossAttention,
@@ -97,6 +118,7 @@ class DualPathDiffusion(AnimationModel):
         sampling_space: SamplingSpace = "folded",
         diffusion_steps: Annotated[int, Range(1, 100_000)] = 1000,
         noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
+        noise_scale: NoiseScale = 1.0,
         style_tokens: TokenForm = "levels",
         identity_dropout: Share = 0.1,
         velocity_weight: Weight = 0.003,
@@ -112,12 +134,15 @@ class DualPathDiffusion(AnimationModel):
             "acceleration": acceleration_weight,
             "face": face_weight,
         }
-        self.process = NoiseProcess(diffusion_steps, noise_schedule)
+        self.noise_scale: NoiseScale = noise_scale
+        self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
+        self._sampler_factory: SamplerFactory = sampler
         self.sampler = sampler(process=self.process)
         self.sampling_space: SamplingSpace = sampling_space
+        self.motion_space = motion_space(n_vertices=self.n_vertices, steps=diffusion_steps)
         style = style_encoder(dim=dim)
         self.network = DualPathNetwork(
-            n_vertices=self.n_vertices,
+            coordinates=self.motion_space.coordinates,
             dim=dim,
             audio_encoder=audio_encoder(dim=dim),
             identity_encoder=identity_encoder(dim=dim, n_identities=len(self.identities)),
@@ -128,6 +153,45 @@ class DualPathDiffusion(AnimationModel):
             decoder=decoder(dim=dim, style_dim=dim),
             token_form=style_tokens,
         )
+        if self.motion_space.preconditioning is not None:
+            # Training starts from the posterior mean without speech, and not from random motion added to it.
+            nn.init.zeros_(self.network.unembed.weight)
+            nn.init.zeros_(self.network.unembed.bias)
+
+    def setup(self, stage: str) -> None:
+        """Measure the training motion for a model that was never trained: its components, and how much noise hides."""
+        new = self._assets is None
+        super().setup(stage)
+        space = self.motion_space
+        if stage != "fit" or not new or not (space.principal or self.noise_scale == "auto"):
+            return
+        data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        weights = torch.ones(self.n_vertices, 3)
+        for region, weight in space.region_weights.items():
+            weights[self.assets.regions[region]] = weight
+        mean, shapes = data.principal_motion(max(PRINCIPAL, space.coordinates), weights.flatten())
+        if space.principal:
+            space.attach(mean * self.scale, shapes[: space.coordinates] * self.scale, weights.flatten())
+        if self.noise_scale == "auto":
+            variances = (shapes * self.scale).square().sum(1)
+            self.rescale_noise(half_hidden(space.noised_variances(variances), variances))
+        space.fit(self.process.signal)
+
+    def rescale_noise(self, scale: float) -> None:
+        """Noise motion at another scale from now on."""
+        self.process = NoiseProcess(self.process.steps, self.process.schedule, scale)
+        self.sampler = self._sampler_factory(process=self.process)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the measured noise scale."""
+        super().on_save_checkpoint(checkpoint)
+        checkpoint[NOISE_SCALE_KEY] = self.process.scale
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take the noise scale from the checkpoint."""
+        super().on_load_checkpoint(checkpoint)
+        if self.noise_scale == "auto" and NOISE_SCALE_KEY in checkpoint:
+            self.rescale_noise(float(checkpoint[NOISE_SCALE_KEY]))
 
     def personal_modules(self) -> list[nn.Module]:
         """The identity's and the dynamic style's encoders, and how both are presented to the decoder."""
@@ -141,13 +205,14 @@ class DualPathDiffusion(AnimationModel):
         options = dict(self.hparams["sampler"]["init_args"]) if name is None else {}
         if steps is not None:
             options["steps"] = steps
-        self.sampler = chosen(process=self.process, **options)
+        self._sampler_factory = partial(chosen, **options)
+        self.sampler = self._sampler_factory(process=self.process)
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Noise each clip to a random step (algorithm 1, lines 3 and 4), then take the four losses (eq. 15 to 19)."""
-        motion = batch.motion.flatten(2)
-        step = self.process.draw_steps(len(batch), motion.device, generator)
-        return self.losses_at(batch, step, unit_noise(motion.shape, motion.device, generator))
+        device, shape = batch.motion.device, (*batch.motion.shape[:2], self.motion_space.coordinates)
+        step = self.process.draw_steps(len(batch), device, generator)
+        return self.losses_at(batch, step, unit_noise(shape, device, generator))
 
     def losses_at(
         self, batch: Batch, step: Int[Tensor, " batch"], noise: Float[Tensor, "batch frames coordinates"]
@@ -160,6 +225,8 @@ class DualPathDiffusion(AnimationModel):
             noise: unit noise.
         """
         network = self.network
+        if self.motion_space.preconditioning is not None:
+            return self._preconditioned_losses(batch, step, noise)
         # √ᾱ M⁰ + √(1 − ᾱ) ε, as NoiseProcess.add_noise, but in place: on a processor, allocating tensors of this size
         # takes longer than the arithmetic.
         signal = self.process.signal.to(noise.device)[step][:, None, None]
@@ -175,6 +242,16 @@ class DualPathDiffusion(AnimationModel):
             self.loss_weights,
             scale=self.scale,
         )
+
+    def _preconditioned_losses(self, batch: Batch, step: Tensor, noise: Tensor) -> dict[str, Tensor]:
+        space, preconditioning = self.motion_space, self.motion_space.preconditioning
+        assert preconditioning is not None  # noqa: S101 - for the type checker
+        clean = space.encode(batch.motion * self.scale)
+        noisy = self.process.add_noise(clean, noise, step)
+        embedded = self.network.embed(preconditioning.into[step][:, None] * noisy)
+        features = self.network.clean_motion(self.network.core(embedded, step, self.conditions(batch)))
+        predicted = preconditioning.clean(noisy, features, step)
+        return preconditioned_losses(predicted, clean, batch.mask, preconditioning.loss[step], self.loss_weights)
 
     def conditions(self, batch: Batch) -> Conditions:
         """Everything that is computed once per clip; in training, identities are hidden now and then."""
@@ -236,7 +313,13 @@ class DualPathDiffusion(AnimationModel):
         """
         # A sampler that clips or thresholds acts on vertices, and no fold can follow it.
         folded = self.sampling_space == "folded" and self.sampler.linear
-        space = self.network.prepare_for_inference(conditions, self.process.steps, folded=folded, blend=blend)
+        space = self.network.prepare_for_inference(
+            conditions,
+            self.process.steps,
+            folded=folded,
+            blend=blend,
+            preconditioning=self.motion_space.preconditioning,
+        )
         rows, frames = conditions.mask.shape
 
         def noise(like: Tensor) -> Tensor:
@@ -244,7 +327,7 @@ class DualPathDiffusion(AnimationModel):
 
         start = noise(torch.empty(rows, frames, space.width, device=self.device, dtype=next(self.parameters()).dtype))
         sample = self.sampler.run(space.denoise, start, noise=noise, progress=progress)
-        return (space.motion(sample) / self.scale).view(rows, frames, self.n_vertices, 3)
+        return self.motion_space.decode(space.motion(sample)) / self.scale
 
 
 @dataclass(frozen=True)
@@ -280,11 +363,12 @@ class Conditions:
 class DualPathNetwork(nn.Module):
     """Predicts clean motion from noisy motion under speech, identity and style.
 
-    In the denoising loop vertices appear in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V). Outside it
+    In the denoising loop motion appears in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V), or fewer
+    coordinates than 3V in another motion space. Outside it
     ``mesh_encoder`` stands in front of the style encoder (X = Linear(M_ref) in the paper).
 
     Args:
-        n_vertices: vertices V of the topology.
+        coordinates: numbers in a frame of noisy motion.
         dim: channels C.
         audio_encoder: speech to F_a.
         identity_encoder: identity to F_id.
@@ -298,7 +382,7 @@ class DualPathNetwork(nn.Module):
     def __init__(
         self,
         *,
-        n_vertices: int,
+        coordinates: int,
         dim: int,
         audio_encoder: AudioEncoder,
         identity_encoder: IdentityEncoder,
@@ -309,18 +393,18 @@ class DualPathNetwork(nn.Module):
         token_form: TokenForm,
     ) -> None:
         super().__init__()
-        self.coordinates = 3 * n_vertices
+        self.coordinates = coordinates
         self.audio_encoder = audio_encoder
         self.identity_encoder = identity_encoder
         self.style_encoder = style_encoder
         self.style_tokens = StyleTokens(identity_encoder.token_dims + style_encoder.token_dims, dim, token_form)
-        self.embed = nn.Linear(3 * n_vertices, dim)
+        self.embed = nn.Linear(coordinates, dim)
         self.mesh_encoder = mesh_encoder
         self.step_embedding = StepEmbedding(dim)
         self.fusion = fusion
         self.fused_norm = nn.LayerNorm(dim)
         self.decoder = decoder
-        self.unembed = nn.Linear(dim, 3 * n_vertices)
+        self.unembed = nn.Linear(dim, coordinates)
         self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
 
     def conditions(
@@ -381,7 +465,13 @@ class DualPathNetwork(nn.Module):
             return self.unembed(features.to(next(self.unembed.parameters()).dtype))
 
     def prepare_for_inference(
-        self, conditions: Conditions, steps: int, *, folded: bool, blend: Blend = unchanged
+        self,
+        conditions: Conditions,
+        steps: int,
+        *,
+        folded: bool,
+        blend: Blend = unchanged,
+        preconditioning: Preconditioning | None = None,
     ) -> Space:
         """Everything that is constant over the denoising steps of a clip or window, as the space a sampler runs in.
 
@@ -393,9 +483,10 @@ class DualPathNetwork(nn.Module):
             steps: the process's steps N.
             folded: run in the width of the model where both ends are linear, else on the vertices.
             blend: changes the features that the network gives in every step.
+            preconditioning: the scales around the network in a space of its own; None on vertices.
         """
         first, last = self.embed, self.unembed
-        folded = folded and isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
+        folded = folded and preconditioning is None and isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
         ends = [weight for weight in (first.weight, last.weight, last.bias) if weight is not None] if folded else []
 
         def of_weights() -> tuple[Tensor, Fold | None]:
@@ -409,6 +500,8 @@ class DualPathNetwork(nn.Module):
         audio, style, mask = conditions.audio, conditions.style, conditions.mask
         fusion, decoder = self.fusion.prepare(audio, mask), self.decoder.prepare(style, mask)
         ready = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
+        if preconditioning is not None:
+            return PreconditionedSpace(self, ready, preconditioning, blend)
         return VertexSpace(self, ready, blend) if product is None else FoldedSpace(self, ready, product, blend)
 
 

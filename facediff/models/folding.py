@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError
 from facediff.models.layers import Frames
+from facediff.models.motion_space import Preconditioning
 
 SamplingSpace = Literal["folded", "vertices"]
 
@@ -168,6 +169,39 @@ class FoldedSpace(Space):
                 "choose --model.sampling_space=vertices"
             )
         return self.network.clean_motion(self._last[0])
+
+
+class PreconditionedSpace(Space):
+    """Coordinates of motion with known variances; the network predicts what the noisy motion leaves open.
+
+    Args:
+        network: predicts that.
+        conditions: as :class:`Space` takes them.
+        preconditioning: the scales around the network.
+        blend: changes the predictions of every step.
+    """
+
+    def __init__(
+        self, network: Network, conditions: object, preconditioning: Preconditioning, blend: Blend = unchanged
+    ) -> None:
+        super().__init__(network, conditions, network.coordinates, blend)
+        self.preconditioning = preconditioning
+
+    def noise(self, unit: State) -> State:
+        """Unit noise as it is."""
+        return unit
+
+    def denoise(self, state: State, step: int) -> State:
+        """M̂⁰."""
+        steps = torch.full((len(state),), step, device=state.device)
+        scaled = self.preconditioning.into[step] * state
+        features = self.network.core(self.network.embed(scaled), steps, self.conditions)
+        # The prediction is blended, not the features: the noisy motion is a part of it.
+        return self.blend(self.preconditioning.clean(state, self.network.clean_motion(features), steps))
+
+    def motion(self, sample: State) -> ScaledMotion:
+        """The sample as it is."""
+        return sample
 
 
 CHUNK = 8192

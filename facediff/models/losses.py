@@ -100,3 +100,32 @@ def masked_std(values: Float[Tensor, "batch frames vertices"], mask: Mask) -> Fl
     # The square root's slope is infinite at 0: the inner `where` keeps it out of the gradient, the outer one gives 0.
     positive = variance > 0
     return torch.where(positive, variance.where(positive, torch.ones_like(variance)).sqrt(), 0.0)
+
+
+def preconditioned_losses(
+    prediction: Float[Tensor, "batch frames coordinates"],
+    truth: Float[Tensor, "batch frames coordinates"],
+    mask: Mask,
+    importance: Float[Tensor, "batch coordinates"],
+    weights: Mapping[str, float],
+) -> dict[str, Tensor]:
+    """Squared errors of motion, velocity and acceleration in a motion space, and their weighted sum ``loss``.
+
+    Squared and not Huber's, and without L_face: the mean of the motions that are possible is the minimum of the first
+    alone, and a sampler needs this mean. Huber's minimum lies nearer to the median, that of L_face at the liveliness of
+    a whole motion, which a mean over many does not have.
+
+    Args:
+        prediction: predicted coordinates.
+        truth: true coordinates.
+        mask: valid frames.
+        importance: what a squared error of each coordinate counts in each clip.
+        weights: weight of ``reconstruction``, ``velocity`` and ``acceleration`` in the sum.
+    """
+    gap, valid = prediction - truth, mask
+    terms = {}
+    for name in ("reconstruction", "velocity", "acceleration"):
+        squared = (gap.square() * importance[:, None]).sum(-1)
+        terms[name] = (squared * valid).sum() / valid.sum().clamp_min(1)
+        gap, valid = gap[:, 1:] - gap[:, :-1], valid[:, 1:] & valid[:, :-1]
+    return {**terms, "loss": torch.stack([weights[name] * term for name, term in terms.items()]).sum()}

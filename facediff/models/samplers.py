@@ -57,6 +57,9 @@ class NoiseProcess:
     Args:
         steps: number of steps N.
         schedule: ``squaredcos_cap_v2`` (the cosine schedule), ``linear`` or ``scaled_linear``.
+        scale: what motion is multiplied by before it is noised (Chen 2023, arXiv 2301.10972): below 1, noise hides more
+            of it at every step. The noisy motion is divided by its new size, so that this is another schedule for the
+            same motion: ᾱ becomes b²ᾱ / (b²ᾱ + 1 − ᾱ).
 
     Attributes:
         variances: the noise variance α_n of each step, float32.
@@ -71,16 +74,22 @@ class NoiseProcess:
         [0.847, 0.494, 0.144, 0.0]
     """
 
-    def __init__(self, steps: int = 1000, schedule: str = "squaredcos_cap_v2") -> None:
+    def __init__(self, steps: int = 1000, schedule: str = "squaredcos_cap_v2", scale: float = 1.0) -> None:
         if schedule not in SCHEDULES:
             raise FaceDiffError(f'noise_schedule: there is no schedule "{schedule}": {choices(schedule, SCHEDULES)}')
         self.steps = steps
         self.schedule = schedule
         self.variances: Tensor = SCHEDULES[schedule](steps)
         self.signal = torch.cumprod(1.0 - self.variances, dim=0)
+        self.scale = scale
+        if scale != 1:
+            shown = scale**2 * self.signal.double()
+            signal = shown / (shown + 1 - self.signal.double())
+            before = torch.cat([signal.new_ones(1), signal[:-1]])
+            self.signal, self.variances = signal.float(), (1 - signal / before).float()
         if not 0 < float(self.signal[-1]) < 1:
             raise ArgumentError(
-                {"diffusion_steps": steps, "noise_schedule": schedule},
+                {"diffusion_steps": steps, "noise_schedule": schedule, "noise_scale": scale},
                 "the schedule leaves no signal after so many steps; choose fewer steps or squaredcos_cap_v2",
             )
 
@@ -99,6 +108,28 @@ class NoiseProcess:
     ) -> Int[Tensor, " batch"]:
         """Uniform random step numbers (algorithm 1, line 3)."""
         return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
+
+
+def half_hidden(
+    variances: Float[Tensor, " components"], importance: Float[Tensor, " components"] | None = None
+) -> float:
+    """The scale at which half of the motion's variance shows through the noise of the schedule's middle.
+
+    Where ᾱ = ½, a principal component of variance λ that is noised at the scale b shows the share b²λ / (b²λ + 1) of
+    its variance in a single frame. With less hidden, a model learns to read its input and not the speech.
+
+    Args:
+        variances: of the principal components, as they are noised at the scale 1.
+        importance: what each contributes to the variance of the motion; ``variances`` if None.
+    """
+    own = variances.double()
+    shares = (own if importance is None else importance.double()) / (own if importance is None else importance).sum()
+    low, high = -60.0, 60.0  # of ln b²; the share that shows rises with it
+    for _ in range(100):
+        middle = (low + high) / 2
+        shown = math.exp(middle) * own
+        low, high = (middle, high) if float((shares * shown / (shown + 1)).sum()) < 0.5 else (low, middle)
+    return math.exp(middle / 2)
 
 
 PART = 2**21

@@ -222,7 +222,7 @@ def test_the_step_embedding_is_sinusoids_and_an_mlp() -> None:
 def test_the_core_adds_the_step_before_the_norm() -> None:
     """Eq. 13, with all parts: from speech features, noisy motion, step and style to F_dec."""
     network = DualPathNetwork(
-        n_vertices=5,
+        coordinates=15,
         dim=DIM,
         audio_encoder=registry.audio_encoder.mel(dim=DIM),
         identity_encoder=registry.identity_encoder.hierarchical(dim=DIM, n_identities=2),

@@ -1,0 +1,269 @@
+"""The motion that a diffusion model noises: all vertices, as in the paper, or principal components of the corpus.
+
+From top to bottom: the two spaces, and the preconditioning that a space with known variances makes possible. Choosing
+``components`` changes three things at once, each an option of its own:
+
+- A frame is a few dozen numbers, whatever the mesh.
+- The noise hides the motion: vertices move together, so independent noise on thousands of them averages out, and a
+  model reads half of the motion off its noisy input at almost every step without listening to the speech.
+- The network predicts what the noisy motion leaves open, and no longer the whole motion: a network of limited width
+  cannot copy what it is shown, and ancestral sampling repeats that error a thousand times.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Protocol
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff.errors import FaceDiffError
+from facediff.models.layers import Share
+from facediff.models.mesh_encoders import Vertices
+from facediff.models.samplers import Steps
+from facediff.registry import Range, motion_space
+
+Offsets = Float[Tensor, "batch frames vertices 3"]
+"""Scaled offsets from the template."""
+
+Coordinates = Float[Tensor, "batch frames coordinates"]
+"""A frame as the numbers that are noised."""
+
+RegionWeight = Annotated[float, Range(1e-3, 1e3)]
+
+SMALLEST = 1e-4
+"""Components below this share of the first one's deviation are treated as if they had it."""
+
+
+class MotionSpace(nn.Module, ABC):
+    """A linear image of motion, in which it is noised and denoised.
+
+    Class attributes:
+        principal: whether :meth:`attach` must be called with the principal components of the training motion.
+
+    Attributes:
+        coordinates: numbers in a frame.
+        preconditioning: the scales around the network; None if it predicts clean motion itself.
+    """
+
+    principal: ClassVar[bool] = False
+    coordinates: int
+    preconditioning: Preconditioning | None
+
+    @property
+    def region_weights(self) -> Mapping[str, float]:
+        """Weights of regions, by name, in the principal components that :meth:`attach` gets."""
+        return {}
+
+    def attach(  # noqa: B027 - a space that needs no data has nothing to do
+        self, mean: Float[Tensor, " all"], shapes: Float[Tensor, "components all"], weights: Float[Tensor, " all"]
+    ) -> None:
+        """Take over the training motion's statistics.
+
+        Args:
+            mean: mean of all coordinates, 3V, scaled.
+            shapes: principal components of weighted motion, each as long as its standard deviation, largest first.
+            weights: what each coordinate was multiplied by.
+        """
+
+    def noised_variances(self, variances: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
+        """Variances of principal components as the noise sees them, from those of the motion."""
+        return variances
+
+    def fit(self, signal: Float[Tensor, " steps"]) -> None:  # noqa: B027
+        """Take over the noise process, once motion is known.
+
+        Args:
+            signal: ᾱ of every step.
+        """
+
+    @abstractmethod
+    def encode(self, motion: Offsets) -> Coordinates:
+        """From scaled offsets to what is noised."""
+
+    @abstractmethod
+    def decode(self, coordinates: Coordinates) -> Offsets:
+        """The way back."""
+
+
+class MotionSpaceFactory(Protocol):
+    """Makes a space once the model's sizes are known."""
+
+    def __call__(self, *, n_vertices: int, steps: int) -> MotionSpace:
+        """Make one for motion of ``n_vertices`` vertices, noised in ``steps`` steps."""
+        ...
+
+
+@motion_space.register("vertices")
+class VertexMotion(MotionSpace):
+    """All coordinates of all vertices; the network predicts clean motion (the paper's setting).
+
+    Args:
+        n_vertices: vertices; given by the model.
+        steps: of the noise process; given by the model.
+    """
+
+    def __init__(self, *, n_vertices: Vertices, steps: Steps) -> None:
+        super().__init__()
+        self.coordinates = 3 * n_vertices
+        self.preconditioning = None
+
+    def encode(self, motion: Offsets) -> Coordinates:
+        """Every coordinate."""
+        return motion.flatten(2)
+
+    def decode(self, coordinates: Coordinates) -> Offsets:
+        """Every coordinate."""
+        return coordinates.view(*coordinates.shape[:2], -1, 3)
+
+
+@motion_space.register("components")
+class ComponentMotion(MotionSpace):
+    """Principal components of the training motion; the network predicts what the noisy motion leaves open.
+
+    A component of standard deviation d is noised at the size d₁ · (d / d₁)^(1 − whitening), with the largest deviation
+    d₁. Losses weigh each component as its vertices do, whatever its size in the noise.
+
+    Args:
+        n_vertices: vertices; given by the model.
+        steps: of the noise process; given by the model.
+        count: components K; motion outside them is lost.
+        whitening: 0 keeps the components' sizes, which is vertices up to truncation; at 1 all are of equal size, so
+            that noise hides small movements (lids, brows) no earlier than large ones (the jaw).
+        upper_face_weight: how much more a movement of the upper face counts than another of the same size, in the
+            components and in the losses.
+        lips_weight: the same for the lips.
+    """
+
+    principal: ClassVar[bool] = True
+    mean: Tensor
+    basis: Tensor
+    weights: Tensor
+    deviations: Tensor
+    sizes: Tensor
+
+    def __init__(
+        self,
+        *,
+        n_vertices: Vertices,
+        steps: Steps,
+        count: Annotated[int, Range(1, 4096)] = 64,
+        whitening: Share = 0.5,
+        upper_face_weight: RegionWeight = 1.0,
+        lips_weight: RegionWeight = 1.0,
+    ) -> None:
+        super().__init__()
+        self.coordinates = count
+        self.whitening = whitening
+        self._region_weights = {"upper_face": upper_face_weight, "lips": lips_weight}
+        # Shapes follow from the sizes alone, since weight averaging copies the module before a corpus is known.
+        self.register_buffer("mean", torch.zeros(3 * n_vertices))
+        self.register_buffer("basis", torch.zeros(count, 3 * n_vertices))
+        self.register_buffer("weights", torch.ones(3 * n_vertices))
+        self.register_buffer("deviations", torch.ones(count))
+        self.register_buffer("sizes", torch.ones(count))
+        self.preconditioning: Preconditioning = Preconditioning(steps, count)
+
+    @property
+    def region_weights(self) -> Mapping[str, float]:
+        """Those of upper face and lips."""
+        return self._region_weights
+
+    def attach(
+        self, mean: Float[Tensor, " all"], shapes: Float[Tensor, "components all"], weights: Float[Tensor, " all"]
+    ) -> None:
+        """Keep mean, unit components and their deviations; components that the corpus does not have stay zero.
+
+        Raises:
+            FaceDiffError: if the training motion never changes.
+        """
+        deviations = torch.linalg.vector_norm(shapes, dim=1)
+        if not len(deviations) or not float(deviations[0]) > 0:
+            raise FaceDiffError("motion_space=components: the training motion never changes, so it has no components")
+        self.mean.copy_(mean)
+        self.weights.copy_(weights)
+        self.basis.zero_()[: len(shapes)] = shapes / deviations[:, None]
+        smallest = SMALLEST * float(deviations[0])
+        self.deviations.fill_(smallest)[: len(shapes)] = deviations.clamp_min(smallest)
+        share = self.deviations / self.deviations[0]
+        self.sizes.copy_(self.deviations[0] * share ** (1 - self.whitening))
+
+    def noised_variances(self, variances: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
+        """Sizes squared, of as many components as there are."""
+        return variances[0] * (variances / variances[0]).clamp_min(SMALLEST**2) ** (1 - self.whitening)
+
+    def fit(self, signal: Float[Tensor, " steps"]) -> None:
+        """Precondition the network by each component's own variance."""
+        self.preconditioning.fit(signal, self.sizes.square(), (self.deviations / self.sizes).square())
+
+    def encode(self, motion: Offsets) -> Coordinates:
+        """Components of weighted offsets from the mean, in the sizes that are noised."""
+        with torch.autocast(motion.device.type, enabled=False):
+            centred = (motion.flatten(2) - self.mean) * self.weights
+            return centred @ self.basis.T * (self.sizes / self.deviations)
+
+    def decode(self, coordinates: Coordinates) -> Offsets:
+        """The mean and the sum of the components."""
+        with torch.autocast(coordinates.device.type, enabled=False):
+            back = coordinates.to(self.basis.dtype) * (self.deviations / self.sizes)
+            motion = (back @ self.basis) / self.weights + self.mean
+            return motion.view(*motion.shape[:2], -1, 3)
+
+
+class Preconditioning(nn.Module):
+    """Scales that let a network see and predict numbers of unit variance (Karras et al. 2022, table 1).
+
+    For motion x of known variance λ, noised to y = √ᾱ x + √(1 − ᾱ) ε, the prediction of clean motion is
+    skip · y + out · F(into · y). Without any network, F = 0, it is the posterior mean of Gaussian motion; F has to say
+    what speech and style tell beyond that, in units of what is left open. All four tables are (steps, coordinates).
+
+    Args:
+        steps: of the noise process.
+        coordinates: numbers in a frame.
+
+    Attributes:
+        into: 1 / √(ᾱλ + 1 − ᾱ), which gives the network's input unit variance.
+        skip: √ᾱ λ / (ᾱλ + 1 − ᾱ), the Wiener filter.
+        out: √(λ(1 − ᾱ) / (ᾱλ + 1 − ᾱ)), the deviation that the filter leaves open.
+        loss: weights of squared errors: those of the vertices, divided by what the filter leaves open in a step, so
+            that every step counts alike.
+    """
+
+    into: Tensor
+    skip: Tensor
+    out: Tensor
+    loss: Tensor
+
+    def __init__(self, steps: int, coordinates: int) -> None:
+        super().__init__()
+        for name in ("into", "skip", "out", "loss"):
+            self.register_buffer(name, torch.zeros(steps, coordinates))
+
+    def fit(
+        self,
+        signal: Float[Tensor, " steps"],
+        variances: Float[Tensor, " coordinates"],
+        importance: Float[Tensor, " coordinates"],
+    ) -> None:
+        """Fill the tables for motion of given variances.
+
+        Args:
+            signal: ᾱ of every step.
+            variances: λ of every coordinate.
+            importance: what a squared error of each coordinate counts.
+        """
+        # In float64: 1 − ᾱ loses all digits at the clean end.
+        kept, own, counted = signal.cpu().double()[:, None], variances.cpu().double(), importance.cpu().double()
+        total = kept * own + 1 - kept
+        left = own * (1 - kept) / total
+        self.into.copy_(total.rsqrt())
+        self.skip.copy_(kept.sqrt() * own / total)
+        self.out.copy_(left.sqrt())
+        self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
+
+    def clean(self, noisy: Coordinates, features: Coordinates, step: Int[Tensor, " batch"]) -> Coordinates:
+        """The prediction of clean motion from the noisy one and what the network says of it."""
+        return self.skip[step][:, None] * noisy + self.out[step][:, None] * features

@@ -1,0 +1,238 @@
+"""Noise and network in principal components: exact for Gaussian motion, and the same distances as on the vertices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import Trainer
+from torch import Tensor
+
+from facediff import registry
+from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion, load_model
+from facediff.models.losses import preconditioned_losses
+from facediff.models.motion_space import ComponentMotion, Preconditioning
+from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler, half_hidden
+from tests.fakes.tiny import Tiny
+
+Make = Callable[..., Any]
+VARIANCES = torch.tensor([9.0, 1.0, 0.04])
+
+
+def motion(frames: int = 300, vertices: int = 6, rank: int = 5) -> Tensor:
+    """Scaled motion of a few degrees of freedom with a mean, (1, frames, vertices, 3)."""
+    random = torch.Generator().manual_seed(4)
+    amounts = torch.randn(frames, rank, generator=random) * torch.tensor([3.0, 1.0, 0.5, 0.2, 0.1])[:rank]
+    shapes = torch.linalg.qr(torch.randn(3 * vertices, rank, generator=random))[0].T
+    return (amounts @ shapes + 0.3 * torch.randn(3 * vertices, generator=random)).view(1, frames, vertices, 3)
+
+
+def components(x: Tensor, weights: Tensor | None = None, **options: Any) -> ComponentMotion:  # noqa: ANN401
+    """A space that knows motion, by a singular value decomposition."""
+    space = ComponentMotion(n_vertices=x.shape[2], steps=1000, **options)
+    flat = x[0].flatten(1)
+    weights = torch.ones(flat.shape[1]) if weights is None else weights
+    _, sizes, shapes = torch.linalg.svd((flat - flat.mean(0)) * weights, full_matrices=False)
+    space.attach(flat.mean(0), (sizes[:, None] * shapes / len(flat) ** 0.5)[: space.coordinates], weights)
+    return space
+
+
+@pytest.mark.parametrize("whitening", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_components_of_the_motions_own_rank_lose_nothing(whitening: float, weighted: bool) -> None:
+    x = motion()
+    weights = torch.linspace(0.5, 4, 18) if weighted else None
+    space = components(x, weights, count=5, whitening=whitening)
+    torch.testing.assert_close(space.decode(space.encode(x)), x, rtol=1e-4, atol=1e-4)
+    assert space.encode(x).mean(1).abs().max() < 1e-4
+    torch.testing.assert_close(space.encode(x).var(1, unbiased=False)[0], space.sizes.square(), rtol=1e-3, atol=0)
+
+
+def test_more_components_than_the_motion_has_change_nothing() -> None:
+    x = motion()
+    space = components(x, count=40)
+    torch.testing.assert_close(space.decode(space.encode(x)), x, rtol=1e-4, atol=1e-4)
+    assert space.sizes.isfinite().all()
+
+
+def test_without_whitening_distances_are_those_of_the_vertices() -> None:
+    x = motion()
+    z = components(x, count=5, whitening=0.0).encode(x)
+    z, x = z.double(), x.double()
+    between = torch.cdist(z[0, :40], z[0, :40])
+    torch.testing.assert_close(between, torch.cdist(x[0, :40].flatten(1), x[0, :40].flatten(1)), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("whitening", "ratio"), [(0.0, 15.0), (0.5, 15.0**0.5), (1.0, 1.0)])
+def test_whitening_brings_the_sizes_of_components_together(whitening: float, ratio: float) -> None:
+    sizes = components(motion(20_000), count=4, whitening=whitening).sizes
+    assert float(sizes[0] / sizes[3]) == pytest.approx(ratio, rel=0.05)
+
+
+@pytest.mark.parametrize("whitening", [0.0, 0.5, 1.0])
+def test_losses_weigh_components_as_their_vertices(whitening: float) -> None:
+    x = motion()
+    other = x + 0.1 * (x - x.mean(1, keepdim=True)).flip(1)  # within the components
+    space = components(x, count=5, whitening=whitening)
+    space.fit(NoiseProcess().signal)
+    squared = (space.encode(other) - space.encode(x)).square() * space.preconditioning.loss[500]
+    error = (other - x).square().sum((2, 3))[0]
+    ratio = squared.sum(-1)[0] / error
+    assert float(ratio.std() / ratio.mean()) < 1e-3
+
+
+def test_motion_that_never_changes_has_no_components() -> None:
+    with pytest.raises(FaceDiffError, match="motion_space"):
+        components(torch.zeros(1, 5, 6, 3), count=3)
+
+
+def gaussian(process: NoiseProcess) -> Preconditioning:
+    made = Preconditioning(process.steps, len(VARIANCES))
+    made.fit(process.signal, VARIANCES, torch.ones(3))
+    return made
+
+
+@pytest.mark.parametrize("step", [0, 300, 999])
+def test_a_silent_network_gives_the_posterior_mean_of_gaussian_motion(step: int) -> None:
+    process = NoiseProcess()
+    kept, own = float(process.signal.double()[step]), VARIANCES.double().numpy()
+    noisy = np.array([[[1.5, -0.7, 0.2]]])
+    # Regression of x on y = √ᾱ x + √(1 − ᾱ) ε: cov(x, y) / var(y); what is left is var(x) − cov² / var(y).
+    covariance, variance = np.sqrt(kept) * own, kept * own + 1 - kept
+    scales = gaussian(process)
+    found = scales.clean(torch.from_numpy(noisy).float(), torch.zeros(1, 1, 3), torch.tensor([step]))
+    np.testing.assert_allclose(found.numpy(), covariance / variance * noisy, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(scales.out[step].numpy() ** 2, own - covariance**2 / variance, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(scales.into[step].numpy() ** 2 * variance, 1, rtol=1e-4)
+    assert float((scales.loss[step] * scales.out[step] ** 2).sum()) == pytest.approx(1, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("sampler", "tolerance"),
+    [
+        (lambda process: DdpmSampler(process=process), 0.02),
+        (lambda process: DdimSampler(process=process, steps=200), 0.08),
+        (lambda process: DpmSolverSampler(process=process, steps=200), 0.02),
+        (lambda process: DdpmSampler(process=process, steps=50), 0.15),
+    ],
+)
+def test_sampling_with_a_silent_network_gives_gaussian_motion(
+    sampler: Callable[[NoiseProcess], Sampler], tolerance: float
+) -> None:
+    process = NoiseProcess()
+    scales = gaussian(process)
+    random = torch.Generator().manual_seed(0)
+
+    def noise(like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=random)
+
+    def denoise(noisy: Tensor, step: int) -> Tensor:
+        return scales.clean(noisy, torch.zeros_like(noisy), torch.full((len(noisy),), step))
+
+    sample = sampler(process).run(denoise, noise(torch.empty(20, 1000, 3)), noise=noise)
+    deviations = sample.flatten(0, 1).std(0) / VARIANCES.sqrt()
+    assert (deviations - 1).abs().max() < tolerance
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.5, 3.0])
+def test_noise_scale_is_motion_of_another_size(scale: float) -> None:
+    plain, scaled = NoiseProcess(), NoiseProcess(scale=scale)
+    clean, noise = torch.randn(4, 7), torch.randn(4, 7)
+    steps = torch.tensor([0, 400, 700, 999])
+    kept = plain.signal[steps, None]
+    total = (scale**2 * kept + 1 - kept).sqrt()
+    torch.testing.assert_close(
+        scaled.add_noise(clean, noise, steps),
+        plain.add_noise(scale * clean, noise, steps) / total,
+        rtol=1e-4,
+        atol=1e-5,
+    )
+    torch.testing.assert_close(
+        torch.cumprod(1 - scaled.variances.double(), 0).float(), scaled.signal, rtol=2e-2, atol=0
+    )
+
+
+def test_the_noise_scale_hides_half_of_the_variance() -> None:
+    variances = torch.tensor([900.0, 30.0, 2.0, 0.1])
+    scale = half_hidden(variances)
+    shown = scale**2 * variances / (scale**2 * variances + 1)
+    assert float((variances * shown).sum() / variances.sum()) == pytest.approx(0.5, abs=1e-5)
+    assert half_hidden(4 * variances) == pytest.approx(scale / 2)
+    # White motion of which the components count differently.
+    assert half_hidden(torch.ones(4), variances) == pytest.approx(1.0)
+
+
+def test_preconditioned_losses_are_their_formulas_and_padding_never_counts() -> None:
+    random = np.random.default_rng(0)
+    gaps, weight = [random.standard_normal((frames, 3)) for frames in (7, 4)], random.uniform(0.5, 2, (2, 3))
+    expected = {}
+    for order, name in enumerate(("reconstruction", "velocity", "acceleration")):
+        terms = [(np.diff(gap, n=order, axis=0) ** 2 * w).sum(1) for gap, w in zip(gaps, weight, strict=True)]
+        expected[name] = np.concatenate(terms).mean()
+    padded = torch.full((2, 9, 3), 1e3)
+    for row, gap in zip(padded, gaps, strict=True):
+        row[: len(gap)] = torch.from_numpy(gap)
+    mask = torch.arange(9) < torch.tensor([[7], [4]])
+    weights = {"reconstruction": 1.0, "velocity": 2.0, "acceleration": 0.5, "face": 9.0}
+    found = preconditioned_losses(padded, torch.zeros_like(padded), mask, torch.from_numpy(weight).float(), weights)
+    for name, value in expected.items():
+        assert float(found[name]) == pytest.approx(value, rel=1e-5)
+    assert float(found["loss"]) == pytest.approx(
+        sum(weights[name] * value for name, value in expected.items()), rel=1e-5
+    )
+
+
+SPACE = partial(registry.motion_space.components, count=6)
+
+
+@pytest.fixture
+def trained(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) -> DualPathDiffusion:
+    model: DualPathDiffusion = make_model(motion_space=SPACE, noise_scale="auto", learning_rate=1e-2)
+    make_trainer(max_epochs=2).fit(model, datamodule=tiny)
+    return model.eval()
+
+
+def test_training_measures_components_and_noise_scale(trained: DualPathDiffusion, tiny: Tiny) -> None:
+    space = trained.motion_space
+    assert isinstance(space, ComponentMotion)
+    mean, shapes = tiny.principal_motion(6)
+    torch.testing.assert_close(space.mean, mean * trained.scale)
+    torch.testing.assert_close(space.deviations[0], shapes[0].norm() * trained.scale)
+    variances = space.sizes.square() * trained.process.scale**2
+    share = space.deviations.square() / space.deviations.square().sum()
+    assert float((share * variances / (variances + 1)).sum()) == pytest.approx(0.5, abs=0.02)
+    assert trained.sampler.process is trained.process
+    torch.testing.assert_close(space.preconditioning.skip[0, :2], torch.ones(2), rtol=0.2, atol=0)
+
+
+def test_a_checkpoint_animates_as_the_model_that_wrote_it(
+    trained: DualPathDiffusion, make_trainer: Callable[..., Trainer], tiny: Tiny, tmp_path: Path
+) -> None:
+    trainer = make_trainer()
+    trainer.strategy.connect(trained)
+    trainer.save_checkpoint(tmp_path / "model.ckpt")
+    loaded = load_model(tmp_path / "model.ckpt")
+    assert isinstance(loaded, DualPathDiffusion)
+    assert loaded.process.scale == trained.process.scale != 1
+    speech = torch.randn(16_000, generator=torch.Generator().manual_seed(0))
+    identity = trained.identities[0]
+    first, second = (model.animate(speech, identity=identity, seed=3).vertices for model in (trained, loaded))
+    torch.testing.assert_close(first, second)
+    assert not torch.equal(first, trained.animate(speech, identity=identity, seed=4).vertices)
+
+
+def test_the_upper_face_can_count_more(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) -> None:
+    model: DualPathDiffusion = make_model(motion_space=partial(SPACE, upper_face_weight=3.0))
+    make_trainer().fit(model, datamodule=tiny)
+    space = model.motion_space
+    assert isinstance(space, ComponentMotion)
+    weights = space.weights.view(-1, 3)
+    upper = model.assets.regions["upper_face"]
+    assert (weights[upper] == 3).all()
+    assert int((weights == 3).sum()) == 3 * len(upper)
