@@ -13,9 +13,14 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.arrays import in_range
+from facediff.utils.limits import COORDINATE, FRAME_RATES, SAMPLE_RATES, brief, check_number
 
 MAPPED_BYTES = 1 << 26  # How much of a memory map is read before its pages are released
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+OUT_OF_RANGE = f"NaN, infinity or a coordinate beyond {COORDINATE:g}"
+UNITS = (1e-9, 1e9)
+"""Metres that a unit of length may have."""
 _ABOUT = re.compile(r"about ([0-9.]+) mm\b")
 
 
@@ -38,8 +43,11 @@ def metres_per_unit(unit: str) -> float:
         value = float(about[1]) / 1000 if about else METRES.get(unit) or float(unit)
     except ValueError:
         value = 0.0
-    if not 0 < value < float("inf"):
-        raise FaceDiffError(f'unit "{unit}": expected one of {", ".join(METRES)}, or a number of metres above 0')
+    if not UNITS[0] <= value <= UNITS[1]:
+        raise FaceDiffError(
+            f'unit "{brief(unit) if unit else ""}": expected one of {", ".join(METRES)}, or a number of metres from '
+            f"{UNITS[0]:g} to {UNITS[1]:g}"
+        )
     return value
 
 
@@ -63,7 +71,7 @@ class Animation:
         metadata: text about how it was made: identity, style, what in it is procedural …
 
     Raises:
-        FaceDiffError: if the arrays do not fit one another, or there is no frame.
+        FaceDiffError: if the arrays do not fit one another, there is no frame, or a number is out of range.
 
     Example:
         >>> template = np.zeros((4, 3), np.float32)
@@ -101,12 +109,17 @@ class Animation:
                 f"{self.name}: its triangles name vertex {int(self.faces.max())} of {shape[1]}; give the mesh that the "
                 f"motion was made for"
             )
-        if not 0 < self.frame_rate <= 1000:
+        if self.colours is not None and self.colours.shape != (shape[1], 3):
             raise FaceDiffError(
-                f"{self.name}: frame rate {self.frame_rate:g} is impossible; expected e.g. 25, 30 or 60"
+                f"{self.name}: has {shape[1]} vertices and colours of shape {self.colours.shape}; give the mesh that "
+                f"the motion was made for"
             )
-        if self.sample_rate < 1:
-            raise FaceDiffError(f"{self.name}: sample rate {self.sample_rate} is impossible; expected e.g. 16000")
+        if not in_range(self.template):
+            raise FaceDiffError(f"{self.name}: its template holds {OUT_OF_RANGE}; give another one")
+        if self.speech is not None and not np.isfinite(self.speech).all():
+            raise FaceDiffError(f"{self.name}: its speech holds NaN or infinity; give another recording")
+        check_number(self.name, "frame rate", self.frame_rate, *FRAME_RATES)
+        check_number(self.name, "sample rate", self.sample_rate, *SAMPLE_RATES, whole=True)
         metres_per_unit(self.unit)
 
     @property
@@ -141,11 +154,11 @@ class Animation:
         """Check every frame.
 
         Raises:
-            FaceDiffError: naming the first frame that holds NaN or infinity.
+            FaceDiffError: naming the first frame that holds NaN, infinity or something near it.
         """
         for index, frame in enumerate(self.frames()):
-            if not np.isfinite(frame).all():
-                raise FaceDiffError(f"{self.name}: frame {index} holds NaN or infinity; generate the motion again")
+            if not in_range(frame):
+                raise FaceDiffError(f"{self.name}: frame {index} holds {OUT_OF_RANGE}; generate the motion again")
 
     def sound(self) -> npt.NDArray[np.float32] | None:
         """The speech (S,) as long as the motion: cut, or padded with silence; None for a silent animation."""

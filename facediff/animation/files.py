@@ -3,31 +3,41 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypedDict, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation.animation import Animation
+from facediff.animation.animation import OUT_OF_RANGE, Animation
 from facediff.errors import FaceDiffError
-from facediff.utils.arrays import open_vertices, read_arrays
+from facediff.utils.arrays import in_range, open_vertices, read_arrays
 from facediff.utils.files import atomic, parse_json
+from facediff.utils.limits import FRAME_RATES, LIMITS, SAMPLE_RATES, check_format, check_number, quoted
+
+T = TypeVar("T")
 
 FORMAT = "facediff take 1"
 """Marks an archive. The word is older than the class :class:`Animation`; it stays, so that old and new files agree."""
 
-ARRAYS: dict[str, tuple[str, str, tuple[int | None, ...]]] = {
-    "vertices": ("f", "floating point (frames, vertices, 3)", (None, None, 3)),
-    "template": ("f", "floating point (vertices, 3)", (None, 3)),
-    "faces": ("iu", "whole numbers (triangles, 3)", (None, 3)),
-    "speech": ("f", "floating point (samples,)", (None,)),
-    "colours": ("u", "bytes (vertices, 3)", (None, 3)),
-    "inner_lip_pairs": ("iu", "whole numbers (pairs, 2)", (None, 2)),
+ARRAYS: dict[str, tuple[str, str, tuple[int | None, ...], type[np.generic]]] = {
+    "vertices": ("f", "floating point (frames, vertices, 3)", (None, None, 3), np.float32),
+    "template": ("f", "floating point (vertices, 3)", (None, 3), np.float32),
+    "faces": ("iu", "whole numbers (triangles, 3)", (None, 3), np.int32),
+    "speech": ("f", "floating point (samples,)", (None,), np.float32),
+    "colours": ("u", "bytes (vertices, 3)", (None, 3), np.uint8),
+    "inner_lip_pairs": ("iu", "whole numbers (pairs, 2)", (None, 2), np.int64),
 }
-"""The arrays of an archive: kinds of number, in words, and lengths of the axes."""
+"""An archive's arrays: kinds of number, in words, lengths of the axes, and the type that :class:`Animation` has."""
+
+REGION = ("iu", "whole numbers (vertices,)", (None,), np.int64)
+"""The same of each region."""
+
+OF_ARCHIVE = re.compile(f"about|region_.*|{'|'.join(ARRAYS)}")
+"""The entries of an archive; any others are not read."""
 
 OF_TOPOLOGY = ("template", "faces", "colours", "inner_lip_pairs")
 """Facts that hold for one topology only, as regions do."""
@@ -66,16 +76,27 @@ def read_animation(
     if path.suffix == ".npz":
         animation = read_archive(path)
         facts = complete(complete(overrides, facts_of(animation)), defaults)
-        return replace(animation, **facts)
+        return _named(path, lambda: replace(animation, **facts))
     if path.suffix != ".npy":
         raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a motion in .npz or .npy')
-    vertices = open_vertices(path).astype(np.float32, copy=False)
+    with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused before it is used
+        vertices = open_vertices(path).astype(np.float32, copy=False)
     facts = complete(overrides, defaults)
     if "frame_rate" not in facts:
         raise FaceDiffError(f"{path}: an array has no frame rate; give --frame-rate or --checkpoint")
     if "template" not in facts:
+        if not in_range(vertices[0]):
+            raise FaceDiffError(f"{path}: frame 0 holds {OUT_OF_RANGE}; generate the motion again")
         facts = {**facts, "template": np.array(vertices[0], np.float32)}
-    return Animation(name=path.stem, vertices=vertices, **facts)
+    return _named(path, lambda: Animation(name=path.stem, vertices=vertices, **facts))
+
+
+def _named(path: Path, make: Callable[[], T]) -> T:
+    """What a function makes of a file; errors name the file instead of the animation."""
+    try:
+        return make()
+    except FaceDiffError as error:
+        raise FaceDiffError(f"{path}: {error}") from error
 
 
 def facts_of(animation: Animation) -> AnimationFacts:
@@ -136,39 +157,70 @@ def read_archive(path: Path) -> Animation:
     expected = "expected an animation that `facediff animate … -o hello.npz` wrote"
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; {expected}")
-    arrays: dict[str, Any] = {**read_arrays(path)}
+    arrays = read_arrays(path, _Entries())
     missing = [name for name in ("vertices", "template", "about") if name not in arrays]
     if missing:
         raise FaceDiffError(f"{path}: has no {', '.join(missing)}; {expected}")
-    try:
-        about = parse_json(str(arrays["about"]), f"{path}: its entry about", remedy="write the file again")
-        facts: dict[str, Any] = {
-            "name": str(about["name"]),
-            "frame_rate": float(about["frame_rate"]),
-            "unit": str(about["unit"]),
-            "sample_rate": int(about["sample_rate"]),
-            "metadata": {str(key): str(value) for key, value in about["metadata"].items()},
-        }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise FaceDiffError(
-            f"{path}: its entry about is not what facediff writes ({error!r}); write the file again"
-        ) from error
-    regions = {name.removeprefix("region_"): arrays[name] for name in arrays if name.startswith("region_")}
-    for name in ARRAYS.keys() & arrays.keys():
-        array, (kinds, words, lengths) = arrays[name], ARRAYS[name]
-        fits = array.ndim == len(lengths) and all(
-            wanted in (None, length) for length, wanted in zip(array.shape, lengths, strict=True)
-        )
-        if array.dtype.kind not in kinds or not (fits or not array.size):  # an empty array may have any shape
-            raise FaceDiffError(
-                f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {words}; write the file again"
-            )
-    indices = regions if "inner_lip_pairs" not in arrays else {**regions, "inner_lip_pairs": arrays["inner_lip_pairs"]}
-    count = len(arrays["template"])
-    for name, array in indices.items():
-        if array.size and (array.dtype.kind not in "iu" or not 0 <= array.min() <= array.max() < count):
-            raise FaceDiffError(f"{path}: its {name} names vertices other than 0 to {count - 1}; write the file again")
-    return Animation(**{name: arrays[name] for name in ARRAYS if name in arrays}, regions=regions, **facts)
+    facts = _about(arrays.pop("about"), f"{path}: its entry about")
+    count = len(np.atleast_1d(arrays["template"]))
+    checked = {name: _checked(path, name, array, count) for name, array in arrays.items()}
+    LIMITS.check("frames", len(checked["vertices"]), path)
+    LIMITS.check("vertices", count, path)
+    LIMITS.check("seconds", len(checked["vertices"]) / facts["frame_rate"], path)
+    regions = {name.removeprefix("region_"): array for name, array in checked.items() if name.startswith("region_")}
+    parts: dict[str, Any] = {name: checked[name] for name in ARRAYS if name in checked and checked[name].size}
+    animation = _named(path, lambda: Animation(**parts, regions=regions, **facts))
+    _named(path, animation.refuse_not_finite)
+    return animation
+
+
+class _Entries:
+    """The names of an archive's entries."""
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and OF_ARCHIVE.fullmatch(name) is not None
+
+
+def _about(array: npt.NDArray[Any], source: str) -> dict[str, Any]:
+    """The facts of an archive that are no arrays."""
+    remedy = "write the file again"
+    if array.dtype.kind != "U" or array.ndim:
+        raise FaceDiffError(f"{source} is {array.dtype} of shape {array.shape}; expected JSON; {remedy}")
+    about = parse_json(str(array), source, remedy=remedy)
+    if not isinstance(about, dict):
+        raise FaceDiffError(f"{source} is {quoted(about)}; expected an object; {remedy}")
+    check_format(source, about.get("format"), FORMAT)
+    metadata = about.get("metadata")
+    texts = [about.get("name"), about.get("unit"), *(metadata.values() if isinstance(metadata, dict) else [None])]
+    if not all(isinstance(text, str) for text in texts):
+        raise FaceDiffError(f"{source} lacks its name, its unit or its metadata, which are texts; {remedy}")
+    numbers = {
+        "frame_rate": check_number(source, "frame_rate", about.get("frame_rate"), *FRAME_RATES, remedy=remedy),
+        "sample_rate": int(
+            check_number(source, "sample_rate", about.get("sample_rate"), *SAMPLE_RATES, whole=True, remedy=remedy)
+        ),
+    }
+    return {"name": about["name"], "unit": about["unit"], "metadata": metadata, **numbers}
+
+
+def _checked(path: Path, name: str, array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
+    """One array of an archive in the type that :class:`Animation` has; indices name one of ``count`` vertices."""
+    kinds, words, lengths, wanted = ARRAYS.get(name, REGION)
+    remedy = "write the file again"
+    fits = array.ndim == len(lengths) and all(
+        length in (None, found) for found, length in zip(array.shape, lengths, strict=True)
+    )
+    if not array.size and name not in ("vertices", "template"):
+        return np.zeros([length or 0 for length in lengths], wanted)  # an empty array may have any shape
+    if array.dtype.kind not in kinds or not fits:
+        raise FaceDiffError(f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {words}; {remedy}")
+    if kinds == "f":
+        with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+            return array.astype(wanted, copy=False)
+    last = 255 if name == "colours" else count - 1
+    if not 0 <= array.min() <= array.max() <= last:
+        raise FaceDiffError(f"{path}: its {name} hold numbers other than 0 to {last}; {remedy}")
+    return array.astype(wanted, copy=False)
 
 
 class MotionWriter:

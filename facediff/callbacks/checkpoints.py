@@ -29,6 +29,7 @@ from lightning.pytorch.trainer.states import RunningStage
 
 from facediff.callbacks.runs import JOB_FILE, LAST, STATE_KEY, ResumableCSVLogger, logger_versions, run_folder
 from facediff.errors import FaceDiffError
+from facediff.models.checkpoint import read_checkpoint
 from facediff.registry import Range, checks_arguments
 from facediff.utils.files import atomic
 
@@ -64,6 +65,16 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                 f"{target}: cannot be written ({str(error).splitlines()[0]}); the previous file, if any, is unchanged. "
                 f"Free some disk space and repeat the command; `facediff fit` continues with --ckpt_path last"
             ) from error
+
+    def load_checkpoint(
+        self, path: str | os.PathLike[str], map_location: object = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """Read a file by the door that every checkpoint goes through; nothing in it can ask for a less safe one.
+
+        Raises:
+            FaceDiffError: if it is no checkpoint of facediff's, or names anything that is not known.
+        """
+        return read_checkpoint(path)
 
 
 class Stopped(SystemExit):

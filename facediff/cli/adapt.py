@@ -100,11 +100,10 @@ def adaptation_data(
     checkpoint: Path, content: dict[str, Any], person: str, mode: Mode, data_root: Path | None
 ) -> tuple[str, SpeechMotionDataModule]:
     """The new speaker's name, and the checkpoint's data module with that speaker put first."""
-    from facediff.data.batch import DATA_SOURCE_KEY
     from facediff.data.datamodule import person_name
-    from facediff.models.checkpoint import corpus_class, corpus_options
+    from facediff.models.checkpoint import corpus_of
 
-    module, options = corpus_class(checkpoint, content[DATA_SOURCE_KEY]), corpus_options(content)
+    module, options = corpus_of(checkpoint, content)
     if data_root is not None:
         options["root"] = str(data_root)
     folder = Path(person)

@@ -151,10 +151,10 @@ def words_of_checkpoint(name: str, path: Path, words: Sequence[str]) -> list[str
     import yaml
 
     from facediff.cli.lightning_cli import LINKS
-    from facediff.data.batch import DATA_SOURCE_KEY
-    from facediff.models.checkpoint import corpus_class, corpus_options, read_checkpoint
+    from facediff.models.checkpoint import build_model, corpus_of, read_checkpoint
 
     checkpoint = read_checkpoint(path)
+    build_model(path, checkpoint)  # what Lightning would stumble over is reported before it starts
     if name == "fit":
         return []
     given = [word for word in words if re.match(rf"--model(?!\.(init_args\.)?({'|'.join(FREE)})\b)\b", word)]
@@ -167,9 +167,6 @@ def words_of_checkpoint(name: str, path: Path, words: Sequence[str]) -> list[str
     options = {key: value for key, value in hparams.items() if not key.startswith("_") and key not in LINKS}
     config = {"seed_everything": 0, "model": {"class_path": hparams["_class_path"], "init_args": options}}
     if value_of(words, "--data") is None:
-        corpus = corpus_class(path, checkpoint[DATA_SOURCE_KEY])
-        config["data"] = {
-            "class_path": f"{corpus.__module__}.{corpus.__qualname__}",
-            "init_args": corpus_options(checkpoint),
-        }
+        corpus, arguments = corpus_of(path, checkpoint)
+        config["data"] = {"class_path": f"{corpus.__module__}.{corpus.__qualname__}", "init_args": arguments}
     return ["--config", yaml.safe_dump(config, sort_keys=False)]

@@ -6,9 +6,10 @@ template, in the corpus's unit of length. Tensors are padded with zeros; lengths
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -16,6 +17,8 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from facediff.errors import FaceDiffError
+from facediff.utils.limits import FRAME_RATES, LIMITS, check_number, quoted
+from facediff.utils.plain_options import is_name
 
 UNKNOWN_IDENTITY = -1
 
@@ -268,6 +271,82 @@ class Assets:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> Assets:
-        """The inverse of :meth:`state`."""
+        """The inverse of :meth:`state`.
+
+        Raises:
+            FaceDiffError: naming the field that is missing, of another type, or does not fit the others. A checkpoint
+                may come from anybody, and these fields reach meshes, file names and sizes of arrays.
+        """
+        known = {each.name for each in fields(cls)}
+        if not isinstance(state, dict) or state.keys() != known:
+            odd = sorted(map(str, known ^ state.keys())) if isinstance(state, dict) else []
+            raise FaceDiffError(
+                f"its assets are not those of this version of facediff (different: {quoted(odd)}); train it again"
+            )
+        names = state["identities"]
+        if not isinstance(names, list) or not names or not all(map(is_name, names)) or len(set(names)) < len(names):
+            raise _bad("identities", names, "a list of different names without path separators")
+        LIMITS.check("identities", len(names), "assets")
+        for key in ("templates", "regions", "references"):
+            if not isinstance(state[key], dict) or not all(map(is_name, state[key])):
+                raise _bad(key, state[key], "a dict by name")
+            LIMITS.check("identities", len(state[key]), f"assets {key}")
+        for key in ("corpus", "unit"):
+            if not is_name(state[key]):
+                raise _bad(key, state[key], "a short text")
+        if not isinstance(state["synthetic"], bool):
+            raise _bad("synthetic", state["synthetic"], "true or false")
+        check_number("assets", "frame_rate", state["frame_rate"], *FRAME_RATES)
+        if state["motion_scale"] is not None:
+            check_number("assets", "motion_scale", state["motion_scale"], sys.float_info.min)
+        cls._check_tensors(state)
         references = {name: Reference(clip, motion) for name, (clip, motion) in state["references"].items()}
         return cls(**{**state, "references": references})
+
+    @staticmethod
+    def _check_tensors(state: dict[str, Any]) -> None:
+        """Refuse tensors of the wrong shape or type, not finite, or with indices of vertices that do not exist."""
+        sizes = {len(t) for t in state["templates"].values() if isinstance(t, Tensor) and t.ndim == 2}
+        if len(sizes) != 1 or not min(sizes):
+            raise _bad("templates", state["templates"], "a neutral face of equally many vertices for every speaker")
+        (count,) = sizes
+        LIMITS.check("vertices", count, "assets templates")
+        for name, template in state["templates"].items():
+            _check_tensor(f"templates[{name}]", template, (count, 3))
+        for name, reference in state["references"].items():
+            if not isinstance(reference, list | tuple) or len(reference) != 2 or not is_name(reference[0]):
+                raise _bad(f"references[{name}]", reference, "a clip's name and its motion")
+            _check_tensor(f"references[{name}]", reference[1], (None, count, 3))
+            if not len(reference[1]):
+                raise _bad(f"references[{name}]", reference, "a motion of at least one frame")
+        for name in {"lips", "upper_face"} - state["regions"].keys():
+            raise FaceDiffError(f"its assets have no region {name}; train the model again with `facediff fit`")
+        for name, region in state["regions"].items():
+            _check_tensor(f"regions[{name}]", region, (None,), below=count)
+        for name, shape in (("faces", (None, 3)), ("inner_lip_pairs", (None, 2))):
+            if state[name] is not None:
+                _check_tensor(name, state[name], shape, below=count)
+        if state["colours"] is not None:
+            _check_tensor("colours", state["colours"], (count, 3), below=256)
+
+
+def _check_tensor(name: str, value: object, shape: tuple[int | None, ...], *, below: int | None = None) -> None:
+    """Refuse anything but a finite tensor of a shape (None: any size), or of indices ``below`` a number."""
+    wanted = ", ".join("any" if size is None else str(size) for size in shape)
+    kind = "finite numbers" if below is None else f"whole numbers from 0 to {below - 1}"
+    fits = isinstance(value, Tensor) and value.layout == torch.strided and value.ndim == len(shape)
+    if not fits or any(size not in (None, own) for size, own in zip(shape, value.shape, strict=True)):  # type: ignore[attr-defined]
+        raise _bad(name, value, f"{kind} of the shape ({wanted})")
+    tensor = cast(Tensor, value)
+    if below is None:
+        good = tensor.is_floating_point() and bool(tensor.isfinite().all())
+    else:
+        good = not tensor.is_floating_point() and not tensor.is_complex() and tensor.dtype != torch.bool
+        good = good and (not tensor.numel() or (int(tensor.min()) >= 0 and int(tensor.max()) < below))
+    if not good:
+        raise _bad(name, value, f"{kind} of the shape ({wanted})")
+
+
+def _bad(name: str, value: object, expected: str) -> FaceDiffError:
+    shown = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else quoted(value)
+    return FaceDiffError(f"its assets' {name} is {shown}; expected {expected}. The file is damaged")

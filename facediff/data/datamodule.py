@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import IO, Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -30,6 +30,8 @@ from facediff.data.dataset import (
 )
 from facediff.errors import FaceDiffError
 from facediff.registry import Range, defaults, keeps_arguments, plain
+from facediff.utils.plain_options import read_options
+from facediff.utils.torch_files import load_tensors, open_checkpoint
 
 FRAMES = 16
 """Frames of each training clip, evenly spread, from which size and principal components of motion are measured."""
@@ -167,6 +169,28 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def keep_hyperparameters(self, given: dict[str, Any]) -> None:
         """Save the constructor's arguments as plain data, so that checkpoints load with ``weights_only=True``."""
         self.save_hyperparameters(plain({**defaults(type(self)), **given}))
+
+    @classmethod
+    def load_from_checkpoint(
+        cls,
+        checkpoint_path: str | Path | IO[bytes],
+        *arguments: Any,  # noqa: ANN401
+        **options: Any,  # noqa: ANN401
+    ) -> Self:
+        """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's.
+
+        Raises:
+            FaceDiffError: if the file is no checkpoint, or its options are not plain values of this class's.
+        """
+        with open_checkpoint(checkpoint_path) as (stream, path):
+            content = load_tensors(stream, path)
+            given = content.get("datamodule_hyper_parameters") if isinstance(content, dict) else None
+            if not isinstance(given, dict):
+                raise FaceDiffError(f"{path}: holds no options of a data module; expected a file of `facediff fit`")
+            read_options(str(path), cls, given, {})
+            stream.seek(0)
+            made: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
+        return made
 
     # What a corpus adds.
 

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
-from facediff.errors import FaceDiffError
 from facediff.render.rasteriser import face_outward, to_linear, vertex_normals
 
 Up = Literal["y", "z"]
@@ -157,13 +156,6 @@ def check_animation(animation: Animation, *, needs_mesh: bool = True) -> None:
         FaceDiffError: naming the animation and what is wrong with it.
     """
     animation.refuse_not_finite()
-    if not np.isfinite(animation.template).all():
-        raise FaceDiffError(f"{animation.name}: its template holds NaN or infinity; give a mesh without them")
-    if animation.colours is not None and animation.colours.shape != animation.template.shape:
-        raise FaceDiffError(
-            f"{animation.name}: its vertex colours have shape {animation.colours.shape}; expected "
-            f"{animation.template.shape}"
-        )
     if needs_mesh:
         _ = animation.triangles
 
@@ -206,16 +198,10 @@ def folder_of(path: Path) -> Path:
 
 
 def speech_wav(animation: Animation) -> bytes | None:
-    """The speech as a .wav file of 16 bits, exactly as long as the motion; None for a silent animation.
-
-    Raises:
-        FaceDiffError: if the speech is not finite.
-    """
+    """The speech as a .wav file of 16 bits, exactly as long as the motion; None for a silent animation."""
     sound = animation.sound()
     if sound is None:
         return None
-    if not np.isfinite(sound).all():
-        raise FaceDiffError(f"{animation.name}: its speech holds NaN or infinity; read the recording again")
     # Readers divide by 32768, so that a 16-bit recording comes back bit by bit.
     data = np.clip(np.rint(sound * 32768), -32768, 32767).astype("<i2").tobytes()
     rate = animation.sample_rate

@@ -238,6 +238,8 @@ class HubertEncoder(AudioEncoder):
         MissingExtraError: if transformers is not installed.
     """
 
+    checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere
+
     def __init__(
         self,
         *,
@@ -379,7 +381,9 @@ def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
     except ImportError as error:
         raise MissingExtraError("transformers", "train", "the hubert audio encoder") from error
     if config is not None:
-        return HubertModel(HubertConfig.from_dict(config))
+        # A configuration may name code on the hub (an attention kernel, a model class) in keys of its own.
+        known = HubertConfig().to_dict()
+        return HubertModel(HubertConfig.from_dict({key: value for key, value in config.items() if key in known}))
     # A path that does not exist would be taken for a name on the hub and fail with a puzzling message.
     if (source.startswith((".", "/", "~")) or source.count("/") > 1) and not Path(source).expanduser().is_dir():
         raise FaceDiffError(

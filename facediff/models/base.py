@@ -10,7 +10,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import IO, Annotated, Any, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -373,3 +374,21 @@ class AnimationModel(LightningModule, Inference, ABC):
         if ASSETS_KEY in checkpoint:
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
             self.data_source = checkpoint.get(DATA_SOURCE_KEY, {})
+
+    @classmethod
+    def load_from_checkpoint(
+        cls,
+        checkpoint_path: str | Path | IO[bytes],
+        *arguments: Any,  # noqa: ANN401
+        **options: Any,  # noqa: ANN401
+    ) -> Self:
+        """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's.
+
+        Raises:
+            FaceDiffError: as :func:`facediff.models.checkpoint.read_checkpoint`.
+        """
+        from facediff.models.checkpoint import checked_file
+
+        with checked_file(checkpoint_path) as stream:
+            made: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
+        return made

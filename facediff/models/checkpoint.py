@@ -1,25 +1,49 @@
-"""Opening checkpoints: an untrusted file becomes a model that is ready for inference.
+"""The one door into a checkpoint: an untrusted file becomes a model that is ready for inference.
 
-A checkpoint is read as plain data (``weights_only=True``). The classes that it names (model, components, corpus) must
-be registered, or be imported already; nothing is imported because a file asks for it.
+Every command and every method that loads a checkpoint comes through here, before Lightning or jsonargparse see any of
+it. In this order, and before anything is imported or allocated because the file asks for it:
+
+1. The archive's directory and the sizes of all tensors agree and stay within the budget
+   (:mod:`facediff.utils.torch_files`); the content is tensors and plain data (``weights_only=True``).
+2. The model, its components and the data module are classes that are registered, or imported already.
+3. Their options are plain values of the types that the constructors ask for
+   (:mod:`facediff.utils.plain_options`): nothing that could be imported, opened as a config, fetched from another
+   machine or resolved as ``${…}``.
+4. The assets are what :meth:`Assets.from_state` accepts.
+5. The model is built within a budget that follows from its weights, and the weights fit it.
+
+What a checkpoint may make facediff read are the folders of the corpus that it was trained on, when it is scored on that
+corpus or adapted; see SECURITY.md.
 """
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Mapping
+import types
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import torch
 
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, Assets
 from facediff.errors import FaceDiffError
+from facediff.models.allocation import allocation_budget
 from facediff.registry import COMPONENTS, Kind, corpus, model
+from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.plain_options import Components, is_name, is_path, is_plain_text, read_options, unknown_class
+from facediff.utils.torch_files import EXPECTED, load_tensors, open_checkpoint
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
     from facediff.models.base import AnimationModel
+
+INSTANTIATOR = "lightning.pytorch.cli.instantiate_module"
+"""What Lightning imports and calls to rebuild a module; no checkpoint of facediff's names anything else."""
 
 
 def load_model(path: Path | str, device: str = "cpu") -> AnimationModel:
@@ -46,45 +70,114 @@ def read_assets(path: Path | str) -> Assets:
     Raises:
         FaceDiffError: if the file is missing, or no checkpoint of this version of facediff.
     """
-    return Assets.from_state(read_file(path)[ASSETS_KEY])
+    with open_checkpoint(path) as (stream, name):
+        return assets_of(name, read_file(stream, name))
 
 
-def read_checkpoint(path: Path | str) -> dict[str, Any]:
-    """Read a checkpoint without running any code from it, and check the classes that it names.
+def assets_of(path: Path | str, checkpoint: Mapping[str, Any]) -> Assets:
+    """The assets of a checkpoint's content.
 
     Raises:
-        FaceDiffError: if the file is missing, or no checkpoint of this version of facediff, or names a model or a
-            component that is not known.
+        FaceDiffError: naming the file and what is wrong with them.
     """
-    checkpoint = read_file(path)
-    check_classes(path, checkpoint["hyper_parameters"])
+    try:
+        return Assets.from_state(checkpoint[ASSETS_KEY])
+    except FaceDiffError as error:
+        raise FaceDiffError(f"{path}: {error}") from error
+
+
+def read_checkpoint(path: str | os.PathLike[str] | IO[bytes]) -> dict[str, Any]:
+    """Read a checkpoint without running any code from it, and check all that it names.
+
+    Args:
+        path: the file, which may be open.
+
+    Raises:
+        FaceDiffError: if the file is missing, or no checkpoint of this version of facediff, or names a model, a
+            component or a value that is not known.
+    """
+    with open_checkpoint(path) as (stream, name):
+        checkpoint = read_file(stream, name)
+    model_of(name, checkpoint["hyper_parameters"])
+    assets = assets_of(name, checkpoint)
+    if checkpoint["hyper_parameters"].get("identities") != assets.identities:
+        raise FaceDiffError(f"{name}: its model and its assets do not have the same identities; {EXPECTED}")
     return checkpoint
 
 
-def read_file(path: Path | str) -> dict[str, Any]:
-    """The plain data and tensors of a checkpoint of facediff's."""
-    expected = "expected a .ckpt file that `facediff fit` has written"
-    if not Path(path).is_file():
-        raise FaceDiffError(f"{path}: no such checkpoint; {expected}")
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        # Whatever a damaged or hostile file makes the reader raise, the reason is the file.
-        raise FaceDiffError(
-            f"{path}: not a checkpoint that can be loaded safely (damaged, or more than tensors and plain values); "
-            f"{expected}"
-        ) from error
+@contextmanager
+def checked_file(path: str | os.PathLike[str] | IO[bytes]) -> Iterator[IO[bytes]]:
+    """An open checkpoint at its beginning, after all checks, for those who must read it themselves.
+
+    Raises:
+        FaceDiffError: as :func:`read_checkpoint` and :func:`build_model`.
+    """
+    with open_checkpoint(path) as (stream, name):
+        build_model(name, read_checkpoint(stream))
+        stream.seek(0)
+        yield stream
+
+
+def read_file(stream: IO[bytes], path: Path | str) -> dict[str, Any]:
+    """The plain data and tensors of a checkpoint of facediff's; only its outer form is checked."""
+    checkpoint = load_tensors(stream, path)
     if not isinstance(checkpoint, dict) or not {ASSETS_KEY, "hyper_parameters", "state_dict"} <= checkpoint.keys():
         raise FaceDiffError(
             f"{path}: a checkpoint, but not of facediff: it lacks the templates and sizes that animation needs; "
-            f"{expected}"
+            f"{EXPECTED}"
         )
-    if checkpoint.get(FORMAT_KEY) != FORMAT:
+    found = checkpoint.get(FORMAT_KEY)
+    if type(found) is not int or found != FORMAT:
         raise FaceDiffError(
             f"{path}: written by another version of facediff, whose checkpoints this one cannot read; train the model "
             f"again with `facediff fit`, or use the version that wrote it"
         )
+    for key in ("hyper_parameters", "state_dict", ASSETS_KEY, DATA_SOURCE_KEY, "datamodule_hyper_parameters"):
+        value = checkpoint.get(key)
+        if not (isinstance(value, dict) and all(isinstance(name, str) for name in value)) and (
+            value is not None or key in ("hyper_parameters", "state_dict", ASSETS_KEY)
+        ):
+            raise FaceDiffError(f"{path}: its {key} is {quoted(value)}; expected values by name. The file is damaged")
+    for name, value in (checkpoint.get(DATA_SOURCE_KEY) or {}).items():
+        if not isinstance(value, str) or not is_plain_text(value):
+            raise FaceDiffError(
+                f"{path}: its corpus has the {quoted(name)} {quoted(value)}; expected a path. {EXPECTED}"
+            )
+    for name, value in checkpoint["state_dict"].items():
+        if not isinstance(value, torch.Tensor):
+            raise FaceDiffError(f"{path}: its weight {quoted(name)} is {quoted(value)}; expected a tensor")
     return checkpoint
+
+
+def model_of(path: Path | str, hparams: Mapping[str, Any]) -> tuple[type[AnimationModel], dict[str, Any]]:
+    """The model's class and its constructor's arguments.
+
+    Raises:
+        FaceDiffError: if the hyper-parameters name anything but a model, components and plain values.
+    """
+    from facediff.models.base import AnimationModel
+
+    named = hparams.get("_class_path")
+    found: type[AnimationModel] | None = find_class(model, named, AnimationModel)
+    if found is None:
+        raise unknown_class(path, "model", named)
+    if hparams.get("_instantiator", INSTANTIATOR) != INSTANTIATOR:
+        raise FaceDiffError(
+            f"{path}: it names {quoted(hparams['_instantiator'])} to rebuild it; expected {INSTANTIATOR}"
+        )
+    identities = hparams.get("identities")
+    if not isinstance(identities, list) or not all(map(is_name, identities)):
+        raise FaceDiffError(f"{path}: its identities are {quoted(identities)}; expected names without path separators")
+    LIMITS.check("identities", len(identities), path)
+    kept = ("_class_path", "_instantiator", "identities")
+    arguments = read_options(
+        str(path), found, {name: value for name, value in hparams.items() if name not in kept}, component_finders()
+    )
+    for name in ("n_vertices", "frame_rate"):
+        if not arguments.get(name, 0) > 0:
+            raise FaceDiffError(f"{path}: its {name} is {quoted(hparams.get(name))}; expected a number above zero")
+    LIMITS.check("vertices", arguments["n_vertices"], path)
+    return found, {**arguments, "identities": list(identities)}
 
 
 def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
@@ -97,60 +190,49 @@ def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
     Raises:
         FaceDiffError: if a component cannot be made here, or the weights do not fit.
     """
-    from lightning.pytorch.cli import instantiate_module
-
-    hparams = {name: value for name, value in checkpoint["hyper_parameters"].items() if name != "_instantiator"}
+    weights = checkpoint["state_dict"]
+    # The model is rebuilt from its own options with the sizes that the checkpoint states; then come the assets,
+    # before the weights, since tables of mesh encoders are among these.
+    found, arguments = model_of(path, checkpoint["hyper_parameters"])
     try:
-        # The model is rebuilt from its own options with the sizes that the checkpoint states; then come the assets,
-        # before the weights, since tables of mesh encoders are among these.
-        made: AnimationModel = instantiate_module(check_classes(path, hparams), hparams)
+        with warnings.catch_warnings(), allocation_budget(path, weights.values()):
+            warnings.simplefilter("ignore")  # of sizes that are 0, for example
+            made = found(**arguments)
         made.on_load_checkpoint(checkpoint)
-        made.load_state_dict(checkpoint["state_dict"])
-    except FaceDiffError:
-        raise
-    except (Exception, SystemExit) as error:
-        # Lightning, jsonargparse and the components each have their own exceptions for what cannot be rebuilt.
-        reason = next(iter(str(error).strip().splitlines()), repr(error))
+        check_weights(path, weights, made.state_dict())
+        made.load_state_dict(weights)
+    except FaceDiffError as error:
+        raise FaceDiffError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+    except Exception as error:
+        # Components have their own exceptions for what cannot be rebuilt, and PyTorch lists every weight.
+        lines = str(error).strip().splitlines() or [repr(error)]
+        reason = " ".join(" ".join(lines[:2]).split())[:200]
         raise FaceDiffError(
-            f"{path}: cannot be rebuilt as {hparams['_class_path']} ({reason}); install the packages that its "
-            f"components come from"
+            f"{path}: cannot be rebuilt as {found.__name__} ({reason}); install the packages that its components come "
+            f"from, in the versions that wrote it"
         ) from error
+    for name, parameter in made.named_parameters():
+        if not parameter.isfinite().all():
+            raise FaceDiffError(
+                f"{path}: its weights {name} hold NaN or infinity, so the training has diverged; use an earlier "
+                f"checkpoint, or train again with a lower learning rate"
+            )
     return made.eval()
 
 
-def check_classes(path: Path | str, hparams: dict[str, Any]) -> type[AnimationModel]:
-    """The model's class; refuse hyper-parameters that name anything but a model and components.
-
-    Whatever class path stands in a checkpoint would be imported and called when the model is rebuilt.
+def check_weights(path: Path | str, weights: Mapping[str, torch.Tensor], own: Mapping[str, Any]) -> None:
+    """Refuse weights whose numbers are of another sort than the model's: copying would change them in silence.
 
     Raises:
-        FaceDiffError: if a class is neither registered nor imported, or stands where none belongs.
+        FaceDiffError: naming the weights.
     """
-    from facediff.models.base import AnimationModel
-    from facediff.models.samplers import Sampler
-
-    # Lightning and jsonargparse import and call whatever class path they find. weights_only=True does not prevent that:
-    # a path is plain text. So every path must be known before either of them sees the file.
-    found: type[AnimationModel] | None = find_class(model, str(hparams.get("_class_path")), AnimationModel)
-    if found is None:
-        raise unknown_class(path, "model", hparams.get("_class_path"))
-    for name, value in hparams.items():
-        options = value
-        if name in COMPONENTS and isinstance(value, dict):
-            base = Sampler if name == "sampler" else torch.nn.Module
-            if find_class(COMPONENTS[name], str(value.get("class_path")), base) is None:
-                raise unknown_class(path, name, value.get("class_path"))
-            options = value.get("init_args", {})
-        if names_a_class(options):
-            raise FaceDiffError(f"{path}: its option {name} names a class where none belongs; it was not loaded")
-    return found
-
-
-def names_a_class(value: object) -> bool:
-    """Whether plain data holds a class path at any depth."""
-    if isinstance(value, dict):
-        return "class_path" in value or any(names_a_class(item) for item in value.values())
-    return isinstance(value, list) and any(names_a_class(item) for item in value)
+    for name, value in weights.items():
+        mine = own.get(name)
+        if isinstance(mine, torch.Tensor) and mine.is_floating_point() != value.is_floating_point():
+            raise FaceDiffError(
+                f"{path}: its weights {quoted(name)} are of the type {value.dtype}, and {mine.dtype} in the model; the "
+                f"file is damaged"
+            )
 
 
 def corpus_class(path: Path | str, source: Mapping[str, Any]) -> type[SpeechMotionDataModule]:
@@ -165,29 +247,43 @@ def corpus_class(path: Path | str, source: Mapping[str, Any]) -> type[SpeechMoti
     """
     from facediff.data import SpeechMotionDataModule
 
-    found: type[SpeechMotionDataModule] | None = find_class(
-        corpus, str(source.get("class_path")), SpeechMotionDataModule
-    )
+    found: type[SpeechMotionDataModule] | None = find_class(corpus, source.get("class_path"), SpeechMotionDataModule)
     if found is None:
         raise unknown_class(path, "data module", source.get("class_path"))
     return found
 
 
-def unknown_class(path: Path | str, role: str, named: object) -> FaceDiffError:
-    """The error for a class that is neither registered nor imported."""
-    return FaceDiffError(
-        f'{path}: its {role} is "{named}", which is not known; it was not loaded. If you trust the file, install or '
-        f"import the package that the {role} comes from"
-    )
+def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[SpeechMotionDataModule], dict[str, Any]]:
+    """The data module that a checkpoint was trained on, and its options.
+
+    Raises:
+        FaceDiffError: if the class is not known, or an option is no plain value of the type that the class asks for.
+    """
+    source = checkpoint.get(DATA_SOURCE_KEY) or {}
+    found = corpus_class(path, source)
+    given = checkpoint.get("datamodule_hyper_parameters") or {"root": source.get("root")}
+    options = {name: value for name, value in given.items() if not name.startswith("_")}
+    read_options(str(path), found, options, component_finders())
+    return found, options
 
 
-def corpus_options(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of the data module that a checkpoint was trained on."""
-    options = checkpoint.get("datamodule_hyper_parameters") or {"root": checkpoint[DATA_SOURCE_KEY].get("root")}
-    return {name: value for name, value in options.items() if not name.startswith("_")}
+def component_finders() -> Components:
+    """What finds the classes of components, by kind; those that are not registered must be of the kind's base class."""
+    from facediff.models import audio_encoders, decoders, fusions, mesh_encoders, samplers, speaker_encoders
+
+    bases: dict[str, type] = {
+        "audio_encoder": audio_encoders.AudioEncoder,
+        "identity_encoder": speaker_encoders.IdentityEncoder,
+        "style_encoder": speaker_encoders.StyleEncoder,
+        "mesh_encoder": mesh_encoders.MeshEncoder,
+        "fusion": fusions.Fusion,
+        "decoder": decoders.Decoder,
+        "sampler": samplers.Sampler,
+    }
+    return {name: partial(find_class, kind, base=bases[name]) for name, kind in COMPONENTS.items()}
 
 
-def find_class(kind: Kind, path: str, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``
+def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``
     """The class of an import path, if it is registered or its module is imported already; else None.
 
     Args:
@@ -195,10 +291,15 @@ def find_class(kind: Kind, path: str, base: type) -> Any:  # noqa: ANN401 - a cl
         path: the import path.
         base: what the class must be a subclass of.
     """
+    if not isinstance(path, str) or not is_path(path):
+        return None
     module, _, name = path.rpartition(".")
     if module == f"facediff.registry.{kind.kind}":
         return kind.get(name) if name in kind.names() else None
     kind.load()
     # Not getattr, which may make a lazily loaded package import the module that the file asks for.
-    found = vars(sys.modules[module]).get(name) if module in sys.modules else None
-    return found if isinstance(found, type) and issubclass(found, base) else None
+    place = sys.modules.get(module)
+    found = vars(place).get(name) if isinstance(place, types.ModuleType) else None
+    if not isinstance(found, type):
+        return None
+    return found if issubclass(found, base) or found in [entry.implementation for entry in kind] else None

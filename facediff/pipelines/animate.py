@@ -273,8 +273,9 @@ def usable_device(name: str) -> str:
     import torch
 
     try:
-        torch.empty(0, device=name)
-    except (RuntimeError, AssertionError) as error:
-        reason = next(iter(str(error).splitlines()), "")
+        # Memory is allocated and read back, which devices that exist in name only cannot do (meta).
+        float(torch.ones(1, device=torch.device(name)).sum())
+    except Exception as error:  # each backend raises its own, down to NotImplementedError and ImportError
+        reason = next(iter(str(error).splitlines()), "")[:200]
         raise FaceDiffError(f"--device {name}: not usable on this machine ({reason}); try --device cpu") from error
     return name

@@ -89,13 +89,16 @@ FRAME_RATES = (0.1, 1000.0)
 SAMPLE_RATES = (1000, 768_000)
 """Samples a second that speech may have; resampling multiplies the length of anything slower."""
 
+COORDINATE = 1e12
+"""Largest absolute coordinate, in any unit; squares and sums of larger ones leave the range of float32."""
+
 WORDS_SHOWN = 60  # characters of a file's own text that a message repeats
 
 
 def quoted(value: object) -> str:
     """A value from a file as a message may show it: short, on one line, and whatever it is."""
     try:
-        text = repr(value)
+        text = " ".join(repr(value).split())  # arrays and tensors take several lines
     except Exception:  # a whole number of more than 4300 digits has no decimal form; other objects may raise anything
         text = f"a {type(value).__name__}"
     return text if len(text) <= WORDS_SHOWN else f"{text[: WORDS_SHOWN - 1]}…"

@@ -114,11 +114,11 @@ def test_defaults_never_override_a_file(animation: Animation, tmp_path: Path) ->
         ({"vertices": np.zeros((5, 7, 3), np.float32)}, "has 7 vertices and its template 6"),
         ({"vertices": np.zeros((5, 18), np.float32)}, "expected (frames, vertices, 3)"),
         ({"faces": np.array([[0, 1, 6]], np.int32)}, "name vertex 6 of 6"),
-        ({"frame_rate": 0.0}, "frame rate 0 is impossible"),
+        ({"frame_rate": 0.0}, "frame rate is 0.0; expected a number from 0.1"),
         ({"unit": "parsec"}, 'unit "parsec"'),
-        ({"unit": "normalised (about 0 mm)"}, "above 0"),
-        ({"unit": "about 1.2.3 mm"}, "above 0"),
-        ({"sample_rate": 0}, "sample rate 0 is impossible"),
+        ({"unit": "normalised (about 0 mm)"}, "metres from 1e-09"),
+        ({"unit": "about 1.2.3 mm"}, "metres from 1e-09"),
+        ({"sample_rate": 0}, "sample rate is 0; expected a whole number from 1000"),
     ],
 )
 def test_animation_refuses_parts_that_do_not_fit(
@@ -188,9 +188,9 @@ def test_archive_refuses_files_that_are_no_animations(tmp_path: Path) -> None:
         ("faces", np.zeros((2, 3)), "expected whole numbers (triangles, 3)"),
         ("speech", np.zeros((9, 2), np.float32), "expected floating point (samples,)"),
         ("colours", np.zeros((6, 3)), "expected bytes (vertices, 3)"),
-        ("inner_lip_pairs", np.array([[0, 6]]), "its inner_lip_pairs names vertices other than 0 to 5"),
-        ("region_lips", np.array([-1]), "its lips names vertices other than 0 to 5"),
-        ("region_lips", np.array([0.5]), "its lips names vertices other than 0 to 5"),
+        ("inner_lip_pairs", np.array([[0, 6]]), "its inner_lip_pairs hold numbers other than 0 to 5"),
+        ("region_lips", np.array([-1]), "its region_lips hold numbers other than 0 to 5"),
+        ("region_lips", np.array([0.5]), "its region_lips are float64"),
     ],
 )
 def test_archive_by_others_is_checked(

@@ -82,7 +82,7 @@ def test_export_accepts_the_unit_that_the_format_prescribes(tmp_path: Path, unit
         ({"vertices": "nan"}, "frame 3 holds NaN"),
         ({"template": "nan"}, "its template holds NaN"),
         ({"faces": None}, "comes without a mesh"),
-        ({"colours": np.zeros((7, 3), np.uint8)}, "vertex colours have shape (7, 3)"),
+        ({"colours": np.zeros((7, 3), np.uint8)}, "colours of shape (7, 3)"),
         ({"speech": np.full(9, np.nan, np.float32)}, "its speech holds NaN"),
     ],
 )

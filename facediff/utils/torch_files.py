@@ -1,0 +1,289 @@
+"""Files of ``torch.save`` from elsewhere: what they declare is checked before anything is allocated.
+
+Such a file is a zip archive with a pickle (``data.pkl``) and one entry of bytes for each storage. ``torch.load`` with
+``weights_only=True`` runs no code of a file, but believes its sizes: the length of a storage comes from the pickle, not
+from the archive, and reading past the end of the bytes ends the process. So the archive's directory is checked first,
+then the pickle is read once with outlines in place of tensors; PyTorch sees only a file in which all sizes agree.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import pickle
+import warnings
+import zipfile
+from collections import Counter, OrderedDict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, ClassVar
+
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import LIMITS, check_nesting, quoted
+
+PICKLE_BYTES = 64 * 2**20
+"""Most bytes of ``data.pkl``: names, numbers and the outlines of tensors, not their values."""
+
+EXPECTED = "expected a .ckpt file that `facediff fit` has written"
+
+MAGIC = b"PK\x03\x04"
+LOCAL_HEADER = 30  # bytes of a zip entry's own header, without its name
+
+STORAGES = {
+    **dict.fromkeys(("DoubleStorage", "LongStorage"), 8),
+    **dict.fromkeys(("FloatStorage", "IntStorage"), 4),
+    **dict.fromkeys(("HalfStorage", "BFloat16Storage", "ShortStorage"), 2),
+    **dict.fromkeys(("ByteStorage", "CharStorage", "BoolStorage", "UntypedStorage"), 1),
+}
+"""Bytes of a number in the storages that may occur; complex and quantised ones may not."""
+
+TYPES = {
+    **dict.fromkeys(("float64", "int64", "uint64"), 8),
+    **dict.fromkeys(("float32", "int32", "uint32"), 4),
+    **dict.fromkeys(("float16", "bfloat16", "int16", "uint16"), 2),
+    **dict.fromkeys(("int8", "uint8", "bool", "float8_e4m3fn", "float8_e5m2"), 1),
+}
+"""Bytes of a number of the types that may occur."""
+
+
+Declared = Any
+"""What a file states, of whatever type."""
+
+
+@dataclass(frozen=True)
+class NumberType:
+    """In place of a type of numbers or of the class of a storage: the bytes of one number."""
+
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Storage:
+    """In place of a storage: its bytes, and those of one of its numbers."""
+
+    bytes: int
+    item: int
+
+
+@dataclass(frozen=True)
+class Outline:
+    """In place of a tensor: what it takes in memory."""
+
+    bytes: int
+
+
+class PlainOrderedDict(OrderedDict[Any, Any]):
+    """In place of ``OrderedDict``, whose attributes a pickle may set and so hide its methods."""
+
+    def __setstate__(self, state: object) -> None:
+        """Only modules' versions, which ``state_dict()`` adds."""
+        if not isinstance(state, dict) or set(state) - {"_metadata"}:
+            raise pickle.UnpicklingError("it sets attributes of a dict")
+
+
+class OutlineReader(pickle._Unpickler):  # C's unpickler reserves whatever memory a file asks for
+    """Reads ``data.pkl`` with an :class:`Outline` in place of every tensor; makes nothing but plain data.
+
+    Args:
+        stream: the pickle.
+        entries: bytes of every storage by its key.
+    """
+
+    names: ClassVar[dict[tuple[str, str], Any]] = {
+        ("collections", "OrderedDict"): PlainOrderedDict,
+        ("collections", "Counter"): Counter,
+        ("builtins", "set"): set,
+        ("__builtin__", "set"): set,
+        ("torch", "Size"): tuple,
+        ("torch", "device"): lambda *words: words,
+        **{("torch", name): NumberType(size) for name, size in {**STORAGES, **TYPES}.items()},
+        ("torch.storage", "UntypedStorage"): NumberType(1),
+    }
+
+    def __init__(self, stream: IO[bytes], entries: Mapping[str, int]) -> None:
+        super().__init__(stream)
+        self._entries = entries
+        self.bytes = 0
+        self._rebuild = {
+            "_rebuild_tensor_v2": self._tensor,
+            "_rebuild_tensor_v3": self._tensor_of_type,
+            "_rebuild_parameter": self._parameter,
+        }
+
+    def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401
+        """The stand-in for a name; nothing is imported."""
+        if module == "torch._utils" and name in self._rebuild:
+            return self._rebuild[name]
+        if (module, name) not in self.names:
+            raise pickle.UnpicklingError(f"it asks for {quoted(f'{module}.{name}')}")
+        return self.names[module, name]
+
+    def persistent_load(self, pid: Any) -> Storage:  # noqa: ANN401
+        """A storage, once its length agrees with its bytes."""
+        word, kind, key, _, length = pid
+        if word != "storage" or not isinstance(kind, NumberType) or not isinstance(key, str) or not is_size(length):
+            raise pickle.UnpicklingError("it holds numbers in an unknown form")
+        if length and length * kind.bytes != self._entries.get(key, -1):
+            raise pickle.UnpicklingError(f"its numbers {quoted(key)} are fewer or more than it declares")
+        return Storage(length * kind.bytes, kind.bytes)
+
+    def _tensor(self, storage: Storage, *form: Declared) -> Outline:
+        offset, shape, stride, _, hooks, *metadata = form
+        return self._outline(storage, storage.item, offset, shape, stride, [hooks, *metadata])
+
+    def _tensor_of_type(self, storage: Storage, *form: Declared) -> Outline:
+        offset, shape, stride, _, hooks, kind, *metadata = form
+        return self._outline(storage, kind.bytes, offset, shape, stride, [hooks, *metadata])
+
+    def _outline(
+        self, storage: Storage, item: int, offset: Declared, shape: Declared, stride: Declared, more: list[Any]
+    ) -> Outline:
+        plain = isinstance(storage, Storage) and isinstance(shape, tuple) and isinstance(stride, tuple)
+        if not plain or any(more) or len(shape) != len(stride):
+            raise pickle.UnpicklingError("it holds a tensor in an unknown form")
+        if not all(map(is_size, (offset, *shape, *stride))):
+            raise pickle.UnpicklingError("it holds a tensor of an impossible size")
+        count = math.prod(shape)
+        last = offset + sum((size - 1) * step for size, step in zip(shape, stride, strict=True)) + 1 if count else 0
+        # A tensor that repeats its numbers is small here and huge wherever it is copied.
+        if max(count, last) * item > storage.bytes:
+            raise pickle.UnpicklingError("it holds a tensor that is larger than its numbers")
+        self.bytes += count * item
+        return Outline(count * item)
+
+    @staticmethod
+    def _parameter(data: object, gradient: object, hooks: object) -> object:
+        if not isinstance(data, Outline) or hooks:
+            raise pickle.UnpicklingError("it holds a parameter in an unknown form")
+        return data
+
+
+def is_size(value: object) -> bool:
+    """Whether a value can be a size, a stride or an offset."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
+
+
+@contextmanager
+def open_checkpoint(file: str | os.PathLike[str] | IO[bytes]) -> Iterator[tuple[IO[bytes], str]]:
+    """Open a checkpoint once, for reading it more than once; an open one is left open.
+
+    Yields:
+        the open file, and its name for messages.
+
+    Raises:
+        FaceDiffError: if there is no such file, or it cannot be read.
+    """
+    if not isinstance(file, str | os.PathLike):
+        yield file, str(getattr(file, "name", "checkpoint"))
+        return
+    if not os.path.isfile(file):  # noqa: PTH113 - also of a name with a NUL, which pathlib raises for
+        raise FaceDiffError(f"{file}: no such checkpoint; {EXPECTED}")
+    try:
+        stream = Path(file).open("rb")  # noqa: SIM115 - closed below; only opening is guarded
+    except OSError as error:
+        raise FaceDiffError(f"{file}: cannot be read ({error.strerror}); {EXPECTED}") from error
+    with stream:
+        yield stream, str(file)
+
+
+def load_tensors(stream: IO[bytes], source: object) -> Any:  # noqa: ANN401
+    """The tensors and plain data of a file that ``torch.save`` wrote, on the CPU.
+
+    Args:
+        stream: the open file. It is read twice, so that both readings see the same file even if a running training
+            replaces it.
+        source: the file's name, for messages.
+
+    Raises:
+        FaceDiffError: if the file is damaged, holds anything else, or needs more than the budget.
+    """
+    import torch
+
+    try:
+        outline = read_outline(stream, source)
+        check_nesting(outline, source)
+        check_numbers(outline)
+        stream.seek(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.load(stream, map_location="cpu", weights_only=True)
+    except FaceDiffError:
+        raise
+    except Exception as error:
+        # Whatever a damaged or hostile file makes the readers raise, the reason is the file.
+        reason = next(iter(str(error).strip().splitlines()), "") if isinstance(error, pickle.UnpicklingError) else ""
+        detail = reason if 0 < len(reason) < 120 else "damaged, or more than tensors and plain values"
+        raise FaceDiffError(f"{source}: not a checkpoint that can be loaded safely ({detail}); {EXPECTED}") from error
+
+
+def read_outline(stream: IO[bytes], source: object) -> object:
+    """The content with outlines in place of tensors; see the module's docstring.
+
+    Raises:
+        FaceDiffError: if it needs more than the budget.
+        pickle.UnpicklingError: if the archive or the pickle is none that ``torch.save`` writes.
+    """
+    stream.seek(0)
+    if stream.read(len(MAGIC)) != MAGIC:
+        # PyTorch's formats of before 2020 are pickles whose sizes stand nowhere before the numbers.
+        raise pickle.UnpicklingError("it is no zip archive")
+    length = stream.seek(0, io.SEEK_END)
+    LIMITS.check("bytes", length, source)
+    with zipfile.ZipFile(stream) as archive:
+        entries = archive.infolist()
+        LIMITS.check("entries", len(entries), source)
+        check_directory(archive, entries, length)
+        folder = entries[0].filename.partition("/")[0]
+        sizes = {entry.filename: entry.file_size for entry in entries}
+        name = f"{folder}/data.pkl"
+        if sizes.get(name, PICKLE_BYTES) >= PICKLE_BYTES:
+            raise pickle.UnpicklingError("its plain values are missing or too long")
+        reader = OutlineReader(
+            io.BytesIO(archive.read(name)),
+            {name.removeprefix(f"{folder}/data/"): size for name, size in sizes.items() if "/data/" in name},
+        )
+        outline: object = reader.load()
+    LIMITS.check("bytes", reader.bytes, source)
+    return outline
+
+
+def check_directory(archive: zipfile.ZipFile, entries: list[zipfile.ZipInfo], length: int) -> None:
+    """Refuse an archive that another reader could understand in another way, or that expands.
+
+    ``torch.save`` compresses nothing, writes one entry after the other from the first byte on, and one of each name.
+
+    Raises:
+        pickle.UnpicklingError: if this archive is different.
+    """
+    end = 0
+    for entry in sorted(entries, key=lambda entry: entry.header_offset):
+        stored = entry.compress_type == zipfile.ZIP_STORED and entry.file_size == entry.compress_size
+        if not stored or entry.header_offset < end or entry.flag_bits & 1:
+            raise pickle.UnpicklingError("its archive is compressed or its entries overlap")
+        end = entry.header_offset + LOCAL_HEADER + len(entry.filename) + entry.file_size
+    names = {entry.filename.lower() for entry in entries}  # PyTorch's reader does not distinguish capitals
+    if end > length or len(names) < len(entries) or archive.comment or min(e.header_offset for e in entries) > 0:
+        raise pickle.UnpicklingError("its archive is none that PyTorch writes")
+
+
+def check_numbers(value: object) -> None:
+    """Refuse plain data with whole numbers of more than 64 bits, which nothing can use and few can print.
+
+    Raises:
+        pickle.UnpicklingError: if there is one.
+    """
+    # The nesting and the number of entries are known to be within the budget.
+    waiting = [value]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, Mapping):
+            waiting += [*item.keys(), *item.values()]
+        elif isinstance(item, list | tuple | set):
+            waiting += item
+        elif isinstance(item, int) and item.bit_length() > 64:
+            raise pickle.UnpicklingError("it holds a whole number of more than 64 bits")
+        elif not isinstance(item, Outline | bool | int | float | str | bytes | NumberType | None):
+            raise pickle.UnpicklingError(f"it holds a {type(item).__name__}")

@@ -1,0 +1,197 @@
+"""The one door into a checkpoint: whatever stands in the file, it loads or is refused in one sentence.
+
+The catalogue replaces every leaf of a valid checkpoint by wild values; whoever adds a key to checkpoints has it tested
+here without a further line.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import itertools
+import random
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion
+from facediff.models.checkpoint import build_model, corpus_of, read_checkpoint
+from tests.fakes.tiny import Tiny
+
+Tree = Any
+EVIL = "evilmodule"
+HIDDEN = "c0ffee-hidden"
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory: pytest.TempPathFactory) -> Tree:
+    """A checkpoint as training writes it, of a model and a corpus in miniature."""
+    import lightning.pytorch as pl
+
+    from facediff import registry
+    from tests.fakes.tiny import write_tiny
+
+    folder = tmp_path_factory.mktemp("door")
+    root = write_tiny(folder / "tiny")
+    torch.manual_seed(0)
+    model = DualPathDiffusion(
+        n_vertices=24, identities=["A", "B"], frame_rate=25.0, dim=8, diffusion_steps=10, decoder=registry.decoder.gru
+    )
+    trainer = pl.Trainer(
+        accelerator="cpu", max_steps=1, logger=False, enable_progress_bar=False, enable_model_summary=False,
+        enable_checkpointing=False, default_root_dir=folder, limit_val_batches=0,
+    )  # fmt: skip
+    trainer.fit(model, Tiny(root=str(root)))
+    trainer.save_checkpoint(folder / "valid.ckpt")
+    return torch.load(folder / "valid.ckpt", weights_only=True)
+
+
+@pytest.fixture
+def evil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A working folder with a module that leaves a mark when it is imported."""
+    (tmp_path / f"{EVIL}.py").write_text(f"open(r'{tmp_path}/harm', 'w').close()\nclass Evil: pass\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("DOOR_SECRET", HIDDEN)
+    yield
+    assert EVIL not in sys.modules
+    assert not (tmp_path / "harm").exists()
+
+
+def leaves(tree: Tree, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The path of every node: leaves and containers."""
+    if path:
+        yield path
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, item in items:
+        yield from leaves(item, (*path, key))
+
+
+def replaced(tree: Tree, path: tuple[Any, ...], value: object) -> Tree:
+    """The tree with another value at a path; only the containers on the way are copied."""
+    key, *rest = path
+    changed = copy.copy(tree)
+    changed[key] = value if not rest else replaced(tree[key], tuple(rest), value)
+    return changed
+
+
+def removed(tree: Tree, path: tuple[Any, ...]) -> Tree:
+    """The tree without what stands at a path."""
+    *above, last = path
+    holder = tree
+    for key in above:
+        holder = holder[key]
+    kept = {k: v for k, v in holder.items() if k != last} if isinstance(holder, dict) else []
+    return replaced(tree, tuple(above), kept) if above else kept
+
+
+def cycle() -> list[Any]:
+    made: list[Any] = []
+    made.append(made)
+    return made
+
+
+def deep(levels: int) -> list[Any]:
+    made: list[Any] = []
+    for _ in range(levels):
+        made = [made]
+    return made
+
+
+def laughs() -> list[Any]:
+    made: list[Any] = ["ha"]
+    for _ in range(40):
+        made = [made] * 10
+    return made
+
+
+WILD: dict[str, object] = {
+    "none": None,
+    "true": True,
+    "zero": 0,
+    "minus": -1,
+    "huge": 10**12,
+    "beyond": 10**400,
+    "nan": float("nan"),
+    "infinite": float("inf"),
+    "empty": "",
+    "module": f"{EVIL}.Evil",
+    "attribute": "facediff.utils.files.os.system",
+    "builtin": "builtins.eval",
+    "secret": "${oc.env:DOOR_SECRET}",
+    "relative": "${.root}",
+    "address": "https://example.org/weights",
+    "long": "x" * 100_000,
+    "control": "a\x1b[31m\nb",
+    "path": "../../etc/passwd",
+    "yaml": f"{{class_path: {EVIL}.Evil}}",
+    "class": {"class_path": f"{EVIL}.Evil", "init_args": {}},
+    "hidden class": {"_class_path": f"{EVIL}.Evil", "_instantiator": f"{EVIL}.Evil"},
+    "list": [],
+    "nested": [[1, {"a": None}]],
+    "keys": {1: 2, None: 3},
+    "tensor": torch.zeros(2, 3),
+    "whole": torch.zeros(2, 3, dtype=torch.long),
+    "scalar": torch.tensor(float("nan")),
+    "empty tensor": torch.zeros(0, 24, 3),
+}
+
+
+def law(load: Callable[[], object]) -> str:
+    """Run a load: "loaded", or the sentence of its refusal; anything else fails the test."""
+    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    try:
+        load()
+    except FaceDiffError as error:
+        text = str(error)
+        assert "\n" not in text.strip()
+        assert text.isprintable()
+        assert len(text) < 1500
+        assert HIDDEN not in text
+    else:
+        text = "loaded"
+    assert time.perf_counter() - start < 60
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1.5 * 2**20  # KiB
+    return text
+
+
+def load_everything(tree: Tree) -> object:
+    """What the commands do with a checkpoint between the file and the first use."""
+    for key in ("hyper_parameters", "state_dict", "facediff_assets"):
+        if not isinstance(tree.get(key), dict):
+            return read_tree(tree)
+    read = read_tree(tree)
+    corpus_of("file.ckpt", read)
+    return build_model("file.ckpt", read)
+
+
+def read_tree(tree: Tree) -> Tree:
+    stream = io.BytesIO()
+    torch.save(tree, stream)
+    return read_checkpoint(stream)
+
+
+CHECKED = ("hyper_parameters", "facediff_assets", "facediff_data", "datamodule_hyper_parameters", "facediff_format")
+
+
+def test_every_leaf_of_a_checkpoint_may_be_anything(content: Tree, evil: None) -> None:
+    """Each node of the checked parts becomes each wild value, in turn: some hundred trees, by a fixed draw."""
+    small = {key: value for key, value in content.items() if key in (*CHECKED, "state_dict")}
+    paths = [path for path in leaves(small) if path[0] in CHECKED or len(path) == 1]
+    pairs = list(itertools.product(paths, WILD))
+    broken = []
+    for path, name in random.Random(0).sample(pairs, 400):  # noqa: S311
+        try:
+            law(lambda path=path, name=name: load_everything(replaced(small, path, WILD[name])))
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - collected, so that one run shows all
+            broken.append(f"{path} = {name}: {type(error).__name__}: {error}"[:300])
+        except AssertionError as error:
+            broken.append(f"{path} = {name}: {error}"[:300])
+    assert not broken, "\n".join(broken)
