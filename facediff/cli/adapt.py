@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from facediff.cli.options import Checkpoint, Folder, Output, Seed
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
+from facediff.utils import ranges
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
@@ -23,8 +24,8 @@ def adapt(
     output: Output,
     mode: Mode = "finetune",
     train: Literal["all", "person"] = "all",
-    epochs: Annotated[int, Option(metavar="N", least=1)] = 60,
-    learning_rate: Annotated[float, Option(metavar="RATE", above=0)] = 5e-4,
+    epochs: Annotated[ranges.Epochs, Option(metavar="N")] = 60,
+    learning_rate: Annotated[ranges.LearningRate, Option(metavar="RATE")] = 5e-4,
     data_root: Folder = None,
     seed: Seed = 0,
     accelerator: str = "auto",

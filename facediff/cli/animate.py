@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from facediff.cli.options import Checkpoint, ControlOptions, File, Identity, Map, OutputOptions, Seed, Workers
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
+from facediff.utils import ranges
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,11 @@ class WindowOptions:
         rate: sample rate of that PCM
     """
 
-    window: Annotated[float | None, Option(metavar="S")] = None
-    overlap: Annotated[float | None, Option(metavar="S")] = None
-    max_seconds: Annotated[float | None, Option(metavar="S")] = None
+    window: Annotated[ranges.Window | None, Option(metavar="S")] = None
+    overlap: Annotated[ranges.Window | None, Option(metavar="S")] = None
+    max_seconds: Annotated[ranges.Duration | None, Option(metavar="S")] = None
     stream: bool = False
-    rate: Annotated[int, Option(metavar="HZ", least=1000, most=384_000)] = 16_000
+    rate: Annotated[ranges.SampleRate, Option(metavar="HZ")] = 16_000
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,9 @@ def animate(
     identity: Identity = None,
     style: Annotated[str | None, Option(metavar="STYLE", reads=True)] = None,
     style_template: Annotated[str | None, Option(metavar="FACE", reads=True)] = None,
-    samples: Annotated[int, Option(metavar="N", least=1)] = 1,
+    samples: Annotated[ranges.Samples, Option(metavar="N")] = 1,
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
-    steps: Annotated[int | None, Option(metavar="N")] = None,
+    steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
     seed: Seed = 0,
     device: str = "cpu",
     precision: Literal["32", "bf16"] = "32",

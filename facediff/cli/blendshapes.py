@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from facediff.cli.options import Picture, SourceOptions, check_picture_path
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
+from facediff.utils import ranges
 
 if TYPE_CHECKING:
     from facediff.editing.blendshapes import Weights
@@ -19,9 +20,9 @@ def blendshapes(
     output: Annotated[Path | None, Option(also="-o", metavar="CSV", writes="file")] = None,
     shapes: Annotated[Path | None, Option(metavar="SHAPES", reads=True)] = None,
     carry: bool = False,
-    smoothness: Annotated[float, Option(metavar="S")] = 0.02,
-    symmetry: Annotated[float, Option(metavar="S")] = 0.0,
-    bounds: Annotated[tuple[float, float], Option(metavar=("LO", "HI"))] = (0.0, 1.0),
+    smoothness: Annotated[ranges.Strength, Option(metavar="S")] = 0.02,
+    symmetry: Annotated[ranges.Strength, Option(metavar="S")] = 0.0,
+    bounds: Annotated[tuple[ranges.Bound, ranges.Bound], Option(metavar=("LO", "HI"))] = (0.0, 1.0),
     region: Annotated[str | None, Option(metavar="NAME")] = None,
     only_arkit: bool = False,
     plain: bool = False,

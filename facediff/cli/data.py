@@ -12,9 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from facediff.cli.options import Corpus, File, FileOrList, Output, OutputFolder, Size, Workers
+from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Size, Workers
 from facediff.cli.parsing import Group, Option, Parameter, Parameters, parameters_of, parse
 from facediff.errors import FaceDiffError, choices
+from facediff.utils import ranges
 
 if TYPE_CHECKING:
     from facediff.data.prepare.runner import Plan, Report
@@ -193,13 +194,13 @@ def import_person(
     name: str,
     corpus: Annotated[Path, Option(metavar="ROOT", reads=True)],
     output: OutputFolder,
-    frame_rate: Annotated[float, Option(metavar="F", above=0)],
-    corpus_frame_rate: Annotated[float | None, Option(metavar="F", above=0)] = None,
+    frame_rate: Annotated[ranges.FrameRate, Option(metavar="F")],
+    corpus_frame_rate: FrameRate = None,
     template: File = None,
     stable: FileOrList = None,
     flame: Annotated[Path | None, Option(metavar="MODEL", reads=True)] = None,
-    scale: Annotated[float | None, Option(metavar="FACTOR")] = None,
-    clip_seconds: Annotated[float, Option(metavar="S")] = 8.0,
+    scale: Annotated[ranges.Factor | None, Option(metavar="FACTOR")] = None,
+    clip_seconds: Annotated[ranges.ClipLength, Option(metavar="S")] = 8.0,
     quiet: bool = False,
 ) -> None:
     """Turn the 3D reconstruction of one person's video into a corpus entry.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import OutputFolder
 from facediff.cli.parsing import Option
+from facediff.utils import ranges
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
@@ -23,7 +24,7 @@ SHEET = 12
 def demo(
     *,
     output: OutputFolder = Path("demo"),
-    epochs: Annotated[int | None, Option(metavar="N", least=1)] = None,
+    epochs: Annotated[ranges.Epochs | None, Option(metavar="N")] = None,
     data_root: Annotated[Path | None, Option(metavar="FOLDER", writes="folder")] = None,
 ) -> None:
     """Make a corpus, train, test and render a talking face.

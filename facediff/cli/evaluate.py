@@ -10,6 +10,7 @@ from typing import Annotated
 from facediff.cli.options import File, FileOrList, Folder, FrameRate, Seed, Workers, check_folders, named_folders
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
+from facediff.utils import ranges
 
 
 def evaluate(
@@ -26,13 +27,13 @@ def evaluate(
     lip_pairs: FileOrList = None,
     frame_rate: FrameRate = None,
     topology: Annotated[str | None, Option(metavar="NAME")] = None,
-    n_vertices: Annotated[int | None, Option(metavar="V", least=1)] = None,
+    n_vertices: Annotated[ranges.Vertices | None, Option(metavar="V")] = None,
     pattern: Annotated[list[str] | None, Option(metavar="PATTERN")] = None,
     truth_pattern: Annotated[str | None, Option(metavar="PATTERN")] = None,
     identity: Annotated[str, Option(metavar="NAME")] = "own",
-    truth_stride: Annotated[int, Option(metavar="N", least=1)] = 1,
-    bootstrap: Annotated[int, Option(metavar="N", least=0)] = 1000,
-    level: Annotated[float, Option(metavar="P", above=0, below=1)] = 0.95,
+    truth_stride: Annotated[ranges.Stride, Option(metavar="N")] = 1,
+    bootstrap: Annotated[ranges.Resamples, Option(metavar="N")] = 1000,
+    level: Annotated[ranges.Level, Option(metavar="P")] = 0.95,
     seed: Seed = 0,
     workers: Workers = None,
     json: Annotated[str | None, Option(metavar="FILE", writes="file", dash=True)] = None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from facediff.cli.options import File, FileOrList, Folder, FrameRate, Output, View, check_folders, named_folders
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
+from facediff.utils import ranges
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,7 +23,7 @@ Predictions = Annotated[str, Option(metavar="PREDICTIONS", reads=True)]
 Truth = Annotated[Path, Option(metavar="TRUTH", reads=True)]
 Clip = Annotated[str | None, Option(metavar="CLIP")]
 Clips = Annotated[list[str] | None, Option(metavar="CLIP", many=True)]
-Highest = Annotated[float | None, Option(metavar="VALUE")]
+Highest = Annotated[ranges.Factor | None, Option(metavar="VALUE")]
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class FileOptions:
     templates: File = None
     mesh: File = None
     frame_rate: FrameRate = None
-    truth_stride: Annotated[int | None, Option(metavar="N", least=1)] = None
+    truth_stride: Annotated[ranges.Stride | None, Option(metavar="N")] = None
     unit: Annotated[str | None, Option(metavar="U")] = None
 
     def gather(self, predictions: str, truth: Path, page: PageOptions) -> tuple[Paper, Material]:
@@ -95,8 +96,8 @@ class PageOptions:
     """
 
     output: Output
-    width: Annotated[float, Option(metavar="MM")] = 175.0
-    dpi: Annotated[int, Option(metavar="N")] = 300
+    width: Annotated[ranges.PageWidth, Option(metavar="MM")] = 175.0
+    dpi: Annotated[ranges.Resolution, Option(metavar="N")] = 300
     font: Annotated[str, Option(metavar="NAME")] = "DejaVu Sans"
 
     def paper(self) -> Paper:
@@ -114,7 +115,7 @@ def frames(
     truth: Truth,
     *,
     clip: Clip = None,
-    times: Annotated[list[float] | None, Option(metavar="SECONDS", many=True)] = None,
+    times: Annotated[list[ranges.Seconds] | None, Option(metavar="SECONDS", many=True)] = None,
     phonemes: Annotated[list[str] | None, Option(metavar="IPA", many=True)] = None,
     phoneme_file: Annotated[Path | None, Option(metavar="CSV", reads=True)] = None,
     close_up: bool = False,
@@ -246,7 +247,7 @@ def lips(
     lip_pairs: FileOrList = None,
     audio: File = None,
     phoneme_file: Annotated[Path | None, Option(metavar="CSV", reads=True)] = None,
-    span: Annotated[tuple[float, float] | None, Option(metavar=("FROM", "TO"))] = None,
+    span: Annotated[tuple[ranges.Seconds, ranges.Seconds] | None, Option(metavar=("FROM", "TO"))] = None,
     files: FileOptions,
     page: PageOptions,
 ) -> None:
@@ -283,7 +284,7 @@ def training(
     runs: Annotated[list[str], Option(metavar="RUN", reads=True)],
     *,
     scalar: Annotated[list[str] | None, Option(metavar="NAME")] = None,
-    smooth: Annotated[float, Option(metavar="W")] = 0.0,
+    smooth: Annotated[ranges.Smoothing, Option(metavar="W")] = 0.0,
     log: bool = False,
     x: Literal["step", "epoch"] = "step",
     page: PageOptions,

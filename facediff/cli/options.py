@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
+from facediff.utils import ranges
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -27,12 +28,11 @@ FileOrList = Annotated[str | None, Option(metavar="FILE", reads=True)]
 Folder = Annotated[Path | None, Option(metavar="FOLDER", reads=True)]
 Map = Annotated[Path | None, Option(metavar="MAP", reads=True, writes="file")]
 Identity = Annotated[str | None, Option(metavar="NAME")]
-FrameRate = Annotated[float | None, Option(metavar="F", above=0)]
-# The generators of random numbers take 64 bits, and the numbers of clips and samples are added to the seed.
-Seed = Annotated[int, Option(metavar="N", least=0, most=2**62 - 1)]
-Size = Annotated[int, Option(metavar="PIXELS", least=16)]
+FrameRate = Annotated[ranges.FrameRate | None, Option(metavar="F")]
+Seed = Annotated[ranges.Seed, Option(metavar="N")]
+Size = Annotated[ranges.Pixels, Option(metavar="PIXELS")]
 View = Literal["front", "three_quarter", "side"]
-Workers = Annotated[int | None, Option(metavar="N", least=1)]
+Workers = Annotated[ranges.Workers | None, Option(metavar="N")]
 
 
 @dataclass(frozen=True)
@@ -122,11 +122,11 @@ class ControlOptions:
     """
 
     expressiveness: Annotated[str | None, Option(metavar="FACTORS")] = None
-    blinks: Annotated[float | None, Option(metavar="RATE", bare=17.0)] = None
-    gaze: Annotated[float | None, Option(metavar="DEGREES", bare=4.0)] = None
-    sway: Annotated[float | None, Option(metavar="DEGREES", bare=2.0)] = None
+    blinks: Annotated[ranges.BlinkRate | None, Option(metavar="RATE", bare=17.0)] = None
+    gaze: Annotated[ranges.GazeAngle | None, Option(metavar="DEGREES", bare=4.0)] = None
+    sway: Annotated[ranges.SwayAngle | None, Option(metavar="DEGREES", bare=2.0)] = None
     eyes: File = None
-    controls_seed: Annotated[int | None, Option(metavar="N", least=0)] = None
+    controls_seed: Annotated[ranges.Seed | None, Option(metavar="N")] = None
 
     def controls(self) -> AnimationControls:
         """The controls that the options ask for."""
@@ -155,7 +155,7 @@ class OutputOptions:
     up: Literal["y", "z"] | None = None
     no_speech: bool = False
     shapes: Annotated[Path | None, Option(metavar="SHAPES", reads=True)] = None
-    tolerance: Annotated[float, Option(metavar="MM", above=0)] = 0.05
+    tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.05
     view: View = "front"
     size: Size = 512
 

@@ -15,17 +15,17 @@ import argparse
 import collections.abc
 import dataclasses
 import inspect
-import math
 import re
 import types
 import typing
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
+from typing import Any, Literal, NoReturn, Union, get_args, get_origin
 
 from facediff.cli.paths import check_paths, refuse_empty
 from facediff.errors import FaceDiffError, choices
+from facediff.utils.ranges import Range, extras_of, range_of, shown
 
 MISSING = inspect.Parameter.empty
 
@@ -37,15 +37,13 @@ RENAMED = {"--takes": "--samples", "--directing-seed": "--controls-seed"}
 class Option:
     """What a type hint cannot say about an option; used as ``Annotated[float, Option(...)]``.
 
+    Which numbers an option takes is said by a :class:`~facediff.utils.ranges.Range`.
+
     Attributes:
         also: another flag, such as ``-o``.
         metavar: the name or, for a pair, the names of the value in the help text.
         many: for lists, whether one flag takes several values; else the flag is repeated.
         bare: the value if the option is given without one; None if a value is needed.
-        least: smallest number allowed; infinity and NaN are never allowed.
-        most: largest number allowed.
-        above: number that the value must exceed.
-        below: number that the value must not reach.
         reads: for paths, and texts that hold paths: whether the file or folder is read.
         writes: for paths: what is written; with ``reads``, what exists is read instead.
         dash: for paths: whether ``-`` stands for standard input or output.
@@ -55,10 +53,6 @@ class Option:
     metavar: str | tuple[str, ...] = ""
     many: bool = False
     bare: Any = None
-    least: float | None = None
-    most: float | None = None
-    above: float | None = None
-    below: float | None = None
     reads: bool = False
     writes: Literal["", "file", "folder", "file or folder"] = ""
     dash: bool = False
@@ -74,6 +68,7 @@ class Parameter:
     help: str
     option: Option
     positional: bool
+    range: Range | None = None
 
     @property
     def flag(self) -> str:
@@ -91,6 +86,14 @@ class Parameter:
     def is_path(self) -> bool:
         """Whether a value is a path; texts may hold one as well."""
         return self.value_type is Path
+
+    @property
+    def flags(self) -> list[str]:
+        """All spellings of an option."""
+        if self.positional:
+            return []
+        also = [self.option.also] if self.option.also else []
+        return list(dict.fromkeys([*also, self.flag, f"--{self.flag[2:].replace('-', '_')}"]))
 
     @property
     def is_switch(self) -> bool:
@@ -119,32 +122,48 @@ class Parameter:
         hint = without_none(self.hint)
         return get_args(hint)[0] if self.is_list or self.length else hint
 
-    def check(self, value: Any) -> None:  # noqa: ANN401
-        """Refuse numbers outside the range."""
-        o = self.option
-        for number in value if isinstance(value, list | tuple) else [value]:
-            if isinstance(number, bool) or not isinstance(number, int | float):
-                continue
-            inside = (
-                math.isfinite(number)
-                and (o.least is None or number >= o.least)
-                and (o.most is None or number <= o.most)
-                and (o.above is None or number > o.above)
-                and (o.below is None or number < o.below)
-            )
-            if not inside:
-                raise FaceDiffError(f"{self.flag} {number}: out of range; expected {self.expected()}")
+    @property
+    def is_number(self) -> bool:
+        """Whether values are numbers, which need a range."""
+        return self.value_type in (int, float)
+
+    @property
+    def given_once(self) -> bool:
+        """Whether a second value would replace the first one without a word."""
+        repeated = self.is_list and not self.has_commas and not self.option.many
+        return not (self.positional or self.is_switch or repeated)
+
+    def read(self, word: str) -> Any:  # noqa: ANN401 - the type of the hint
+        """One word of the command line as a value.
+
+        Raises:
+            FaceDiffError: naming the option, and what was expected.
+        """
+        if self.range is not None and self.is_number:
+            try:
+                return self.range.read(self.flag, word, whole=self.value_type is int)
+            except FaceDiffError as error:
+                bare = f"; {self.flag} without a value goes to the end" if self.option.bare is not None else ""
+                raise FaceDiffError(f"{error}{bare}") from error
+        if not word.strip() or "\0" in word:
+            raise FaceDiffError(f"{self.flag} {shown(word)}: is empty or no text; expected {self.expected()}")
+        if self.has_commas:
+            words = word.split(",")
+            names = [name.strip() for name in words]
+            if "" in names or len({*names}) < len(names):
+                raise FaceDiffError(
+                    f"{self.flag} {shown(word)}: has an empty or a repeated entry; expected names with commas between"
+                )
+            return names
+        return Path(word) if self.value_type is Path else word
 
     def expected(self) -> str:
         """What values the parameter takes, in words."""
-        o = self.option
         if get_origin(self.value_type) is Literal:
             return f"one of {', '.join(str(value) for value in get_args(self.value_type))}"
-        noun = {int: "a whole number", float: "a finite number", str: "text"}.get(self.value_type, "a path")
-        words = {"above": o.above, "of at least": o.least, "below": o.below, "of at most": o.most}
-        limits = " and ".join(f"{word} {limit}" for word, limit in words.items() if limit is not None)
-        several = f"{self.length} times {noun}" if self.length else noun
-        return f"{several} {limits}".strip()
+        one = {int: "a whole number", float: "a number", str: "text"}.get(self.value_type, "a path")
+        several = f"{self.length} times {one}" if self.length else one
+        return several if self.range is None else f"{several} {self.range}"
 
 
 Parameters = Mapping[str, "Parameter | Group"]
@@ -175,23 +194,23 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, Parameter | Group]:
 
     parsed = docstring_parser.parse(inspect.getdoc(function) or "", docstring_parser.DocstringStyle.GOOGLE)
     helps = {entry.arg_name: plain_text(entry.description or "") for entry in parsed.params}
-    hints = typing.get_type_hints(function, include_extras=True)
+    hints, annotations = typing.get_type_hints(function), typing.get_type_hints(function, include_extras=True)
     found: dict[str, Parameter | Group] = {}
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
             continue
-        hint, option = hints[name], Option()
+        hint, annotated = hints[name], annotations[name]
         if dataclasses.is_dataclass(hint):
             made = typing.cast(type, hint)
             fields = [field for field in parameters_of(made).values() if isinstance(field, Parameter)]
             found[name] = Group(made, *summary_of(made), fields)
             continue
-        if get_origin(hint) is Annotated:
-            hint, *extras = get_args(hint)
-            option = next((extra for extra in extras if isinstance(extra, Option)), option)
+        option = next((extra for extra in extras_of(annotated) if isinstance(extra, Option)), Option())
         # The fields of a dataclass may be given by position in Python, but are options of the command line.
         positional = parameter.kind is not parameter.KEYWORD_ONLY and not inspect.isclass(function)
-        found[name] = Parameter(name, hint, parameter.default, helps.get(name, ""), option, positional)
+        found[name] = Parameter(
+            name, hint, parameter.default, helps.get(name, ""), option, positional, range_of(annotated)
+        )
     return found
 
 
@@ -262,16 +281,20 @@ def make_parser(
 
 def add(parser: Any, parameter: Parameter) -> None:  # noqa: ANN401 - argparse's groups have no public type
     """Add one parameter to a parser or to a group of it."""
-    option = parameter.option
-    words: dict[str, Any] = {"help": parameter.help.replace("%", "%%")}
-    dashed = parameter.flag
-    flags = list(dict.fromkeys([*([option.also] if option.also else []), dashed, f"--{dashed[2:].replace('-', '_')}"]))
+    option, flags = parameter.option, parameter.flags
+    text = parameter.help if parameter.range is None else f"{parameter.help}; {parameter.range}"
+    words: dict[str, Any] = {"help": text.replace("%", "%%")}
     if parameter.is_switch:
         parser.add_argument(
             *flags, dest=parameter.name, action="store_false" if parameter.default else "store_true", **words
         )
         return
-    words["type"] = str if parameter.has_commas else parameter.value_type
+    # jsonargparse converts literals; what it knows of numbers and paths is looser than what is declared here. It calls
+    # the function with defaults, too.
+    literal = get_origin(parameter.value_type) is Literal
+    words["type"] = (
+        parameter.value_type if literal else lambda word: parameter.read(word) if isinstance(word, str) else word
+    )
     if option.metavar:
         words["metavar"] = option.metavar
     if parameter.length:
@@ -300,14 +323,12 @@ def parse(
 ) -> dict[str, Any]:
     """The values of a command's parameters; those of a group as an instance of its dataclass."""
     refuse_empty(arguments, program)
+    refuse_repeated(flat(parameters), arguments)
     values = vars(make_parser(parameters, program, summary, details).parse_args(list(arguments)))
     for parameter in flat(parameters):
         value = values[parameter.name]
-        if parameter.has_commas and isinstance(value, str):
-            values[parameter.name] = [word for word in value.replace(",", " ").split() if word]
-        elif parameter.length and value is not None:
+        if parameter.length and value is not None:
             values[parameter.name] = tuple(value)
-        parameter.check(value)
     check_paths(flat(parameters), values)
     return {
         name: values[name]
@@ -315,6 +336,26 @@ def parse(
         else entry.made(**{p.name: values[p.name] for p in entry.parameters})
         for name, entry in parameters.items()
     }
+
+
+def refuse_repeated(parameters: Collection[Parameter], arguments: Sequence[str]) -> None:
+    """Refuse an option that is given twice: argparse would drop the first value without a word.
+
+    Raises:
+        FaceDiffError: naming the option.
+    """
+    once = {flag: parameter for parameter in parameters if parameter.given_once for flag in parameter.flags}
+    seen: set[str] = set()
+    for word in arguments:
+        if word == "--":
+            return
+        flag = word.partition("=")[0] if word.startswith("--") else word[:2]
+        if (parameter := once.get(flag)) is None:
+            continue
+        if parameter.name in seen:
+            fix = "give all its values after one" if parameter.is_list else "give it once"
+            raise FaceDiffError(f"{parameter.flag}: is given twice; {fix}")
+        seen.add(parameter.name)
 
 
 def arguments_of(function: Callable[..., Any], program: str, words: Sequence[str]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from facediff.cli.options import Animations, File, Output, SourceOptions, with_different_names
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
+from facediff.utils import ranges
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -22,7 +23,7 @@ def view(
     truth: File = None,
     labels: Annotated[list[str] | None, Option(metavar="NAME", many=True)] = None,
     shortest: bool = False,
-    max_mb: Annotated[float, Option(metavar="MB", above=0)] = 30.0,
+    max_mb: Annotated[ranges.Megabytes, Option(metavar="MB")] = 30.0,
     open: bool = False,  # noqa: A002 - the option's name
     source: SourceOptions,
 ) -> None:

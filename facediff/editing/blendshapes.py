@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from facediff.animation import Animation, metres_per_unit
 from facediff.editing.shapes import ARKIT, ROTATIONS, ShapeSet, absent_from, beyond_arkit, live_link_name, mirror_pairs
 from facediff.errors import FaceDiffError, choices
 from facediff.mesh.mesh import triangle_areas
+from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable, write_table
 
 Array = npt.NDArray[np.float64]
@@ -45,26 +45,20 @@ class SolveOptions:
         FaceDiffError: if a strength is negative, or a bound, tolerance or count is impossible.
     """
 
-    smoothness: float = 0.02
-    symmetry: float = 0.0
-    ridge: float = 1e-6
-    lower: float = 0.0
-    upper: float = 1.0
+    smoothness: ranges.Strength = 0.02
+    symmetry: ranges.Strength = 0.0
+    ridge: ranges.Strength = 1e-6
+    lower: ranges.Bound = 0.0
+    upper: ranges.Bound = 1.0
     region: str | None = None
     area_weighted: bool = True
-    tolerance: float = 1e-8
-    max_iterations: int = 200
+    tolerance: ranges.Tolerance = 1e-8
+    max_iterations: ranges.Steps = 200
 
     def __post_init__(self) -> None:
-        for name in ("smoothness", "symmetry", "ridge"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise FaceDiffError(f"{name} {getattr(self, name):g}: expected a strength of 0 (off) or more")
-        if not -math.inf < self.lower < self.upper < math.inf:
+        ranges.check_fields(self)
+        if not self.lower < self.upper:
             raise FaceDiffError(f"bounds {self.lower:g} to {self.upper:g}: expected the lower one first, as in 0 1")
-        if not (self.tolerance > 0 and self.max_iterations > 0):
-            raise FaceDiffError(
-                f"tolerance {self.tolerance:g} and {self.max_iterations} iterations: expected both above 0"
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.utils import ranges
 
 # What edits an animation is imported where it is asked for: most animations have no controls.
 if TYPE_CHECKING:
@@ -39,26 +40,15 @@ class AnimationControls:
     """
 
     expressiveness: str | None = None
-    blinks: float | None = None
-    gaze: float | None = None
-    sway: float | None = None
+    blinks: ranges.BlinkRate | None = None
+    gaze: ranges.GazeAngle | None = None
+    sway: ranges.SwayAngle | None = None
     eyes: Path | None = None
-    seed: int | None = None
+    seed: ranges.Seed | None = None
 
     def __post_init__(self) -> None:
-        if not self.is_off:
-            from facediff.editing.procedural import blink_curve, gaze_curve, sway_curve
-
-            _ = self.factors
-            # Each of these refuses an impossible value, also for an animation without frames.
-            if self.blinks is not None:
-                blink_curve(0, 25.0, rate=self.blinks)
-            if self.gaze is not None:
-                gaze_curve(0, 25.0, degrees=self.gaze)
-            if self.sway is not None:
-                sway_curve(0, 25.0, degrees=self.sway)
-        if self.seed is not None and self.seed < 0:
-            raise FaceDiffError(f"--controls-seed {self.seed}: expected 0 or more")
+        ranges.check_fields(self)
+        _ = self.factors
         if self.eyes is not None and not self.eyes.is_file():
             raise FaceDiffError(
                 f"--eyes {self.eyes}: no such file; expected .json or .npz (see docs/animation_controls.md)"

@@ -16,6 +16,7 @@ from facediff.animation import Animation
 from facediff.editing.eyes import GIVE, Array, Eyes, smooth_step
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import rotations
+from facediff.utils import ranges
 
 PROCEDURAL = "procedural"  # Metadata key: what was added by rules
 EDITED = "edited"  # Metadata key: how the animation's own motion was changed
@@ -35,7 +36,6 @@ def random_of(layer: Layer, seed: int) -> np.random.Generator:
 # Movement Disorders 12(6), 1997: 17 times a minute at rest, 26 in conversation, 4.5 when reading.
 
 RATE = 17.0  # Blinks a minute of somebody at rest
-RATES = (1.0, 40.0)
 CLOSE, SHUT, OPEN = 0.10, 0.03, 0.20
 """Seconds that the lids take to shut, stay shut, and take to open: about a third of a second, quicker down than up."""
 SPREAD = (0.85, 1.2)  # How much shorter and longer than that a blink may be
@@ -65,7 +65,8 @@ def add_blinks(animation: Animation, eyes: Eyes, *, rate: float = RATE, seed: in
     return noted(animation, vertices, PROCEDURAL, f"blinks ({rate:g} a minute, seed {seed})")
 
 
-def blink_curve(frames: int, frame_rate: float, *, rate: float = RATE, seed: int = 0) -> Array:
+@ranges.checked
+def blink_curve(frames: int, frame_rate: float, *, rate: ranges.BlinkRate = RATE, seed: int = 0) -> Array:
     """How far the eyes are shut in every frame (T,), 0 to 1.
 
     Intervals are a gamma distribution of shape 2 above the shortest possible one, with the mean that the rate asks for.
@@ -78,11 +79,6 @@ def blink_curve(frames: int, frame_rate: float, *, rate: float = RATE, seed: int
         >>> bool((blink_curve(250, 25.0, seed=1) == 1.0).any())
         True
     """
-    if not RATES[0] <= rate <= RATES[1]:
-        raise FaceDiffError(
-            f"--blinks {rate:g}: expected blinks a minute, {RATES[0]:g} to {RATES[1]:g} (17 at rest, 26 in "
-            f"conversation)"
-        )
     random = random_of("blinks", seed)
     times = np.arange(frames) / frame_rate
     last = times[-1] if frames else 0.0
@@ -111,7 +107,6 @@ def blink_curve(frames: int, frame_rate: float, *, rate: float = RATE, seed: int
 # (Carpenter, "Movements of the Eyes", 1988).
 
 DEGREES_GAZE = 4.0  # Default of the largest angle from straight ahead: the eyes wander over a listener's face
-WIDEST_GAZE = 20.0
 AHEAD_SECONDS, ASIDE_SECONDS = 1.6, 0.6  # Mean duration of a fixation straight ahead, and elsewhere
 SHORTEST = 0.2  # Seconds between saccades at least
 CHUNK = 256  # Frames that are turned at a time
@@ -150,7 +145,8 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: float = DEGREES_GAZE,
     return noted(animation, vertices, PROCEDURAL, f"gaze ({degrees:g} degrees, seed {seed})")
 
 
-def gaze_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_GAZE, seed: int = 0) -> Array:
+@ranges.checked
+def gaze_curve(frames: int, frame_rate: float, *, degrees: ranges.GazeAngle = DEGREES_GAZE, seed: int = 0) -> Array:
     """Where the eyes look in every frame, (T, 2): degrees to the face's left and upwards.
 
     Fixations straight ahead and elsewhere alternate, now and then with two elsewhere; the first and the last are
@@ -159,8 +155,6 @@ def gaze_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_GAZE,
     Raises:
         FaceDiffError: if the angle is not above 0 and at most 20.
     """
-    if not 0 < degrees <= WIDEST_GAZE:
-        raise FaceDiffError(f"--gaze {degrees:g}: expected degrees above 0 and up to {WIDEST_GAZE:g}")
     random = random_of("gaze", seed)
 
     def fixation(mean: float) -> float:
@@ -210,7 +204,6 @@ def sphere_centre(points: npt.NDArray[np.floating]) -> Array:
 # Head sway: slow, small rotations and shifts of the whole head.
 
 DEGREES_SWAY = 2.0  # Default of the largest rotation
-WIDEST_SWAY = 15.0
 BAND = (0.08, 0.6)  # Hertz: slower sway cannot be seen, and faster sway looks like a tremor
 WAVES = 6
 AXES = np.array([0.7, 1.0, 0.5])  # How much of the rotation is nodding, shaking and tilting
@@ -242,7 +235,10 @@ def neck(template: npt.NDArray[np.floating]) -> Array:
     return np.array([0.5 * (low[0] + high[0]), low[1] + 0.15 * height, high[2] - 0.6 * height])
 
 
-def sway_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_SWAY, seed: int = 0) -> tuple[Array, Array]:
+@ranges.checked
+def sway_curve(
+    frames: int, frame_rate: float, *, degrees: ranges.SwayAngle = DEGREES_SWAY, seed: int = 0
+) -> tuple[Array, Array]:
     """Rotations (T, 3), axis-angle in radians, and shifts (T, 3), in head heights; zero in the first and last frame.
 
     Sums of six sines between 0.08 and 0.6 Hz, so that nothing is quick; the largest rotation is ``degrees``.
@@ -250,8 +246,6 @@ def sway_curve(frames: int, frame_rate: float, *, degrees: float = DEGREES_SWAY,
     Raises:
         FaceDiffError: if the angle is not above 0 and at most 15.
     """
-    if not 0 < degrees <= WIDEST_SWAY:
-        raise FaceDiffError(f"--sway {degrees:g}: expected degrees above 0 and up to {WIDEST_SWAY:g}")
     random = random_of("sway", seed)
     times = np.arange(frames) / frame_rate
     last = float(times[-1]) if frames else 0.0

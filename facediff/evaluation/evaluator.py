@@ -31,8 +31,10 @@ from facediff.evaluation.report import Bootstrap, MethodTable, Report
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
 from facediff.metrics import Context, LipPairs, Protocol, Region, protocol
 from facediff.metrics.by_name import parse_all
+from facediff.utils import ranges
 
 
+@ranges.checked
 def evaluate(
     methods: Mapping[str, str | Path],
     truth: str | Path,
@@ -40,21 +42,21 @@ def evaluate(
     lips: Region,
     upper_face: Region | None = None,
     templates: Mapping[str, Tensor] | None = None,
-    n_vertices: int,
+    n_vertices: ranges.Vertices,
     protocols: Sequence[str | Protocol] = ("paper",),
     metrics: Sequence[str] = (),
     lip_pairs: LipPairs | None = None,
     corpus: Path | None = None,
-    frame_rate: float | None = None,
+    frame_rate: ranges.FrameRate | None = None,
     topology: str | None = None,
     patterns: Sequence[str] = DEFAULT_PATTERNS,
     truth_pattern: str = TRUTH_PATTERN,
     identity: str = OWN,
-    truth_stride: int = 1,
-    bootstrap: int = 1000,
-    level: float = 0.95,
-    seed: int = 0,
-    workers: int | None = None,
+    truth_stride: ranges.Stride = 1,
+    bootstrap: ranges.Resamples = 1000,
+    level: ranges.Level = 0.95,
+    seed: ranges.Seed = 0,
+    workers: ranges.Workers | None = None,
     progress: bool = False,
 ) -> Report:
     """Score the files of one or several methods against the truth.
@@ -93,8 +95,8 @@ def evaluate(
         FaceDiffError: if an argument does not fit, a method has nothing that can be scored, a clip holds NaN or
             infinity, or a protocol refuses a clip's length.
     """
-    if not methods or not protocols or truth_stride < 1:
-        raise FaceDiffError("expected at least one method, at least one protocol and a truth_stride of at least 1")
+    if not methods or not protocols:
+        raise FaceDiffError("expected at least one method and at least one protocol")
     settings = find_protocols(protocols, topology)
     sampling = Bootstrap(bootstrap, level, seed)
     requests = parse_all(metrics)

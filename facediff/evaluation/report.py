@@ -14,6 +14,7 @@ from facediff.errors import FaceDiffError, printable
 from facediff.evaluation.files import Missing, Pair
 from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
+from facediff.utils import ranges
 from facediff.utils.tables import format_table
 
 
@@ -175,17 +176,12 @@ class Bootstrap:
         FaceDiffError: if a number is out of range.
     """
 
-    resamples: int = 1000
-    level: float = 0.95
-    seed: int = 0
+    resamples: ranges.Resamples = 1000
+    level: ranges.Level = 0.95
+    seed: ranges.Seed = 0
 
     def __post_init__(self) -> None:
-        if self.resamples < 0:
-            raise FaceDiffError(f"bootstrap is {self.resamples}; expected a number of resamples, or 0 for no intervals")
-        if not 0 < self.level < 1:
-            raise FaceDiffError(f"level is {self.level:g}; expected a share between 0 and 1, such as 0.95")
-        if self.seed < 0:
-            raise FaceDiffError(f"seed is {self.seed}; expected a whole number from 0")
+        ranges.check_fields(self)
 
     def scores(self, values: Array, weights: Array) -> Array | None:
         """The score of every resample: a ratio of sums, so that a sequence keeps the weight of its frames.

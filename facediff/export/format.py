@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.render.rasteriser import face_outward, to_linear, vertex_normals
+from facediff.utils import ranges
 
 Up = Literal["y", "z"]
 
@@ -44,12 +45,15 @@ class ExportOptions:
     up: Up | None = None
     speech: bool = True
     view: str = "front"
-    size: int = 512
+    size: ranges.Pixels = 512
     shapes: Path | None = None
-    tolerance_mm: float = 0.05
+    tolerance_mm: ranges.Millimetres = 0.05
     footer: str = ""
     quiet: bool = True
     speech_file: str | None = None
+
+    def __post_init__(self) -> None:
+        ranges.check_fields(self)
 
 
 class Format(ABC):

@@ -127,8 +127,6 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
         )
     if form.needs_shapes and options.shapes is not None and not options.shapes.exists():
         raise FaceDiffError(f"{options.shapes}: no such folder or file; expected the blendshapes for {path}")
-    if not 0 < options.tolerance_mm < float("inf"):
-        raise FaceDiffError(f"tolerance of {options.tolerance_mm:g} mm: expected more than 0, such as 0.05")
     if form.requires is not None and importlib.util.find_spec(form.requires[0]) is None:
         raise MissingExtraError(*form.requires, f"writing {suffix}")
     for target in _targets(path, form, n_animations):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from facediff.editing.controls import AnimationControls
 from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, check_export
+from facediff.utils import ranges
 from facediff.utils.files import scratch_folder
 from facediff.utils.progress import track
 
@@ -39,18 +40,21 @@ class AnimationOptions:
     identity: str | None = None
     style: str | None = None
     style_template: str | None = None
-    samples: int = 1
+    samples: ranges.Samples = 1
     sampler: str | None = None
-    steps: int | None = None
+    steps: ranges.Steps | None = None
     device: str = "cpu"
     precision: Literal["32", "bf16"] = "32"
-    window: float | None = None
-    overlap: float | None = None
+    window: ranges.Window | None = None
+    overlap: ranges.Window | None = None
     controls: AnimationControls = field(default_factory=AnimationControls)
     target_mesh: Path | None = None
     correspondence: Path | None = None
     export: ExportOptions = field(default_factory=ExportOptions)
     quiet: bool = True
+
+    def __post_init__(self) -> None:
+        ranges.check_fields(self)
 
     def check(self, output: Path) -> None:
         """Refuse what can be refused before a model is loaded."""

@@ -22,6 +22,7 @@ from facediff.cli.parsing import arguments_of
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures import Material
 from tests.fakes.tiny import VERTICES
+from tests.fakes.words import last_of_each
 
 ROOT = Path(__file__).parents[2]
 TINY = ["--topology", "tests.fakes.tiny.Tiny"]
@@ -57,7 +58,7 @@ def words(figure: str, corpus: Path, *more: str) -> list[str]:
         "lips": files,
         "training": [f"one={folder / 'run'}", f"two={folder / 'run' / 'metrics.csv'}"],
     }[figure]
-    return ["figure", figure, *given, *SMALL, *([] if "-o" in more else ["-o", str(folder / "figure.png")]), *more]
+    return last_of_each(["figure", figure, *given, *SMALL, "-o", str(folder / "figure.png"), *more])
 
 
 @pytest.mark.parametrize("figure", FIGURES)
@@ -173,7 +174,7 @@ WRONG = {
     "method without folder": (["error", "--method", "x=gone"], "gone: no such folder"),
     "method called truth": (["error", "--method", "truth={ours}"], 'cannot be called "truth"'),
     "condition not there": (["error", "--identity", "B"], "under the condition B"),
-    "scale without extent": (["error", "--highest-mean", "0"], "above 0"),
+    "scale without extent": (["error", "--highest-mean", "0"], "--highest-mean 0"),
     "width": (["error", "--width", "5"], "--width 5"),
     "too many pixels": (["error", "--width", "30", "--dpi", "50"], "raise --width or --dpi"),
     "pairs": (["lips", "--lip-pairs", "3-900"], "--lip-pairs 3-900"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,11 +25,15 @@ from facediff.cli.parsing import (
     with_more_help,
 )
 from facediff.errors import FaceDiffError
+from facediff.utils.ranges import Range
 
 ROOT = Path(__file__).parents[2]
 CONSOLE = re.compile(r"^```(?:console|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 OWN_PARSERS = ("run", "lightning")
 FUNCTIONS = sorted(name for name in COMMANDS if COMMANDS[name].target.partition(":")[2] not in OWN_PARSERS)
+
+
+Second = Annotated[float, Range(0, 60)]
 
 
 @dataclass(frozen=True)
@@ -44,8 +49,8 @@ class LookOptions:
     """
 
     colour: str = "grey"
-    blinks: Annotated[float | None, Option(metavar="RATE", bare=17.0)] = None
-    share: Annotated[float, Option(above=0, below=1)] = 0.5
+    blinks: Annotated[float | None, Option(metavar="RATE", bare=17.0), Range(1, 40)] = None
+    share: Annotated[float, Range(0, 1, above=True, below=True)] = 0.5
 
 
 def command(
@@ -54,11 +59,11 @@ def command(
     *,
     output: Annotated[Path, Option(also="-o", metavar="OUT")],
     name: str | None = None,
-    frame_rate: Annotated[float | None, Option(above=0)] = None,
-    seed: Annotated[int, Option(least=0, most=10)] = 0,
+    frame_rate: Annotated[float | None, Range(0, 1000, above=True)] = None,
+    seed: Annotated[int, Range(0, 10)] = 0,
     precision: Literal["32", "bf16"] = "32",
-    span: Annotated[tuple[float, float], Option(metavar=("FROM", "TO"))] = (0.0, 1.0),
-    times: Annotated[list[float] | None, Option(many=True)] = None,
+    span: Annotated[tuple[Second, Second], Option(metavar=("FROM", "TO"))] = (0.0, 1.0),
+    times: Annotated[list[Second] | None, Option(many=True)] = None,
     method: list[str] | None = None,
     sound: bool = True,
     quiet: bool = False,
@@ -152,12 +157,12 @@ FILES = ["a.wav", "b.wav", "-o", "out.mp4"]
         ([*FILES, "--zzz"], "--zzz"),
         ([*FILES, "--seed"], "--seed"),
         ([*FILES, "--seed", "1.5"], "--seed 1.5"),
-        ([*FILES, "--seed", "11"], "at most 10"),
+        ([*FILES, "--seed", "11"], "from 0 to 10"),
         ([*FILES, "--seed", "-1"], "--seed -1"),
         ([*FILES, "--frame-rate", "nan"], "--frame-rate nan"),
         ([*FILES, "--frame-rate", "inf"], "--frame-rate inf"),
         ([*FILES, "--frame-rate", "0"], "--frame-rate 0"),
-        ([*FILES, "--share", "1"], "below 1"),
+        ([*FILES, "--share", "1"], "and below 1"),
         ([*FILES, "--precision", "16"], "one of 32, bf16"),
         ([*FILES, "--span", "1"], "--span"),
         ([*FILES, "--span", "1", "x"], "--span"),
@@ -285,3 +290,70 @@ def test_documented_commands_parse() -> None:
         name, rest = find(words)
         if name in FUNCTIONS:
             assert arguments_of(load(name), f"{page}: facediff {name}", rest)
+
+
+def test_every_number_of_every_command_has_a_range() -> None:
+    numbers = [
+        (command_name, parameter)
+        for command_name, parameters in all_parameters().items()
+        for parameter in flat(parameters)
+        if parameter.is_number
+    ]
+    assert len(numbers) > 40
+    assert [(name, parameter.flag) for name, parameter in numbers if parameter.range is None] == []
+
+
+SPELLINGS = ["nan", "inf", "-inf", "1e999", "-1", "1_0", "٣", "0x10", "", " 1", "1 2", "1,", "9" * 5000, "one", "None"]
+
+
+@pytest.mark.parametrize("word", SPELLINGS)
+def test_numbers_that_are_none_or_out_of_range_are_refused(word: str) -> None:
+    for flag in ("--seed", "--frame-rate", "--share"):
+        assert flag in refused(*FILES, f"{flag}={word}")
+
+
+@pytest.mark.parametrize("word", ["1e3", "1.0", "1.5"])
+def test_a_count_is_spelt_in_digits(word: str) -> None:
+    assert "--seed" in refused(*FILES, "--seed", word)
+
+
+def test_the_help_says_the_range(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parsed("--help")
+    assert "of the noise; from 0 to 10" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--seed", "1", "--seed", "1"],
+        ["--seed=1", "--seed", "2"],
+        ["--frame-rate", "1", "--frame_rate", "2"],
+        ["-o", "again.mp4"],
+        ["--times", "1", "--times", "2"],
+    ],
+)
+def test_an_option_given_twice_is_refused(words: list[str]) -> None:
+    assert "is given twice" in refused(*FILES, *words)
+
+
+def test_lists_and_switches_may_be_repeated() -> None:
+    assert parsed("--method", "a=x", "--quiet", "--method", "b=y", "--quiet")["method"] == ["a=x", "b=y"]
+
+
+@pytest.mark.parametrize("word", ["", " ", "\t", "a\0b"])
+def test_empty_words_are_refused(word: str) -> None:
+    assert "--name" in refused(*FILES, f"--name={word}")
+    assert "--output" in refused("a.wav", "b.wav", "-o", word)
+
+
+@pytest.mark.parametrize("word", [",", "F2,", "F2,,F3", "F2,F2"])
+def test_empty_and_repeated_entries_of_a_list_are_refused(word: str) -> None:
+    with pytest.raises(FaceDiffError, match="--subjects"):
+        arguments_of(load_plan(), "x", ["raw", "--subjects", word])
+
+
+def load_plan() -> Callable[..., object]:
+    from facediff.data.prepare.biwi import plan
+
+    return plan

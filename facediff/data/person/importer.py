@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -36,16 +35,17 @@ from facediff.data.prepare.runner import MANIFEST, version, write_clip, write_te
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, stable_vertices
 from facediff.mesh.alignment import chunks
+from facediff.utils import ranges
 from facediff.utils.files import check_writable, describe_files, put_in_place, scratch_folder, write_json, write_rows
 
 MIN_SECONDS = 2.0
-MIN_CLIP_SECONDS = 1.0
 SILENCE = 1e-4  # loudest sample below which a recording counts as silent
 MISMATCH = 0.1  # speech and motion may differ in length by this share; more is an error
 SLACK = 0.25  # how far a cut may lie from an equal division, as a share of a clip
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9-]{0,63}")
 
 
+@ranges.checked
 def import_person(
     motion: Path,
     *,
@@ -53,13 +53,13 @@ def import_person(
     name: str,
     corpus: Path,
     output: Path,
-    frame_rate: float,
-    corpus_frame_rate: float | None = None,
+    frame_rate: ranges.FrameRate,
+    corpus_frame_rate: ranges.FrameRate | None = None,
     template: Path | None = None,
     stable: str | None = None,
     flame: Path | None = None,
-    scale: float | None = None,
-    clip_seconds: float = 8.0,
+    scale: ranges.Factor | None = None,
+    clip_seconds: ranges.ClipLength = 8.0,
     progress: bool = False,
 ) -> Report:
     """Turn the reconstruction of one speaker's video into a corpus entry that fits an existing corpus.
@@ -86,8 +86,8 @@ def import_person(
         FaceDiffError: for anything that is wrong with files or arguments; nothing is left behind then.
     """
     output = output.expanduser().absolute()
-    rates = {"--frame-rate": frame_rate, "--corpus-frame-rate": corpus_frame_rate}
-    _check_arguments(name, {**rates, "--scale": scale, "--clip-seconds": clip_seconds})
+    if not NAME.fullmatch(name):
+        raise FaceDiffError(f"--name {name!r}: expected letters, digits and dashes, at most 64, with no dash first")
     _check_output(output)
     known = read_auxiliary(corpus, name=name, frame_rate=corpus_frame_rate)
     speech = read_speech(audio)
@@ -161,16 +161,6 @@ def _fit(
         best, residual = lay_onto_corpus(source, neutral.face, known)
     place = into_coordinates(neutral.face, best, scale)
     return Fitted(made, neutral, place, best.scale, residual, compared)
-
-
-def _check_arguments(name: str, numbers: dict[str, float | None]) -> None:
-    if not NAME.fullmatch(name):
-        raise FaceDiffError(f"--name {name!r}: expected letters, digits and dashes, at most 64, with no dash first")
-    for option, number in numbers.items():
-        if number is not None and not (math.isfinite(number) and number > 0):
-            raise FaceDiffError(f"{option} {number:g}: expected a positive number")
-    if (numbers["--clip-seconds"] or 0) < MIN_CLIP_SECONDS:
-        raise FaceDiffError(f"--clip-seconds {numbers['--clip-seconds']:g}: expected at least {MIN_CLIP_SECONDS:g}")
 
 
 def _check_output(path: Path) -> None:

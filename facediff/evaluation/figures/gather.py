@@ -22,10 +22,12 @@ from facediff.evaluation.figures.material import Material, find_clips
 from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
 from facediff.mesh.files import SUFFIXES, read_mesh
 from facediff.mesh.mesh import Mesh
+from facediff.utils import ranges
 
 Module = type[SpeechMotionDataModule]
 
 
+@ranges.checked
 def gather(
     methods: Mapping[str, Path],
     truth: Path,
@@ -36,8 +38,8 @@ def gather(
     topology: str | None = None,
     templates: Path | None = None,
     mesh: Path | None = None,
-    frame_rate: float | None = None,
-    truth_stride: int | None = None,
+    frame_rate: ranges.FrameRate | None = None,
+    truth_stride: ranges.Stride | None = None,
     unit: str | None = None,
 ) -> Material:
     """Find truth, methods and what is known about their mesh; where an option is None, the corpus says it.
@@ -152,11 +154,7 @@ def _rates(
     stated = manifest.get("frame_rate") or (module and (module.stored_frame_rate or module.frame_rate))
     stored = float(stated) if isinstance(stated, int | float) else None
     rate = frame_rate if frame_rate is not None else module.frame_rate if module else stored
-    if rate is not None and not 0 < rate < 10_000:
-        raise FaceDiffError(f"--frame-rate {rate:g}: expected frames a second, e.g. 25")
     if truth_stride is not None:
-        if truth_stride < 1:
-            raise FaceDiffError(f"--truth-stride {truth_stride}: expected a number from 1")
         return rate, truth_stride
     if rate is None or stored is None:
         return rate, 1

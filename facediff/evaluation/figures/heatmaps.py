@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import FLAT, TRUTH, Array, Material, Painter, chunks, shortest
 from facediff.evaluation.figures.page import (
     GAP,
@@ -24,6 +23,7 @@ from facediff.evaluation.figures.page import (
     style,
     wrapped,
 )
+from facediff.utils import ranges
 
 HIGHEST = 70.0  # Largest height of a picture in mm
 BAR, BAR_SPACE = 2.5, 16.0  # Width of a colour bar, and of the bar with its numbers and label, in mm
@@ -114,6 +114,7 @@ def _vertex_maps(
     return maps, notes
 
 
+@ranges.checked
 def draw_heatmap(
     material: Material,
     clips: Sequence[str],
@@ -121,7 +122,7 @@ def draw_heatmap(
     *,
     paper: Paper | None = None,
     view: str = "front",
-    highest: tuple[float | None, float | None] = (None, None),
+    highest: tuple[ranges.Factor | None, ranges.Factor | None] = (None, None),
 ) -> list[str]:
     """Draw mean and standard deviation over time of each vertex's distance from the template, truth and methods.
 
@@ -150,6 +151,7 @@ def draw_heatmap(
     return notes
 
 
+@ranges.checked
 def draw_error(
     material: Material,
     clips: Sequence[str],
@@ -158,7 +160,7 @@ def draw_error(
     paper: Paper | None = None,
     view: str = "front",
     statistic: Statistic = "mean",
-    highest: tuple[float | None, float | None] = (None, None),
+    highest: tuple[ranges.Factor | None, ranges.Factor | None] = (None, None),
 ) -> list[str]:
     """Draw how far each vertex is from the truth's, mean or maximum over frames, a column for each method.
 
@@ -207,14 +209,8 @@ def _draw(material: Material, clips: Sequence[str], rows: Sequence[Row], output:
 
 
 def scale_end(values: Mapping[str, Array], factor: float, highest: float | None) -> float:
-    """Value of a row's last colour, in the unit shown.
-
-    Raises:
-        FaceDiffError: if it is not above 0.
-    """
+    """Value of a row's last colour, in the unit shown."""
     if highest is not None:
-        if not (np.isfinite(highest) and highest > 0):
-            raise FaceDiffError(f"the end of a colour scale is {highest:g}; expected a number above 0")
         return highest
     largest = max(float(each.max()) for each in values.values()) * factor
     return largest if largest > 0 else 1.0  # nothing moves: any scale is right

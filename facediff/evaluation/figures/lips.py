@@ -32,7 +32,7 @@ from facediff.evaluation.figures.page import (
 )
 from facediff.metrics import LipPairs
 from facediff.metrics.mouth import opening
-from facediff.utils import SAMPLE_RATE
+from facediff.utils import SAMPLE_RATE, ranges
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,6 +91,7 @@ def envelope(samples: npt.NDArray[np.float32], columns: int) -> tuple[Array, Arr
     return low, high
 
 
+@ranges.checked
 def draw_lips(
     curves: Curves,
     sound: Sound,
@@ -98,7 +99,7 @@ def draw_lips(
     *,
     paper: Paper | None = None,
     scale: tuple[float, str] = (1.0, "unit of the vertices"),
-    span: tuple[float, float] | None = None,
+    span: tuple[ranges.Seconds, ranges.Seconds] | None = None,
     remark: str = "",
 ) -> None:
     """Draw the opening of the mouth of truth and methods, with phonemes and waveform beneath.

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
 
 if TYPE_CHECKING:
@@ -52,15 +53,12 @@ NAME_LINES = 2  # The most lines of a row's name
 class Paper:
     """Size, resolution and font of a figure."""
 
-    width: float = PAGE  # in mm
-    dpi: int = 300  # of PNG and of the pictures inside PDF and SVG
+    width: ranges.PageWidth = PAGE  # in mm
+    dpi: ranges.Resolution = 300  # of PNG and of the pictures inside PDF and SVG
     font: str = FONT  # family of all letters
 
     def __post_init__(self) -> None:
-        if not 30 <= self.width <= 1000:
-            raise FaceDiffError(f"--width {self.width:g}: expected millimetres from 30 to 1000, e.g. 85 or 175")
-        if not 50 <= self.dpi <= 1200:
-            raise FaceDiffError(f"--dpi {self.dpi}: expected pixels an inch from 50 to 1200, e.g. 300")
+        ranges.check_fields(self)
 
     def pixels(self, mm: float) -> int:
         """Whole pixels of a length."""

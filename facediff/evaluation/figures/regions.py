@@ -16,6 +16,7 @@ from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
 from facediff.render import Renderer, save_image, side_by_side
 from facediff.render.panels import draw_text
+from facediff.utils import ranges
 
 COLOURS: dict[str, tuple[int, int, int]] = {"lips": (214, 40, 57), "upper_face": (38, 102, 207)}
 """Colour (sRGB) of each region; vertices of both have the last."""
@@ -24,6 +25,7 @@ REST = (219, 209, 200)  # Colour (sRGB) of all other vertices
 VIEWS = {"front": "front", "three_quarter": "three-quarter"}  # Views from left to right, with the text above them
 
 
+@ranges.checked
 def draw_regions(
     root: Path,
     output: Path,
@@ -31,7 +33,7 @@ def draw_regions(
     corpus: str | None = None,
     lips: str | None = None,
     upper_face: str | None = None,
-    size: int = 640,
+    size: ranges.Pixels = 640,
 ) -> list[str]:
     """Draw a corpus's lips and upper face, the vertices that LVE and FDD use, on its mesh.
 

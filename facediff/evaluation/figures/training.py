@@ -24,6 +24,7 @@ from facediff.evaluation.figures.page import (
     save,
     style,
 )
+from facediff.utils import ranges
 from facediff.utils.files import read_rows
 
 if TYPE_CHECKING:
@@ -140,6 +141,7 @@ def smooth(values: Array, weight: float) -> Array:
     return smoothed
 
 
+@ranges.checked
 def draw_training(
     runs: Mapping[str, Mapping[str, Curve]],
     scalars: Sequence[str],
@@ -147,7 +149,7 @@ def draw_training(
     *,
     paper: Paper | None = None,
     axis: Axis = "step",
-    smoothing: float = 0.0,
+    smoothing: ranges.Smoothing = 0.0,
     log: bool = False,
 ) -> None:
     """Draw scalars over training, a panel each, all runs in one panel.
@@ -166,8 +168,6 @@ def draw_training(
         FaceDiffError: if the smoothing is out of range, or a logarithmic axis has nothing above 0 to show.
     """
     check_output(output)
-    if not 0 <= smoothing < 1:
-        raise FaceDiffError(f"--smooth {smoothing:g}: expected a number from 0 to below 1, e.g. 0.9")
     paper = paper or Paper()
     across = 1 if paper.width < NARROW else {1: 1, 2: 2, 4: 2}.get(len(scalars), 3)
     down = -(-len(scalars) // across)
