@@ -6,8 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from facediff.cli.options import Checkpoint, ControlOptions, File, Identity, Map, OutputOptions, Seed, Workers
-from facediff.cli.parsing import Option
+from facediff.cli.options import (
+    Checkpoint,
+    ControlOptions,
+    File,
+    Identity,
+    Map,
+    OutputOptions,
+    Seed,
+    Workers,
+    confirm_cost,
+)
+from facediff.cli.parsing import Option, changed, refuse_idle
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -63,6 +73,7 @@ def animate(
     target_mesh: File = None,
     correspondence: Map = None,
     quiet: bool = False,
+    yes: bool = False,
     files: OutputOptions,
     windows: WindowOptions,
     batch: BatchOptions,
@@ -95,6 +106,7 @@ def animate(
         target_mesh: transfer the motion to this mesh
         correspondence: with --target-mesh: .npz to use if it exists, else to write
         quiet: no progress bars
+        yes: start without a question, however much time or memory it takes
         files: how the files are written.
         windows: how long speech is cut.
         batch: how several recordings are animated.
@@ -110,6 +122,12 @@ def animate(
         )
     if streamed and not windows.stream:
         raise FaceDiffError("speech: - is standard input; add --stream, and send samples rather than a file")
+    if windows.stream:
+        refuse_idle("is for recordings, and a stream ends by itself", max_seconds=windows.max_seconds is not None)
+    else:
+        refuse_idle("is for --stream", rate=changed(windows)["rate"])
+    if windows.stream or (len(speech) == 1 and not speech[0].is_dir()):
+        refuse_idle("is for several recordings or a folder of them", **changed(batch))
     if not streamed and len(speech) == 1 and not speech[0].exists():
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
     if not checkpoint.is_file():
@@ -157,7 +175,10 @@ def animate(
         )
     options.check(output)
     samples_of_speech = read_recording(speech[0], windows.max_seconds)  # before the model, which takes longer to load
-    written, animation = AnimationPipeline(options).write(samples_of_speech, speech[0].stem, output, seed=seed)
+    pipeline = AnimationPipeline(options)
+    seconds, size = pipeline.cost(samples_of_speech, output)
+    confirm_cost(yes, "--samples, --steps or --size", seconds=seconds, size=size)
+    written, animation = pipeline.write(samples_of_speech, speech[0].stem, output, seed=seed)
     metadata = animation.metadata
     notes = "".join(f", {name}: {metadata[name]}" for name in ("edited", "procedural") if name in metadata)
     line = f"{len(animation.vertices)} frames, identity {metadata['identity']}, style of {metadata['style']}{notes}"

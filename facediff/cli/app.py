@@ -53,6 +53,8 @@ COMMANDS = {
     "components": Command("facediff.cli.components:components", "list what can be chosen by name"),
 }
 HELP = ("-h", "--help")
+LONGEST = 900
+"""Characters of an error that are printed."""
 GROUPS = {
     "style": "speaking styles of trained models",
     "figure": "draw the figures of a paper: faces, heat maps, lip and training curves",
@@ -163,5 +165,7 @@ def load(name: str) -> Callable[..., int | None]:
 
 def fail(message: str, status: int = 2) -> int:
     """Print one sentence to standard error and give back the exit status."""
-    print(f"facediff: error: {message}", file=sys.stderr)
+    # Names of files may hold line breaks and control characters, or be as long as a page.
+    line = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in message)
+    print(f"facediff: error: {line if len(line) <= LONGEST else line[:LONGEST] + '…'}", file=sys.stderr)
     return status

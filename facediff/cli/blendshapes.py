@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import Picture, SourceOptions, check_picture_path
-from facediff.cli.parsing import Option
+from facediff.cli.parsing import Option, changed, refuse_idle
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -53,6 +53,15 @@ def blendshapes(
     if write_puppet_shapes is not None:
         if animation is not None:
             raise FaceDiffError("--write-puppet-shapes: writes shapes and solves for none; omit the animation")
+        asked = {"output": output, "shapes": shapes, "region": region, "show": show}
+        others = {name: is_changed for name, is_changed in changed(source).items() if name != "identity"}
+        switches = {"carry": carry, "only_arkit": only_arkit, "plain": plain}
+        refuse_idle(
+            "has no effect with --write-puppet-shapes",
+            **{name: value is not None for name, value in asked.items()},
+            **switches,
+            **others,
+        )
         from facediff.synthetic.arkit import write_puppet_shapes as write
 
         written = write(write_puppet_shapes, source.identity)

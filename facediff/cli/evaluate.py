@@ -7,10 +7,23 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-from facediff.cli.options import File, FileOrList, Folder, FrameRate, Seed, Workers, check_folders, named_folders
-from facediff.cli.parsing import Option
+from facediff.cli.options import (
+    File,
+    FileOrList,
+    Folder,
+    FrameRate,
+    Seed,
+    Workers,
+    check_folders,
+    confirm_cost,
+    named_folders,
+)
+from facediff.cli.parsing import Option, refuse_idle
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+
+LEVEL = 0.95
+DRAW_SECONDS = 4e-8  # What a resample takes for each clip
 
 
 def evaluate(
@@ -33,12 +46,13 @@ def evaluate(
     identity: Annotated[str, Option(metavar="NAME")] = "own",
     truth_stride: Annotated[ranges.Stride, Option(metavar="N")] = 1,
     bootstrap: Annotated[ranges.Resamples, Option(metavar="N")] = 1000,
-    level: Annotated[ranges.Level, Option(metavar="P")] = 0.95,
+    level: Annotated[ranges.Level, Option(metavar="P")] = LEVEL,
     seed: Seed = 0,
     workers: Workers = None,
     json: Annotated[str | None, Option(metavar="FILE", writes="file", dash=True)] = None,
     csv: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
     quiet: bool = False,
+    yes: bool = False,
 ) -> None:
     """Score predictions against the truth by one or several protocols and metrics, with confidence intervals.
 
@@ -71,7 +85,12 @@ def evaluate(
         json: write everything as JSON; - prints it instead of the table
         csv: write one row for each sequence and method
         quiet: no progress bar
+        yes: start without a question, however long it takes
     """
+    if not bootstrap:
+        refuse_idle("is for intervals, of which --bootstrap 0 makes none", level=level != LEVEL, seed=seed != 0)
+    if not metric:
+        refuse_idle("is for further metrics, chosen with --metric", lip_pairs=lip_pairs is not None)
     methods = named_folders([predictions, *(method or [])])
     check_folders(methods)
     if not truth.is_dir():
@@ -96,6 +115,9 @@ def evaluate(
     upper = None
     if needs_upper_face(protocols, metrics):
         upper = read_region("upper_face", n_vertices, folder=regions, source=upper_face)
+    clips = sum(1 for _ in truth.glob("*.npy"))
+    seconds = DRAW_SECONDS * bootstrap * clips * (2 * len(methods) - 1) * len(protocols)
+    confirm_cost(yes, "--bootstrap", seconds=seconds)
     report = score(
         methods,
         truth,

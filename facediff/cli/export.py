@@ -11,7 +11,6 @@ from facediff.cli.options import (
     with_different_names,
 )
 from facediff.cli.parsing import with_more_help
-from facediff.errors import FaceDiffError
 
 
 def format_table() -> str:
@@ -42,8 +41,6 @@ def export(
         controls: what is changed in the animations.
     """
     source.check(animations)
-    if files.shapes is not None and output.suffix != ".csv":
-        raise FaceDiffError(f"--shapes: is for weights; write .csv instead of {output.suffix}, or omit it")
 
     from facediff.export import FORMATS, check_export, write_animations
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from facediff.cli.options import File, FileOrList, Folder, FrameRate, Output, View, check_folders, named_folders
-from facediff.cli.parsing import Option
+from facediff.cli.parsing import Option, refuse_idle
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -143,6 +143,8 @@ def frames(
     """
     if bool(times) == bool(phonemes):
         raise FaceDiffError("choose what the columns show, with either --times or --phonemes")
+    if not close_up:
+        refuse_idle("is for --close-up", regions=regions is not None, lips=lips is not None)
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import Moment, draw_frames, find_phoneme
     from facediff.evaluation.figures.gather import phonemes_of
@@ -224,6 +226,11 @@ def error(
         files: what is drawn.
         page: how it is printed.
     """
+    refuse_idle(
+        f"has no effect on --statistic {statistic}",
+        highest_mean=statistic == "max" and highest_mean is not None,
+        highest_max=statistic == "mean" and highest_max is not None,
+    )
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_error
 

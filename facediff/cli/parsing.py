@@ -15,6 +15,7 @@ import argparse
 import collections.abc
 import dataclasses
 import inspect
+import os
 import re
 import types
 import typing
@@ -155,7 +156,11 @@ class Parameter:
                     f"{self.flag} {shown(word)}: has an empty or a repeated entry; expected names with commas between"
                 )
             return names
-        return Path(word) if self.value_type is Path else word
+        if self.value_type is not Path:
+            return word
+        if max(len(os.fsencode(part)) for part in word.split("/")) > 255 or len(os.fsencode(word)) > 4095:
+            raise FaceDiffError(f"{self.flag} {shown(word)}: too long for the name of a file; choose a shorter one")
+        return Path(word)
 
     def expected(self) -> str:
         """What values the parameter takes, in words."""
@@ -356,6 +361,26 @@ def refuse_repeated(parameters: Collection[Parameter], arguments: Sequence[str])
             fix = "give all its values after one" if parameter.is_list else "give it once"
             raise FaceDiffError(f"{parameter.flag}: is given twice; {fix}")
         seen.add(parameter.name)
+
+
+def refuse_idle(reason: str, **given: bool) -> None:
+    """Refuse options that were given, but change nothing.
+
+    Args:
+        reason: where the options have an effect, as in "is for --stream".
+        given: whether an option was given, by its name.
+
+    Raises:
+        FaceDiffError: naming the first of them.
+    """
+    for name, is_given in given.items():
+        if is_given:
+            raise FaceDiffError(f"--{name.replace('_', '-')}: {reason}; omit it")
+
+
+def changed(options: Any) -> dict[str, bool]:  # noqa: ANN401 - an instance of a dataclass
+    """Which fields of a group of options differ from their defaults."""
+    return {field.name: getattr(options, field.name) != field.default for field in dataclasses.fields(options)}
 
 
 def arguments_of(function: Callable[..., Any], program: str, words: Sequence[str]) -> dict[str, Any]:

@@ -97,6 +97,8 @@ class Format(ABC):
     """Units of length that a user may choose: any, metres only, or none where the file has no lengths."""
     up_axes: ClassVar[tuple[Up, ...]] = ("y", "z")
     """Axes that may point up."""
+    uses: ClassVar[tuple[str, ...]] = ()
+    """Which of the options ``view``, ``size`` and ``tolerance_mm`` the format uses; the others are refused."""
     requires: ClassVar[tuple[str, str] | None] = None
     """An optional package that writing needs: its import name, and the extra of facediff that installs it."""
 

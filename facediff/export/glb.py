@@ -39,6 +39,7 @@ class Glb(Format):
     speech = "next to it"
     units = "m"
     up_axes = ("y",)
+    uses = ("tolerance_mm",)
     requires = ("pygltflib", "train")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:

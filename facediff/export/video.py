@@ -27,6 +27,7 @@ class Mp4(Format):
     speech = "in the file"
     units = "none"
     up_axes = ()
+    uses = ("view", "size")
     requires = ("av", "render")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from facediff.models import Style
 
 MIN_SECONDS = 0.2
+STEP_SECONDS = 0.01  # What a denoising step of a second of speech takes on two cores (tools/benchmarks/RESULTS.md)
+PIXEL_SECONDS = 4e-8  # What drawing and encoding a pixel of a video takes
 SILENCE = 1e-4
 """Speech whose largest sample is smaller than this is silence."""
 
@@ -88,6 +90,11 @@ class AnimationPipeline:
 
         self.options = options
         self.model = load_model(options.checkpoint, device=usable_device(options.device))
+        if options.samples > 1 and not self.model.samples:
+            raise FaceDiffError(
+                f"--samples {options.samples}: {type(self.model).__name__} makes one animation, whatever the seed; omit "
+                f"the option"
+            )
         if options.sampler is not None or options.steps is not None:
             self.model.choose_sampler(options.sampler, options.steps)
         usual = self.model.windows
@@ -103,6 +110,18 @@ class AnimationPipeline:
         self.style: Reference | Style | None = None
         if options.style:
             self.style = read_styles(options.style, self.identity, self.model, template=options.style_template)
+
+    def cost(self, speech: npt.NDArray[np.float32], output: Path) -> tuple[float, float]:
+        """Roughly the seconds on two processor cores, and the bytes, that :meth:`write` takes for some speech (S,)."""
+        from facediff.data.audio import SAMPLE_RATE
+
+        count, heard = self.options.samples, len(speech) / SAMPLE_RATE
+        frames = count * heard * self.model.frame_rate
+        steps = getattr(getattr(self.model, "sampler", None), "steps", 1)
+        seconds = STEP_SECONDS * steps * count * heard
+        if output.suffix == ".mp4":
+            seconds += PIXEL_SECONDS * frames * self.options.export.size**2
+        return seconds, 12 * frames * len(self.model.assets.template(self.identity))
 
     def write(
         self, speech: npt.NDArray[np.float32], name: str, output: Path, *, seed: int

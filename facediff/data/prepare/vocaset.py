@@ -76,6 +76,8 @@ def plan(
     Raises:
         FaceDiffError: if a file is missing or is not what it should be, or no clip is complete.
     """
+    if frame_rate == 60 and decimate != "every_second":
+        raise FaceDiffError(f"--decimate {decimate}: nothing is decimated at 60 frames a second; omit it")
     vertices, templates_file = _need(raw, VERTICES), _need(raw, TEMPLATES)
     row_map, sounds = _nested(_need(raw, ROWS)), _nested(_need(raw, AUDIO))
     n_vertices = open_vertices(vertices).shape[1]

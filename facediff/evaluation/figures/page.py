@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 
 SUFFIXES = (".png", ".pdf", ".svg")
+WIDEST = 16_384  # Pixels across: as high, a figure fills a gibibyte
 COLUMN, PAGE = 85.0, 175.0  # Widths in mm of a column and of a page of the usual journals
 SMALLEST_TEXT, TEXT = 7.0, 8.0  # Sizes of letters in points
 POINTS_PER_MM = 72 / 25.4
@@ -59,6 +60,11 @@ class Paper:
 
     def __post_init__(self) -> None:
         ranges.check_fields(self)
+        if (across := self.pixels(self.width)) > WIDEST:
+            raise FaceDiffError(
+                f"--width {self.width:g} --dpi {self.dpi}: a figure {across} pixels wide; expected {WIDEST} at most, "
+                f"lower one of them"
+            )
 
     def pixels(self, mm: float) -> int:
         """Whole pixels of a length."""
