@@ -137,6 +137,8 @@ def animate(
         )
     from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, read_recording
 
+    several = len(speech) > 1 or speech[0].is_dir()
+    files.check(batch.suffix if several else ".npy" if windows.stream else output.suffix)
     options = AnimationOptions(
         checkpoint=checkpoint,
         identity=identity,
@@ -160,7 +162,7 @@ def animate(
 
         animate_stream(options, output, rate=windows.rate, seed=seed)
         return 0
-    if len(speech) > 1 or speech[0].is_dir():
+    if several:
         from facediff.pipelines.folder import animate_folder
 
         return animate_folder(

@@ -50,6 +50,7 @@ def export(
 
         assets = read_assets(source.checkpoint)
         footer = f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
+    files.check(output.suffix)
     options = files.export(footer=footer, quiet=quiet)
     check_export(output, options, len(animations))
     wanted = controls.controls()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
-from facediff.cli.parsing import Option
+from facediff.cli.parsing import Option, changed, refuse_idle
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -159,6 +159,20 @@ class OutputOptions:
     tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.05
     view: View = "front"
     size: Size = 512
+
+    def check(self, suffix: str) -> None:
+        """Refuse options that a format does not use."""
+        from facediff.export import FORMATS
+
+        if suffix not in FORMATS:  # which is refused with the file's name
+            return
+        given, form = changed(self), FORMATS[suffix]
+        for name, field in (("view", "view"), ("size", "size"), ("tolerance", "tolerance_mm")):
+            users = [other for other, each in FORMATS.items() if field in each.uses]
+            if field not in form.uses:
+                refuse_idle(f"has no effect on {suffix}, but on {', '.join(users)}", **{name: given[name]})
+        if not form.needs_shapes:
+            refuse_idle(f"is for weights, and {suffix} holds none; write .csv", shapes=given["shapes"])
 
     def export(self, *, footer: str = "", quiet: bool = True) -> ExportOptions:
         """The same for :func:`facediff.export.write_animations`."""

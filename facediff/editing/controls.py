@@ -49,6 +49,10 @@ class AnimationControls:
     def __post_init__(self) -> None:
         ranges.check_fields(self)
         _ = self.factors
+        if self.eyes is not None and not self.eyes.is_file():
+            raise FaceDiffError(
+                f"--eyes {self.eyes}: no such file; expected .json or .npz (see docs/animation_controls.md)"
+            )
         procedural = (self.blinks, self.gaze, self.sway) != (None, None, None)
         for option, idle, users in (
             ("--controls-seed", self.seed is not None and not procedural, "--blinks, --gaze or --sway"),
@@ -56,10 +60,6 @@ class AnimationControls:
         ):
             if idle:
                 raise FaceDiffError(f"{option}: has no effect without {users}; give one of them, or omit it")
-        if self.eyes is not None and not self.eyes.is_file():
-            raise FaceDiffError(
-                f"--eyes {self.eyes}: no such file; expected .json or .npz (see docs/animation_controls.md)"
-            )
 
     @property
     def is_off(self) -> bool:

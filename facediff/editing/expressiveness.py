@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -12,6 +11,7 @@ from facediff.animation import Animation
 from facediff.editing.eyes import Array, Eyes, Indices, smooth_step
 from facediff.editing.procedural import EDITED, noted, room_for
 from facediff.errors import FaceDiffError, choices
+from facediff.utils.ranges import Range
 
 ALL = "all"  # The name of all vertices that no other name is given for
 FALL_OFF = 0.06
@@ -33,15 +33,13 @@ def read_factors(words: str) -> dict[str, float]:
     for word in words.split(","):
         name, equals, number = word.rpartition("=")
         name = name.strip() if equals else ALL
+        expected = f"a factor from 0 to {HIGHEST:g} (1.2), or factors by region (upper_face=1.5,lips=0.9)"
+        if not name:
+            raise FaceDiffError(f"--expressiveness {words}: expected {expected}")
         try:
-            factor = float(number)
-        except ValueError:
-            factor = math.nan
-        if not name or not 0 <= factor <= HIGHEST:
-            raise FaceDiffError(
-                f"--expressiveness {words}: expected a factor from 0 to {HIGHEST:g} (1.2), or factors by region "
-                f"(upper_face=1.5,lips=0.9)"
-            )
+            factor = Range(0, HIGHEST).read(name, number.strip())
+        except FaceDiffError as error:
+            raise FaceDiffError(f"--expressiveness {words}: expected {expected}") from error
         if name in factors:
             raise FaceDiffError(f"--expressiveness {words}: names {name} twice; give one factor for it")
         factors[name] = factor

@@ -98,7 +98,7 @@ class Format(ABC):
     up_axes: ClassVar[tuple[Up, ...]] = ("y", "z")
     """Axes that may point up."""
     uses: ClassVar[tuple[str, ...]] = ()
-    """Which of the options ``view``, ``size`` and ``tolerance_mm`` the format uses; the others are refused."""
+    """Which of the options ``view``, ``size`` and ``tolerance_mm`` the format uses; the command line refuses others."""
     requires: ClassVar[tuple[str, str] | None] = None
     """An optional package that writing needs: its import name, and the extra of facediff that installs it."""
 

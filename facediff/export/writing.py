@@ -121,13 +121,6 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
     if options.up is not None and options.up not in form.up_axes:
         reason = f"has {form.up_axes[0]} up by definition" if form.up_axes else "holds no axes"
         raise FaceDiffError(f"{path}: {suffix} {reason}; omit the axis")
-    for name in ("view", "size", "tolerance_mm"):
-        if name not in form.uses and getattr(options, name) != getattr(ExportOptions, name):
-            flag = name.removesuffix("_mm")
-            users = [other for other, each in FORMATS.items() if name in each.uses]
-            raise FaceDiffError(f"--{flag}: has no effect on {suffix}, but on {', '.join(users)}; omit it")
-    if options.shapes is not None and not form.needs_shapes:
-        raise FaceDiffError(f"--shapes: is for weights; write .csv instead of {suffix}, or omit it")
     if form.needs_shapes and options.shapes is None:
         raise FaceDiffError(
             f"{path}: {suffix} needs blendshapes; give --shapes with a folder of meshes or a .glb with named targets"

@@ -146,7 +146,10 @@ def _value(text: str, default: object) -> object:
         return text
     kind = int if isinstance(default, int) else float
     try:
-        return kind(text)
+        value = kind(text)
+        if not -1e12 < value < 1e12:  # not NaN either
+            raise ValueError
+        return value
     except ValueError:
         if default is None:
             return None if text.lower() == "none" else text

@@ -92,8 +92,8 @@ class AnimationPipeline:
         self.model = load_model(options.checkpoint, device=usable_device(options.device))
         if options.samples > 1 and not self.model.samples:
             raise FaceDiffError(
-                f"--samples {options.samples}: {type(self.model).__name__} makes one animation, whatever the seed; omit "
-                f"the option"
+                f"--samples {options.samples}: {type(self.model).__name__} makes one animation, whatever the "
+                f"seed; omit the option"
             )
         if options.sampler is not None or options.steps is not None:
             self.model.choose_sampler(options.sampler, options.steps)

@@ -25,6 +25,7 @@ Result = TypeVar("Result")
 Mode = Literal["processes", "threads", "serial"]
 """``processes`` for work in Python, ``threads`` for work that releases the interpreter's lock (torch, hashing)."""
 
+MOST_WORKERS = 4  # For each processor: more would take memory and no time off
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -124,7 +125,7 @@ def run_tasks(
         >>> dict(run_tasks(len, ["a", "bb"], mode="threads"))
         {'a': 1, 'bb': 2}
     """
-    count = min(workers or processors(), len(tasks))
+    count = min(workers or processors(), len(tasks), MOST_WORKERS * processors())
     with progress_bar(progress, len(tasks), shown=bool(progress)) as step:
         for pair in _results(work, tasks, count, mode):
             yield pair

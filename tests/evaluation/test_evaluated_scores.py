@@ -245,8 +245,8 @@ def test_everything_that_is_not_scored_is_told(files: Files) -> None:
         ({"patterns": ["x{subject}_{sentence}"]}, "no file's name is understood, A_e01_condition_A.npy for one"),
         ({"truth_pattern": "{sentence}_{subject}", "templates": None, "protocols": ["meshtalk"]}, "has a truth"),
         ({"truth": Path("nowhere")}, "nowhere: no such folder"),
-        ({"bootstrap": -1}, "bootstrap is -1"),
-        ({"level": 95}, "level is 95"),
+        ({"bootstrap": -1}, "bootstrap -1"),
+        ({"level": 95}, "level 95"),
         ({"truth_stride": 0}, "truth_stride"),
     ],
 )

@@ -51,7 +51,6 @@ def test_formats_are_as_promised() -> None:
         ("a.obj", {"unit": "parsec"}, ['unit "parsec"']),
         ("a.csv", {}, ["a.csv", "--shapes"]),
         ("a.csv", {"shapes": Path("nowhere")}, ["nowhere: no such folder or file"]),
-        ("a.glb", {"tolerance_mm": 0.0}, ["tolerance of 0 mm"]),
         ("file/a.glb", {}, ["cannot be written"]),
         ("folder.glb", {}, ["is a folder"]),
         ("foreign.obj", {}, ["foreign_obj: is a folder with files"]),

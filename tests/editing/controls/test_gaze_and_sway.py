@@ -144,9 +144,9 @@ def test_layers_do_not_change_one_another_and_are_all_named(
 
 @pytest.mark.parametrize("degrees", [0.0, -1.0, 90.0, float("nan")])
 def test_impossible_angles(degrees: float) -> None:
-    with pytest.raises(FaceDiffError, match="--gaze"):
+    with pytest.raises(FaceDiffError, match="gaze_curve.degrees"):
         gaze_curve(9, 25.0, degrees=degrees)
-    with pytest.raises(FaceDiffError, match="--sway"):
+    with pytest.raises(FaceDiffError, match="sway_curve.degrees"):
         sway_curve(9, 25.0, degrees=degrees)
 
 
