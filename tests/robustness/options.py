@@ -71,7 +71,7 @@ BASES: dict[str, str] = {
     "figure training": "WORLD/run -o out.png --dpi 80 --width 85",
     "data check": "WORLD/corpus --corpus tests.fakes.tiny.Tiny --workers 1 --quiet",
     "data regions": "WORLD/corpus --corpus tests.fakes.tiny.Tiny --size 64 -o out.png",
-    "data import-person": "WORLD/motion.npy --audio WORLD/speech.wav --name P --corpus WORLD/corpus --frame-rate 25 "
+    "data import-person": "WORLD/motion.npy --audio WORLD/person.wav --name P --corpus WORLD/people --frame-rate 30 "
     "-o person --quiet",
     "components": "",
     "demo": "-o demo",
@@ -90,6 +90,7 @@ def build_world(folder: Path) -> Path:
 
     from facediff.animation import write_archive
     from tests.fakes.clicks import clicks
+    from tests.fakes.person import person, write_auxiliary, write_speech
     from tests.fakes.tiny import write_tiny
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -108,7 +109,9 @@ def build_world(folder: Path) -> Path:
     for clip in ("A_e06", "A_e07"):
         truth = np.load(corpus / "vertices_npy" / f"{clip}.npy")
         np.save(folder / "ours" / f"{clip}_condition_A.npy", truth + np.float32(0.001))
-    np.save(folder / "motion.npy", np.load(corpus / "vertices_npy" / "A_e01.npy"))
+    write_auxiliary(folder / "people")
+    np.save(folder / "motion.npy", person().seen[:90].astype(np.float32))
+    write_speech(folder / "person.wav", 3)
     (folder / "run").mkdir()
     (folder / "run" / "metrics.csv").write_text("epoch,step,train/loss\n0,0,1.0\n1,1,0.5\n2,2,0.3\n")
     (folder / "empty").mkdir()
