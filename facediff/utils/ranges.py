@@ -90,7 +90,9 @@ class Range:
         """
         if not (_WHOLE if whole else _DECIMAL).fullmatch(text):
             raise FaceDiffError(f"{name} {shown(text)}: not valid; expected {noun(whole)} {self}")
-        number: float = self.check(name, int(text) if whole else float(text), whole=whole)
+        number = int(text) if whole else float(text)
+        if number not in self:
+            raise FaceDiffError(f"{name} {shown(text)}: out of range; expected {noun(whole)} {self}")
         return number
 
 
