@@ -194,6 +194,8 @@ def _about(array: npt.NDArray[Any], source: str) -> dict[str, Any]:
     texts = [about.get("name"), about.get("unit"), *(metadata.values() if isinstance(metadata, dict) else [None])]
     if not all(isinstance(text, str) for text in texts):
         raise FaceDiffError(f"{source} lacks its name, its unit or its metadata, which are texts; {remedy}")
+    if any("\ud800" <= letter <= "\udfff" for text in [*texts, *(metadata or ())] for letter in str(text)):
+        raise FaceDiffError(f"{source} holds halves of characters, which no file can hold; {remedy}")
     numbers = {
         "frame_rate": check_number(source, "frame_rate", about.get("frame_rate"), *FRAME_RATES, remedy=remedy),
         "sample_rate": int(

@@ -24,6 +24,7 @@ from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable, read_table
+from facediff.utils.limits import check_format
 
 ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20
@@ -248,8 +249,9 @@ def load_correspondence(path: Path) -> Correspondence:
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected a correspondence that `facediff retarget` wrote")
     held = read_arrays(path)
-    if "format" not in held or str(held["format"]) != FORMAT:
+    if "format" not in held:
         raise FaceDiffError(f"{path}: is no correspondence; expected one that `facediff retarget` wrote")
+    check_format(path, str(held["format"]), FORMAT)
     for name, (kind, axes) in {**ARRAYS, **SIMILARITY}.items():
         if name not in held:
             raise FaceDiffError(f"{path}: has no {name}; make a new correspondence")

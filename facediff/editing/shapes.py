@@ -349,6 +349,6 @@ def _targets(glb: Glb) -> tuple[tuple[str, ...], Array, Array, npt.NDArray[np.in
         moves.append(delta)
         before += len(position)
     neutral, deltas = np.concatenate(points), np.concatenate(moves, axis=1)
-    check_coordinates(neutral, glb.source)
-    check_coordinates(deltas, glb.source)
+    check_coordinates(neutral, f"{glb.source}:")
+    check_coordinates(deltas, f"{glb.source}:")
     return tuple(names), neutral, deltas, np.concatenate(faces)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.errors import FaceDiffError
 from facediff.render.rasteriser import face_outward, to_linear, vertex_normals
 from facediff.utils import ranges
 
@@ -148,7 +149,11 @@ class Space:
         moved = points * self.factor if self.factor != 1 else points
         if self.up == "z":
             moved = np.stack([moved[..., 0], -moved[..., 2], moved[..., 1]], -1)
-        return np.asarray(moved, np.float32)
+        with np.errstate(over="ignore"):  # is refused
+            placed = np.asarray(moved, np.float32)
+        if not np.isfinite(placed).all():
+            raise FaceDiffError(f"unit {self.unit}: single precision does not hold these coordinates; choose another")
+        return placed
 
     def frames(self, animation: Animation) -> Iterator[npt.NDArray[np.float32]]:
         """Frame after frame (V, 3), so that a memory map is never read as a whole."""

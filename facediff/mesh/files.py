@@ -68,7 +68,7 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
         raise FaceDiffError(f"{path}: holds no vertices; expected a mesh with vertices and faces")
     if not len(mesh.faces) and not points_allowed:
         raise FaceDiffError(f"{path}: holds no triangles; expected a mesh with faces")
-    check_coordinates(mesh.vertices, path)
+    check_coordinates(mesh.vertices, f"{path}:")
     return mesh
 
 

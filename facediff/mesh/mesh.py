@@ -8,11 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.utils.arrays import in_range
+from facediff.utils.limits import COORDINATE
 
 Array = npt.NDArray[np.float64]
-
-FARTHEST = 1e12
-"""Largest coordinate, in any unit: sums of its cubes fit into single precision."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +33,11 @@ def check_coordinates(points: npt.NDArray[np.floating], source: object) -> None:
     """Refuse positions or displacements that are not finite, or so large that computing with them overflows.
 
     Raises:
-        FaceDiffError: naming the file, ``source``, and the range.
+        FaceDiffError: beginning with ``source``, and naming the range.
     """
-    if points.size and not -FARTHEST <= points.min() <= points.max() <= FARTHEST:
+    if not in_range(points):
         raise FaceDiffError(
-            f"{source}: holds NaN, infinity or absurd coordinates; expected numbers from -{FARTHEST:g} to {FARTHEST:g}"
+            f"{source} holds NaN, infinity or absurd coordinates; expected numbers up to {COORDINATE:g} in size"
         )
 
 
