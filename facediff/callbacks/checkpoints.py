@@ -148,6 +148,9 @@ class LastCheckpoint(Callback):
                 restore_random_states(states[min(trainer.global_rank, len(states) - 1)])
             continue_counting(trainer, self._resumed.get("throughput", []))
             trainer.fit_loop.restarting = False  # schedules that follow a metric would miss the first epoch's end
+            if self._resumed.get("place") == "step":
+                # Lightning has counted a validation that it did not run again.
+                trainer.fit_loop.epoch_loop.val_loop.batch_progress.load_state_dict(self._resumed["validated"])
             self._resumed = {}
         if batch_idx % trainer.accumulate_grad_batches:
             return  # gradients of earlier batches are in no checkpoint
@@ -261,8 +264,12 @@ class LastCheckpoint(Callback):
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """Take the random states for the first step, and drop log rows of steps that will be repeated."""
-        loaders = checkpoint["loops"]["fit_loop"]["state_dict"].get("combined_loader", [])
-        self._resumed = {**checkpoint.get(STATE_KEY, {}), "loaders": loaders}
+        loop = checkpoint["loops"]["fit_loop"]
+        self._resumed = {
+            **checkpoint.get(STATE_KEY, {}),
+            "loaders": loop["state_dict"].get("combined_loader", []),
+            "validated": loop["epoch_loop.val_loop.batch_progress"],
+        }
         for logger, rows in zip(trainer.loggers, self._resumed.get("rows", ()), strict=False):
             if isinstance(logger, ResumableCSVLogger) and trainer.is_global_zero and rows >= 0:
                 logger.keep(rows)

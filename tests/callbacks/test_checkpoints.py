@@ -12,16 +12,32 @@ from pathlib import Path
 import lightning.pytorch as pl
 import pytest
 import torch
-from lightning.pytorch.callbacks import EMAWeightAveraging
+from lightning.pytorch.callbacks import (
+    EMAWeightAveraging,
+    LearningRateMonitor,
+    ModelCheckpoint,
+    ThroughputMonitor,
+)
 
 from facediff import registry
 from facediff.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint, random_states, restore_random_states
 from facediff.callbacks.runs import ResumableCSVLogger
+from facediff.data.batch import clips_in
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import Tiny
 
-EPOCHS = 3
+pytestmark = pytest.mark.filterwarnings("ignore:Checkpoint directory", "ignore:.*ThroughputMonitor")
+
+TRAINER = {
+    "accelerator": "cpu",
+    "devices": 1,
+    "max_epochs": 3,
+    "enable_progress_bar": False,
+    "enable_model_summary": False,
+    "num_sanity_val_steps": 0,
+    "log_every_n_steps": 1,
+}
 
 
 class Stop(pl.Callback):
@@ -46,41 +62,39 @@ def fit(
     *stops: pl.Callback,
     ckpt_path: Path | None = None,
     every_n_steps: int = 1,
-    num_workers: int = 0,
+    model_options: dict[str, object] | None = None,
+    data_options: dict[str, object] | None = None,
+    **trainer_options: object,
 ) -> tuple[DualPathDiffusion, list[dict[str, str]]]:
     pl.seed_everything(7)
-    model = make_model(
-        audio_encoder=partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.1),
-        lr_schedule="cosine",
-        warmup_steps=2,
-    )
+    encoder = partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.1)
+    options = {"lr_schedule": "cosine", "warmup_steps": 2, **(model_options or {})}
+    model = make_model(audio_encoder=encoder, **options)
     logger = ResumableCSVLogger(folder, name="run", version=0)
     logger.continues = ckpt_path is not None
     trainer = pl.Trainer(
-        accelerator="cpu",
-        devices=1,
-        max_epochs=EPOCHS,
         logger=logger,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        log_every_n_steps=1,
         default_root_dir=folder,
-        plugins=[AtomicCheckpointIO()],
         callbacks=[
             EMAWeightAveraging(decay=0.9, use_buffers=False),
+            ModelCheckpoint(monitor="val/lve", filename="best"),
+            LearningRateMonitor(),
+            ThroughputMonitor(clips_in),
             LastCheckpoint(every_n_steps=every_n_steps),
             *stops,
         ],
+        **{**TRAINER, **trainer_options},  # type: ignore[arg-type]
     )
-    data = Tiny(root=str(tiny_root), batch_size=3, num_workers=num_workers)
+    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+    data = Tiny(root=str(tiny_root), **{"batch_size": 3, **(data_options or {})})  # type: ignore[arg-type]
     trainer.fit(model, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
     return model, rows(folder)
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
+    """The log without times, which differ from run to run."""
     with (folder / "run" / "version_0" / "metrics.csv").open() as stream:
-        return [row for row in csv.DictReader(stream)]
+        return [{name: row[name] for name in row if not name.endswith("/time")} for row in csv.DictReader(stream)]
 
 
 def last(folder: Path) -> Path:
@@ -102,7 +116,6 @@ def uninterrupted(
     return whole["weights"], whole["curve"]  # type: ignore[return-value]
 
 
-@pytest.mark.filterwarnings("ignore:Checkpoint directory")
 @pytest.mark.parametrize(
     ("step", "every", "number", "workers"),
     [
@@ -116,6 +129,7 @@ def uninterrupted(
         (2, 100, signal.SIGINT, 0),
         (5, 100, signal.SIGINT, 0),
         (4, 100, signal.SIGTERM, 0),
+        (3, 100, signal.SIGUSR1, 0),
     ],
 )
 def test_a_stopped_run_continues_to_the_same_weights_and_curve(
@@ -129,13 +143,57 @@ def test_a_stopped_run_continues_to_the_same_weights_and_curve(
     make_model: Callable[..., DualPathDiffusion],
 ) -> None:
     weights, curve = uninterrupted
-    with pytest.raises((RuntimeError, SystemExit, BaseException)):
-        fit(tmp_path, tiny_root, make_model, Stop(step, number), every_n_steps=every, num_workers=workers)
+    with pytest.raises((RuntimeError, SystemExit)) as stop:
+        fit(
+            tmp_path,
+            tiny_root,
+            make_model,
+            Stop(step, number),
+            every_n_steps=every,
+            data_options={"num_workers": workers},
+        )
+    assert number is None or stop.value.code == 128 + number  # type: ignore[union-attr]
     assert last(tmp_path).is_file()
     torch.rand(99)  # whatever happened since must not matter
-    model, continued = fit(tmp_path, tiny_root, make_model, ckpt_path=last(tmp_path), num_workers=workers)
+    model, continued = fit(
+        tmp_path, tiny_root, make_model, ckpt_path=last(tmp_path), data_options={"num_workers": workers}
+    )
     assert continued == curve
     assert {k: v.tolist() for k, v in model.state_dict().items()} == {k: v.tolist() for k, v in weights.items()}
+
+
+VARIANTS: dict[str, dict[str, object]] = {
+    "accumulated gradients": {"accumulate_grad_batches": 2},
+    "validation within an epoch": {"val_check_interval": 1},
+    "validation across epochs": {"val_check_interval": 2, "check_val_every_n_epoch": None},
+    "validation now and then": {"check_val_every_n_epoch": 2, "num_sanity_val_steps": 2},
+    "a part of each epoch": {"limit_train_batches": 2},
+    "mixed precision": {"precision": "bf16-mixed"},
+    "steps in place of epochs": {"max_epochs": -1, "max_steps": 7},
+    "windows": {"data_options": {"batch_size": 3, "window": 6}},
+    "two workers": {"data_options": {"batch_size": 3, "window": 6, "num_workers": 2}},
+    "a budget of frames": {"data_options": {"batch_size": 3, "max_frames_per_batch": 60}},
+    "a constant rate": {"model_options": {"lr_schedule": "constant", "warmup_steps": 0}},
+    "clipped gradients": {"gradient_clip_val": 0.1, "log_every_n_steps": 2},
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_way_of_training_continues_exactly(
+    variant: str, tmp_path: Path, tiny_root: Path, make_model: Callable[..., DualPathDiffusion]
+) -> None:
+    options = VARIANTS[variant]
+    model, curve = fit(tmp_path / "whole", tiny_root, make_model, **options)
+    stopped = tmp_path / "stopped"
+    for step in (1, 2, 3, 5):  # stopped again and again
+        start = last(stopped) if last(stopped).exists() else None
+        with pytest.raises(RuntimeError, match="killed"):
+            fit(stopped, tiny_root, make_model, Stop(step), ckpt_path=start, **options)
+    again, continued = fit(stopped, tiny_root, make_model, ckpt_path=last(stopped), **options)
+    assert continued == curve
+    assert all(torch.equal(mine, again.state_dict()[name]) for name, mine in model.state_dict().items())
+    left = [sorted(path.name for path in folder.rglob("*.ckpt")) for folder in (tmp_path / "whole", stopped)]
+    assert left[0] == left[1]
 
 
 def test_the_state_of_every_generator_comes_back() -> None:
