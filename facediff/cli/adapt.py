@@ -58,9 +58,10 @@ def adapt(
         raise FaceDiffError(f"--checkpoint {checkpoint}: no such file")
     from lightning.pytorch import Trainer, seed_everything
 
+    from facediff.callbacks.checkpoints import AtomicCheckpointIO
+    from facediff.cli.lightning import exit_statuses
     from facediff.models.adaptation import train_only, with_extra_identities
     from facediff.models.checkpoint import build_model, read_checkpoint
-    from facediff.utils.files import atomic
 
     started = time.monotonic()
     content = read_checkpoint(checkpoint)
@@ -88,12 +89,13 @@ def adapt(
         enable_checkpointing=False,
         enable_model_summary=False,
         enable_progress_bar=not quiet,
+        plugins=[AtomicCheckpointIO()],
     )
-    trainer.fit(model, data)
+    with exit_statuses():
+        trainer.fit(model, data)
     for parameter in model.parameters():
         parameter.requires_grad_(True)
-    with atomic(output) as temporary:
-        trainer.save_checkpoint(temporary)
+    trainer.save_checkpoint(output)
     seconds = sum(data.corpus.frames(clip) for clip in clips if clip.identity == name) / data.frame_rate
     print(
         f"{output}: adapted to {name} by {seconds:.0f} s of motion, in {time.monotonic() - started:.0f} s; "

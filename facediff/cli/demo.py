@@ -39,7 +39,6 @@ def demo(
     """
     from facediff.cli.lightning import run_cli
     from facediff.export import ExportOptions, check_export
-    from facediff.utils.files import atomic
 
     check_export(output / "truth_and_prediction.mp4", ExportOptions())
     started = time.monotonic()
@@ -49,8 +48,7 @@ def demo(
     logger = [f"--trainer.logger.save_dir={output}", "--trainer.logger.name=training"]
     fitted = run_cli("fit", ["--config", CONFIG, *logger, *options])
     checkpoint = output / "puppet.ckpt"
-    with atomic(checkpoint) as temporary:
-        fitted.trainer.save_checkpoint(temporary)
+    fitted.trainer.save_checkpoint(checkpoint)
     print(f"facediff demo: trained in {time.monotonic() - started:.0f} s; now the test", flush=True)
     where = ["--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={output}"]
     tested = run_cli("test", ["--ckpt_path", str(checkpoint), *where])

@@ -10,8 +10,10 @@ import difflib
 import json
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,7 +67,28 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
         kind.load()
     if os.getcwd() not in sys.path:  # a corpus or a component may be a file of the working folder
         sys.path.append(os.getcwd())
-    return run_lightning_cli(name, words)
+    with exit_statuses():
+        return run_lightning_cli(name, words)
+
+
+@contextmanager
+def exit_statuses() -> Iterator[None]:
+    """Let what is stopped end as a shell expects it, with 130 on Ctrl-C and 143 on SIGTERM; Lightning has 1 and 0.
+
+    Lightning also goes on to ignore Ctrl-C, which the rest of this process may need.
+    """
+    interrupt = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from stop
+        if type(stop).__name__ == "SIGTERMException":
+            raise SystemExit(128 + signal.SIGTERM) from stop
+        raise
+    finally:
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+            signal.signal(signal.SIGINT, interrupt)
 
 
 def check_options(name: str, words: Sequence[str]) -> None:

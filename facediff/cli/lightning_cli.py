@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import sys
 import threading
 import urllib.error
@@ -24,7 +23,6 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from facediff import registry
 from facediff.callbacks import GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
@@ -46,7 +44,6 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
     logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
     # Lightning starts the other processes of a distributed run with the words of this one.
     argv, sys.argv = sys.argv, [sys.argv[0], name, *words]
-    interrupt = signal.getsignal(signal.SIGINT)
     try:
         with warnings.catch_warnings():
             for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, *RESUME_WARNINGS):
@@ -63,12 +60,6 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
                 save_config_callback=RunConfig,
                 save_config_kwargs={"overwrite": True},
             )
-    except SIGTERMException as error:
-        raise SystemExit(128 + signal.SIGTERM) from error
-    except SystemExit as stop:
-        if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning ends with status 1
-            raise KeyboardInterrupt from stop
-        raise
     except Exception as error:
         # jsonargparse wraps what a constructor raises; our own sentence is the useful one.
         ours = next((cause for cause in causes(error) if isinstance(cause, FaceDiffError)), None)
@@ -77,13 +68,16 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
                 f"wandb could not start the run ({error}); correct the key with `wandb login --relogin`, or set "
                 f"WANDB_MODE=offline and upload the run later"
             ) from error
+        if isinstance(error, OSError) and not isinstance(error, BrokenPipeError) and ours is None:
+            raise FaceDiffError(
+                f"{error.filename or 'the folder of the run'}: {error.strerror or error}; expected a folder that can "
+                f"be written and has room. `facediff fit` continues with --ckpt_path last"
+            ) from error
         if ours is None or ours is error:
             raise
         raise ours from error
     finally:
         sys.argv = argv
-        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # Lightning ignores all further ones
-            signal.signal(signal.SIGINT, interrupt)
 
 
 def built_in_callbacks(name: str) -> list[Callback]:
@@ -218,9 +212,9 @@ class FaceDiffCLI(LightningCLI):
         path = find_checkpoint(trainer, self._get(self.config_init, "ckpt_path"))
         content = read_checkpoint(path) if path is not None and path.is_file() else {}
         if continue_run(trainer, path, content, sys.argv):
-            warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
             self.config[str(self.subcommand)].ckpt_path = None  # the config that is saved describes the whole run
         if path is not None:
+            warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
             self.config_init[str(self.subcommand)].ckpt_path = str(path) if content else None
 
     def _parse_ckpt_path(self) -> None:

@@ -1,0 +1,234 @@
+"""Training that was stopped continues with ``--ckpt_path last``, in the folder of its run."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from facediff.callbacks.checkpoints import AtomicCheckpointIO
+from facediff.models import DualPathDiffusion
+from tests.cli.conftest import SMALL
+
+Fit = Callable[..., int]
+EVERY_STEP = ["--trainer.callbacks+=facediff.callbacks.LastCheckpoint", "--trainer.callbacks.every_n_steps=1"]
+LONGER = ["--trainer.max_epochs=3", "--data.batch_size=2", "--trainer.limit_val_batches=1", *EVERY_STEP]
+CLOCK = ("/time", "/seconds", "per_sec", "device/")
+
+
+def curve(run: Path) -> list[dict[str, str]]:
+    """What was logged, without times."""
+    with (run / "metrics.csv").open() as stream:
+        rows = [
+            {k: v for k, v in row.items() if v and not any(t in k for t in CLOCK)} for row in csv.DictReader(stream)
+        ]
+    return [row for row in rows if row.keys() - {"step"}]
+
+
+def weights(run: Path) -> dict[str, list[float]]:
+    content = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    parts = {**content["state_dict"], **{f"own {k}": v for k, v in content["current_model_state"].items()}}
+    return {name: tensor.tolist() for name, tensor in parts.items()}
+
+
+def files(run: Path) -> list[str]:
+    return sorted(path.relative_to(run).as_posix() for path in run.rglob("*"))
+
+
+def stop_at(step: int, monkeypatch: pytest.MonkeyPatch, number: int | None = None) -> None:
+    """Let a signal come, or an error, in the middle of a step."""
+    step_of = DualPathDiffusion.training_step
+
+    def training_step(self: DualPathDiffusion, *words: object) -> torch.Tensor:
+        if self.trainer.global_step == step:
+            if number is None:
+                raise RuntimeError("killed")
+            os.kill(os.getpid(), number)
+        return step_of(self, *words)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(DualPathDiffusion, "training_step", training_step)
+
+
+@pytest.fixture(scope="module")
+def whole(fit: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole")
+    assert fit(*LONGER, f"--trainer.logger.save_dir={folder}") == 0
+    return folder / "puppet" / "version_0"
+
+
+def test_a_run_stopped_by_an_error_and_a_signal_continues_in_its_folder(
+    fit: Fit, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*LONGER, f"--trainer.logger.save_dir={tmp_path}"]
+    with monkeypatch.context() as patched:
+        stop_at(5, patched)
+        with pytest.raises(RuntimeError, match="killed"):
+            fit(*words)
+    for step, number in ((6, signal.SIGTERM), (9, signal.SIGINT)):
+        with monkeypatch.context() as patched:
+            stop_at(step, patched, number)
+            with pytest.raises(SystemExit) as stop:
+                fit(*words, "--ckpt_path=last")
+        assert stop.value.code == 128 + number
+        assert "--ckpt_path last" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    run = tmp_path / "puppet" / "version_0"
+    path = run / "checkpoints" / "last.ckpt"
+    assert fit(*LONGER, f"--trainer.logger.save_dir={tmp_path}", f"--ckpt_path={path}") == 0
+    assert curve(run) == curve(whole)
+    assert weights(run) == weights(whole)
+    assert files(run) == files(whole)
+    assert "ckpt_path: null" in (run / "config.yaml").read_text()
+
+
+def test_a_run_without_a_checkpoint_begins_again_and_no_run_is_an_error(
+    fit: Fit, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*LONGER, f"--trainer.logger.save_dir={tmp_path}", "--ckpt_path", "last"]
+    assert fit(*words) == 2
+    assert "--ckpt_path last" in capsys.readouterr().err
+    run = tmp_path / "puppet" / "version_0"
+    run.mkdir(parents=True)
+    shutil.copy(whole / "config.yaml", run)
+    assert fit(*words) == 0
+    assert curve(run) == curve(whole)
+    # A newer run without a checkpoint: neither is meant for sure.
+    newer = tmp_path / "puppet" / "version_1"
+    newer.mkdir()
+    (newer / "config.yaml").write_text("")
+    os.utime(newer, (time.time() + 60,) * 2)
+    assert fit(*words) == 2
+    assert str(run / "checkpoints" / "last.ckpt") in capsys.readouterr().err
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_the_checkpoint(
+    fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save, saved = AtomicCheckpointIO.save_checkpoint, []
+
+    def full(self: AtomicCheckpointIO, checkpoint: dict[str, object], path: str, storage_options: object) -> None:
+        if len(saved) == 3:
+            monkeypatch.setattr(os, "fsync", no_room)
+        saved.append(path)
+        save(self, checkpoint, path)
+
+    def no_room(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(AtomicCheckpointIO, "save_checkpoint", full)
+    words = [*LONGER, f"--trainer.logger.save_dir={tmp_path}"]
+    assert fit(*words) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("facediff: error:")
+    assert ".ckpt" in error
+    run = tmp_path / "puppet" / "version_0"
+    assert torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] >= 2
+    assert not [path for path in run.rglob("*") if "partial" in path.name]
+
+
+def test_an_unwritable_place_is_one_sentence(fit: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert fit(f"--trainer.logger.save_dir={tmp_path / 'file'}") == 2
+    assert str(tmp_path / "file") in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_fast_dev_run_leaves_nothing(fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert fit("--trainer.fast_dev_run=1", "--trainer.logger.save_dir=runs") == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_checkpoints_can_be_switched_off(fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert fit("--trainer.enable_checkpointing=false", "--trainer.callbacks=[]", "--trainer.logger.save_dir=runs") == 0
+    assert not list(tmp_path.rglob("*.ckpt"))
+
+
+def test_a_users_own_callbacks_and_loggers_come_with_a_last_checkpoint(
+    fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert fit("--trainer.callbacks=[]", "--trainer.logger=false") == 0
+    assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["epoch"] == 1
+    assert fit("--trainer.callbacks=[]", "--trainer.logger=false", "--trainer.max_epochs=2", "--ckpt_path=last") == 0
+    assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["epoch"] == 2
+
+
+def test_no_checkpoint_makes_training_remove_files_elsewhere(whole: Path, fit: Fit, tmp_path: Path) -> None:
+    run = tmp_path / "puppet" / "version_0"
+    shutil.copytree(whole, run)
+    mine = tmp_path / "mine.ckpt"
+    mine.write_text("mine")
+    path = run / "checkpoints" / "last.ckpt"
+    content = torch.load(path, weights_only=True)
+    for name, state in content["callbacks"].items():
+        if name.startswith(ModelCheckpoint.__name__):
+            worst = torch.tensor(1e9)
+            state |= {
+                "best_k_models": {str(mine): worst},
+                "kth_best_model_path": str(mine),
+                "best_model_path": str(mine),
+            }
+            state |= {"best_model_score": worst, "kth_value": worst}
+    torch.save(content, path)
+    words = [*LONGER, "--trainer.max_epochs=4", f"--trainer.logger.save_dir={tmp_path}"]
+    assert fit(*words, "--ckpt_path=last") == 0
+    assert mine.read_text() == "mine"
+
+
+@pytest.fixture
+def start(tiny_root: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    running: list[subprocess.Popen[str]] = []
+
+    def run(*words: str) -> subprocess.Popen[str]:
+        data = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}"]
+        command = [sys.executable, "-m", "facediff", "fit", "--config", "configs/experiment/puppet.yaml", *data, *SMALL]
+        root = Path(__file__).parents[2]
+        environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+        pipe = subprocess.PIPE
+        running.append(
+            subprocess.Popen([*command, *words], cwd=root, env=environment, stdout=pipe, stderr=pipe, text=True)
+        )
+        return running[-1]
+
+    yield run
+    for process in running:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_killed_process_loses_nothing(
+    number: int, processes: int, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    words = [*LONGER, "--trainer.max_epochs=8"]
+    if processes > 1:
+        words += [f"--trainer.devices={processes}", "--trainer.strategy=ddp"]
+    assert start(*words, f"--trainer.logger.save_dir={tmp_path / 'whole'}").wait(300) == 0
+    mine = [*words, f"--trainer.logger.save_dir={tmp_path / 'mine'}"]
+    process, run = start(*mine), tmp_path / "mine" / "puppet" / "version_0"
+    seen, limit = set(), time.monotonic() + 200
+    while len(seen) < 4 and process.poll() is None and time.monotonic() < limit:
+        if (run / "checkpoints" / "last.ckpt").exists():
+            seen.add((run / "checkpoints" / "last.ckpt").stat().st_mtime_ns)
+        time.sleep(0.002)
+    process.send_signal(number)
+    assert process.wait(120) == (-number if number == signal.SIGKILL else 128 + number)
+    assert start(*mine, "--ckpt_path=last").wait(300) == 0
+    other = tmp_path / "whole" / "puppet" / "version_0"
+    assert curve(run) == curve(other)
+    assert weights(run) == weights(other)
+    assert files(run) == files(other)
