@@ -269,13 +269,22 @@ def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[Spe
 
 def component_finders() -> Components:
     """What finds the classes of components, by kind; those that are not registered must be of the kind's base class."""
-    from facediff.models import audio_encoders, decoders, fusions, mesh_encoders, samplers, speaker_encoders
+    from facediff.models import (
+        audio_encoders,
+        decoders,
+        fusions,
+        mesh_encoders,
+        motion_space,
+        samplers,
+        speaker_encoders,
+    )
 
     bases: dict[str, type] = {
         "audio_encoder": audio_encoders.AudioEncoder,
         "identity_encoder": speaker_encoders.IdentityEncoder,
         "style_encoder": speaker_encoders.StyleEncoder,
         "mesh_encoder": mesh_encoders.MeshEncoder,
+        "motion_space": motion_space.MotionSpace,
         "fusion": fusions.Fusion,
         "decoder": decoders.Decoder,
         "sampler": samplers.Sampler,

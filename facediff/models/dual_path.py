@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
+from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.decoders import Decoder, DecoderFactory, StyleTransformer
@@ -57,10 +58,11 @@ from facediff.models.speaker_encoders import (
     StyleEncoderFactory,
     TcnGruTransformer,
 )
-from facediff.registry import Range
+from facediff.registry import Range, mismatch
 
 TokenForm = Literal["levels", "single"]
-NoiseScale = Annotated[float, Range(1e-6, 1e6)] | Literal["auto"]
+NumericScale = Annotated[float, Range(1e-6, 1e6)]
+NoiseScale = NumericScale | Literal["auto"]
 
 NOISE_SCALE_KEY = "facediff_noise_scale"
 PRINCIPAL = 64
@@ -190,8 +192,11 @@ class DualPathDiffusion(AnimationModel):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the noise scale from the checkpoint."""
         super().on_load_checkpoint(checkpoint)
-        if self.noise_scale == "auto" and NOISE_SCALE_KEY in checkpoint:
-            self.rescale_noise(float(checkpoint[NOISE_SCALE_KEY]))
+        if self.noise_scale == "auto":
+            scale = checkpoint.get(NOISE_SCALE_KEY, 1.0)
+            if mismatch(NumericScale, scale) is not None:
+                raise FaceDiffError(f"its {NOISE_SCALE_KEY} is {str(scale)[:40]}; the file is damaged")
+            self.rescale_noise(float(scale))
 
     def personal_modules(self) -> list[nn.Module]:
         """The identity's and the dynamic style's encoders, and how both are presented to the decoder."""

@@ -227,6 +227,13 @@ def test_a_checkpoint_animates_as_the_model_that_wrote_it(
     assert not torch.equal(first, trained.animate(speech, identity=identity, seed=4).vertices)
 
 
+@pytest.mark.parametrize("scale", [0.0, float("nan"), "0.1", [1.0], torch.ones(2)])
+def test_a_wild_noise_scale_in_a_checkpoint_is_refused(scale: object, make_model: Make, tiny: Tiny) -> None:
+    model = make_model(noise_scale="auto")
+    with pytest.raises(FaceDiffError, match="noise_scale"):
+        model.on_load_checkpoint({"facediff_assets": tiny.assets().state(), "facediff_noise_scale": scale})
+
+
 def test_the_upper_face_can_count_more(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) -> None:
     model: DualPathDiffusion = make_model(motion_space=partial(SPACE, upper_face_weight=3.0))
     make_trainer().fit(model, datamodule=tiny)
