@@ -287,6 +287,7 @@ def component_finders() -> Components:
         "motion_space": motion_space.MotionSpace,
         "fusion": fusions.Fusion,
         "decoder": decoders.Decoder,
+        "motion_space": motion_space.MotionSpace,
         "sampler": samplers.Sampler,
     }
     return {name: partial(find_class, kind, base=bases[name]) for name, kind in COMPONENTS.items()}

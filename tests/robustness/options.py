@@ -222,10 +222,9 @@ class Counts:
 
 
 def snapshot(folder: Path) -> dict[str, tuple[int, int]]:
-    """Size and time of change of every file."""
-    return {
-        str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in folder.rglob("*") if not path.is_dir()
-    }
+    """Size and time of change of every file, but for those that may be named as outputs."""
+    files = [path for path in folder.rglob("*") if not path.is_dir() and path.stem != "empty"]
+    return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
 
 
 @contextmanager
