@@ -12,6 +12,7 @@ install_import_hook([f"facediff.models.{module}" for module in SHAPED.split()], 
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["WANDB_MODE"] = "offline"
 os.environ["WANDB_SILENT"] = "true"
+os.environ["FACEDIFF_TRACEBACK"] = "1"  # unexpected errors fail a test as what they are
 
 import signal
 from collections.abc import Callable

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import facediff
+from facediff.cli import process
 from facediff.errors import FaceDiffError, choices
 
 
@@ -53,8 +54,6 @@ COMMANDS = {
     "components": Command("facediff.cli.components:components", "list what can be chosen by name"),
 }
 HELP = ("-h", "--help")
-LONGEST = 900
-"""Characters of an error that are printed."""
 GROUPS = {
     "style": "speaking styles of trained models",
     "figure": "draw the figures of a paper: faces, heat maps, lip and training curves",
@@ -106,41 +105,49 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        args: the words after ``facediff``; those of the process if None.
+        args: the words after ``facediff``; those of the process if None, whose streams and signals are then set up.
 
     Returns:
-        the exit status: 0 for success, 2 for something the user can put right.
+        the exit status: 0 for success, 2 for something the user can put right; all are in docs/command_line.md.
     """
-    words = list(sys.argv[1:] if args is None else args)
+    if args is not None:
+        return answer(args)
+    process.prepare_process()
+    try:
+        return answer(sys.argv[1:])
+    finally:
+        process.finish_process()
+
+
+def answer(words: Sequence[str]) -> int:
+    """Do what the words say, and report in one sentence what goes wrong; the exit status."""
     name = words[0] if words else ""
     try:
-        rest = words[1:] if name in GROUPS else words
-        if not rest or rest[0] in HELP:  # no command, a group alone, or a flag for help where a command is expected
-            print(usage(name if name in GROUPS else ""))
-            status = 0 if words[-1:] and words[-1] in HELP else 2
-        elif name == "--version":
-            print(facediff.__version__)
-            status = 0
-        else:
+        try:
+            rest = words[1:] if name in GROUPS else words
+            if not rest or rest[0] in HELP:  # no command, a group alone, or a flag for help in place of a command
+                print(usage(name if name in GROUPS else ""))
+                return 0 if words[-1:] and words[-1] in HELP else 2
+            if name == "--version":
+                print(facediff.__version__)
+                return 0
             name, rest = find(words)
-            status = run(name, rest)
-        sys.stdout.flush()
-    except FaceDiffError as error:
-        return fail(str(error))
-    except KeyboardInterrupt:
-        return fail("interrupted", 130)
+            return run(name, rest)
+        finally:
+            process.flush()
     except BrokenPipeError:
         # Whoever read our output (`| head`) has had enough; Python would say so once more when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        return process.READER_GONE
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] == "facediff":
-            raise
-        return fail(
+            return process.report(error)
+        return process.fail(
             f'`facediff {name}` needs the package "{error.name}", which is not installed: '
             f'run  pip install "facediff[all]"'
         )
-    return status
+    except (Exception, KeyboardInterrupt) as error:
+        return process.report(error)
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
@@ -161,11 +168,3 @@ def load(name: str) -> Callable[..., int | None]:
     module, _, function = COMMANDS[name].target.partition(":")
     found: Callable[..., int | None] = getattr(importlib.import_module(module), function)
     return found
-
-
-def fail(message: str, status: int = 2) -> int:
-    """Print one sentence to standard error and give back the exit status."""
-    # Names of files may hold line breaks and control characters, or be as long as a page.
-    line = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in message)
-    print(f"facediff: error: {line if len(line) <= LONGEST else line[:LONGEST] + '…'}", file=sys.stderr)
-    return status

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NoReturn, Union, get_args, get_origin
 
-from facediff.cli.paths import check_paths, refuse_empty
+from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.ranges import Range, extras_of, range_of, shown
 
@@ -322,7 +322,6 @@ def parse(
     details: str | Callable[[], str] = "",
 ) -> dict[str, Any]:
     """The values of a command's parameters; those of a group as an instance of its dataclass."""
-    refuse_empty(arguments, program)
     refuse_repeated(flat(parameters), arguments)
     values = vars(make_parser(parameters, program, summary, details).parse_args(list(arguments)))
     for parameter in flat(parameters):

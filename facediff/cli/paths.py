@@ -112,20 +112,3 @@ def check_input(parameter: Parameter, path: Path) -> None:
         raise FaceDiffError(f"{parameter.shown} {path}: is a device or a pipe; expected a file, or a folder of files")
     if not os.access(path, os.R_OK):
         raise FaceDiffError(f"{parameter.shown} {path}: cannot be read (permission denied)")
-
-
-def refuse_empty(words: Sequence[str], program: str) -> None:
-    """Refuse empty words, as an unset variable of a shell gives: as a path they would stand for the working folder.
-
-    Raises:
-        FaceDiffError: naming the option.
-    """
-    before = ""
-    for word in words:
-        name, equals, value = word.partition("=")
-        option = name if equals and name.startswith("-") else before if before.startswith("-") else "an argument"
-        if not word or (equals and not value and name.startswith("-")):
-            raise FaceDiffError(f"{option}: is empty; expected a value (see `{program} --help`)")
-        if "\0" in word:
-            raise FaceDiffError(f"{option}: holds a zero byte; expected text (see `{program} --help`)")
-        before = word

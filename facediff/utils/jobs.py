@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
@@ -26,6 +26,8 @@ Mode = Literal["processes", "threads", "serial"]
 """``processes`` for work in Python, ``threads`` for work that releases the interpreter's lock (torch, hashing)."""
 
 MOST_WORKERS = 4  # For each processor: more would take memory and no time off
+GRACE = 10.0
+"""Seconds that running tasks are given to come to their end when the work is stopped."""
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -101,8 +103,8 @@ def run_tasks(
 
     No worker gets a task before it is free for it, and at most one result for each worker waits to be taken, so memory
     is bounded and a stop waits only for what is running. Wrap the generator in :func:`contextlib.closing`, so that it
-    stops with the loop that takes the results: what is running is finished then, and nothing else is begun. Workers
-    ignore Ctrl-C; only this process reacts to it.
+    stops with the loop that takes the results: what is running then has some seconds to come to its end before its
+    process is stopped, and nothing else is begun. Workers ignore Ctrl-C; only this process reacts to it.
 
     Args:
         work: does a task. For processes: a picklable function or object, which each worker gets once and keeps, such as
@@ -173,8 +175,27 @@ def _together(
                 raise BrokenProcessPool
     except BrokenProcessPool:
         suspects += running.values()
+    except (KeyboardInterrupt, SystemExit, GeneratorExit):
+        _end_soon(pool, running)
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _end_soon(pool: Executor, running: Collection[Future[Any]]) -> None:
+    """Let what is running come to its end for some seconds, then end the worker processes; Ctrl-C again ends them."""
+    workers = list((getattr(pool, "_processes", None) or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    try:
+        wait(running, GRACE)
+    finally:
+        if any(not future.done() for future in running):
+            for worker in workers:
+                worker.terminate()  # what it has begun to write is removed
+            wait(running, GRACE if workers else 0)
+        for worker in workers:
+            if any(not future.done() for future in running):
+                worker.kill()
 
 
 # Worker processes.
@@ -202,9 +223,15 @@ def _start_worker(work: Callable[[Any], Any] | None) -> None:
     global _work
     _work = work
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _stop_task)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+
+
+def _stop_task(number: int, _frame: object) -> None:
+    signal.signal(number, signal.SIG_DFL)
+    raise SystemExit(128 + number)  # so that a half-written file is removed on the way out
 
 
 def _end_with(sentinel: int) -> None:

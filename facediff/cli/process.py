@@ -1,0 +1,150 @@
+"""What the command line is to the system: standard streams, signals and exit statuses.
+
+A command is stopped by an exception in any case, so that whatever it has begun to write is removed on the way out.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+import facediff
+from facediff.errors import FaceDiffError
+
+USAGE, FAULT, INTERRUPTED, READER_GONE = 2, 70, 130, 141
+"""Exit statuses in addition to 0 and to 1, which means that a part of the work failed; see docs/command_line.md."""
+LONGEST = 900
+"""Characters of an error that are printed."""
+TRACEBACK = "FACEDIFF_TRACEBACK"
+"""Environment variable that shows the traceback of an unexpected error in place of a sentence."""
+
+
+class StandardOutputError(FaceDiffError):
+    """What a command prints cannot be printed."""
+
+    def __init__(self, error: OSError) -> None:
+        super().__init__(
+            f"standard output: cannot be written ({error.strerror}); redirect it to a place with room, or to /dev/null"
+        )
+        self.status = READER_GONE if error.errno == errno.EPIPE else USAGE
+
+
+def prepare_process() -> None:
+    """Set up the streams and signals of a process that does nothing but run a command."""
+    # A file that is opened while the number of a standard stream is free would get that number and what is printed.
+    for number, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, mode)  # standard output read-only: printing is an error
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", closefd=False, errors="backslashreplace")  # noqa: SIM115 - open to the end
+    before = sys.stdout
+    sys.stdout = io.TextIOWrapper(
+        io.BufferedWriter(_StandardOutput(1, "w", closefd=False)),
+        encoding=getattr(before, "encoding", None) or "utf-8",
+        errors="backslashreplace",  # names of files may hold what the terminal's encoding does not have
+        line_buffering=bool(getattr(before, "line_buffering", False)),
+        write_through=bool(getattr(before, "write_through", False)),
+    )
+    for name in ("SIGTERM", "SIGHUP"):
+        signal_number = getattr(signal, name, None)
+        if signal_number is not None and signal.getsignal(signal_number) is signal.SIG_DFL:
+            signal.signal(signal_number, _stop)
+
+
+def finish_process() -> None:
+    """Let Ctrl-C end the process without a word from now on."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _stop(number: int, _frame: FrameType | None) -> NoReturn:
+    signal.signal(number, signal.SIG_DFL)  # the second one does not wait for anything to be tidied up
+    raise SystemExit(128 + number)
+
+
+class _StandardOutput(io.FileIO):
+    """Standard output whose failure is an error of its own, not one of the file that is being written meanwhile."""
+
+    def write(self, data: Any) -> int:  # noqa: ANN401 - any buffer
+        try:
+            return super().write(data)
+        except OSError as error:
+            # What comes later, such as the rest of the buffer at the end of the process, goes nowhere.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            raise StandardOutputError(error) from error
+
+
+def flush() -> None:
+    """Write what has been printed, so that a failure is noticed before the process ends."""
+    if sys.stdout is not None:
+        sys.stdout.flush()
+
+
+def fail(message: str, status: int = USAGE) -> int:
+    """Print one sentence to standard error and give back the exit status."""
+    # Names of files may hold line breaks and the codes by which terminals are controlled, or be as long as a page.
+    shown = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in message)
+    shown = shown if len(shown) <= LONGEST else f"{shown[:LONGEST]}…"
+    with suppress(OSError, ValueError):  # standard error is closed or full: the status has to do
+        print(f"facediff: error: {shown}", file=sys.stderr, flush=True)
+    return status
+
+
+def report(error: BaseException) -> int:
+    """Print what has ended a command, in one sentence; the exit status.
+
+    Raises:
+        BaseException: the error itself where it is unexpected and ``FACEDIFF_TRACEBACK`` is set.
+    """
+    if any(isinstance(each, KeyboardInterrupt) for each in _chain(error)):
+        return fail("interrupted", INTERRUPTED)
+    if isinstance(error, StandardOutputError):
+        return error.status if error.status == READER_GONE else fail(str(error), error.status)
+    if isinstance(error, FaceDiffError):
+        return fail(str(error))
+    if os.environ.get(TRACEBACK):
+        raise error
+    more = f"{TRACEBACK}=1 shows where"
+    text = " ".join(str(error).split())
+    out_of_memory = ("out of memory" in text, "allocate memory" in text, "Unable to allocate" in text)
+    if isinstance(error, MemoryError) or any(out_of_memory):
+        return fail(f"there is not enough memory ({text or 'none left'}); use shorter inputs or --workers 1 ({more})")
+    if isinstance(error, RecursionError):
+        return fail(f"an input is nested too deeply; expected plain data ({more})")
+    if isinstance(error, OSError):
+        name = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return fail(f"{name}{error.strerror or text}; check that it exists, may be used and has room ({more})")
+    if isinstance(error, UnicodeError):
+        return fail(f"a name or a text is not valid UTF-8 ({text}); rename or convert it ({more})")
+    return fail(
+        f"unexpected {type(error).__name__}: {text[:300]} ({_place(error)}, facediff {facediff.__version__}); this is "
+        f"a fault of facediff: run the command again with {TRACEBACK}=1 and report what it prints",
+        FAULT,
+    )
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _place(error: BaseException) -> str:
+    """The innermost line of facediff that an error passed through."""
+    import traceback
+
+    own = Path(__file__).parents[1]
+    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if own in Path(frame.filename).parents]
+    return f"{Path(lines[-1].filename).relative_to(own.parent)}, line {lines[-1].lineno}" if lines else "in a library"
