@@ -289,6 +289,7 @@ def component_finders() -> Components:
         "decoder": decoders.Decoder,
         "motion_space": motion_space.MotionSpace,
         "sampler": samplers.Sampler,
+        "motion_space": motion_space.MotionSpace,
     }
     return {name: partial(find_class, kind, base=bases[name]) for name, kind in COMPONENTS.items()}
 
