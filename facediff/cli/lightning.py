@@ -137,7 +137,12 @@ def find_config(flag: str, value: str) -> str:
     Raises:
         FaceDiffError: if there is no such file.
     """
-    if flag not in ("-c", "--config") or re.search(r"[\n{]|: ", value) or Path(value).is_file():
+    if os.path.isfile(value) and (flag in ("-c", "--config") or value.endswith((".yaml", ".yml"))):  # noqa: PTH113
+        from facediff.cli.configs import check_config
+
+        check_config(value)
+        return value
+    if flag not in ("-c", "--config") or re.search(r"[\n{]|: ", value):
         return value
     bundled = config_dir() / value.removeprefix("configs/")
     if value.startswith("configs/") and bundled.is_file():

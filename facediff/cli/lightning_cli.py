@@ -15,6 +15,7 @@ import urllib.request
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any, NoReturn
 
 import yaml
@@ -28,11 +29,13 @@ from facediff import registry
 from facediff.callbacks import GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
 from facediff.callbacks.runs import continue_run, find_checkpoint
+from facediff.cli.configs import guard_configs
 from facediff.data import SpeechMotionDataModule
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
 from facediff.utils.files import atomic
+from facediff.utils.limits import brief
 
 LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a model that the data module knows."""
@@ -41,6 +44,7 @@ LINKS = ("n_vertices", "identities", "frame_rate")
 def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
     """Run a subcommand whose words are checked and complete; see :func:`facediff.cli.lightning.run_cli`."""
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    guard_configs("omegaconf+")
     logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
     # Lightning starts the other processes of a distributed run with the words of this one.
     argv, sys.argv = sys.argv, [sys.argv[0], name, *words]
@@ -73,11 +77,24 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
                 f"{error.filename or 'the folder of the run'}: {error.strerror or error}; expected a folder that can "
                 f"be written and has room. `facediff fit` continues with --ckpt_path last"
             ) from error
+        if ours is None and any(restores(cause) for cause in causes(error)):
+            raise FaceDiffError(
+                f"--ckpt_path: training cannot continue from this checkpoint ({brief(error)}); it is damaged, or of "
+                f"another model or trainer. Give the config of its run, or train from the beginning"
+            ) from error
+        if ours is None and any(isinstance(cause, UnicodeDecodeError) for cause in causes(error)):
+            raise FaceDiffError("--config: a file that the config names is not UTF-8; save it as UTF-8") from error
         if ours is None or ours is error:
             raise
         raise ours from error
     finally:
         sys.argv = argv
+
+
+def restores(error: BaseException) -> bool:
+    """Whether an error comes from restoring a checkpoint: of loops, optimisers, schedules or callbacks."""
+    places = {frame.f_code.co_filename.replace(os.sep, "/") for frame, _ in walk_tb(error.__traceback__)}
+    return any(place.endswith("connectors/checkpoint_connector.py") for place in places)
 
 
 def built_in_callbacks(name: str) -> list[Callback]:
@@ -200,13 +217,13 @@ class FaceDiffCLI(LightningCLI):
         if self._get(self.config_init, "trainer").get("enable_checkpointing") is False:
             named.add(LastCheckpoint)
         callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in named]
+        if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:  # written whole, read by the one door
+            trainer.strategy.checkpoint_io = AtomicCheckpointIO()
         return trainer
 
     def before_fit(self) -> None:
-        """Let checkpoints be written whole, and a run that was stopped continue in its folder."""
+        """Let a run that was stopped continue in its folder."""
         trainer: Trainer = self.trainer
-        if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:
-            trainer.strategy.checkpoint_io = AtomicCheckpointIO()
         if trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         path = find_checkpoint(trainer, self._get(self.config_init, "ckpt_path"))

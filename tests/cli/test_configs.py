@@ -1,0 +1,82 @@
+"""Configs that are damaged, huge, self-referring or no configs at all: one sentence that names the file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from facediff.cli.app import main
+from facediff.cli.configs import check_config, check_yaml
+from facediff.errors import FaceDiffError
+
+LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefghij", "bcdefghijk", strict=True)
+)
+BAD: dict[str, bytes] = {
+    "not utf-8": b"model: \xff\xfe\xe4\n",
+    "utf-16": "model: x\n".encode("utf-16"),
+    "laughs": LAUGHS.encode(),
+    "itself": b"model: &m\n  init_args: *m\n",
+    "unknown alias": b"model: *nothing\n",
+    "deep": b"model: " + b"[" * 5000,
+    "deep and closed": b"model: " + b"[" * 5000 + b"]" * 5000,
+    "twice": b"seed_everything: 0\nseed_everything: 1\n",
+    "list": b"- 1\n- 2\n",
+    "number": b"42\n",
+    "empty": b"",
+    "binary": bytes(range(256)),
+    "huge": b"# comment\n" * 200_000,
+    "tab": b"model:\n\tdim: 3\n",
+    "no end": b'model: "open\n',
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_config_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(BAD[name])
+    assert main(["fit", "--config", str(path)]) == 2
+    printed = capsys.readouterr().err
+    assert str(path) in printed
+    assert printed.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["missing.yaml", "."])
+def test_a_config_that_is_no_file_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", "--config", name]) == 2
+    assert f"--config {name}" in capsys.readouterr().err
+
+
+def test_aliases_anchors_and_merges_may_be_used(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("base: &base {a: 1}\nmore:\n  <<: *base\n  <<: *base\n  b: [*base, *base]\n")
+    check_config(path)
+
+
+def test_a_config_within_a_config_is_checked_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "decoder.yaml").write_text(f"class_path: gru\ninit_args:\n  {LAUGHS.replace(chr(10), chr(10) + '  ')}")
+    (tmp_path / "mine.yaml").write_text(
+        "model:\n  class_path: DualPathDiffusion\n  init_args: {decoder: decoder.yaml}\n"
+    )
+    words = ["--config", "configs/experiment/puppet.yaml", "--config", str(tmp_path / "mine.yaml")]
+    assert main(["fit", *words]) == 2
+    assert "entries" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "tag", ["!!python/object/apply:os.system ['touch harm']", "!!python/name:os.system", "!mine x"]
+)
+def test_tags_run_nothing(
+    tag: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text(f"model: {tag}\n")
+    assert main(["fit", "--config", "mine.yaml"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "harm").exists()
+
+
+def test_expansion_is_counted_without_expanding() -> None:
+    with pytest.raises(FaceDiffError, match="FACEDIFF_MAX_ENTRIES"):
+        check_yaml(LAUGHS, "mine.yaml")
