@@ -44,7 +44,7 @@ def guard_configs(mode: str) -> None:
     from jsonargparse import set_loader
     from jsonargparse._optionals import get_omegaconf_loader
 
-    read = get_omegaconf_loader(mode)
+    read = get_omegaconf_loader(mode)  # type: ignore[no-untyped-call]
 
     def load(text: str) -> Any:  # noqa: ANN401
         if len(text) > SHORT:
@@ -92,7 +92,8 @@ def check_yaml(text: str, source: object) -> type | None:
     outermost: type | None = None
     try:
         for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-            place = f"{source}, line {event.start_mark.line + 1}"
+            mark: Any = event.start_mark
+            place = f"{source}, line {mark.line + 1}"
             if isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
                 mapping = isinstance(event, yaml.MappingStartEvent)
                 outermost = outermost or (dict if mapping else list)

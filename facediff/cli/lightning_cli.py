@@ -93,8 +93,16 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
 
 def restores(error: BaseException) -> bool:
     """Whether an error comes from restoring a checkpoint: of loops, optimisers, schedules or callbacks."""
-    places = {frame.f_code.co_filename.replace(os.sep, "/") for frame, _ in walk_tb(error.__traceback__)}
-    return any(place.endswith("connectors/checkpoint_connector.py") for place in places)
+    frames = [frame.f_code for frame, _ in walk_tb(error.__traceback__)]
+    return any(
+        code.co_name in RESTORING
+        or code.co_filename.replace(os.sep, "/").endswith("connectors/checkpoint_connector.py")
+        for code in frames
+    )
+
+
+RESTORING = ("load_state_dict", "_load_state_dicts", "on_load_checkpoint", "restore_random_states")
+"""Functions that put back what a checkpoint holds, also later than Lightning's own restoring."""
 
 
 def built_in_callbacks(name: str) -> list[Callback]:
