@@ -284,14 +284,13 @@ def component_finders() -> Components:
         "identity_encoder": speaker_encoders.IdentityEncoder,
         "style_encoder": speaker_encoders.StyleEncoder,
         "mesh_encoder": mesh_encoders.MeshEncoder,
-        "motion_space": motion_space.MotionSpace,
         "fusion": fusions.Fusion,
         "decoder": decoders.Decoder,
         "motion_space": motion_space.MotionSpace,
         "sampler": samplers.Sampler,
         "motion_space": motion_space.MotionSpace,
     }
-    return {name: partial(find_class, kind, base=bases[name]) for name, kind in COMPONENTS.items()}
+    return {name: partial(find_class, kind, base=bases.get(name, torch.nn.Module)) for name, kind in COMPONENTS.items()}
 
 
 def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``
