@@ -18,7 +18,7 @@ from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, align, face_size, robust_align
 from facediff.mesh.alignment import TUKEY
 from facediff.mesh.flame import rotations
-from facediff.mesh.mesh import closest_on_triangles
+from facediff.mesh.mesh import check_coordinates, closest_on_triangles, triangle_areas
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -139,8 +139,9 @@ def _checked(name: str, vertices: npt.NDArray[np.floating], faces: npt.NDArray[n
         raise FaceDiffError(
             f"{name}: {len(points)} vertices and {len(corners)} triangles make no face; give a whole mesh"
         )
-    if not np.isfinite(points).all():
-        raise FaceDiffError(f"{name}: holds NaN or infinity; write it again")
+    check_coordinates(points, f"{name}:")
+    if np.count_nonzero(triangle_areas(points, corners)) < 4:
+        raise FaceDiffError(f"{name}: its {len(corners)} triangles have no area; give the mesh of a face")
     return Surface(points, corners)
 
 

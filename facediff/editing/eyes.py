@@ -15,6 +15,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.files import load_json
+from facediff.utils.limits import quoted
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -179,7 +180,9 @@ def _read_shape(path: Path, name: object) -> Vertices:
     """Vertices of a mesh, or displacements (V, 3) of a .npy file, that the eyes' file names."""
     from facediff.mesh import read_mesh
 
-    file = path.parent / str(name)
+    if not isinstance(name, str):
+        raise FaceDiffError(f"--eyes {path}: {quoted(name)} is no file name; expected meshes or .npy files")
+    file = path.parent / name
     if file.suffix.lower() != ".npy":
         return read_mesh(file).vertices
     array = open_array(file, kinds="f", name=f"--eyes {path}: {file}")
@@ -193,10 +196,10 @@ def _indices(path: Path, listed: object, n_vertices: int) -> Indices:
     from facediff.mesh.flame import read_masks
     from facediff.metrics.regions import read_indices
 
-    if not isinstance(listed, str):
-        return _checked(path, np.asarray(listed), n_vertices)
-    file, _, mask = listed.partition(":") if ".pkl:" in listed else (listed, "", "")
     try:
+        if not isinstance(listed, str):
+            return _checked(path, np.asarray(listed), n_vertices)
+        file, _, mask = listed.partition(":") if ".pkl:" in listed else (listed, "", "")
         read = read_masks(path.parent / file, mask) if file.endswith(".pkl") else read_indices(path.parent / file)
     except ValueError as error:
         raise FaceDiffError(f"--eyes {path}: {error}") from error

@@ -379,6 +379,8 @@ def _read_weights(path: Path) -> list[float]:
 
 def _read_text(path: Path, expected: str) -> str:
     try:
+        if path.exists() and not path.is_file():
+            raise OSError("not a regular file")  # a device or a pipe may never end
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         reason = error.strerror or str(error)

@@ -129,3 +129,65 @@ def test_a_correspondence_of_a_later_format_is_refused(tmp_path: Path) -> None:
     np.savez(path, **held)
     with pytest.raises(FaceDiffError, match=r"map\.npz.*format"):
         load_correspondence(path)
+
+
+EYES = [
+    '{"lids": [], "lids": []}',
+    '{"eyeballs": [[NaN]]}',
+    '{"eyeballs": [[-1]]}',
+    '{"eyeballs": [[1e30]]}',
+    '{"eyeballs": [[10000000000000000000000000]]}',
+    '{"eyeballs": [[0.5]]}',
+    '{"eyeballs": [[[[1]]]]}',
+    '{"eyeballs": [[1, "a"]]}',
+    '{"eyeballs": [[1, [2]]]}',
+    '{"eyeballs": ["/dev/zero"]}',
+    '{"eyeballs": ["/dev/zero.pkl:left"]}',
+    '{"blinks": ["/dev/zero"], "neutral": "/dev/zero"}',
+    '{"blinks": [1, 2]}',
+    '{"neutral": "a\\u0000b"}',
+    '{"lids": [{"upper": [0, 1], "lower": [99]}]}',
+    '{"lids": [{"upper": [], "lower": []}]}',
+    '{"lids": [1]}',
+    "[1]",
+    "",
+]
+
+
+@pytest.mark.parametrize("text", EYES)
+def test_eyes_that_are_none_are_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_archive(tmp_path / "good.npz", clicks())
+    (tmp_path / "eyes.json").write_text(text, encoding="utf-8")
+    command = ["export", "good.npz", "-o", "out.npz", "--blinks", "--eyes", "eyes.json"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        assert main(command) == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1
+    assert "eyes.json" in error or "/dev/zero" in error
+    assert not (tmp_path / "out.npz").exists()
+
+
+FACE = clicks()
+MESHES = {
+    "point": (FACE.template * 0, FACE.faces),
+    "line": (FACE.template * [1, 0, 0], FACE.faces),
+    "degenerate": (FACE.template, np.zeros((10, 3), int)),
+    "one triangle": (FACE.template[:3], np.array([[0, 1, 2]])),
+    "huge": (FACE.template * 1e20, FACE.faces),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_motion_is_not_carried_to_a_mesh_that_is_no_face(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    vertices, faces = MESHES[name]
+    write_archive(tmp_path / "good.npz", FACE)
+    lines = [f"v {x} {y} {z}\n" for x, y, z in vertices] + [f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces]
+    (tmp_path / "other.obj").write_text("".join(lines))
+    files = [str(tmp_path / file) for file in ("good.npz", "other.obj", "out.npz")]
+    assert main(["retarget", files[0], "--target-mesh", files[1], "-o", files[2]]) == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1
+    assert "other.obj" in error
