@@ -15,6 +15,7 @@ import argparse
 import collections.abc
 import dataclasses
 import inspect
+import os
 import re
 import types
 import typing
@@ -28,6 +29,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.utils.ranges import Range, extras_of, range_of, shown
 
 MISSING = inspect.Parameter.empty
+LONGEST_NAME = 255  # Bytes of the name of a file on usual disks; a path may be longer
 
 RENAMED = {"--takes": "--samples", "--directing-seed": "--controls-seed"}
 """Options of version 0.1 that have another name now; the error names it."""
@@ -155,6 +157,9 @@ class Parameter:
                     f"{self.flag} {shown(word)}: has an empty or a repeated entry; expected names with commas between"
                 )
             return names
+        path = self.is_path or self.option.reads or self.option.writes
+        if path and any(len(os.fsencode(part)) > LONGEST_NAME for part in re.split(r"[/,]", word)):
+            raise FaceDiffError(f"{self.shown} {shown(word)}: too long for the name of a file; choose a shorter one")
         return Path(word) if self.is_path else word
 
     def expected(self) -> str:
