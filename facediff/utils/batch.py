@@ -172,7 +172,10 @@ class FileTask:
 
     def _read_record(self) -> dict[str, Any] | None:
         record = read_json(self._record_file)
-        return record if record is not None and isinstance(record.get("speech"), dict) else None
+        recipe = {} if record is None else record.get("recipe")
+        parts = [] if record is None else [record.get("speech"), recipe]
+        parts += [recipe.get("files")] if isinstance(recipe, dict) else []
+        return record if parts and all(isinstance(part, dict) for part in parts) else None
 
     def _same_source(self, known: Mapping[str, Any]) -> bool:
         """By path, size and time; where path or time differ, by the content."""

@@ -148,7 +148,8 @@ def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = 
         begun = _read_record(out / STATE) or manifest
         if begun is None:
             _refuse_foreign(out)
-        finished = {job.name: frames for job in plan.jobs if (frames := finished_frames(plan, job, out))}
+        recorded = {} if manifest is None else manifest.get("files", {})
+        finished = {job.name: frames for job in plan.jobs if (frames := finished_frames(plan, job, out, recorded))}
         if manifest is not None and not (out / STATE).exists() and _is_complete(plan, finished, out, manifest):
             return _report(plan, out, manifest, 0)
         if begun is not None:
@@ -224,9 +225,15 @@ def version() -> str:
 # What an earlier run has left in the folder.
 
 
-def finished_frames(plan: Plan, job: Job, out: Path) -> int | None:
-    """Frames of a clip whose motion and speech are both there and whole; None for any other."""
+def finished_frames(plan: Plan, job: Job, out: Path, recorded: Mapping[str, Any]) -> int | None:
+    """Frames of a clip whose motion and speech are both there and whole; None for any other.
+
+    Files that an earlier manifest records have the sizes that it records.
+    """
     motion, speech = clip_files(out, job.name)
+    names = [path.relative_to(out).as_posix() for path in (motion, speech)]
+    if not same_sizes(out, {name: recorded[name] for name in names if name in recorded}):
+        return None
     try:
         if speech.stat().st_size <= WAV_HEADER:
             return None
@@ -253,7 +260,8 @@ def _read_record(path: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     record = load_json(path, remedy=f"remove {path.parent}, or choose another folder")
-    if not isinstance(record, dict) or not {"corpus", "options"} <= set(record):
+    parts = (record, record.get("options"), record.get("files", {})) if isinstance(record, dict) else ()
+    if not parts or not all(isinstance(part, dict) for part in parts) or "corpus" not in record:
         raise FaceDiffError(f"{path}: not written by `facediff data prepare`; choose another folder to write to")
     return record
 

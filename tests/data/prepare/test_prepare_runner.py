@@ -96,7 +96,9 @@ def test_a_second_run_changes_nothing(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("flaw", ["npy cut", "npy gone", "wav empty", "wav gone", "templates gone", "other type"])
+@pytest.mark.parametrize(
+    "flaw", ["npy cut", "npy gone", "wav empty", "wav cut", "wav grown", "wav gone", "templates gone", "other type"]
+)
 def test_damaged_files_are_written_again(tmp_path: Path, flaw: str) -> None:
     out = tmp_path / "out"
     prepare(toy_plan(), out, workers=1)
@@ -108,11 +110,24 @@ def test_damaged_files_are_written_again(tmp_path: Path, flaw: str) -> None:
         np.save(motion, np.load(motion).astype("f8"))
     elif flaw == "wav empty":
         speech.write_bytes(b"")
+    elif flaw == "wav cut":
+        speech.write_bytes(speech.read_bytes()[:-500])
+    elif flaw == "wav grown":
+        speech.write_bytes(speech.read_bytes() + b"more")
     else:
         {"npy gone": motion, "wav gone": speech, "templates gone": out / "templates.pkl"}[flaw].unlink()
     report = prepare(toy_plan(), out, workers=1)
     assert report.written == (0 if flaw == "templates gone" else 1)
     assert contents(out) == whole
+
+
+@pytest.mark.parametrize(
+    "record", [[], {"corpus": "toy", "options": []}, {"corpus": "toy", "options": {}, "files": [1]}]
+)
+def test_a_manifest_of_another_form_is_named(tmp_path: Path, record: object) -> None:
+    (tmp_path / "manifest.json").write_text(json.dumps(record))
+    with pytest.raises(FaceDiffError, match=r"manifest\.json"):
+        prepare(toy_plan(), tmp_path, workers=1)
 
 
 def test_a_failing_clip_does_not_stop_the_others_and_can_be_repaired(tmp_path: Path) -> None:
