@@ -1,0 +1,657 @@
+"""Every reader of every format: how a small valid file is written, and what reads it.
+
+A function of the package that decodes files and is reached by none of these readers makes a test fail.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import json
+import os
+import pickle
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+SAMPLES = 8000
+MATERIAL = Path(tempfile.gettempdir())
+"""Where material is made that several readers share, whatever the environment says later."""
+VERTICES = 9
+FACES = [[0, 1, 3], [1, 4, 3], [1, 2, 4], [2, 5, 4], [3, 4, 6], [4, 7, 6], [4, 5, 7], [5, 8, 7]]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A format.
+
+    Attributes:
+        suffix: of its files.
+        write: writes a valid file.
+        read: reads a file, valid or not.
+        share: share of the rounds that it gets; less where reading takes long.
+    """
+
+    suffix: str
+    write: Callable[[Path], object]
+    read: Callable[[Path], object]
+    share: float = 1.0
+
+
+def new_folder() -> Path:
+    """A folder that is removed when this process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="readers-", dir=MATERIAL))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def grid() -> np.ndarray:
+    """Nine vertices in a plane that is not quite one."""
+    y, x = np.divmod(np.arange(VERTICES), 3)
+    return np.stack([x * 0.1, y * 0.1, 0.01 * np.sin(x + y)], -1)
+
+
+@functools.cache
+def shared(name: str) -> Path:
+    """Material that is made once in a process: ``tiny`` (a corpus), ``checkpoint`` (a model trained on it)."""
+    folder = new_folder()
+    if name == "tiny":
+        from tests.fakes.tiny import write_tiny
+
+        return write_tiny(folder / "tiny", sentences=2)
+    import lightning.pytorch as pl
+    import torch
+
+    from facediff import registry
+    from facediff.models import DualPathDiffusion
+    from tests.fakes.tiny import SEEN, Tiny, write_tiny
+    from tests.fakes.tiny import VERTICES as OF_TINY
+
+    torch.manual_seed(0)
+    model = DualPathDiffusion(
+        n_vertices=OF_TINY,
+        identities=SEEN,
+        frame_rate=25.0,
+        dim=16,
+        diffusion_steps=4,
+        audio_encoder=functools.partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1),
+        style_encoder=functools.partial(registry.style_encoder.tcn_gru_transformer, num_layers=1),
+        decoder=functools.partial(registry.decoder.style_transformer, num_layers=1),
+        sampler=functools.partial(registry.sampler.ddim, steps=2),
+    )
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        devices=1,
+        max_steps=1,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=False,
+        limit_val_batches=0,
+        num_sanity_val_steps=0,
+        default_root_dir=folder,
+    )
+    trainer.fit(model, datamodule=Tiny(root=str(write_tiny(folder / "tiny"))))
+    trainer.save_checkpoint(folder / "model.ckpt")
+    return folder / "model.ckpt"
+
+
+def in_a_corpus(path: Path, name: str) -> Path:
+    """The tiny corpus with the file at ``name``, next to the file."""
+    root = path.parent / "corpus"
+    if not root.exists():
+        shutil.copytree(shared("tiny"), root)
+    (root / name).parent.mkdir(exist_ok=True)
+    shutil.copy(path, root / name)
+    return root
+
+
+# Speech
+
+
+def sound(path: Path) -> None:
+    import soundfile
+
+    wave = 0.1 * np.sin(np.arange(SAMPLES) * 0.2)
+    options = {"format": "OGG", "subtype": "OPUS"} if path.suffix == ".opus" else {}
+    soundfile.write(path, wave, 16_000, **options)
+
+
+def container(path: Path) -> None:
+    import av
+
+    kind = {".flv": "flv", ".webm": "webm", ".m4a": "mp4", ".mkv": "matroska"}.get(path.suffix, path.suffix[1:])
+    with av.open(str(path), "w", format="adts" if path.suffix == ".aac" else kind) as out:
+        stream = out.add_stream("libopus" if path.suffix == ".webm" else "aac", rate=48_000)
+        stream.layout = "mono"
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 24_000), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 48_000
+        for packet in [*stream.encode(frame), *stream.encode(None)]:
+            out.mux(packet)
+
+
+def read_sound(path: Path) -> object:
+    from facediff.data.audio import read_speech
+
+    return read_speech(path)
+
+
+def read_a_stretch(path: Path) -> object:
+    from facediff.data.audio import read_stretch
+
+    return read_stretch(path, 100, 2000, None)
+
+
+# Meshes and shapes
+
+
+def mesh(path: Path) -> None:
+    import trimesh
+
+    trimesh.Trimesh(grid(), FACES, process=False).export(path)
+
+
+def read_a_mesh(path: Path) -> object:
+    from facediff.mesh import read_mesh
+
+    return read_mesh(path)
+
+
+def shape_folder(path: Path) -> object:
+    from facediff.editing.shapes import read_shape_files
+
+    folder = path.parent / "shapes"
+    folder.mkdir()
+    mesh(folder / "neutral.obj")
+    shutil.copy(path, folder / "jawOpen.obj")
+    return read_shape_files(folder)
+
+
+def targets(path: Path) -> None:
+    from facediff.export import ExportOptions, write_animations
+    from tests.fakes.clicks import clicks
+
+    write_animations(path, [clicks()], ExportOptions())
+
+
+def read_targets(path: Path) -> object:
+    from facediff.editing.shapes import read_shape_files
+
+    return read_shape_files(path)
+
+
+def head() -> np.ndarray:
+    """A small patch with lids, and a face around it."""
+    return np.concatenate([0.2 * grid(), grid() + [0, 0.3, 0]])
+
+
+def eyes(path: Path) -> None:
+    lids = [{"upper": [0, 1, 2], "lower": [3, 4, 5]}]
+    path.write_text(json.dumps({"lids": lids, "eyeballs": [[6, 7, 8, 9], [10, 11, 12, 14]]}))
+
+
+def blinks(path: Path) -> None:
+    path.write_text(json.dumps({"neutral": "neutral.obj", "blinks": ["blink.npy"], "eyeballs": ["balls.txt"]}))
+
+
+def eyes_arrays(path: Path) -> None:
+    np.savez(path, closing=np.full((18, 3), 0.01), neutral=head(), eyeball_left=np.arange(3, 9))
+
+
+def read_the_eyes(path: Path) -> object:
+    import trimesh
+
+    from facediff.editing.eyes import read_eyes
+
+    trimesh.Trimesh(head(), FACES, process=False).export(path.parent / "neutral.obj")
+    np.save(path.parent / "blink.npy", np.full((18, 3), 0.01))
+    (path.parent / "balls.txt").write_text("6, 7, 8, 10, 12")
+    return read_eyes(path, head())
+
+
+# Animations, styles, weights
+
+
+def animation(path: Path) -> None:
+    from facediff.animation import write_archive
+    from tests.fakes.clicks import clicks
+
+    write_archive(path, clicks())
+
+
+def read_an_animation(path: Path) -> object:
+    from facediff.animation import read_animation
+
+    return read_animation(path)
+
+
+def read_a_style(path: Path) -> object:
+    from facediff.models.styles import open_style
+
+    opened = open_style(path)
+    return np.asarray(opened.array).sum()
+
+
+def correspondence(path: Path) -> None:
+    from facediff.editing.correspondence import correspond
+    from facediff.editing.retargeting import save_correspondence
+
+    save_correspondence(path, correspond(grid(), np.array(FACES), grid(), np.array(FACES)))
+
+
+def read_correspondence(path: Path) -> object:
+    from facediff.editing.retargeting import load_correspondence
+
+    return load_correspondence(path)
+
+
+def landmarks(path: Path) -> None:
+    path.write_text("source,target\n1,2\n3,4\n5,6\n")
+
+
+def read_the_landmarks(path: Path) -> object:
+    from facediff.editing.retargeting import read_landmarks
+
+    return read_landmarks(path)
+
+
+def _hierarchy(cache: Path) -> object:
+    from facediff.mesh.hierarchy import mesh_hierarchy
+
+    return mesh_hierarchy(grid(), np.array(FACES), levels=1, factor=2, spiral_length=3, cache=cache)
+
+
+def hierarchy(path: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        _hierarchy(Path(folder))
+        (made,) = Path(folder).iterdir()
+        shutil.copy(made, path)
+
+
+def read_hierarchy(path: Path) -> object:
+    """A damaged file in the cache is made again."""
+    cache = path.parent / "made"
+    cache.mkdir()
+    _hierarchy(cache)
+    (made,) = cache.iterdir()
+    shutil.copy(path, made)
+    return _hierarchy(cache)
+
+
+# Corpora
+
+
+def templates(path: Path) -> None:
+    path.write_bytes(pickle.dumps({"A": grid(), "B": grid() + 1}))
+
+
+def read_the_templates(path: Path) -> object:
+    from facediff.data.corpus import read_templates
+
+    return read_templates(path, VERTICES)
+
+
+def vertices(path: Path) -> None:
+    np.save(path, np.zeros((5, 3 * VERTICES), np.float32))
+
+
+def read_the_vertices(path: Path) -> object:
+    from facediff.utils.arrays import open_vertices
+
+    return np.asarray(open_vertices(path, VERTICES)).sum()
+
+
+def indices(path: Path) -> None:
+    path.write_text("1, 2, 3, 4, 8")
+
+
+def read_the_indices(path: Path) -> object:
+    from facediff.data.corpus import find_region
+
+    return find_region(path.parent, [path.name], "lips", VERTICES)
+
+
+def weights(path: Path) -> None:
+    path.write_text("\n".join(f"{0.1 * vertex:.3f}" for vertex in range(VERTICES)))
+
+
+def read_the_weights(path: Path) -> object:
+    from facediff.evaluation import read_region
+
+    return read_region("lips", VERTICES, source=f"{path}>0.1")
+
+
+def pairs(path: Path) -> None:
+    path.write_text("0, 6\n1, 7\n")
+
+
+def read_the_pairs(path: Path) -> object:
+    from facediff.evaluation.files import read_pairs
+
+    return read_pairs(str(path), None, VERTICES)
+
+
+def masks(path: Path) -> None:
+    path.write_bytes(pickle.dumps({"lips": np.arange(4), "forehead": np.arange(5, 9)}, protocol=2))
+
+
+def read_the_masks(path: Path) -> object:
+    from facediff.mesh.flame import read_masks
+
+    try:
+        return read_masks(path, "lips+forehead")
+    except ValueError as error:  # as its callers do
+        from facediff.errors import FaceDiffError
+
+        raise FaceDiffError(str(error)) from error
+
+
+def clip_table(path: Path) -> None:
+    path.write_text("clip,subject,sentence,mood\nA_e01,A,e01,calm\nB_e01,B,e01,lively\n")
+
+
+def read_the_clip_table(path: Path) -> object:
+    from facediff.data.corpus import Corpus, read_clip_table
+
+    root = in_a_corpus(path, "clips.csv")
+    read_clip_table(root)
+    return Corpus
+
+
+def corpus_pairs(path: Path) -> object:
+    from tests.fakes.tiny import Tiny
+
+    root = in_a_corpus(path, "regions/inner_lip_pairs.txt")
+    data = Tiny(root=str(root))
+    data.setup("test")
+    return data.assets
+
+
+def phonemes(path: Path) -> None:
+    path.write_text("start,end,ipa\n0.0,0.1,b\n0.1,0.3,a\n")
+
+
+def read_the_phonemes(path: Path) -> object:
+    from facediff.data.phonemes import read_phonemes
+
+    return read_phonemes(path)
+
+
+def manifest(path: Path) -> None:
+    path.write_text(json.dumps({"frame_rate": 25, "unit": "m", "files": {"a": {"bytes": 1, "sha256": "b"}}}))
+
+
+def read_the_manifest(path: Path) -> object:
+    from facediff.data.corpus import read_manifest
+
+    target = path.with_name("manifest.json")
+    os.replace(path, target)
+    return read_manifest(target.parent)
+
+
+def checking(name: str) -> Callable[[Path], object]:
+    """Check a corpus folder in which one file is damaged."""
+
+    def check(path: Path) -> object:
+        from facediff.data.check import check as check_folder
+
+        root = in_a_corpus(path, name)
+        return check_folder(root, "tests.fakes.tiny.Tiny", workers=1, progress=False)
+
+    return check
+
+
+def of_tiny(name: str) -> Callable[[Path], object]:
+    """A copy of a file of the tiny corpus."""
+    return lambda path: shutil.copy(shared("tiny") / name, path)
+
+
+def state(path: Path) -> None:
+    from facediff.data.prepare.runner import prepare
+    from tests.data.prepare.test_prepare_runner import toy_plan
+
+    with tempfile.TemporaryDirectory() as folder:
+        prepare(toy_plan(), Path(folder), workers=1, quiet=True)
+        shutil.copy(Path(folder) / "manifest.json", path)
+
+
+def read_the_state(path: Path) -> object:
+    from facediff.data.prepare.runner import prepare
+    from tests.data.prepare.test_prepare_runner import toy_plan
+
+    out = path.parent / "out"
+    out.mkdir()
+    shutil.copy(path, out / "manifest.json")
+    return prepare(toy_plan(), out, workers=1, quiet=True)
+
+
+def record(path: Path) -> None:
+    speech = {"path": "a.wav", "bytes": 3, "modified_ns": 5, "sha256": "0"}
+    recipe = {"command": ["seed=0"], "files": {"model.ckpt": "1"}}
+    path.write_text(json.dumps({"speech": speech, "recipe": recipe, "output_bytes": 7, "problem": ""}))
+
+
+def read_a_record(path: Path) -> object:
+    from facediff.utils.batch import RECORDS, FileTask, Recipe
+
+    folder = path.parent / RECORDS
+    folder.mkdir()
+    shutil.copy(path, folder / "a.mp4.json")
+    task = FileTask(path.parent / "a.wav", path.parent / "a.mp4", Recipe(("seed=0",), {"model.ckpt": "1"}))
+    return task.change(), task.earlier_problem()
+
+
+def read_the_store(path: Path) -> object:
+    """A damaged file in the store counts as none."""
+    from facediff.utils.arrays import ArrayStore
+
+    store = ArrayStore(path.parent / "store")
+    store.put("key", np.zeros(3, np.float32))
+    shutil.copy(path, store.path("key"))
+    return store.get("key")
+
+
+# Raw data sets, people, FLAME
+
+
+def flame(path: Path) -> None:
+    from tests.fakes.flame import flame_arrays, write_flame
+
+    if path.suffix == ".npz":
+        np.savez(path, **flame_arrays())
+    else:
+        write_flame(path)
+
+
+def read_flame(path: Path) -> object:
+    from facediff.mesh.flame import Flame
+
+    return Flame.read(path)
+
+
+def vl(path: Path) -> None:
+    from tests.fakes.biwi import vl_bytes
+
+    path.write_bytes(vl_bytes(grid()))
+
+
+def read_a_vl(path: Path) -> object:
+    from facediff.data.prepare.biwi import read_vl
+
+    return read_vl(path)
+
+
+def parameters(path: Path) -> None:
+    from tests.fakes.mead3d import CLIPS, parameters_of, write_hdf5
+
+    parts = parameters_of(CLIPS[0])
+    if path.suffix == ".npy":
+        np.save(path, np.concatenate([parts["shape"], parts["exp"], parts["jaw"]], 1)[None])
+    else:
+        write_hdf5(path, parts)
+
+
+def read_the_parameters(path: Path) -> object:
+    from facediff.data.prepare.motion import read_parameters
+
+    return read_parameters(path)
+
+
+def raw_vocaset(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """Writes one file of the raw distribution, and makes the plan of a folder with it."""
+
+    @functools.cache
+    def folder() -> Path:
+        from tests.fakes.vocaset import write_raw_vocaset
+
+        return write_raw_vocaset(new_folder() / "raw")
+
+    def read(path: Path) -> object:
+        from facediff.data.prepare.vocaset import plan
+
+        raw = path.parent / "raw"
+        shutil.copytree(folder(), raw)
+        shutil.copy(path, raw / name)
+        return plan(raw)
+
+    return lambda path: shutil.copy(folder() / name, path), read
+
+
+# Training
+
+
+def checkpoint(path: Path) -> None:
+    shutil.copy(shared("checkpoint"), path)
+
+
+def read_a_checkpoint(path: Path) -> object:
+    from facediff.models import load_model
+
+    return load_model(path)
+
+
+def curves(path: Path) -> None:
+    path.write_text("epoch,step,train/loss\n0,0,1.0\n0,1,0.5\n1,2,0.25\n")
+
+
+def read_the_curves(path: Path) -> object:
+    from facediff.evaluation.figures.training import read_curves
+
+    return read_curves(path)
+
+
+@functools.cache
+def hubert_folder() -> Path:
+    """A HuBERT in miniature."""
+    from transformers import HubertConfig, HubertModel
+    from transformers.utils import logging
+
+    folder = new_folder()
+    small = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
+    config = HubertConfig(**small, conv_dim=(8,) * 7, num_conv_pos_embeddings=8, num_conv_pos_embedding_groups=4)
+    logging.disable_progress_bar()
+    HubertModel(config).save_pretrained(folder)
+    return folder
+
+
+def hubert(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """Writes one file of a pretrained audio encoder, and loads the encoder with it."""
+
+    def read(path: Path) -> object:
+        from facediff.models.audio_encoders import load_hubert
+
+        folder = path.parent / "hubert"
+        shutil.copytree(hubert_folder(), folder)
+        shutil.copy(path, folder / name)
+        return load_hubert(str(folder), None)
+
+    return lambda path: shutil.copy(hubert_folder() / name, path), read
+
+
+def config(path: Path) -> None:
+    path.write_text(
+        "seed_everything: 0\nmodel:\n  class_path: facediff.models.DualPathDiffusion\n  init_args: {dim: 16}\n"
+        "data: {class_path: tests.fakes.tiny.Tiny, init_args: {root: nowhere}}\ntrainer: {max_epochs: 2}\n"
+    )
+
+
+def read_a_config(path: Path) -> object:
+    from facediff.cli.lightning import run_cli
+
+    try:
+        with open(os.devnull, "w") as nowhere, _output_to(nowhere):
+            return run_cli("fit", ["--config", str(path), "--print_config"])
+    except SystemExit as stop:  # after printing
+        return stop.code
+
+
+def _output_to(stream: object) -> object:
+    from contextlib import redirect_stdout
+
+    return redirect_stdout(stream)
+
+
+READERS = {
+    **{suffix: Reader(f".{suffix}", sound, read_sound) for suffix in ("wav", "flac", "ogg", "opus", "mp3", "aiff")},
+    "wav, a part": Reader(".wav", sound, read_a_stretch),
+    **{
+        suffix: Reader(f".{suffix}", container, read_sound, 0.5)
+        for suffix in ("flv", "m4a", "mp4", "mov", "mkv", "webm", "avi", "aac")
+    },
+    **{suffix: Reader(f".{suffix}", mesh, read_a_mesh) for suffix in ("obj", "ply", "stl", "off", "glb")},
+    "shapes, a folder": Reader(".obj", mesh, shape_folder),
+    "shapes, glb": Reader(".glb", targets, read_targets),
+    "eyes": Reader(".json", eyes, read_the_eyes),
+    "eyes, shapes": Reader(".json", blinks, read_the_eyes),
+    "eyes, arrays": Reader(".npz", eyes_arrays, read_the_eyes),
+    "animation": Reader(".npz", animation, read_an_animation),
+    "style, archive": Reader(".npz", animation, read_a_style),
+    "style, array": Reader(".npy", vertices, read_a_style),
+    "correspondence": Reader(".npz", correspondence, read_correspondence),
+    "hierarchy": Reader(".npz", hierarchy, read_hierarchy, 0.5),
+    "landmarks": Reader(".csv", landmarks, read_the_landmarks),
+    "templates": Reader(".pkl", templates, read_the_templates),
+    "vertices": Reader(".npy", vertices, read_the_vertices),
+    "indices": Reader(".txt", indices, read_the_indices),
+    "weights": Reader(".txt", weights, read_the_weights),
+    "lip pairs": Reader(".txt", pairs, read_the_pairs),
+    "masks": Reader(".pkl", masks, read_the_masks),
+    "clip table": Reader(".csv", clip_table, read_the_clip_table),
+    "a corpus's lip pairs": Reader(".txt", pairs, corpus_pairs),
+    "phonemes": Reader(".csv", phonemes, read_the_phonemes),
+    "manifest": Reader(".json", manifest, read_the_manifest),
+    **{
+        f"check, {name}": Reader(Path(name).suffix, of_tiny(name), checking(name), 0.3)
+        for name in (
+            "wav/A_e01.wav",
+            "vertices_npy/A_e01.npy",
+            "templates.pkl",
+            "clips.csv",
+            "regions/lve.txt",
+            "tiny.ply",
+        )
+    },
+    "check, manifest.json": Reader(".json", manifest, checking("manifest.json"), 0.3),
+    "prepared": Reader(".json", state, read_the_state, 0.5),
+    "batch record": Reader(".json", record, read_a_record),
+    "flame": Reader(".pkl", flame, read_flame, 0.5),
+    "flame, arrays": Reader(".npz", flame, read_flame, 0.5),
+    "array store": Reader(".npy", vertices, read_the_store),
+    "vl": Reader(".vl", vl, read_a_vl),
+    "parameters, hdf5": Reader(".hdf5", parameters, read_the_parameters, 0.5),
+    "parameters, array": Reader(".npy", parameters, read_the_parameters),
+    **{
+        f"vocaset, {name}": Reader(Path(name).suffix, *raw_vocaset(name), 0.5)
+        for name in ("data_verts.npy", "subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl")
+    },
+    "checkpoint": Reader(".ckpt", checkpoint, read_a_checkpoint, 0.3),
+    "curves": Reader(".csv", curves, read_the_curves),
+    "hubert, config": Reader(".json", *hubert("config.json"), 0.2),
+    "hubert, weights": Reader(".safetensors", *hubert("model.safetensors"), 0.2),
+    "config": Reader(".yaml", config, read_a_config, 0.1),
+}
+"""By a name for the tests."""
