@@ -1,0 +1,258 @@
+"""What ``tools/fault_drill.py`` runs: every command that writes, on inputs of a few kilobytes.
+
+A command without an entry in :data:`DRILLS` or :data:`WRITES_NOTHING` makes a test fail.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+TINY = "tests.fakes.tiny.Tiny"
+RUN = "--trainer.accelerator=cpu --trainer.enable_progress_bar=false --trainer.logger.version=0"
+PAPER = f"ours corpus --method other=theirs --topology {TINY} --width 120 --dpi 80"
+SMALL_MODEL = """\
+seed_everything: 0
+model:
+  class_path: facediff.models.DualPathDiffusion
+  init_args:
+    dim: 16
+    diffusion_steps: 20
+    warmup_steps: 2
+    lr_schedule: cosine
+    audio_encoder: {class_path: mel, init_args: {hidden_dim: 16, num_layers: 1, dropout: 0.1}}
+    style_encoder: {class_path: tcn_gru_transformer, init_args: {num_layers: 1}}
+    decoder: {class_path: style_transformer, init_args: {num_layers: 1}}
+    sampler: {class_path: dpm_solver, init_args: {steps: 2}}
+data: {class_path: tests.fakes.tiny.Tiny, init_args: {root: corpus, batch_size: 3}}
+"""
+SMALL_TRAINER = """\
+trainer:
+  accelerator: cpu
+  devices: 1
+  log_every_n_steps: 1
+  check_val_every_n_epoch: 2
+  num_sanity_val_steps: 0
+  gradient_clip_val: 1.0
+  enable_progress_bar: false
+  enable_model_summary: false
+  logger: {class_path: lightning.pytorch.loggers.CSVLogger, init_args: {save_dir: runs, name: small, version: 0}}
+"""
+CALLBACKS = """\
+  max_epochs: 6
+  callbacks:
+    - {class_path: lightning.pytorch.callbacks.EMAWeightAveraging, init_args: {decay: 0.9, use_buffers: false}}
+    - {class_path: lightning.pytorch.callbacks.ModelCheckpoint,
+       init_args: {monitor: val/lve, mode: min, filename: best}}
+    - {class_path: lightning.pytorch.callbacks.LearningRateMonitor}
+    - {class_path: facediff.callbacks.checkpoints.LastCheckpoint, init_args: {every_n_steps: 2}}
+"""
+"""Averaged weights, dropout, a schedule, shuffled batches, and the state saved at every second step."""
+
+
+@dataclass(frozen=True)
+class Drill:
+    """A command on small inputs.
+
+    Attributes:
+        command: its name in ``facediff.cli.app.COMMANDS``.
+        words: what follows the name, in a folder with copies of the inputs that the words mention.
+        earlier: words of a run whose outputs are there already; an empty string stands for none.
+        label: tells two drills of one command apart.
+        pieces: whether the output grows file by file, and the next run continues it.
+        also: inputs that the words do not mention.
+    """
+
+    command: str
+    words: str
+    earlier: str = ""
+    label: str = ""
+    pieces: bool = False
+    also: str = ""
+
+    @property
+    def name(self) -> str:
+        """Command and label."""
+        return f"{self.command} ({self.label})" if self.label else self.command
+
+    def argv(self, words: str | None = None) -> list[str]:
+        """The words after ``facediff``."""
+        return [*self.command.split(), *(self.words if words is None else words).split()]
+
+    def inputs(self, folder: Path) -> list[Path]:
+        """The inputs that the words mention."""
+        mentioned = f"{self.words} {self.earlier} {self.also}".replace("=", " ").replace("/", " ").split()
+        return [path for path in sorted(folder.iterdir()) if path.name in mentioned]
+
+
+DRILLS = [
+    Drill("demo", "-o demo --epochs 1", "-o demo --epochs 2", also="corpus demo.yaml", pieces=True),
+    Drill(
+        "animate",
+        "speech.wav --checkpoint model.ckpt --quiet -o out/a.npz",
+        "speech.wav --checkpoint model.ckpt --quiet --seed 5 -o out/a.npz",
+    ),
+    Drill(
+        "animate",
+        "speech.wav --checkpoint model.ckpt --quiet --size 64 -o a.mp4",
+        "speech.wav --checkpoint model.ckpt --quiet --seed 5 --size 64 -o a.mp4",
+        label="video",
+    ),
+    Drill("animate", "speech.wav --checkpoint model.ckpt --quiet --samples 2 -o a.obj", label="samples, a new folder"),
+    Drill(
+        "animate",
+        "recordings --checkpoint model.ckpt --quiet --workers 1 --suffix .glb -o out",
+        label="batch",
+        pieces=True,
+    ),
+    Drill(
+        "adapt",
+        "--checkpoint model.ckpt --person C --data-root corpus --epochs 1 --accelerator cpu --quiet -o C.ckpt",
+        "--checkpoint model.ckpt --person C --data-root corpus --epochs 1 --accelerator cpu --quiet --seed 5 -o C.ckpt",
+    ),
+    Drill(
+        "style extract",
+        "A_e01.npy --checkpoint model.ckpt -o style.npy",
+        "A_e02.npy --checkpoint model.ckpt -o style.npy",
+    ),
+    Drill("view", "ball.npz -o page.html", "ball.npz --labels earlier -o page.html"),
+    *(
+        Drill(
+            "export",
+            f"ball.npz --quiet --size 64 -o out{suffix}",
+            f"ball.npz --quiet --size 64 --expressiveness 0.5 -o out{suffix}",
+            label=suffix,
+        )
+        for suffix in (".glb", ".usdc", ".pc2", ".mdd", ".npy", ".mp4", ".html")
+    ),
+    Drill("export", "ball.npz --quiet -o frames.ply", label=".ply"),
+    Drill(
+        "blendshapes",
+        "ball.npz --shapes shapes -o weights.csv",
+        "ball.npz --shapes shapes --smoothness 1 -o weights.csv",
+    ),
+    Drill(
+        "retarget",
+        "ball.npz --target-mesh coarse.obj --correspondence map.npz -o mine.npz",
+        "ball.npz --target-mesh coarse.obj -o mine.npz",
+    ),
+    Drill("validate", f"--ckpt_path model.ckpt --data {TINY} --data.root corpus {RUN}", label="", pieces=True),
+    Drill(
+        "test",
+        f"--ckpt_path model.ckpt --data {TINY} --data.root corpus {RUN}",
+        f"--ckpt_path model.ckpt --data {TINY} --data.root corpus {RUN} --seed_everything=5",
+        pieces=True,
+    ),
+    Drill(
+        "predict",
+        f"--ckpt_path model.ckpt --data {TINY} --data.root corpus {RUN}",
+        f"--ckpt_path model.ckpt --data {TINY} --data.root corpus {RUN} --seed_everything=5",
+        pieces=True,
+    ),
+    Drill(
+        "evaluate",
+        "ours corpus --bootstrap 20 --workers 1 --quiet --json a.json --csv a.csv",
+        "ours corpus --bootstrap 10 --workers 1 --quiet --json a.json --csv a.csv",
+        pieces=True,
+    ),
+    Drill("figure frames", f"{PAPER} --phonemes m -o a.png", f"{PAPER} --phonemes f -o a.png"),
+    Drill("figure heatmap", f"{PAPER} -o a.png", f"{PAPER} --dpi 100 -o a.png"),
+    Drill("figure error", f"{PAPER} -o a.svg", f"{PAPER} --dpi 100 -o a.svg"),
+    Drill("figure lips", f"{PAPER} -o a.pdf", f"{PAPER} --dpi 100 -o a.pdf"),
+    Drill("figure training", "one=curve --width 60 --dpi 50 -o a.png", "one=curve --width 50 --dpi 50 -o a.png"),
+    Drill("data prepare", "biwi biwi out --workers 1 --quiet", label="biwi", pieces=True),
+    Drill("data prepare", "vocaset vocaset out --workers 1 --quiet", label="vocaset", pieces=True),
+    Drill("data prepare", "mead3d mead3d out --flame flame.pkl --workers 1 --quiet", label="mead3d", pieces=True),
+    Drill("data regions", f"corpus --corpus {TINY} --size 64 -o a.png", f"corpus --corpus {TINY} --size 80 -o a.png"),
+    Drill(
+        "data import-person",
+        "person.npy --audio person.wav --name Target --frame-rate 30 --corpus persons --quiet -o entry",
+    ),
+]
+"""One or several for each command that writes, except ``fit``, which has a drill of its own."""
+
+WRITES_NOTHING = ("components", "data check")
+FIT = "fit"
+
+
+def write_inputs(folder: Path, run: object) -> None:
+    """Write all inputs; ``run(words, folder)`` runs a command in a folder.
+
+    Args:
+        folder: an empty folder.
+        run: called with the words of a command and the folder to run it in.
+    """
+    import numpy as np
+    import trimesh
+
+    from facediff.animation import Animation, write_archive
+    from tests.fakes import biwi, flame, mead3d, person, vocaset
+    from tests.fakes.tiny import write_tiny
+
+    assert callable(run)
+    rng = np.random.default_rng(0)
+    corpus = write_tiny(folder / "corpus")
+    phonemes = "start,end,ipa,viseme\n0,0.10,,SIL\n0.10,0.20,m,PP\n0.20,0.30,a,AA\n0.30,0.9,f,FF\n"
+    (corpus / "phonemes").mkdir()
+    for name, moved in (("ours", 0.001), ("theirs", 0.004)):
+        (folder / name).mkdir()
+        for clip in ("A_e06", "A_e07"):
+            truth = np.load(corpus / "vertices_npy" / f"{clip}.npy")
+            np.save(folder / name / f"{clip}_condition_A.npy", truth + np.float32(moved))
+            (corpus / "phonemes" / f"{clip}.csv").write_text(phonemes, encoding="utf-8")
+    (folder / "curve").mkdir()
+    rows = [f"{step},{step},{1 / (step + 1)}" for step in range(30)]
+    (folder / "curve" / "metrics.csv").write_text("\n".join(["epoch,step,train/loss", *rows]))
+
+    (folder / "demo.yaml").write_text(SMALL_MODEL + SMALL_TRAINER)
+    (folder / "fit.yaml").write_text(SMALL_MODEL + SMALL_TRAINER + CALLBACKS)
+    run(["fit", "--config", "fit.yaml", "--trainer.max_epochs=2", "--trainer.logger.save_dir=training"], folder)
+    (made,) = (folder / "training").rglob("best.ckpt")
+    shutil.move(made, folder / "model.ckpt")
+    shutil.rmtree(folder / "training")
+
+    shutil.copy(corpus / "wav" / "A_e06.wav", folder / "speech.wav")
+    (folder / "recordings").mkdir()
+    for clip in ("A_e01", "A_e02"):
+        shutil.copy(corpus / "wav" / f"{clip}.wav", folder / "recordings" / f"{clip}.wav")
+        shutil.copy(corpus / "vertices_npy" / f"{clip}.npy", folder / f"{clip}.npy")
+
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    rest = np.array(ball.vertices) * [1, 1.3, 0.8]
+    shapes = {name: rng.normal(0, 2e-3, rest.shape) for name in ("jawOpen", "mouthFunnel", "mouthPucker")}
+    weights = 0.5 + 0.5 * np.sin(np.arange(20)[:, None] / 3 + np.arange(3))
+    vertices = rest + np.tensordot(weights, np.stack(list(shapes.values())), axes=1)
+    speech = (0.3 * np.sin(np.arange(12_800) / 9)).astype(np.float32)
+    performance = Animation(
+        "ball",
+        vertices.astype(np.float32),
+        rest.astype(np.float32),
+        25.0,
+        faces=np.asarray(ball.faces, np.int32),
+        speech=speech,
+    )
+    write_archive(folder / "ball.npz", performance)
+    (folder / "shapes").mkdir()
+    for name, moved_by in {"neutral": np.zeros_like(rest), **shapes}.items():
+        write_obj(folder / "shapes" / f"{name}.obj", rest + moved_by, np.asarray(ball.faces))
+    coarse = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
+    write_obj(folder / "coarse.obj", np.array(coarse.vertices) * [1, 1.3, 0.8], np.asarray(coarse.faces))
+
+    biwi.write_raw_biwi(folder / "biwi")
+    vocaset.write_raw_vocaset(folder / "vocaset")
+    mead3d.write_raw_emote(folder / "mead3d", audio="wav")
+    flame.write_flame(folder / "flame.pkl")
+    masks = vocaset.python2_pickle(vocaset.flame_masks(flame.VERTICES))
+    (folder / "FLAME_masks.pkl").write_bytes(masks)
+
+    person.write_auxiliary(folder / "persons")
+    person.write_speech(folder / "person.wav", person.FRAMES / person.RATE)
+    np.save(folder / "person.npy", person.person().seen.astype(np.float32))
+
+
+def write_obj(path: Path, vertices: object, faces: object) -> None:
+    """A plain OBJ file."""
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices]  # type: ignore[attr-defined]
+    lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]  # type: ignore[operator]
+    path.write_text("\n".join(lines) + "\n")
