@@ -286,7 +286,6 @@ def component_finders() -> Components:
         "mesh_encoder": mesh_encoders.MeshEncoder,
         "fusion": fusions.Fusion,
         "decoder": decoders.Decoder,
-        "motion_space": motion_space.MotionSpace,
         "sampler": samplers.Sampler,
         "motion_space": motion_space.MotionSpace,
     }
