@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +17,16 @@ import torch
 from torch import Tensor
 
 from facediff.data.audio import read_stretch, samples_for
+from facediff.data.manifest import LONGEST
+from facediff.data.manifest import read_manifest as read_manifest
 from facediff.errors import FaceDiffError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
 from facediff.utils.arrays import ArrayStore, open_vertices
-from facediff.utils.files import cache_dir, load_json, read_rows, read_table
+from facediff.utils.files import cache_dir, read_table
+from facediff.utils.limits import COORDINATE, LIMITS, quoted
 from facediff.utils.pickles import load_pickle
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
@@ -32,6 +34,9 @@ MOTION_FOLDERS = ("vertices_npy", "vertex")
 
 CHUNK = 8
 """Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
+
+WIDEST = 1000
+"""Most columns of ``clips.csv``."""
 
 ALL = "all"
 """The region source that stands for every vertex."""
@@ -124,11 +129,7 @@ class Corpus:
                 f"{root}: its preparation was interrupted (prepare.json is there, manifest.json is not); run the same "
                 f"`facediff data prepare` again to continue it"
             )
-        stored = read_manifest(root).get("frame_rate") or default
-        if not isinstance(stored, int | float) or not 0 < stored < float("inf"):
-            raise FaceDiffError(
-                f"{root / 'manifest.json'}: frame_rate is {stored!r}, expected frames per second, e.g. 25"
-            )
+        stored = float(read_manifest(root).get("frame_rate") or default)
         stride = round(stored / self.frame_rate)
         if stride < 1 or abs(stride * self.frame_rate - stored) > 1e-6:
             raise FaceDiffError(
@@ -157,6 +158,8 @@ class Corpus:
         rows = read_clip_table(root)
         clips = {}
         for name in sorted(path.stem for path in (root / "wav").glob("*.wav")):
+            if not name.isprintable():
+                raise FaceDiffError(f"{root / 'wav'}: has a file {quoted(name)}; rename it, its name cannot be printed")
             clip = parse(name) if motion_path(root, name).is_file() else None
             if clip is not None:
                 attributes = {**rows.get(name, {}), **clip.attributes}
@@ -205,7 +208,8 @@ class Corpus:
         # other over the whole clip, each would wait for main memory.
         for first in range(0, len(stored), CHUNK):
             chunk = motion[first : first + CHUNK]
-            np.copyto(chunk, stored[first : first + CHUNK], casting="same_kind")
+            with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+                np.copyto(chunk, stored[first : first + CHUNK], casting="same_kind")
             if not np.isfinite(chunk.sum()):
                 bad = (start + first + int(np.argmax(~np.isfinite(chunk).all((1, 2))))) * self._strides[clip.root]
                 raise FaceDiffError(
@@ -275,10 +279,13 @@ def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tenso
         if not size or size % 3:
             raise FaceDiffError(f"{path}: expected a dict from identity to (V, 3) array, as every corpus has it")
         n_vertices = size // 3
+    LIMITS.check("identities", len(loaded), path)
     templates = {}
     for name, value in loaded.items():
+        if not (isinstance(name, str) and name.isprintable() and 0 < len(name) <= LONGEST):
+            raise FaceDiffError(f"{path}: has a template of {quoted(name)}; expected the names of identities")
         try:
-            templates[str(name)] = torch.from_numpy(as_template(value, n_vertices))
+            templates[name] = torch.from_numpy(as_template(value, n_vertices))
         except ValueError as error:
             raise FaceDiffError(f"{path}: the template of {name} {error}") from error
     return templates
@@ -291,32 +298,22 @@ def as_template(value: object, n_vertices: int) -> npt.NDArray[np.float32]:
         ValueError: saying what is wrong with it.
     """
     try:
-        with np.errstate(all="ignore"):
-            array = np.array(value, np.float32)
-    except (TypeError, ValueError, OverflowError) as error:
+        given = np.asarray(value)
+    except (TypeError, ValueError, OverflowError) as error:  # lists of unequal length
         raise ValueError(f"is no array of numbers; expected ({n_vertices}, 3)") from error
-    if array.shape not in ((3 * n_vertices,), (n_vertices, 3)):
-        raise ValueError(f"has shape {array.shape}, expected ({n_vertices}, 3)")
-    array = array.reshape(n_vertices, 3)
-    bad = np.count_nonzero(~np.isfinite(array).all(axis=1))
+    if given.dtype.kind != "f":
+        # Anything else would lose something: an imaginary part, or what comes after the point.
+        raise ValueError(f"is no array of floating-point numbers but of {given.dtype}; expected ({n_vertices}, 3)")
+    if given.shape not in ((3 * n_vertices,), (n_vertices, 3)):
+        raise ValueError(f"has shape {given.shape}, expected ({n_vertices}, 3)")
+    with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+        array = np.array(given.reshape(n_vertices, 3), np.float32)
+    bad = np.count_nonzero(~(np.abs(array) <= COORDINATE).all(axis=1))
     if bad:
-        raise ValueError(f"holds NaN or infinity in {bad} {'vertex' if bad == 1 else 'vertices'}")
+        raise ValueError(
+            f"holds NaN, infinity or a coordinate beyond {COORDINATE:g} in {bad} {'vertex' if bad == 1 else 'vertices'}"
+        )
     return array
-
-
-def read_manifest(root: Path) -> dict[str, Any]:
-    """``manifest.json`` of a folder; empty if there is none.
-
-    Raises:
-        FaceDiffError: if it is damaged.
-    """
-    path = root / "manifest.json"
-    if not path.is_file():
-        return {}
-    manifest = load_json(path, remedy="prepare the folder again, or remove the file")
-    if not isinstance(manifest, dict):
-        raise FaceDiffError(f"{path}: holds no JSON object; prepare the folder again, or remove the file")
-    return manifest
 
 
 def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
@@ -328,11 +325,28 @@ def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
     path = root / "clips.csv"
     if not path.is_file():
         return {}
-    found = read_rows(path, remedy="save it as CSV UTF-8, with one row a clip")
-    rows = [{key: value for key, value in row.items() if key} for row in found]
-    if rows and "clip" not in rows[0]:
+    remedy = "save it as CSV UTF-8, with one row a clip"
+    rows = list(read_table(path, remedy=remedy))
+    header = rows.pop(0) if rows else []
+    if rows and "clip" not in header:
         raise FaceDiffError(f"{path}: has no column clip; expected clip and further columns, one row a clip")
-    return {str(row.pop("clip")): {key: (value or "").strip() for key, value in row.items()} for row in rows}
+    twice = [name for name in header if name and header.count(name) > 1] if len(header) <= WIDEST else header
+    if twice:
+        raise FaceDiffError(f"{path}: has {len(header)} columns, {quoted(twice[0])} more than once; {remedy}")
+    found: dict[str, dict[str, str]] = {}
+    for number, cells in enumerate(rows, 2):
+        where = f"{path}: row {number}"
+        if len(cells) < len(header) or any(cells[len(header) :]):
+            raise FaceDiffError(f"{where} has {len(cells)} cells, the header has {len(header)}; {remedy}")
+        row = {key: cell.strip() for key, cell in zip(header, cells, strict=False) if key}
+        wrong = next((cell for cell in row.values() if not cell.isprintable()), None)
+        if wrong is not None:
+            raise FaceDiffError(f"{where} holds {quoted(wrong)}; expected text that can be printed")
+        clip = row.pop("clip")
+        if clip in found:
+            raise FaceDiffError(f"{where} is another one of clip {quoted(clip)}; {remedy}")
+        found[clip] = row
+    return found
 
 
 def find_region(root: Path, sources: Sequence[str], name: str, n_vertices: int, help_text: str = "") -> Region:

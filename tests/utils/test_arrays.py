@@ -207,6 +207,6 @@ def test_arrays_are_read_in_one_place_only() -> None:
             ):
                 found.append(f"{file.relative_to(PACKAGE)}:{node.lineno} calls {owner}.{name}")
             loads = owner in ("pickle", "torch", "joblib") and name in ("load", "loads")
-            if loads and file.name != "checkpoint.py":
+            if loads and file.name not in ("torch_files.py", "checkpoint.py"):
                 found.append(f"{file.relative_to(PACKAGE)}:{node.lineno} calls {owner}.{name}")
     assert not found, "\n".join(found)

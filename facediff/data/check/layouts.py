@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args, get_origin, get_type_hints
 
 from facediff.data.check.report import Findings, Report, few, number
+from facediff.data.manifest import load_manifest
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.arrays import open_array, vertices_of
-from facediff.utils.files import load_json
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
@@ -171,10 +171,7 @@ def read_record(root: Path, name: str, findings: Findings) -> dict[str, Any]:
     path = root / name
     if path.is_file():
         with findings.guard("manifest_unreadable", path, root):
-            record = load_json(path, remedy="prepare the folder again, or remove the file")
-            if not isinstance(record, dict):
-                raise FaceDiffError("holds no JSON object; prepare the folder again, or remove the file")
-            return record
+            return load_manifest(path)
     return {}
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.audio import SAMPLE_RATE, fit_length, read_speech, samples_for
+from facediff.data.manifest import FORMAT
 from facediff.data.person.fitting import (
     Auxiliary,
     Neutral,
@@ -388,5 +389,12 @@ def _write_entry(
     ]
     write_rows(folder / "clips.csv", rows, line_end="\n")
     facts = {"frame_rate": known.frame_rate, "n_vertices": known.n_vertices, "unit": known.unit}
-    about = {"facediff": version(), "corpus": "person", "person": report.name, **facts, "report": asdict(report)}
+    about = {
+        "facediff": version(),
+        "format": FORMAT,
+        "corpus": "person",
+        "person": report.name,
+        **facts,
+        "report": asdict(report),
+    }
     write_json(folder / MANIFEST, {**about, "files": describe_files(folder, workers=2)})

@@ -34,6 +34,7 @@ from facediff.data.prepare.runner import (
 from facediff.errors import FaceDiffError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.mesh import surface_area
+from facediff.utils.limits import LIMITS
 
 SUBJECTS = [*(f"F{i}" for i in range(1, 9)), *(f"M{i}" for i in range(1, 7))]
 TRAINING_SUBJECTS = ["F2", "F3", "F4", "M3", "M4", "M5"]
@@ -328,6 +329,9 @@ def read_vl(path: Path) -> npt.NDArray[np.float32]:
         FaceDiffError: if the file is missing, or its size does not fit its count: bytes found and expected are named.
     """
     try:
+        if not path.is_file():  # a device would never end
+            raise OSError(0, "no regular file")
+        LIMITS.check("bytes", path.stat().st_size, path)
         data = path.read_bytes()
     except OSError as error:
         raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a frame of BIWI") from error

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.flame import EXPRESSIONS, SHAPES
 from facediff.utils.arrays import open_array
+from facediff.utils.limits import check_array
 
 if TYPE_CHECKING:
     import h5py
@@ -189,6 +190,8 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
     try:
         with h5py.File(path, "r") as file:
             holder = file if "exp" in file else file.get("data", file)
+            if holder.file.filename != file.filename:
+                raise FaceDiffError(f"{path}: its data lie in another file; expected a file that holds its own data")
             # hickle keeps the quotes of a key as part of its name.
             names = {name.strip("\"'"): name for name in holder} if isinstance(holder, h5py.Group) else {}
             absent = [name for name in WIDTHS if name not in names]
@@ -210,10 +213,12 @@ def _dataset(holder: h5py.Group, name: str, most: int, path: Path) -> Array:
     if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiu":
         raise FaceDiffError(f"{where} holds no numbers; expected floats of shape (1, frames, up to {most})")
     # A file from elsewhere must not make facediff read other files of this machine.
-    if isinstance(link, h5py.ExternalLink) or dataset.external or dataset.is_virtual:
+    elsewhere = isinstance(link, h5py.ExternalLink) or dataset.file.filename != holder.file.filename
+    if elsewhere or dataset.external or dataset.is_virtual:
         raise FaceDiffError(f"{where} lies in another file; expected a file that holds its own data")
     if max(dataset.shape, default=0) > MOST_FRAMES:
         raise FaceDiffError(f"{where} has shape {dataset.shape}; expected at most {MOST_FRAMES} frames")
+    check_array(where, dataset.shape, max(8, dataset.dtype.itemsize))
     return _as_frames(dataset[()], most, where)
 
 

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.manifest import FORMAT, load_manifest
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import run_batch
@@ -24,7 +25,6 @@ from facediff.utils.files import (
     atomic,
     check_writable,
     describe_files,
-    load_json,
     locked,
     parse_json,
     remove_partial,
@@ -101,7 +101,7 @@ class Plan:
     def recipe(self) -> dict[str, Any]:
         """What decides the bytes that are written; a run may be resumed only with the same."""
         options = parse_json(json.dumps(self.options), "options")  # as the manifest will hold them: lists, no tuples
-        return {"facediff": version(), "corpus": self.corpus, "options": options}
+        return {"facediff": version(), "format": FORMAT, "corpus": self.corpus, "options": options}
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ def finished_frames(plan: Plan, job: Job, out: Path, recorded: Mapping[str, Any]
 
 def _is_complete(plan: Plan, finished: dict[str, int], out: Path, manifest: dict[str, Any]) -> bool:
     """Whether the manifest records just this plan, carried out without a failure, and all its files are there."""
-    expected = {name: value for name, value in plan.recipe.items() if name != "facediff"}
+    expected = {name: value for name, value in plan.recipe.items() if name not in ("facediff", "format")}
     expected |= {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": finished}
     return (
         len(finished) == len(plan.jobs)
@@ -259,9 +259,9 @@ def _read_record(path: Path) -> dict[str, Any] | None:
     """The manifest or the state of a run; None if there is none."""
     if not path.is_file():
         return None
-    record = load_json(path, remedy=f"remove {path.parent}, or choose another folder")
-    parts = (record, record.get("options"), record.get("files", {})) if isinstance(record, dict) else ()
-    if not parts or not all(isinstance(part, dict) for part in parts) or "corpus" not in record:
+    record = load_manifest(path, remedy=f"remove {path.parent}, or choose another folder")
+    parts = (record.get("options"), record.get("files", {}))
+    if not all(isinstance(part, dict) for part in parts) or "corpus" not in record:
         raise FaceDiffError(f"{path}: not written by `facediff data prepare`; choose another folder to write to")
     return record
 

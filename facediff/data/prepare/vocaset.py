@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from operator import index
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -28,7 +29,7 @@ from facediff.data.prepare.runner import (
     write_templates,
 )
 from facediff.errors import FaceDiffError
-from facediff.utils.arrays import open_vertices
+from facediff.utils.arrays import in_range, open_vertices
 from facediff.utils.pickles import load_pickle
 
 RAW_RATE = 60
@@ -222,12 +223,12 @@ def _read_templates(path: Path, n_vertices: int, vertices: Path) -> dict[str, Ar
     templates = {}
     for subject, value in loaded.items():
         array = np.asarray(value)
-        if array.dtype.kind not in "fi" or array.size != 3 * n_vertices:
+        if array.dtype.kind != "f" or array.size != 3 * n_vertices:
             raise FaceDiffError(
-                f"{path}: the template of {subject} has shape {array.shape}, but the frames of {vertices} have "
-                f"{n_vertices} vertices; expected the same mesh everywhere"
+                f"{path}: the template of {subject} has shape {array.shape} and holds {array.dtype}, but the frames of "
+                f"{vertices} have {n_vertices} vertices; expected the same mesh everywhere"
             )
-        if not np.isfinite(array).all():
+        if not in_range(array):
             raise FaceDiffError(f"{path}: the template of {subject} holds NaN or infinity; get the file again")
         templates[str(subject)] = array.reshape(-1, 3).astype(np.float64)
     return templates
@@ -236,7 +237,8 @@ def _read_templates(path: Path, n_vertices: int, vertices: Path) -> dict[str, Ar
 def _rows(frames: object, name: str, notes: list[str]) -> npt.NDArray[np.int64]:
     """Rows of a clip in the order of its frames."""
     try:
-        pairs = sorted((int(frame), int(row)) for frame, row in dict(frames).items())  # type: ignore[call-overload]
+        # An index that has been a float would be rounded silently.
+        pairs = sorted((index(frame), index(row)) for frame, row in dict(frames).items())  # type: ignore[call-overload]
     except (TypeError, ValueError) as error:
         raise FaceDiffError(
             f"{ROWS}: {name}: expected a dict from frame to row ({error}); get the file again"

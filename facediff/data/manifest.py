@@ -1,0 +1,58 @@
+"""``manifest.json`` of a corpus folder: what wrote it, of which format it is, and facts that readers rely on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from facediff.errors import FaceDiffError
+from facediff.utils.files import load_json
+from facediff.utils.limits import FRAME_RATES, LIMITS, check_format, check_number, quoted
+
+FORMAT = 1
+"""Goes up when a field changes its meaning; new fields do not count. Folders without the field are of format 1."""
+
+REMEDY = "prepare the folder again, or remove the file"
+TEXTS = ("corpus", "person", "unit")
+LONGEST = 200
+"""Characters of such a text, or of an identity's name, which messages, checkpoints and files' names repeat."""
+
+
+def load_manifest(path: Path, *, name: str = "", remedy: str = REMEDY) -> dict[str, Any]:
+    """The object in a manifest, or in the state of a preparation that is running.
+
+    Args:
+        path: the file.
+        name: what messages call it; its path if empty.
+        remedy: what messages advise.
+
+    Raises:
+        FaceDiffError: if it is damaged, no object, or of a later format.
+    """
+    name = name or str(path)
+    manifest = load_json(path, name=name, remedy=remedy)
+    if not isinstance(manifest, dict):
+        raise FaceDiffError(f"{name}: holds no JSON object; {remedy}")
+    check_format(name, manifest.get("format", FORMAT), FORMAT)
+    return manifest
+
+
+def read_manifest(root: Path) -> dict[str, Any]:
+    """``manifest.json`` of a folder, its facts checked; empty if there is none.
+
+    Raises:
+        FaceDiffError: if it is damaged, of a later format, or a fact is not what it should be.
+    """
+    path = root / "manifest.json"
+    if not path.is_file():
+        return {}
+    manifest = load_manifest(path)
+    if manifest.get("frame_rate") is not None:
+        check_number(path, "frame_rate", manifest["frame_rate"], *FRAME_RATES, remedy=REMEDY)
+    if manifest.get("n_vertices") is not None:
+        check_number(path, "n_vertices", manifest["n_vertices"], 1, LIMITS.vertices, whole=True, remedy=REMEDY)
+    for field in TEXTS:
+        text = manifest.get(field, "")
+        if text is not None and not (isinstance(text, str) and text.isprintable() and len(text) <= LONGEST):
+            raise FaceDiffError(f"{path}: {field} is {quoted(text)}; expected a short text; {REMEDY}")
+    return manifest

@@ -1,0 +1,205 @@
+"""Corpus folders whose files are damaged, absurd or hostile are refused by name."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from facediff.data.corpus import Corpus, read_clip_table, read_manifest, read_templates
+from facediff.data.prepare.biwi import read_vl
+from facediff.data.prepare.motion import read_parameters
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import quoted
+from tests.data.test_hostile_audio import wave
+
+FACE = np.random.default_rng(0).normal(size=(9, 3))
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        FACE + 1j,
+        FACE > 0,
+        FACE.astype(str),
+        FACE.astype(int),
+        FACE.tolist()[:8],
+        [[0.0], [1.0, 2.0]],
+        [FACE.tolist()],
+        None,
+        "face",
+        {},
+        np.where(FACE[2, 1] == FACE, math.nan, FACE),
+        FACE * 1e13,
+        FACE * 1e300,
+        FACE[:, :2],
+        FACE[None],
+        np.zeros((0, 3)),
+    ],
+    ids=lambda value: quoted(getattr(value, "dtype", value)),
+)
+def test_template_that_is_no_face_is_refused(value: Any, tmp_path: Path) -> None:  # noqa: ANN401
+    (tmp_path / "templates.pkl").write_bytes(pickle.dumps({"A": FACE, "B": value}))
+    with pytest.raises(FaceDiffError, match=r"templates\.pkl.* B ") as refused:
+        read_templates(tmp_path / "templates.pkl", 9)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("value", [FACE, FACE.astype("f4"), FACE.astype(">f8"), FACE.ravel(), FACE.tolist()])
+def test_template_of_floating_point_numbers_is_read(value: Any, tmp_path: Path) -> None:  # noqa: ANN401
+    (tmp_path / "templates.pkl").write_bytes(pickle.dumps({"A": value}))
+    np.testing.assert_allclose(read_templates(tmp_path / "templates.pkl")["A"], FACE, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [1, b"A", None, "", "a\nb", "\x1b[31m", "x" * 999, ("A",), 10**5000], ids=quoted)
+def test_template_of_a_name_that_is_no_name_is_refused(name: object, tmp_path: Path) -> None:
+    (tmp_path / "templates.pkl").write_bytes(pickle.dumps({name: FACE}))
+    with pytest.raises(FaceDiffError, match=r"templates\.pkl") as refused:
+        read_templates(tmp_path / "templates.pkl", 9)
+    assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"[]",
+        b"null",
+        b"{",
+        b"\xff\xfe{\x00",
+        b"[" * 5000,
+        *(
+            json.dumps({key: value}).encode()
+            for key, value in [
+                ("format", 2),
+                ("format", "1"),
+                ("format", None),
+                ("format", True),
+                *(("frame_rate", rate) for rate in (-25, 1e-9, 1e9, "25", True, [25], {})),
+                *(("n_vertices", count) for count in (0, -1, 1.5, 1e12, "9", True)),
+                *(("unit", unit) for unit in (1, "m\n", "x" * 999, [])),
+                *(("person", name) for name in (1, "\x1b", [])),
+                *(("corpus", name) for name in (1, {})),
+            ]
+        ),
+        b'{"frame_rate": NaN}',
+        b'{"frame_rate": 1e999}',
+        b'{"frame_rate": 25, "frame_rate": 30}',
+    ],
+    ids=quoted,
+)
+def test_manifest_that_is_wrong_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_bytes(content)
+    with pytest.raises(FaceDiffError, match=r"manifest\.json") as refused:
+        read_manifest(tmp_path)
+    assert "\n" not in str(refused.value)
+
+
+def test_manifest_of_a_later_format_says_so(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text('{"format": 2}')
+    with pytest.raises(FaceDiffError, match="update facediff"):
+        read_manifest(tmp_path)
+    (tmp_path / "manifest.json").write_text('{"frame_rate": 25, "unit": "m"}')  # before formats had numbers
+    assert read_manifest(tmp_path)["frame_rate"] == 25
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"clip,mood\nA_01\n",
+        b"clip,mood\nA_01,sad,more\n",
+        b"clip,mood\nA_01,sad\nA_01,glad\n",
+        b'clip,mood\nA_01,"sad\nglad"\n',
+        b"clip,mood\nA_01,\x1b[31m\n",
+        b"clip,mood\nA_01,\x00\n",
+        b"mood\nsad\n",
+        b"clip,mood\nA_01,gl\xfcck\n",
+        "clip,mood\nA_01,sad\n".encode("utf-16"),
+        b"clip,clip\nA_01,A_02\n",
+        b"clip,mood\nA_01," + b"x" * 200_000,
+    ],
+    ids=quoted,
+)
+def test_clip_table_with_a_damaged_row_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "clips.csv").write_bytes(content)
+    with pytest.raises(FaceDiffError, match=r"clips\.csv") as refused:
+        read_clip_table(tmp_path)
+    assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "content", [b"clip,mood\r\nA_01, sad\r\n\r\n", b"\xef\xbb\xbfclip,mood\nA_01,sad\n", b"clip,mood,\nA_01,sad,,,\n"]
+)
+def test_clip_table_of_a_spreadsheet_is_read(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "clips.csv").write_bytes(content)
+    assert read_clip_table(tmp_path) == {"A_01": {"mood": "sad"}}
+
+
+def corpus(root: Path, clip: str = "A_01") -> Corpus:
+    for folder in ("wav", "vertices_npy"):
+        (root / folder).mkdir(parents=True, exist_ok=True)
+    (root / "wav" / f"{clip}.wav").write_bytes(wave(body=bytes(32_000)))
+    np.save(root / "vertices_npy" / f"{clip}.npy", np.tile(FACE.ravel(), (25, 1)).astype(np.float32))
+    (root / "templates.pkl").write_bytes(pickle.dumps({"A": FACE}))
+    return Corpus(root, 9, 25.0)
+
+
+@pytest.mark.parametrize("name", ["A\n_01", "A\x1b[31m_01", os.fsdecode(b"A\xff_01")], ids=quoted)
+def test_clip_whose_name_cannot_be_printed_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="wav") as refused:
+        _ = corpus(tmp_path, name).clips
+    assert str(refused.value).removeprefix(str(tmp_path)).isprintable()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e300])
+def test_motion_that_is_not_finite_is_refused_by_frame(value: float, tmp_path: Path) -> None:
+    opened = corpus(tmp_path)
+    motion = np.tile(FACE.ravel(), (25, 1))
+    motion[7, 3] = value
+    np.save(tmp_path / "vertices_npy" / "A_01.npy", motion)
+    with pytest.raises(FaceDiffError, match=r"A_01\.npy: frame 7"):
+        opened.read_motion(opened.clips["A_01"])
+
+
+@pytest.mark.parametrize("kind", ["c8", "?", "i4", "S4"])
+def test_motion_of_another_kind_is_refused(kind: str, tmp_path: Path) -> None:
+    opened = corpus(tmp_path)
+    np.save(tmp_path / "vertices_npy" / "A_01.npy", np.zeros((25, 27)).astype(kind))
+    with pytest.raises(FaceDiffError, match=r"A_01\.npy"):
+        opened.read_motion(opened.clips["A_01"])
+
+
+def test_frame_of_biwi_that_is_a_device_is_refused(tmp_path: Path) -> None:
+    os.symlink("/dev/zero", tmp_path / "frame_001.vl")
+    with pytest.raises(FaceDiffError, match=r"frame_001\.vl"):
+        read_vl(tmp_path / "frame_001.vl")
+
+
+def test_parameters_that_lie_in_another_file_or_declare_gigabytes_are_refused(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    widths = {"shape": 300, "exp": 100, "jaw": 3}
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        for name, width in widths.items():
+            other[f"data/{name}"] = np.zeros((1, 5, width))
+    assert len(read_parameters(tmp_path / "other.h5").jaw) == 5
+    with h5py.File(tmp_path / "group.h5", "w") as file:
+        file["data"] = h5py.ExternalLink("other.h5", "/data")
+    with h5py.File(tmp_path / "soft.h5", "w") as file:
+        for name in widths:
+            file[f"far_{name}"] = h5py.ExternalLink("other.h5", f"/data/{name}")
+            file[name] = h5py.SoftLink(f"/far_{name}")
+    with h5py.File(tmp_path / "huge.h5", "w") as file:
+        for name in widths:
+            file.create_dataset(name, (1, 900_000, 900_000), "f8", chunks=(1, 64, 64), compression="gzip")
+    with h5py.File(tmp_path / "complex.h5", "w") as file:
+        for name, width in widths.items():
+            file[name] = np.zeros((1, 5, width), complex)
+    for name in ("group", "soft", "huge", "complex"):
+        with pytest.raises(FaceDiffError, match=rf"{name}\.h5"):
+            read_parameters(tmp_path / f"{name}.h5")
