@@ -271,7 +271,7 @@ class Range:
     def holds(self, number: Any) -> bool:  # noqa: ANN401 - of any numeric type
         """Whether a number lies in the range."""
         return (
-            (not isinstance(number, float) or math.isfinite(number))
+            (isinstance(number, numbers.Integral) or math.isfinite(number))
             and (self.least is None or number >= self.least)
             and (self.most is None or number <= self.most)
             and (self.above is None or number > self.above)
@@ -313,6 +313,8 @@ def mismatch(hint: Any, value: Any, limits: Range = Range()) -> str | None:  # n
             if fits and not wrong
             else f"a list of {limits.items[0]} to {limits.items[1]} items" + (f", each {wrong[0]}" if wrong else "")
         )
+    if origin is dict:
+        return None if isinstance(value, Mapping) else "a mapping"
     if getattr(hint, "_is_protocol", False):  # of what makes a component
         return None if callable(value) else "a component's class"
     plain_types = {bool: (bool,), str: (str, PathLike), types.NoneType: (types.NoneType,)}

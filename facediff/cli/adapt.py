@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from facediff.cli.options import Checkpoint, Folder, Output, Seed, confirm_cost
+from facediff.cli.lightning import import_corpus
+from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed, confirm_cost
 from facediff.cli.parsing import Option
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
@@ -28,6 +30,7 @@ def adapt(
     epochs: Annotated[ranges.Epochs, Option(metavar="N")] = 60,
     learning_rate: Annotated[ranges.LearningRate, Option(metavar="RATE")] = 5e-4,
     data_root: Folder = None,
+    corpus: Corpus = None,
     seed: Seed = 0,
     accelerator: str = "auto",
     quiet: bool = False,
@@ -47,6 +50,8 @@ def adapt(
         epochs: epochs over the training clips
         learning_rate: falls to 0 as a cosine
         data_root: where the corpus is, if not where it was in training
+        corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class; it
+            may be a file of the working folder
         seed: seed of all random numbers
         accelerator: Lightning's: auto, cpu, gpu …
         quiet: no progress bar
@@ -60,14 +65,17 @@ def adapt(
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
     from facediff.cli.lightning import exit_statuses
+    from facediff.cli.trainer_options import explained
     from facediff.models.adaptation import train_only, with_extra_identities
     from facediff.models.checkpoint import build_model, read_checkpoint
 
     started = time.monotonic()
     content = read_checkpoint(checkpoint)
-    name, data = adaptation_data(checkpoint, content, person, mode, data_root)
+    name, data = adaptation_data(checkpoint, content, person, mode, data_root, corpus)
     model = build_model(checkpoint, content)
     data.prepare_data()
+    if not data.root.is_dir():
+        raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
     if name not in data.corpus.templates:
         known = ", ".join(sorted(data.corpus.templates))
         raise FaceDiffError(f"--person {person}: neither a person's folder nor a speaker of the corpus ({known})")
@@ -79,37 +87,42 @@ def adapt(
     model = with_extra_identities(model, list(data.identities))
     model.learning_rate, model.lr_schedule, model.warmup_steps = learning_rate, "cosine", 0
     train_only(model.train(), train)
-    trainer = Trainer(
-        max_epochs=epochs,
-        accelerator=accelerator,
-        devices=1,
-        gradient_clip_val=1.0,
-        limit_val_batches=0,
-        logger=False,
-        enable_checkpointing=False,
-        enable_model_summary=False,
-        enable_progress_bar=not quiet,
-        plugins=[AtomicCheckpointIO()],
-    )
+    with explained({"max_epochs": epochs, "accelerator": accelerator}, prefix="--"):
+        trainer = Trainer(
+            max_epochs=epochs,
+            accelerator=accelerator,
+            devices=1,
+            gradient_clip_val=1.0,
+            limit_val_batches=0,
+            logger=False,
+            enable_checkpointing=False,
+            enable_model_summary=False,
+            enable_progress_bar=not quiet,
+            plugins=[AtomicCheckpointIO()],
+        )
     with exit_statuses():
         trainer.fit(model, data)
     for parameter in model.parameters():
         parameter.requires_grad_(True)
     trainer.save_checkpoint(output)
     seconds = sum(data.corpus.frames(clip) for clip in clips if clip.identity == name) / data.frame_rate
+    # Pictures need a mesh, which a corpus may lack.
+    made = "speech.npz" if model.assets.faces is None else "speech.mp4"
+    words = ["facediff", "animate", "speech.wav", "--checkpoint", str(output), "--identity", name, "-o", made]
     print(
         f"{output}: adapted to {name} by {seconds:.0f} s of motion, in {time.monotonic() - started:.0f} s; "
-        f"next: facediff animate speech.wav --checkpoint {output} --identity {name} -o speech.mp4"
+        f"next: {shlex.join(words)}"
     )
 
 
 def adaptation_data(
-    checkpoint: Path, content: dict[str, Any], person: str, mode: Mode, data_root: Path | None
+    checkpoint: Path, content: dict[str, Any], person: str, mode: Mode, data_root: Path | None, corpus: str | None
 ) -> tuple[str, SpeechMotionDataModule]:
     """The new speaker's name, and the checkpoint's data module with that speaker put first."""
     from facediff.data.datamodule import person_name
     from facediff.models.checkpoint import corpus_of
 
+    import_corpus(checkpoint, content, corpus, "--corpus ")
     module, options = corpus_of(checkpoint, content)
     if data_root is not None:
         options["root"] = str(data_root)

@@ -12,10 +12,10 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from facediff import registry
 from facediff.errors import FaceDiffError, choices
@@ -32,6 +32,9 @@ OWN_OPTIONS = {"validate": ("verbose",), "test": ("verbose",), "predict": ("retu
 NAMED_CHECKPOINTS = ("best", "last", "hpc", "registry")
 """Words that stand for a checkpoint which Lightning finds by itself."""
 
+REPEATABLE = ("-c", "--config", "--trainer.callbacks", "--trainer.logger", "--trainer.plugins", "--print_config")
+"""What options begin with that add to what is there."""
+
 FREE = ("sampler", "sampling_space", "unseen_identity", "protocol", "metrics")
 """Constructor arguments of a model that may differ from its checkpoint's; no weights depend on them."""
 
@@ -42,6 +45,7 @@ def lightning(name: str, arguments: Sequence[str]) -> int:
     Raises:
         FaceDiffError: if an option, a name or a file is wrong.
     """
+    refuse_repeated(arguments)
     run_cli(name, arguments)
     return 0
 
@@ -108,6 +112,56 @@ def check_options(name: str, words: Sequence[str]) -> None:
         needs = {"fit": "--config FILE, such as configs/experiment/puppet.yaml, or --model=NAME and --data=NAME"}
         scoring = "--ckpt_path CHECKPOINT, a file that `facediff fit` has written; it holds everything else"
         raise FaceDiffError(f"`facediff {name}` needs {needs.get(name, scoring)}")
+
+
+def refuse_repeated(words: Sequence[str]) -> None:
+    """Refuse an option that is given twice with different values: the last one would win without a word.
+
+    Raises:
+        FaceDiffError: naming the option.
+    """
+    given: dict[str, str] = {}
+
+    def note(flag: str, value: str) -> str:
+        option = flag.replace(".init_args", "")
+        if given.setdefault(option, value) != value and not option.startswith(REPEATABLE):
+            raise FaceDiffError(f"{option} is given twice, as {given[option]} and as {value}; give it once")
+        return value
+
+    change_values(words, note)
+
+
+def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None, option: str) -> None:
+    """Import the corpus's class that the user names, which may be a file of the working folder.
+
+    It is never imported because a checkpoint names it; the error then says how the user can.
+
+    Args:
+        path: the checkpoint.
+        checkpoint: its content.
+        chosen: the class that the user names; None if the checkpoint's is to be used.
+        option: the command's option for it.
+
+    Raises:
+        FaceDiffError: if the class cannot be imported, or none is named and the checkpoint's is not known.
+    """
+    from facediff.cli.data import find_own_module
+    from facediff.data import SpeechMotionDataModule
+    from facediff.data.batch import DATA_SOURCE_KEY
+    from facediff.data.check.layouts import by_name
+    from facediff.models.checkpoint import find_class
+    from facediff.utils.plain_options import is_path
+
+    named = (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")
+    if chosen is not None and "." in chosen:
+        find_own_module(chosen)
+        by_name(chosen, None)
+    elif chosen is None and is_path(named) and find_class(registry.corpus, named, SpeechMotionDataModule) is None:
+        raise FaceDiffError(
+            f"{path}: was trained on the corpus {named}, which is not known here and was not imported. If it is your "
+            f"own, add  {option}{named}  and run the command in the folder of its file; docs/new_corpus.md says how to "
+            f"register it once and for all"
+        )
 
 
 def change_values(words: Sequence[str], change: Callable[[str, str], str]) -> list[str]:
@@ -179,6 +233,7 @@ def words_of_checkpoint(name: str, path: Path, words: Sequence[str]) -> list[str
     import yaml
 
     from facediff.cli.lightning_cli import LINKS
+    from facediff.data.batch import DATA_SOURCE_KEY
     from facediff.models.checkpoint import build_model, corpus_of, read_checkpoint
 
     checkpoint = read_checkpoint(path)
@@ -194,7 +249,9 @@ def words_of_checkpoint(name: str, path: Path, words: Sequence[str]) -> list[str
     hparams = checkpoint["hyper_parameters"]
     options = {key: value for key, value in hparams.items() if not key.startswith("_") and key not in LINKS}
     config = {"seed_everything": 0, "model": {"class_path": hparams["_class_path"], "init_args": options}}
-    if value_of(words, "--data") is None:
+    chosen = value_of(words, "--data")
+    import_corpus(path, checkpoint, chosen, "--data=")
+    if chosen in (None, (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")):
         corpus, arguments = corpus_of(path, checkpoint)
         config["data"] = {"class_path": f"{corpus.__module__}.{corpus.__qualname__}", "init_args": arguments}
     return ["--config", yaml.safe_dump(config, sort_keys=False)]

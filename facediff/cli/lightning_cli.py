@@ -16,10 +16,11 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from traceback import walk_tb
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import yaml
 from jsonargparse import set_parsing_settings
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import WandbLogger
@@ -30,10 +31,12 @@ from facediff.callbacks import GradientNorm, LastCheckpoint, PredictionWriter, R
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
 from facediff.callbacks.runs import continue_run, find_checkpoint
 from facediff.cli.configs import guard_configs
+from facediff.cli.trainer_options import explained, raised_in, sentence_of
 from facediff.data import SpeechMotionDataModule
-from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
+from facediff.registry import Range, mismatch
 from facediff.utils.files import atomic
 from facediff.utils.limits import brief
 
@@ -84,6 +87,10 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
             ) from error
         if ours is None and any(isinstance(cause, UnicodeDecodeError) for cause in causes(error)):
             raise FaceDiffError("--config: a file that the config names is not UTF-8; save it as UTF-8") from error
+        if isinstance(error, MisconfigurationException | ValueError) and ours is None and raised_in(error, "lightning"):
+            raise FaceDiffError(f"`facediff {name}`: {sentence_of(error)}") from error
+        if isinstance(ours, ArgumentError) and not any(name[0].isupper() for name in ours.values):
+            raise FaceDiffError(ours.sentence("--")) from error
         if ours is None or ours is error:
             raise
         raise ours from error
@@ -133,6 +140,10 @@ RESUME_WARNINGS = (".*callbacks used to create the checkpoint need to be provide
 
 class Parser(LightningArgumentParser):
     """Reports an error in one sentence, in place of the hundred lines of usage that would hide it."""
+
+    def __init__(self, *values: Any, **options: Any) -> None:  # noqa: ANN401 - the base class's
+        # Abbreviations are guesses: the option that one stands for changes when another option is added.
+        super().__init__(*values, **{"allow_abbrev": False, **options})
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Raise a usage error as one sentence."""
@@ -218,7 +229,8 @@ class FaceDiffCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:  # noqa: ANN401
         """Make the trainer; a callback of the config replaces the built-in one of its class."""
-        trainer = super().instantiate_trainer(**kwargs)
+        with explained({**self._get(self.config_init, "trainer", default={}), **kwargs}):
+            trainer = super().instantiate_trainer(**kwargs)
         built_in = self.trainer_defaults["callbacks"]
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         named = {type(callback) for callback in callbacks if callback not in built_in}
@@ -241,6 +253,18 @@ class FaceDiffCLI(LightningCLI):
         if path is not None:
             warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
             self.config_init[str(self.subcommand)].ckpt_path = str(path) if content else None
+
+    def _set_seed(self) -> None:
+        """Set the seed.
+
+        Raises:
+            ArgumentError: if it is no seed.
+        """
+        seed = self._get(self.config, "seed_everything")
+        expected = mismatch(bool | Annotated[int, Range(0, 2**32 - 1)] | None, seed)
+        if expected is not None:
+            raise ArgumentError({"seed_everything": seed}, f"expected {expected}", located=True)
+        super()._set_seed()
 
     def _parse_ckpt_path(self) -> None:
         """Do nothing: upstream would let a checkpoint override the flags; ``words_of_checkpoint`` does the opposite."""

@@ -28,7 +28,7 @@ from facediff.data.dataset import (
     ReferencePolicy,
     ResumableLoader,
 )
-from facediff.errors import FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.registry import Range, defaults, keeps_arguments, plain
 from facediff.utils.plain_options import read_options
 from facediff.utils.torch_files import load_tensors, open_checkpoint
@@ -132,6 +132,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         upper_face: str | None = None,
     ) -> None:
         super().__init__()
+        if not str(root):
+            raise ArgumentError({"root": root}, "expected the corpus's folder")
         self.root = Path(root).expanduser()
         self.batch_size = batch_size
         self.max_frames_per_batch = max_frames_per_batch
@@ -154,6 +156,11 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                     f"data.people: {name} is there more than once among the corpus's identities, the imported speakers "
                     f"and data.extra_identities; import the speaker under a new name, or omit one"
                 )
+        unknown = [name for name in self.train_identities or [] if name not in self.identities]
+        if unknown:
+            raise ArgumentError(
+                {"train_identities": unknown[0]}, f"no such identity: {choices(unknown[0], self.identities)}"
+            )
         self.features = FeatureSlot()
         self.pair_sentences = False
         self._assets: Assets | None = None

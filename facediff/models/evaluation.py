@@ -102,7 +102,10 @@ class Evaluation:
         except ValueError as error:
             raise ArgumentError({"model.protocol": protocol_name}, str(error), located=True) from error
         self.unseen_identity = unseen_identity
-        self.requests = parse_all(metrics)
+        try:
+            self.requests = parse_all(metrics)
+        except FaceDiffError as error:
+            raise ArgumentError({"model.metrics": list(metrics)}, str(error), located=True) from error
         self.needs = {need for request in self.requests for need in request.needs}
         self.splits: list[str] = []
         self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}

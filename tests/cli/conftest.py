@@ -25,7 +25,9 @@ def fit(tiny_root: Path) -> Callable[..., int]:
 
     def run(*words: str, config: str = "configs/experiment/puppet.yaml") -> int:
         data = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}"]
-        return main(["fit", "--config", config, *data, *SMALL, *words])
+        given = {word.partition("=")[0] for word in words}
+        usual = [word for word in [*data, *SMALL] if word.partition("=")[0] not in given]
+        return main(["fit", "--config", config, *usual, *words])
 
     return run
 

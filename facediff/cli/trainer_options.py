@@ -1,0 +1,113 @@
+"""The trainer's options: their ranges, and what Lightning objects to, in one sentence that names the options."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+from facediff.errors import ArgumentError, FaceDiffError
+from facediff.registry import Range, mismatch
+
+Batches = Annotated[int, Range(0)] | Annotated[float, Range(0, 1)] | None
+Interval = Annotated[int, Range(1)] | Annotated[float, Range(above=0, most=1)] | str | dict[str, int] | None
+Epochs = Annotated[int, Range(-1)] | None
+
+RANGES: dict[str, Any] = {
+    "max_epochs": Epochs,
+    "min_epochs": Annotated[int, Range(0)] | None,
+    "max_steps": Annotated[int, Range(-1)],
+    "min_steps": Annotated[int, Range(0)] | None,
+    "num_nodes": Annotated[int, Range(1, 100_000)],
+    "fast_dev_run": bool | Annotated[int, Range(0)],
+    "limit_train_batches": Batches,
+    "limit_val_batches": Batches,
+    "limit_test_batches": Batches,
+    "limit_predict_batches": Batches,
+    "overfit_batches": Batches,
+    "val_check_interval": Annotated[int, Range(1)]
+    | Annotated[float, Range(above=0, most=1)]
+    | str
+    | dict[str, int]
+    | None,
+    "check_val_every_n_epoch": Annotated[int, Range(1)] | None,
+    "num_sanity_val_steps": Annotated[int, Range(-1)] | None,
+    "log_every_n_steps": Annotated[int, Range(0)] | None,
+    "accumulate_grad_batches": Annotated[int, Range(1)],
+    "gradient_clip_val": Annotated[float, Range(0)] | None,
+    "reload_dataloaders_every_n_epochs": Annotated[int, Range(0)],
+}
+"""Types and ranges of those options whose wrong values Lightning takes, or reports after minutes."""
+
+PROCESSES = 4
+"""Processes for each processor core that are believed to be meant."""
+
+
+def check_trainer(options: Mapping[str, Any]) -> None:
+    """Refuse numbers that no training can have.
+
+    Raises:
+        ArgumentError: naming the option.
+    """
+    for name, hint in RANGES.items():
+        expected = mismatch(hint, options[name]) if name in options else None
+        if expected is not None:
+            raise ArgumentError({f"trainer.{name}": options[name]}, f"expected {expected}", located=True)
+    devices, most = options.get("devices"), max(8, PROCESSES * (os.cpu_count() or 1))
+    if options.get("accelerator") in ("cpu", "auto") and str(devices).isdecimal() and int(str(devices)) > most:
+        raise ArgumentError(
+            {"trainer.devices": devices},
+            f"that many processes would be started; expected at most {most} on this machine's {os.cpu_count()} cores",
+            located=True,
+        )
+
+
+@contextmanager
+def explained(options: Mapping[str, Any], prefix: str = "--trainer.") -> Iterator[None]:
+    """A context in which a trainer is made, and Lightning's errors become one sentence.
+
+    Args:
+        options: the trainer's options.
+        prefix: what the user writes before their names.
+
+    Raises:
+        FaceDiffError: naming the options that the error speaks of.
+    """
+    from lightning.fabric.utilities.exceptions import MisconfigurationException
+
+    try:
+        check_trainer(options)
+        yield
+    except FaceDiffError:
+        raise
+    except (MisconfigurationException, ValueError, TypeError, RuntimeError, ImportError) as error:
+        raise FaceDiffError(f"{spoken_of(str(error), options, prefix)}: {sentence_of(error)}") from error
+
+
+def raised_in(error: BaseException, package: str) -> bool:
+    """Whether the statement that raised an error is a package's."""
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    return last is not None and str(last.tb_frame.f_globals.get("__name__")).partition(".")[0] == package
+
+
+def spoken_of(message: str, options: Mapping[str, Any], prefix: str) -> str:
+    """The trainer's options that an error of Lightning's speaks of, with their values; ``--trainer`` if of none."""
+    text = message.lower()
+    # What is left to Lightning (null, auto, switches) is no fault of the user's.
+    chosen = {
+        name: value
+        for name, value in options.items()
+        if isinstance(value, str | int | float) and not isinstance(value, bool) and value != "auto"
+    }
+    named = [name for name, value in chosen.items() if name in text or (isinstance(value, str) and value in text)]
+    of_machine = [name for name in ("accelerator", "strategy", "devices", "precision") if name in chosen]
+    return " ".join(f"{prefix}{name} {chosen[name]}" for name in (named or of_machine)[:3]) or "the trainer"
+
+
+def sentence_of(error: BaseException) -> str:
+    """A message on one line, no longer than a sentence or two."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 300 else f"{text[:300]}…"
