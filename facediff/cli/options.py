@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from facediff.cli.parsing import Option, changed, refuse_idle
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.files import valid_text
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -195,7 +196,7 @@ def with_different_names(animations: Sequence[Animation], paths: Sequence[Path])
     """The animations under their own names; where those are alike, as of one recording, under their files' names."""
     alike = len({animation.name for animation in animations}) < len(animations)
     return [
-        replace(animation, name=path.stem if alike else animation.name)
+        replace(animation, name=valid_text(path.stem if alike else animation.name))
         for animation, path in zip(animations, paths, strict=True)
     ]
 

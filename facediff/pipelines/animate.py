@@ -13,7 +13,7 @@ from facediff.editing.controls import AnimationControls
 from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, check_export
 from facediff.utils import ranges
-from facediff.utils.files import scratch_folder
+from facediff.utils.files import scratch_folder, valid_text
 from facediff.utils.progress import track
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class AnimationPipeline:
 
         from facediff.data.audio import SAMPLE_RATE
 
-        seeds = [seed + i for i in range(self.options.samples)]
+        seeds, name = [seed + i for i in range(self.options.samples)], valid_text(name)
         # Counted in whole frames, as the model counts them: otherwise speech of just about the limit would be animated
         # by windows here and in one pass there.
         rate = self.model.frame_rate
@@ -234,7 +234,7 @@ class AnimationPipeline:
         metadata = {
             "generator": f"facediff {__version__}",
             "model": type(self.model).__name__,
-            "checkpoint": self.options.checkpoint.name,
+            "checkpoint": valid_text(self.options.checkpoint.name),
             "corpus": f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus,
             "identity": self.identity if trained_on else f"{self.identity} (not trained on)",
             "style": style,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.files import atomic
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -80,26 +79,22 @@ def write_video(
         sound = np.clip(sound, -1, 1)
     if target.is_dir():
         raise FaceDiffError(f'video file "{target}" is a folder: give the name of a file.')
-    made = [folder for folder in target.parents if not folder.exists()]
-    partial = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial.mp4")
-    # Unlike utils.files.atomic this lets an OSError through that comes from the caller's generator of frames.
-    try:
+    failed: list[OSError] = []
+
+    def guarded() -> Iterator[Frame]:
         try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FaceDiffError(
-                f'cannot make the folder "{target.parent}" ({error.strerror}): choose another place.'
-            ) from error
-        count = _encode(partial, frames, rate, sound, sample_rate or 0)
-        partial.replace(target)
-    except BaseException:
-        with suppress(OSError):
-            partial.unlink()
-        for folder in made:
-            with suppress(OSError):
-                folder.rmdir()
+            yield from frames
+        except OSError as error:  # of the caller's generator: it does not mean that the video cannot be written
+            failed.append(error)
+            raise
+
+    try:
+        with atomic(target) as partial:
+            return _encode(partial, guarded(), rate, sound, sample_rate or 0)
+    except FaceDiffError:
+        if failed:
+            raise failed[0] from None
         raise
-    return count
 
 
 def _check_frame(frame: Frame, size: tuple[int, int] | None, index: int = 0) -> tuple[int, int]:

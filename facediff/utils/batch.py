@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.utils.files import read_json, sha256, write_json
+from facediff.utils.files import read_json, sha256, short_name, write_json
 from facediff.utils.jobs import SetupError, WorkerDied, run_tasks
 
 Task = TypeVar("Task")
@@ -131,7 +131,7 @@ class FileTask:
 
     @property
     def _record_file(self) -> Path:
-        return self.output.parent / RECORDS / f"{self.output.name}.json"
+        return self.output.parent / RECORDS / f"{short_name(self.output.name, 200)}.json"
 
     def record(self, problem: str) -> None:
         """Record that the task is done; an empty problem means that the output is there."""

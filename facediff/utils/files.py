@@ -80,7 +80,8 @@ def atomic(path: Path) -> Iterator[Path]:
     with _writing(path):
         where = destination(path)
         if where.special:
-            with scratch_folder(Path(tempfile.gettempdir()) / f"facediff-{path.name}", private=True) as folder:
+            place = Path(tempfile.gettempdir()) / f"facediff-{path.name}"
+            with scratch_folder(place, private=True) as folder, _writing(path):
                 temporary = folder / f"whole{_short_suffix(path.suffix)}"
                 yield temporary
                 where.receive(temporary)
@@ -337,6 +338,11 @@ def short_name(name: str, most: int) -> str:
     while len(os.fsencode(name)) + len(mark) > most:
         name = name[:-1]
     return name + mark
+
+
+def valid_text(name: str) -> str:
+    """A file's name as text that every format can hold; bytes that are no UTF-8 become the replacement character."""
+    return os.fsencode(name).decode(errors="replace")
 
 
 def _short_suffix(suffix: str) -> str:

@@ -9,6 +9,7 @@ import pickle
 import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from facediff.utils.files import (
     load_json,
     locked,
     parse_json,
+    put_in_place,
     read_json,
     read_rows,
     same_sizes,
@@ -378,3 +380,108 @@ def test_names_do_nothing_to_a_terminal() -> None:
     shown = "\n".join([str(FaceDiffError(f"{name}: no such file")), format_table([name], [[name], [name]])])
     assert len(shown.splitlines()) == 4
     assert all(letter.isprintable() for line in shown.splitlines() for letter in line)
+
+
+def write(path: Path, text: str = "new") -> None:
+    with atomic(path) as temporary:
+        temporary.write_text(text)
+
+
+def test_an_atomic_file_goes_where_a_link_leads(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "link.npy").symlink_to(tmp_path / "other" / "target.bin")  # nothing is there yet
+    for text in ("first", "second"):
+        with atomic(tmp_path / "link.npy") as temporary:
+            assert temporary.suffix == ".npy"  # writers choose the format by it
+            temporary.write_text(text)
+        assert (tmp_path / "other" / "target.bin").read_text() == text
+        assert (tmp_path / "link.npy").is_symlink()
+    (tmp_path / "made").touch()
+    put_in_place(tmp_path / "made", tmp_path / "link.npy")
+    assert (tmp_path / "link.npy").is_symlink()
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(FaceDiffError, match="loop: cannot be written"):
+        write(tmp_path / "loop")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["link.npy", "loop", "other", "target.bin"]
+
+
+def test_devices_and_pipes_get_the_bytes_and_stay(tmp_path: Path) -> None:
+    write(Path("/dev/null"))
+    assert Path("/dev/null").is_char_device()
+    with pytest.raises(FaceDiffError, match="/dev/full: cannot be written"):
+        write(Path("/dev/full"))
+    os.mkfifo(tmp_path / "pipe")
+    received: list[str] = []
+    reader = threading.Thread(target=lambda: received.append((tmp_path / "pipe").read_text()))
+    reader.start()
+    write(tmp_path / "pipe", "bytes")
+    reader.join()
+    assert received == ["bytes"]
+    assert (tmp_path / "pipe").is_fifo()
+
+
+def test_a_pipe_without_a_reader_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("facediff.utils.destinations.READER_WITHIN", 0.1)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FaceDiffError, match="pipe: cannot be written"):
+        write(tmp_path / "pipe")
+
+
+def test_standard_output_that_is_a_file_keeps_what_was_printed(tmp_path: Path) -> None:
+    program = (
+        "import pathlib; from facediff.utils.files import atomic; print('before', flush=True)\n"
+        "with atomic(pathlib.Path('/dev/stdout')) as temporary: temporary.write_text('whole\\n')\n"
+        "print('after')"
+    )
+    with (tmp_path / "out").open("w") as stream:
+        subprocess.run([sys.executable, "-c", program], cwd=ROOT, stdout=stream, check=True)
+    assert (tmp_path / "out").read_text() == "before\nwhole\nafter\n"
+
+
+def test_a_replaced_file_hands_its_permissions_on_and_a_protected_one_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    write(path)
+    path.chmod(0o640)
+    write(path)
+    assert path.stat().st_mode & 0o777 == 0o640
+    path.chmod(0o444)
+    for call in (write, check_writable):
+        with pytest.raises(FaceDiffError, match=r"a\.npy: cannot be written"):
+            call(path)
+    assert path.stat().st_mode & 0o777 == 0o444
+
+
+@pytest.mark.parametrize("name", ["x" * 251 + ".npy", "é" * 125 + ".npy", os.fsdecode(b"\xff\n.npy"), "-"])
+def test_every_valid_name_can_be_written(tmp_path: Path, name: str) -> None:
+    write(tmp_path / name)
+    check_writable(tmp_path / name)
+    with atomic_folder(tmp_path / "folder" / name) as folder:
+        (folder / "a").touch()
+    write_json(tmp_path / "a.json", {"name": name})
+    assert read_json(tmp_path / "a.json") == {"name": name}
+    assert {path.name for path in tmp_path.iterdir()} == {name, "folder", "a.json"}
+
+
+def test_what_a_killed_process_left_is_removed_and_what_a_living_one_writes_stays(tmp_path: Path) -> None:
+    program = (
+        "import os, sys, pathlib; from facediff.utils.files import atomic\n"
+        "with atomic(pathlib.Path(sys.argv[1])) as temporary: temporary.touch(); os._exit(9)"
+    )
+    subprocess.run([sys.executable, "-c", program, str(tmp_path / "a.npy")], cwd=ROOT, check=False)
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".a.partial-")
+    again = left.with_name(re.sub(r"-\d+-\d+-", f"-{os.getpid()}-1-", left.name))
+    again.touch()  # of another process that had the number of this one
+    with atomic(tmp_path / "b.npy") as living:
+        living.touch()
+        write(tmp_path / "c.npy")
+        assert {path.name for path in tmp_path.iterdir()} == {"c.npy", living.name}
+    assert {path.name for path in tmp_path.iterdir()} == {"b.npy", "c.npy"}
+
+
+def test_a_lock_that_is_a_link_destroys_nothing(tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / ".lock").symlink_to(tmp_path / "precious")
+    with pytest.raises(FaceDiffError, match="cannot be written"):
+        locked(tmp_path / ".lock", "facediff test").__enter__()
+    assert (tmp_path / "precious").read_text() == "precious"
