@@ -19,8 +19,9 @@ from facediff.evaluation.files import Pair
 from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMetric, VertexError, feed
 from facediff.metrics.base import Clips, LengthRule, Pooling, align
 from facediff.metrics.one_pass import one_pass
-from facediff.utils.arrays import open_vertices
+from facediff.utils.arrays import in_range, open_vertices
 from facediff.utils.jobs import run_tasks
+from facediff.utils.limits import COORDINATE
 
 METRICS = "metrics"  # Stands in place of a protocol's name where metrics were chosen by name
 NATIVE = (np.float16, np.float32, np.float64)  # Types that torch reads as they are
@@ -264,12 +265,15 @@ def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
     """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3) of any floating-point type, memory-mapped.
 
     Raises:
-        FaceDiffError: if the file is unreadable or of another shape.
+        FaceDiffError: if the file is unreadable, of another shape, or holds absurd coordinates.
     """
     # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
     array = open_vertices(path, n_vertices, mode="c")[::stride]
     if array.dtype not in NATIVE or not array.dtype.isnative:
         array = array.astype(array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64)
+    # Metrics refuse NaN and infinity themselves; finite numbers may be so large that their squares are infinite.
+    if not in_range(array) and np.isfinite(array).all():
+        raise FaceDiffError(f"{path}: holds coordinates beyond {COORDINATE:g}; generate the motion again")
     return torch.from_numpy(array)
 
 

@@ -190,7 +190,7 @@ def read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]
 def in_range(array: npt.NDArray[Any]) -> bool:
     """Whether all numbers are finite, and none is larger than :data:`~facediff.utils.limits.COORDINATE`."""
     # Minimum and maximum are NaN if any number is, and no comparison with NaN is true.
-    return not array.size or bool(array.min() >= -COORDINATE and array.max() <= COORDINATE)
+    return not array.size or bool(float(array.min()) >= -COORDINATE and float(array.max()) <= COORDINATE)
 
 
 class ArrayStore:

@@ -191,3 +191,13 @@ def test_motion_is_not_carried_to_a_mesh_that_is_no_face(
     error = capsys.readouterr().err.strip()
     assert len(error.splitlines()) == 1
     assert "other.obj" in error
+
+
+def test_scores_of_absurd_motion_are_not_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Squares of 1e30 are infinite in single precision: the scores would be, too."""
+    for folder, factor in (("truth", 1.0), ("pred", 1e30)):
+        (tmp_path / folder).mkdir()
+        np.save(tmp_path / folder / "A_s1.npy", np.float32(factor) * np.ones((5, 4, 3), np.float32))
+    folders = [str(tmp_path / folder) for folder in ("pred", "truth")]
+    assert main(["evaluate", *folders, "--lips", "all", "--protocol", "meshtalk"]) == 2
+    assert "A_s1" in capsys.readouterr().err
