@@ -27,6 +27,15 @@ def printable(text: object) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in found)
 
 
+LONGEST = 1400
+"""Characters of a message. What a damaged file holds may be quoted in one, and that can be megabytes."""
+
+
+def shortened(text: str) -> str:
+    """The text, or its beginning and its end."""
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 400]} … {text[-390:]}"
+
+
 class FaceDiffError(Exception):
     """Something that the user can put right: a file, an argument or an installation.
 
@@ -35,7 +44,7 @@ class FaceDiffError(Exception):
     """
 
     def __init__(self, message: object = "") -> None:
-        super().__init__(printable(message))
+        super().__init__(shortened(printable(message)))
 
 
 class ArgumentError(FaceDiffError, ValueError):

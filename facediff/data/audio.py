@@ -203,7 +203,7 @@ def _decode_container(path: Path, length: _Length) -> tuple[npt.NDArray[np.float
                     parts.append(part.to_ndarray()[0])
                     decoded += len(parts[-1])
                 length.check(decoded, rate)
-    except (av.FFmpegError, ValueError, TypeError, OSError) as error:
+    except (av.FFmpegError, AttributeError, ValueError, TypeError, OSError) as error:  # a track may lack its rate
         raise FaceDiffError(f"{path}: its sound cannot be read ({_reason(path, error)}); convert it to .wav") from error
     return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
 

@@ -49,12 +49,12 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
         >>> read_mesh(path).faces.tolist()
         [[0, 1, 2], [0, 2, 3]]
     """
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such mesh file; expected one of {', '.join(SUFFIXES)}")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise FaceDiffError(f"{path}: not a mesh format that is read; expected one of {', '.join(SUFFIXES)}")
     try:
+        if not path.is_file():
+            raise FaceDiffError(f"{path}: no such mesh file; expected one of {', '.join(SUFFIXES)}")
         size = path.stat().st_size
         LIMITS.check("bytes", size, path)
         data = path.read_bytes()

@@ -11,6 +11,7 @@ import pytest
 
 import facediff
 from facediff.data import audio
+from facediff.errors import FaceDiffError
 from facediff.mesh import files as mesh_files
 from tests.robustness.mutations import EVIL, Law, mutate, run, small_world
 from tests.robustness.readers import READERS
@@ -153,3 +154,15 @@ def test_damage_is_the_same_for_the_same_seed() -> None:
     first, second = ([mutate(data, rng, ".bin") for _ in range(20)] for rng in (random.Random(3), random.Random(3)))  # noqa: S311
     assert first == second
     assert sum(body != data for _, body in first) > 15
+
+
+def test_a_message_quotes_no_megabytes() -> None:
+    error = FaceDiffError(f"face.obj: cannot be read ({'x' * 10**6}); export it again")
+    assert len(str(error)) <= 1400
+    assert str(error).startswith("face.obj: ")
+    assert str(error).endswith("export it again")
+
+
+def test_a_name_that_is_too_long_is_refused() -> None:
+    with pytest.raises(FaceDiffError, match=r"too long"):
+        mesh_files.read_mesh(Path("a" * 3000 + ".obj"))
