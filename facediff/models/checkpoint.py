@@ -287,7 +287,6 @@ def component_finders() -> Components:
         "fusion": fusions.Fusion,
         "decoder": decoders.Decoder,
         "sampler": samplers.Sampler,
-        "motion_space": motion_space.MotionSpace,
     }
     return {name: partial(find_class, kind, base=bases.get(name, torch.nn.Module)) for name, kind in COMPONENTS.items()}
 
