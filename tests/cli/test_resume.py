@@ -181,7 +181,7 @@ def test_no_checkpoint_makes_training_remove_files_elsewhere(whole: Path, fit: F
             }
             state |= {"best_model_score": worst, "kth_value": worst}
     torch.save(content, path)
-    words = [*LONGER, "--trainer.max_epochs=4", f"--trainer.logger.save_dir={tmp_path}"]
+    words = [*LONGER[1:], "--trainer.max_epochs=4", f"--trainer.logger.save_dir={tmp_path}"]
     assert fit(*words, "--ckpt_path=last") == 0
     assert mine.read_text() == "mine"
 
@@ -214,7 +214,7 @@ def start(tiny_root: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
 def test_a_killed_process_loses_nothing(
     number: int, processes: int, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
-    words = [*LONGER, "--trainer.max_epochs=8"]
+    words = [*LONGER[1:], "--trainer.max_epochs=8"]
     if processes > 1:
         words += [f"--trainer.devices={processes}", "--trainer.strategy=ddp"]
     assert start(*words, f"--trainer.logger.save_dir={tmp_path / 'whole'}").wait(300) == 0
