@@ -192,7 +192,9 @@ def start(tiny_root: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
     def run(*words: str) -> subprocess.Popen[str]:
         data = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}"]
-        command = [sys.executable, "-m", "facediff", "fit", "--config", "configs/experiment/puppet.yaml", *data, *SMALL]
+        given = {word.partition("=")[0] for word in words}
+        usual = [word for word in [*data, *SMALL] if word.partition("=")[0] not in given]
+        command = [sys.executable, "-m", "facediff", "fit", "--config", "configs/experiment/puppet.yaml", *usual]
         root = Path(__file__).parents[2]
         environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
         pipe = subprocess.PIPE
