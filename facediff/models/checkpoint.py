@@ -280,6 +280,7 @@ def component_finders() -> Components:
     )
 
     bases: dict[str, type] = {
+        "motion_space": motion_space.MotionSpace,
         "audio_encoder": audio_encoders.AudioEncoder,
         "identity_encoder": speaker_encoders.IdentityEncoder,
         "style_encoder": speaker_encoders.StyleEncoder,
