@@ -306,6 +306,7 @@ def _try_to_write(path: Path) -> None:
     longest = os.pathconf(folder, "PC_NAME_MAX") if hasattr(os, "pathconf") and folder.is_dir() else 255
     if any(len(os.fsencode(part)) > longest for part in path.parts):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(path))
+    _sweep(folder)  # of probes, since nothing else may ever be written here
     probe = folder / _partial(path).name
     probe.touch()
     probe.unlink()
