@@ -165,7 +165,7 @@ def test_an_input_that_is_no_file_is_refused(kind: str, tmp_path: Path) -> None:
         path = tmp_path / ("x" * 300)
     with pytest.raises(FaceDiffError) as caught:
         check(path, "-o", tmp_path / "out")
-    assert str(path) in str(caught.value)
+    assert str(path)[: 40 if kind == "long" else None] in str(caught.value)
 
 
 @pytest.mark.parametrize("words", [["", "-o", "a"], ["a", "-o", ""], ["a", "--output="], ["a", "-oa", "--folder", ""]])
