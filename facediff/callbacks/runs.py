@@ -26,6 +26,9 @@ JOB_FILE = "slurm_job_id"
 LAST = Path("checkpoints", "last.ckpt")
 """The newest state of a run, in its folder."""
 
+CONFIG = "config.yaml"
+"""The config of a run, in its folder."""
+
 
 def run_folder(trainer: Trainer) -> Path:
     """The run's folder, where Lightning keeps its checkpoints too.
@@ -66,7 +69,7 @@ def newest_run(trainer: Trainer) -> Path:
         FaceDiffError: if there is no run, or if the newest has no checkpoint while an older one has.
     """
     logger, folder = trainer.logger, runs_folder(trainer)
-    runs = [path for path in folder.glob("*") if (path / LAST).is_file() or (path / "config.yaml").is_file()]
+    runs = [path for path in folder.glob("*") if (path / LAST).is_file() or _began_training(path / CONFIG)]
     if logger is None or (getattr(logger, "_version", None) is not None and not isinstance(logger, WandbLogger)):
         folder = run_folder(trainer)  # there is one only
         runs = [folder] if (folder / LAST).is_file() or (logger and folder.is_dir()) else []
@@ -90,6 +93,25 @@ def newest_run(trainer: Trainer) -> Path:
     return newest
 
 
+def _began_training(config: Path) -> bool:
+    """Whether a config is of a run of ``fit``: those of scoring stand next to them, and have options of their own."""
+    if not config.is_file():
+        return False
+    return re.search(r"^(verbose|return_predictions):", config.read_text("utf-8", "replace"), re.MULTILINE) is None
+
+
+def find_scored(trainer: Trainer, asked: str | None) -> Path | None:
+    """The checkpoint to score, where ``last`` is that of the run that training would continue; None if none is given.
+
+    Raises:
+        FaceDiffError: if it is not there.
+    """
+    path = newest_run(trainer) / LAST if asked == "last" else None if asked is None else Path(asked)
+    if path is not None and not path.is_file():
+        raise FaceDiffError(f"--ckpt_path {asked}: there is no {path}; expected a .ckpt file of `facediff fit`")
+    return path
+
+
 def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
     """The checkpoint to continue from, which may not be there yet; None for a new run.
 
@@ -98,16 +120,16 @@ def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
         asked: a path, ``last``, or None; a job that SLURM has started again continues its run then.
 
     Raises:
-        FaceDiffError: if ``last`` is asked for, and there is none.
+        FaceDiffError: if a checkpoint is asked for, and there is none.
     """
-    if asked == "last":
-        return newest_run(trainer) / LAST
-    if asked is None and int(os.environ.get("SLURM_RESTART_COUNT") or 0):
+    if asked is not None:
+        return newest_run(trainer) / LAST if asked == "last" else find_scored(trainer, asked)
+    if int(os.environ.get("SLURM_RESTART_COUNT") or 0):
         job = os.environ.get("SLURM_JOB_ID", "")
         for run in runs_folder(trainer).glob("*"):
             if (run / JOB_FILE).is_file() and (run / JOB_FILE).read_text(encoding="utf-8") == job:
                 return run / LAST
-    return None if asked is None else Path(asked)
+    return None
 
 
 def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any], words: Sequence[str]) -> bool:

@@ -29,9 +29,6 @@ OPTIONS = ("config", "model", "data", "trainer", "seed_everything", "ckpt_path",
 OWN_OPTIONS = {"validate": ("verbose",), "test": ("verbose",), "predict": ("return_predictions",)}
 """What options begin with, of every subcommand and of some."""
 
-NAMED_CHECKPOINTS = ("best", "last", "hpc", "registry")
-"""Words that stand for a checkpoint which Lightning finds by itself."""
-
 REPEATABLE = ("-c", "--config", "--trainer.callbacks", "--trainer.logger", "--trainer.plugins", "--print_config")
 """What options begin with that add to what is there."""
 
@@ -56,9 +53,11 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     words = change_values(arguments, find_config)
     words = change_values(words, fresh_component)
     checkpoint = value_of(words, "--ckpt_path")
-    if checkpoint is not None and checkpoint not in NAMED_CHECKPOINTS:
+    if checkpoint is not None and checkpoint != "last":  # that depends on the config
         if not Path(checkpoint).is_file():
-            raise FaceDiffError(f"--ckpt_path {checkpoint}: no such file; expected a .ckpt file of `facediff fit`")
+            raise FaceDiffError(
+                f"--ckpt_path {checkpoint}: no such file; expected a .ckpt file of `facediff fit`, or the word last"
+            )
         words = [*words_of_checkpoint(name, Path(checkpoint), words), *words]
     if name == "test":
         words = ["--verbose=false", *words]  # ScoreTable prints the scores; Lightning's table repeats them per loader
@@ -112,6 +111,13 @@ def check_options(name: str, words: Sequence[str]) -> None:
         needs = {"fit": "--config FILE, such as configs/experiment/puppet.yaml, or --model=NAME and --data=NAME"}
         scoring = "--ckpt_path CHECKPOINT, a file that `facediff fit` has written; it holds everything else"
         raise FaceDiffError(f"`facediff {name}` needs {needs.get(name, scoring)}")
+    if value_of(words, "--ckpt_path") == "last" and not any(
+        re.match(r"-c|-h|--(config|model|help)\b", w) for w in words
+    ):
+        raise FaceDiffError(
+            "--ckpt_path last: the config says where the runs are; add the --config that training began with, or give "
+            "the path of the run's checkpoints/last.ckpt"
+        )
 
 
 def refuse_repeated(words: Sequence[str]) -> None:

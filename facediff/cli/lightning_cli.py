@@ -22,6 +22,7 @@ import yaml
 from jsonargparse import set_parsing_settings
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
@@ -29,7 +30,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from facediff import registry
 from facediff.callbacks import GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
-from facediff.callbacks.runs import continue_run, find_checkpoint
+from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored
 from facediff.cli.configs import guard_configs
 from facediff.cli.trainer_options import explained, raised_in, sentence_of
 from facediff.data import SpeechMotionDataModule
@@ -234,6 +235,8 @@ class FaceDiffCLI(LightningCLI):
         built_in = self.trainer_defaults["callbacks"]
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         named = {type(callback) for callback in callbacks if callback not in built_in}
+        if self.subcommand != "fit":  # a checkpoint's weights are the average, and this one would refuse to load them
+            callbacks[:] = [callback for callback in callbacks if not isinstance(callback, WeightAveraging)]
         if self._get(self.config_init, "trainer").get("enable_checkpointing") is False:
             named.add(LastCheckpoint)
         callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in named]
@@ -253,6 +256,14 @@ class FaceDiffCLI(LightningCLI):
         if path is not None:
             warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
             self.config_init[str(self.subcommand)].ckpt_path = str(path) if content else None
+
+    def before_validate(self) -> None:
+        """Find the checkpoint, where it is named by a word or by a config."""
+        path = find_scored(self.trainer, self._get(self.config_init, "ckpt_path"))
+        if path is not None:
+            self.config_init[str(self.subcommand)].ckpt_path = str(path)
+
+    before_test = before_predict = before_validate
 
     def _set_seed(self) -> None:
         """Set the seed.

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -77,6 +79,43 @@ def test_predict_writes_files(checkpoint: Path, tmp_path: Path, monkeypatch: pyt
     assert np.load(files[0]).shape[1] == 72
 
 
+def test_the_last_checkpoint_is_the_newest_runs(
+    fitted: Path, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}"]
+    words = [
+        "--config",
+        str(fitted / "config.yaml"),
+        *data,
+        f"--trainer.logger.save_dir={tmp_path}",
+        "--ckpt_path=last",
+    ]
+    assert main(["test", *words]) == 2
+    assert "--ckpt_path last" in capsys.readouterr().err.splitlines()[-1]
+    run = tmp_path / "puppet" / "version_0"
+    run.mkdir(parents=True)
+    (run / "config.yaml").write_text("model: begun\n")
+    assert main(["predict", *words]) == 2
+    assert str(run / "checkpoints" / "last.ckpt") in capsys.readouterr().err.splitlines()[-1]
+    shutil.rmtree(run)
+    shutil.copytree(fitted, run)
+    for version in (1, 2):  # a run of scoring is not taken for one of training
+        assert main(["validate", *words]) == 0
+        os.utime(tmp_path / "puppet" / f"version_{version}", (time.time() + 60,) * 2)
+
+
+def test_a_checkpoint_that_a_config_names_is_there(
+    fitted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = yaml.safe_load((fitted / "config.yaml").read_text()) | {"ckpt_path": "best"}
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(config))
+    monkeypatch.chdir(tmp_path)
+    for command in ("fit", "test"):
+        assert main([command, "--config", str(path)]) == 2
+        assert "--ckpt_path best" in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_flags_that_would_change_a_checkpoints_model_are_refused(
     checkpoint: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -137,6 +176,9 @@ def test_a_wrong_option_is_one_sentence(words: list[str], named: list[str], caps
         (["fit", "--config=configs/experiment/pupet.yaml"], ['"configs/experiment/puppet.yaml"']),
         (["test", "--ckpt_path", "nowhere.ckpt"], ["--ckpt_path nowhere.ckpt"]),
         (["test"], ["--ckpt_path CHECKPOINT"]),
+        (["test", "--ckpt_path", "last"], ["--ckpt_path last", "--config"]),
+        (["predict", "--ckpt_path", "best"], ["--ckpt_path best"]),
+        (["fit", "--config", "configs/experiment/puppet.yaml", "--ckpt_path=registry"], ["--ckpt_path registry"]),
         (["fit"], ["--config FILE"]),
         (["fit", "--modell=DualPathDiffusion"], ["--modell", '"model"']),
     ],
