@@ -10,17 +10,14 @@ Third parties add an entry of any kind by installing a package with an entry poi
     [project.entry-points."facediff.decoder"]
     my_decoder = "my_package.my_module:MyDecoder"
 
-This module depends on the standard library only.
+This module needs no library but the standard one.
 """
 
 from __future__ import annotations
 
-import collections.abc
 import importlib
 import inspect
 import keyword
-import math
-import numbers
 import types
 import typing
 import warnings
@@ -29,11 +26,11 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cache, partial, wraps
 from importlib.metadata import entry_points
-from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Any, TypeVar
 
 from facediff.errors import ArgumentError, FaceDiffError, choices
+from facediff.utils.ranges import mismatch
 
 T = TypeVar("T", bound=type)
 
@@ -248,78 +245,6 @@ def alias_path(component: type) -> str:
 
 
 # Constructor arguments are checked where they enter: against their type, and against the range that it states.
-
-
-@dataclass(frozen=True, repr=False)
-class Range:
-    """The numbers that an argument accepts: ``dim: Annotated[int, Range(1, 512)]``. Infinity and NaN are never allowed.
-
-    Attributes:
-        least: smallest number.
-        most: largest number.
-        above: number that the value must exceed.
-        below: number that the value must not reach.
-        items: for lists, whose every item must lie in the range, the fewest and the most items.
-    """
-
-    least: float | None = None
-    most: float | None = None
-    above: float | None = None
-    below: float | None = None
-    items: tuple[int, int] = (0, 1000)
-
-    def holds(self, number: Any) -> bool:  # noqa: ANN401 - of any numeric type
-        """Whether a number lies in the range."""
-        return (
-            (isinstance(number, numbers.Integral) or math.isfinite(number))
-            and (self.least is None or number >= self.least)
-            and (self.most is None or number <= self.most)
-            and (self.above is None or number > self.above)
-            and (self.below is None or number < self.below)
-        )
-
-    def __repr__(self) -> str:
-        """The range in words, as the command line's help shows it."""
-        words = {"above": self.above, "of at least": self.least, "below": self.below, "of at most": self.most}
-        return " and ".join(f"{word} {limit:.15g}" for word, limit in words.items() if limit is not None)
-
-
-def mismatch(hint: Any, value: Any, limits: Range = Range()) -> str | None:  # noqa: ANN401, B008 - a frozen dataclass
-    """What was expected of a value that does not fit its type hint; None if it fits, or if the hint is no plain type.
-
-    >>> mismatch(Annotated[int, Range(1, 8)], 9)
-    'a whole number of at least 1 and of at most 8'
-    """
-    origin, inner = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        return mismatch(inner[0], value, next((extra for extra in inner[1:] if isinstance(extra, Range)), limits))
-    if origin in (Union, types.UnionType):
-        expected = [mismatch(part, value, limits) for part in inner]
-        return None if None in expected else " or ".join(word for word in expected if word)
-    if origin is Literal:
-        fits = any(type(value) is type(known) and value == known for known in inner)
-        return None if fits else f"one of {', '.join(map(str, inner))}"
-    if hint in (int, float):
-        kind = numbers.Integral if hint is int else numbers.Real
-        fits = not isinstance(value, bool) and isinstance(value, kind) and limits.holds(value)
-        return None if fits else f"{'a whole' if hint is int else 'a finite'} number {limits}".strip()
-    if origin in (list, tuple, collections.abc.Sequence):
-        fits = hasattr(value, "__iter__") and hasattr(value, "__len__") and not isinstance(value, str | bytes | Mapping)
-        expected = [mismatch(inner[0], item, limits) for item in value] if fits and inner else []
-        fits = fits and limits.items[0] <= len(value) <= limits.items[1]
-        wrong = [word for word in expected if word]
-        return (
-            None
-            if fits and not wrong
-            else f"a list of {limits.items[0]} to {limits.items[1]} items" + (f", each {wrong[0]}" if wrong else "")
-        )
-    if origin is dict:
-        return None if isinstance(value, Mapping) else "a mapping"
-    if getattr(hint, "_is_protocol", False):  # of what makes a component
-        return None if callable(value) else "a component's class"
-    plain_types = {bool: (bool,), str: (str, PathLike), types.NoneType: (types.NoneType,)}
-    words = {bool: "true or false", str: "text", types.NoneType: "null"}
-    return None if hint not in words or isinstance(value, plain_types[hint]) else words[hint]
 
 
 def checks_arguments(init: Callable[..., None], path: str = "", *, sizes: str = "") -> Callable[..., None]:

@@ -30,8 +30,9 @@ from lightning.pytorch.trainer.states import RunningStage
 from facediff.callbacks.runs import JOB_FILE, LAST, STATE_KEY, ResumableCSVLogger, logger_versions, run_folder
 from facediff.errors import FaceDiffError
 from facediff.models.checkpoint import read_checkpoint
-from facediff.registry import Range, checks_arguments
+from facediff.registry import checks_arguments
 from facediff.utils.files import atomic
+from facediff.utils.ranges import Range
 
 TRAIN = RunningStage.TRAINING
 
@@ -101,7 +102,7 @@ class LastCheckpoint(Callback):
     @checks_arguments
     def __init__(
         self,
-        every_minutes: Annotated[float, Range(above=0)] = 2.0,
+        every_minutes: Annotated[float, Range(0, above=True)] = 2.0,
         every_n_steps: Annotated[int, Range(1)] | None = None,
     ) -> None:
         super().__init__()

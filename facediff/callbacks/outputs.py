@@ -15,8 +15,9 @@ from lightning.pytorch.loggers import WandbLogger
 from facediff.callbacks.dashboard import measure_clips, wandb_media, worst_clips
 from facediff.models import AnimationModel
 from facediff.models.inference import Prediction
-from facediff.registry import Range, checks_arguments
+from facediff.registry import checks_arguments
 from facediff.utils.files import atomic, write_rows
+from facediff.utils.ranges import Range
 from facediff.utils.tables import format_table
 
 METHOD_NAMES = {"model": "model", "still": "still face", "shuffled": "model, shuffled speech"}

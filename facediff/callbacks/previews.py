@@ -36,9 +36,10 @@ from facediff.metrics import SequenceMetric
 from facediff.metrics.base import align
 from facediff.models import AnimationModel
 from facediff.models.evaluation import regions_of
-from facediff.registry import Range, checks_arguments
+from facediff.registry import checks_arguments
 from facediff.render import VIEWS, Renderer, comparison, contact_sheet, save_image, write_video
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Range
 
 Picture = npt.NDArray[np.uint8]
 
@@ -82,13 +83,13 @@ class SamplingPreview(Callback):
         at_end: bool = True,
         clips: Annotated[int, Range(1, 10_000)] = 2,
         names: list[str] | None = None,
-        seconds: Annotated[float, Range(above=0, most=3600)] = 4.0,
+        seconds: Annotated[float, Range(0, 3600, above=True)] = 4.0,
         sampler: str | None = "dpm_solver",
         steps: Annotated[int, Range(1, 100_000)] | None = 10,
         seed: Annotated[int, Range(0, 2**64 - 1)] = 0,
         size: Annotated[int, Range(16, 4096)] = 256,
         view: str = "front",
-        error_scale: Annotated[float, Range(above=0)] | None = None,
+        error_scale: Annotated[float, Range(0, above=True)] | None = None,
     ) -> None:
         if view not in VIEWS:
             raise ArgumentError({"view": view}, f"there is no such view: {choices(view, VIEWS)}")

@@ -37,9 +37,9 @@ from facediff.data import SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
-from facediff.registry import Range, mismatch
 from facediff.utils.files import atomic
 from facediff.utils.limits import brief
+from facediff.utils.ranges import Range, mismatch
 
 LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a model that the data module knows."""

@@ -166,9 +166,11 @@ class Parameter:
         """What values the parameter takes, in words."""
         if get_origin(self.value_type) is Literal:
             return f"one of {', '.join(str(value) for value in get_args(self.value_type))}"
-        one = {int: "a whole number", float: "a number", str: "text"}.get(self.value_type, "a path")
-        several = f"{self.length} times {one}" if self.length else one
-        return several if self.range is None else f"{several} {self.range}"
+        if self.is_number:
+            one = (self.range or Range()).numbers(whole=self.value_type is int)
+        else:
+            one = "text" if self.value_type is str else "a path"
+        return f"{self.length} times {one}" if self.length else one
 
 
 Parameters = Mapping[str, "Parameter | Group"]

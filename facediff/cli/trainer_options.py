@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from typing import Annotated, Any
 
 from facediff.errors import ArgumentError, FaceDiffError
-from facediff.registry import Range, mismatch
+from facediff.utils.ranges import Range, mismatch
 
 Batches = Annotated[int, Range(0)] | Annotated[float, Range(0, 1)] | None
-Interval = Annotated[int, Range(1)] | Annotated[float, Range(above=0, most=1)] | str | dict[str, int] | None
+Interval = Annotated[int, Range(1)] | Annotated[float, Range(0, 1, above=True)] | str | dict[str, int] | None
 Epochs = Annotated[int, Range(-1)] | None
 
 RANGES: dict[str, Any] = {
@@ -26,11 +26,7 @@ RANGES: dict[str, Any] = {
     "limit_test_batches": Batches,
     "limit_predict_batches": Batches,
     "overfit_batches": Batches,
-    "val_check_interval": Annotated[int, Range(1)]
-    | Annotated[float, Range(above=0, most=1)]
-    | str
-    | dict[str, int]
-    | None,
+    "val_check_interval": Interval,
     "check_val_every_n_epoch": Annotated[int, Range(1)] | None,
     "num_sanity_val_steps": Annotated[int, Range(-1)] | None,
     "log_every_n_steps": Annotated[int, Range(0)] | None,

@@ -29,8 +29,9 @@ from facediff.data.dataset import (
     ResumableLoader,
 )
 from facediff.errors import ArgumentError, FaceDiffError, choices
-from facediff.registry import Range, defaults, keeps_arguments, plain
+from facediff.registry import defaults, keeps_arguments, plain
 from facediff.utils.plain_options import read_options
+from facediff.utils.ranges import Range
 from facediff.utils.torch_files import load_tensors, open_checkpoint
 
 FRAMES = 16

@@ -10,9 +10,9 @@ from facediff import synthetic as puppet
 from facediff.data.corpus import Clip
 from facediff.data.datamodule import Count, SpeechMotionDataModule
 from facediff.mesh import Mesh
-from facediff.registry import Range
 from facediff.synthetic.face import build_face
 from facediff.utils.files import cache_dir
+from facediff.utils.ranges import Range
 
 
 def cache_root(seed: int) -> Path:

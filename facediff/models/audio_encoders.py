@@ -18,8 +18,9 @@ from torch import Tensor, nn
 
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
 from facediff.models.layers import Frames, Share, Width, frame_mask, interpolate_frames
-from facediff.registry import Range, audio_encoder
+from facediff.registry import audio_encoder
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
     from transformers import HubertModel

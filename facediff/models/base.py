@@ -27,7 +27,8 @@ from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
 from facediff.models.inference import Inference, Prediction, WindowPlan
 from facediff.models.mesh_encoders import MeshEncoder
-from facediff.registry import COMPONENTS, Range, component_class, defaults, describe, keeps_arguments, plain
+from facediff.registry import COMPONENTS, component_class, defaults, describe, keeps_arguments, plain
+from facediff.utils.ranges import Range, Vertices
 
 Schedule = Literal["constant", "cosine"]
 MotionScale = Literal["unit", "none"]
@@ -87,9 +88,9 @@ class AnimationModel(LightningModule, Inference, ABC):
     def __init__(
         self,
         *,
-        n_vertices: Annotated[int, Range(1, 2_000_000)],
+        n_vertices: Vertices,
         identities: Annotated[list[str], Range(items=(1, 1_000_000))],
-        frame_rate: Annotated[float, Range(above=0, most=1000)],
+        frame_rate: Annotated[float, Range(0, 1000, above=True)],
         motion_scale: MotionScale = "unit",
         learning_rate: Annotated[float, Range(0, 1000)] = 1e-4,
         weight_decay: Decay = 0.05,

@@ -26,7 +26,8 @@ from facediff.models.layers import (
     Width,
     needed_mask,
 )
-from facediff.registry import Range, decoder
+from facediff.registry import decoder
+from facediff.utils.ranges import Range
 
 Tokens = Float[Tensor, "batch tokens style_dim"]
 """The style condition F_s."""

@@ -58,7 +58,7 @@ from facediff.models.speaker_encoders import (
     StyleEncoderFactory,
     TcnGruTransformer,
 )
-from facediff.registry import Range, mismatch
+from facediff.utils.ranges import Range, mismatch
 
 TokenForm = Literal["levels", "single"]
 NumericScale = Annotated[float, Range(1e-6, 1e6)]

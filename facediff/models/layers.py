@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.errors import ArgumentError
-from facediff.registry import Range
+from facediff.utils.ranges import Range
 
 Frames = Float[Tensor, "batch frames dim"]
 """One feature per frame of motion."""

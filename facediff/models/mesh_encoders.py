@@ -14,10 +14,8 @@ from torch.utils.checkpoint import checkpoint
 
 from facediff.errors import FaceDiffError
 from facediff.models.layers import Frames, Share, Width
-from facediff.registry import Range, mesh_encoder
-
-Vertices = Annotated[int, Range(1, 2_000_000)]
-"""Vertices of a mesh."""
+from facediff.registry import mesh_encoder
+from facediff.utils.ranges import Range, Vertices
 
 Motion = Float[Tensor, "batch frames vertices 3"]
 """Offsets from the template."""

@@ -24,7 +24,8 @@ from facediff.errors import FaceDiffError
 from facediff.models.layers import Share
 from facediff.models.mesh_encoders import Vertices
 from facediff.models.samplers import Steps
-from facediff.registry import Range, motion_space
+from facediff.registry import motion_space
+from facediff.utils.ranges import Range
 
 Offsets = Float[Tensor, "batch frames vertices 3"]
 """Scaled offsets from the template."""

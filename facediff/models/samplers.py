@@ -18,7 +18,8 @@ from torch import Tensor
 
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.layers import Share
-from facediff.registry import Range, sampler
+from facediff.registry import sampler
+from facediff.utils.ranges import Range
 
 Steps = Annotated[int, Range(1, 100_000)]
 """Steps of a process."""

@@ -27,7 +27,8 @@ from facediff.models.layers import (
     Width,
     interpolate_frames,
 )
-from facediff.registry import Range, identity_encoder, style_encoder
+from facediff.registry import identity_encoder, style_encoder
+from facediff.utils.ranges import Range
 
 Count = Annotated[int, Range(1, 1_000_000)]
 """Identities of a model."""

@@ -1,23 +1,28 @@
 """Which numbers an option takes: declared next to its type, and checked where the number enters.
 
-The same declaration serves the command line, which checks what is typed and says the range in its help, and the
-dataclasses by which Python calls the same functions, which check their fields when they are made.
+One declaration serves all: the command line, which checks what is typed and says the range in its help; the dataclasses
+and functions by which Python does the same; the constructors of models, components, corpora and callbacks (see
+:func:`facediff.registry.checks_arguments`); and the trainer's options.
 """
 
 from __future__ import annotations
 
+import collections.abc
 import dataclasses
 import functools
 import inspect
+import math
 import re
 import sys
+import types
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from numbers import Integral, Real
+from os import PathLike
 from types import SimpleNamespace
-from typing import Annotated, Any, ParamSpec, TypeVar, get_args
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import FRAME_RATES, WORDS_SHOWN, quoted
@@ -30,27 +35,29 @@ _WHOLE = re.compile(r"[+-]?[0-9]{1,30}", re.ASCII)
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(inf|infinity|nan)", re.ASCII)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Range:
-    """The numbers that an option or a field takes, as in ``Annotated[float, Range(0, 1)]``; NaN and infinity never.
+    """The numbers that an argument or an option takes: ``Annotated[float, Range(0, 1)]``. NaN and infinity never.
 
     Attributes:
         least: the smallest number, which is included unless ``above`` is set.
         most: the largest number, which is included unless ``below`` is set.
         above: whether ``least`` itself is left out.
         below: whether ``most`` itself is left out.
+        items: for lists, whose every item must lie in the range, the fewest and the most items.
 
     Example:
-        >>> Range(0, 1, below=True).check("share", 0.5)
-        0.5
+        >>> 0.5 in Range(0, 1, below=True)
+        True
         >>> print(Range(0, 1, below=True))
         from 0 to below 1
     """
 
-    least: float
-    most: float
+    least: float = -math.inf
+    most: float = math.inf
     above: bool = False
     below: bool = False
+    items: tuple[int, int] = (0, 1000)
 
     def __contains__(self, number: object) -> bool:
         """Whether a number lies in the range."""
@@ -58,29 +65,26 @@ class Range:
             return False
         number = typing.cast(float, number)
         low = number > self.least if self.above else number >= self.least
-        return low and (number < self.most if self.below else number <= self.most)
+        high = number < self.most if self.below else number <= self.most
+        return low and high and -math.inf < number < math.inf
 
     def __str__(self) -> str:
-        """The range in words."""
+        """The range in words; none if it has no ends."""
         low, high = _plain(self.least), _plain(self.most)
-        if self.above:
-            return f"above {low} and {'below' if self.below else 'at most'} {high}"
-        return f"from {low} to {'below ' if self.below else ''}{high}"
+        if low and high and not self.above:
+            return f"from {low} to {'below ' if self.below else ''}{high}"
+        ends = [f"above {low}" if self.above else f"at least {low}"] if low else []
+        ends += [f"below {high}" if self.below else f"at most {high}"] if high else []
+        words = " and ".join(ends)
+        return f"of {words}" if words.startswith("at") else words
 
-    def check(self, name: str, number: Any, *, whole: bool = False) -> Any:  # noqa: ANN401 - a number, given back as it is
-        """Give a number back if it lies in the range.
+    __repr__ = __str__  # the help of Lightning's commands shows type hints as Python does
 
-        Args:
-            name: the option or field, for the message.
-            number: the number.
-            whole: whether it must be an integer.
-
-        Raises:
-            FaceDiffError: naming the option and the range.
-        """
-        if number not in self or (whole and not isinstance(number, Integral)):
-            raise FaceDiffError(f"{name} {shown(number)}: out of range; expected {noun(whole)} {self}")
-        return number
+    def numbers(self, *, whole: bool = False) -> str:
+        """What is expected, in words: ``a whole number from 1 to 8``."""
+        bounded = math.isfinite(self.least) and math.isfinite(self.most)
+        noun = "a whole number" if whole else "a number" if bounded else "a finite number"
+        return f"{noun} {self}".strip()
 
     def read(self, name: str, text: str, *, whole: bool = False) -> float:
         """The number that a text spells, in ASCII digits and without underscores or blanks.
@@ -89,16 +93,11 @@ class Range:
             FaceDiffError: if it spells none, or one outside the range.
         """
         if not (_WHOLE if whole else _DECIMAL).fullmatch(text):
-            raise FaceDiffError(f"{name} {shown(text)}: not valid; expected {noun(whole)} {self}")
+            raise FaceDiffError(f"{name} {shown(text)}: not valid; expected {self.numbers(whole=whole)}")
         number = int(text) if whole else float(text)
         if number not in self:
-            raise FaceDiffError(f"{name} {shown(text)}: out of range; expected {noun(whole)} {self}")
+            raise FaceDiffError(f"{name} {shown(text)}: out of range; expected {self.numbers(whole=whole)}")
         return number
-
-
-def noun(whole: bool) -> str:
-    """What kind of number is expected, in words."""
-    return "a whole number" if whole else "a number"
 
 
 def shown(value: object) -> str:
@@ -108,7 +107,9 @@ def shown(value: object) -> str:
 
 
 def _plain(number: float) -> str:
-    """A number without an exponent where that is readable."""
+    """A number without an exponent where that is readable; nothing for an end that is not there."""
+    if math.isinf(number):
+        return ""
     return str(int(number)) if number == int(number) else f"{number:g}"
 
 
@@ -124,6 +125,44 @@ def extras_of(hint: Any) -> Iterator[Any]:  # noqa: ANN401
     for part in get_args(hint):
         if not isinstance(part, Range):
             yield from extras_of(part)
+
+
+def mismatch(hint: Any, value: Any, limits: Range = Range()) -> str | None:  # noqa: ANN401, B008 - a frozen dataclass
+    """What was expected of a value that does not fit its type hint; None if it fits, or if the hint is no plain type.
+
+    >>> mismatch(Annotated[int, Range(1, 8)], 9)
+    'a whole number from 1 to 8'
+    """
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return mismatch(inner[0], value, next((extra for extra in inner[1:] if isinstance(extra, Range)), limits))
+    if origin in (Union, types.UnionType):
+        expected = [mismatch(part, value, limits) for part in inner]
+        return None if None in expected else " or ".join(word for word in expected if word)
+    if origin is Literal:
+        fits = any(type(value) is type(known) and value == known for known in inner)
+        return None if fits else f"one of {', '.join(map(str, inner))}"
+    if hint in (int, float):
+        kind = Integral if hint is int else Real
+        fits = isinstance(value, kind) and value in limits
+        return None if fits else limits.numbers(whole=hint is int)
+    if origin in (list, tuple, collections.abc.Sequence):
+        fits = hasattr(value, "__iter__") and hasattr(value, "__len__") and not isinstance(value, str | bytes | Mapping)
+        expected = [mismatch(inner[0], item, limits) for item in value] if fits and inner else []
+        fits = fits and limits.items[0] <= len(value) <= limits.items[1]
+        wrong = [word for word in expected if word]
+        return (
+            None
+            if fits and not wrong
+            else f"a list of {limits.items[0]} to {limits.items[1]} items" + (f", each {wrong[0]}" if wrong else "")
+        )
+    if origin is dict:
+        return None if isinstance(value, Mapping) else "a mapping"
+    if getattr(hint, "_is_protocol", False):  # of what makes a component
+        return None if callable(value) else "a component's class"
+    plain_types = {bool: (bool,), str: (str, PathLike), types.NoneType: (types.NoneType,)}
+    words = {bool: "true or false", str: "text", types.NoneType: "null"}
+    return None if hint not in words or isinstance(value, plain_types[hint]) else words[hint]
 
 
 def check_fields(made: Any) -> None:  # noqa: ANN401 - an instance of a dataclass
@@ -158,14 +197,12 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
 
 def _check(owner: Any, values: Mapping[str, Any]) -> None:  # noqa: ANN401 - a class or a function
     for name, hint in _hints(owner).items():
-        allowed, value = range_of(hint), values.get(name)
-        if allowed is None:
+        value = values.get(name)
+        if value is None or range_of(hint) is None:
             continue
-        whole = int in (hint, *_parts(hint))
-        for number in value if isinstance(value, list | tuple) else [value]:
-            if number is None:
-                continue
-            allowed.check(f"{owner.__name__}.{name}", number, whole=whole)
+        expected = mismatch(hint, value)
+        if expected is not None:
+            raise FaceDiffError(f"{owner.__name__}.{name} {shown(value)}: out of range; expected {expected}")
 
 
 @functools.cache
@@ -177,12 +214,6 @@ def _hints(owner: Any) -> dict[str, Any]:  # noqa: ANN401
             alone = SimpleNamespace(__annotations__={name: hint})
             found |= typing.get_type_hints(alone, module, include_extras=True)
     return found
-
-
-def _parts(hint: Any) -> Iterator[Any]:  # noqa: ANN401
-    for part in get_args(hint):
-        yield part
-        yield from _parts(part)
 
 
 # The numbers that several commands and functions take. Upper ends are far above what is useful, and low enough that

@@ -26,7 +26,7 @@ from facediff.data import SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.samplers import NoiseProcess
-from facediff.registry import Range, mismatch
+from facediff.utils.ranges import Range, mismatch
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
 for kind in registry.KINDS.values():

@@ -16,7 +16,7 @@ from facediff.evaluation.report import Bootstrap
 from facediff.export import ExportOptions
 from facediff.pipelines.animate import AnimationOptions
 from facediff.utils import ranges
-from facediff.utils.ranges import Range, check_fields, checked
+from facediff.utils.ranges import Range, check_fields, checked, mismatch
 
 BAD = [float("nan"), float("inf"), -float("inf"), 1e-300, 1e300, -1, 2**64, 10**400, "1", True, 1j]
 
@@ -50,6 +50,29 @@ def test_ends_belong_to_the_range_unless_they_do_not() -> None:
     assert 1 in Range(0, 1)
     assert 0 not in Range(0, 1, above=True)
     assert 1 not in Range(0, 1, below=True)
+
+
+@pytest.mark.parametrize(
+    ("allowed", "words"),
+    [
+        (Range(1, 8), "a number from 1 to 8"),
+        (Range(0, 1, above=True), "a number above 0 and at most 1"),
+        (Range(0, 1, above=True, below=True), "a number above 0 and below 1"),
+        (Range(0), "a finite number of at least 0"),
+        (Range(0, above=True), "a finite number above 0"),
+        (Range(most=2, below=True), "a finite number below 2"),
+        (Range(), "a finite number"),
+    ],
+)
+def test_a_range_in_words(allowed: Range, words: str) -> None:
+    assert allowed.numbers() == words
+    assert allowed.numbers(whole=True).startswith("a whole number")
+    assert mismatch(Annotated[float, allowed], float("nan")) == words
+
+
+def test_a_range_without_ends_takes_every_finite_number() -> None:
+    assert all(number in Range() for number in (-1e300, 10**400, np.float32(0.5)))
+    assert not any(number in Range() for number in (float("nan"), float("inf"), -float("inf"), True, "1", 1j))
 
 
 def test_arguments_are_checked_by_name_and_by_place() -> None:

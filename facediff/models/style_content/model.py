@@ -33,7 +33,7 @@ from facediff.models.style_content.losses import (
     style_contrast,
 )
 from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
-from facediff.registry import Range
+from facediff.utils.ranges import Range
 
 SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
 """Terms that the speech network has as well, by the name ``speech_<term>``."""
