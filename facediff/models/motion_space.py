@@ -22,10 +22,9 @@ from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError
 from facediff.models.layers import Share
-from facediff.models.mesh_encoders import Vertices
 from facediff.models.samplers import Steps
 from facediff.registry import motion_space
-from facediff.utils.ranges import Range
+from facediff.utils.ranges import Range, Vertices
 
 Offsets = Float[Tensor, "batch frames vertices 3"]
 """Scaled offsets from the template."""
