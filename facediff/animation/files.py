@@ -15,8 +15,9 @@ import numpy.typing as npt
 from facediff.animation.animation import OUT_OF_RANGE, Animation
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import in_range, open_vertices, read_arrays
-from facediff.utils.files import atomic, parse_json
+from facediff.utils.files import atomic
 from facediff.utils.limits import FRAME_RATES, LIMITS, SAMPLE_RATES, check_format, check_number, quoted
+from facediff.utils.plain_files import parse_json
 
 T = TypeVar("T")
 

@@ -16,7 +16,8 @@ from facediff.callbacks.dashboard import measure_clips, wandb_media, worst_clips
 from facediff.models import AnimationModel
 from facediff.models.inference import Prediction
 from facediff.registry import checks_arguments
-from facediff.utils.files import atomic, write_rows
+from facediff.utils.files import atomic
+from facediff.utils.plain_files import write_rows
 from facediff.utils.ranges import Range
 from facediff.utils.tables import format_table
 

@@ -95,7 +95,8 @@ def evaluate(
     check_folders(methods)
     if not truth.is_dir():
         raise FaceDiffError(f"{truth}: no such folder; expected truths, or a corpus folder")
-    from facediff.utils.files import atomic, write_rows
+    from facediff.utils.files import atomic
+    from facediff.utils.plain_files import write_rows
 
     json_file = Path(json) if json and json != "-" else None
     from facediff.data.corpus import read_templates

@@ -25,9 +25,10 @@ from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
 from facediff.utils.arrays import ArrayStore, open_vertices
-from facediff.utils.files import cache_dir, read_table
+from facediff.utils.files import cache_dir
 from facediff.utils.limits import COORDINATE, LIMITS, quoted
 from facediff.utils.pickles import load_pickle
+from facediff.utils.plain_files import read_table
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
 """Where projects keep absolute vertices; the second is ProbTalk3D's."""

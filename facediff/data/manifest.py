@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from facediff.errors import FaceDiffError
-from facediff.utils.files import load_json
 from facediff.utils.limits import FRAME_RATES, LIMITS, check_format, check_number, quoted
+from facediff.utils.plain_files import load_json
 
 FORMAT = 1
 """Goes up when a field changes its meaning; new fields do not count. Folders without the field are of format 1."""

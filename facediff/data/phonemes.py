@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
-from facediff.utils.files import read_rows
+from facediff.utils.plain_files import read_rows
 
 STRESS, LENGTH = "ˈˌ", "ː"
 BILABIALS = ("p", "b", "m")

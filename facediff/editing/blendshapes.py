@@ -15,7 +15,8 @@ from facediff.editing.shapes import ARKIT, ROTATIONS, ShapeSet, absent_from, bey
 from facediff.errors import FaceDiffError, choices
 from facediff.mesh.mesh import triangle_areas
 from facediff.utils import ranges
-from facediff.utils.files import atomic, check_writable, write_table
+from facediff.utils.files import atomic, check_writable
+from facediff.utils.plain_files import write_table
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

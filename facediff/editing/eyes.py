@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import open_array, read_arrays
-from facediff.utils.files import load_json
 from facediff.utils.limits import quoted
+from facediff.utils.plain_files import load_json
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -23,8 +23,9 @@ from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.utils.arrays import read_arrays
-from facediff.utils.files import atomic, check_writable, read_table
+from facediff.utils.files import atomic, check_writable
 from facediff.utils.limits import check_format
+from facediff.utils.plain_files import read_table
 
 ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20

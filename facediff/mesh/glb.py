@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.mesh.mesh import Array, Mesh
-from facediff.utils.files import parse_json
 from facediff.utils.limits import LIMITS
+from facediff.utils.plain_files import parse_json
 
 TYPES: dict[int, np.dtype[Any]] = {
     5120: np.dtype("i1"),

@@ -20,8 +20,9 @@ from facediff.synthetic.rig import Rig, build_rig, lip_pairs
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.synthetic.speech import SENTENCES, Phoneme, speak
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.files import atomic_folder, describe_files, read_json, same_sizes, write_json, write_table
+from facediff.utils.files import atomic_folder, describe_files, same_sizes
 from facediff.utils.jobs import WorkerDied, run_tasks
+from facediff.utils.plain_files import read_json, write_json, write_table
 
 FORMAT = 1
 GENERATOR = "1.1"

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.utils.files import read_json, sha256, short_name, write_json
+from facediff.utils.files import sha256, short_name
 from facediff.utils.jobs import SetupError, WorkerDied, run_tasks
+from facediff.utils.plain_files import read_json, write_json
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

@@ -1,13 +1,10 @@
-"""Files and folders that appear whole or not at all, locks, manifests, and the folders that facediff itself uses."""
+"""Files and folders that appear whole or not at all, locks, checksums, and the folders that facediff itself uses."""
 
 from __future__ import annotations
 
-import csv
 import errno
 import glob
 import hashlib
-import json
-import math
 import os
 import re
 import secrets
@@ -17,7 +14,7 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -26,13 +23,7 @@ from typing import IO, Any
 from facediff.errors import FaceDiffError
 from facediff.utils.destinations import destination, refuse_protected
 from facediff.utils.jobs import run_tasks
-from facediff.utils.limits import LIMITS, check_nesting
 
-BYTES_OF_A_CHARACTER = 32  # memory that a character of JSON can take: "[]," makes a list of 56 bytes and a pointer
-_ESCAPES = re.compile(r"\\u(?:0000|d[89a-f])", re.IGNORECASE)
-_ZERO = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
-BYTES_OF_A_CELL = 128  # memory that a cell of a table takes at least
-WIDEST = 10_000  # columns of a table
 ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then even where the file system has no locks
 
 
@@ -518,7 +509,7 @@ def _locked_folder(folder: Path) -> Iterator[bool | None]:
         os.close(descriptor)
 
 
-# What files hold: checksums, manifests, tables.
+# Checksums, as manifests record them.
 
 
 def sha256(path: Path) -> str:
@@ -549,188 +540,3 @@ def same_sizes(folder: Path, files: Mapping[str, Mapping[str, Any]]) -> bool:
         return all((folder / name).stat().st_size == facts["bytes"] for name, facts in files.items())
     except (OSError, KeyError, TypeError):
         return False
-
-
-def parse_json(text: bytes | str, source: object, *, remedy: str = "expected a JSON file") -> Any:  # noqa: ANN401
-    """Plain data of a JSON text from elsewhere; no other module parses one.
-
-    Stricter than Python's parser, so that whoever reads a value need not expect the worst: numbers are finite, keys
-    are unique, text can be printed, written and used as a file's name, and all fits into the budget.
-
-    Args:
-        text: the text; of bytes, UTF-8, UTF-16 or UTF-32 with or without a mark.
-        source: what messages call it.
-        remedy: how messages end.
-
-    Raises:
-        FaceDiffError: if it is anything else.
-    """
-    LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(text), source)
-    try:
-        if isinstance(text, bytes):
-            text = text.decode(json.detect_encoding(text))
-        value = json.loads(
-            text,
-            parse_constant=_finite,
-            parse_float=_finite,
-            parse_int=_whole,
-            object_pairs_hook=_unique,
-        )
-        # Escapes can state what no text should hold: zero bytes, and halves of a character, other than those that
-        # Python uses for bytes of a file's name that are no UTF-8.
-        if _ESCAPES.search(text) and _ZERO.search(
-            json.dumps(value, ensure_ascii=False).encode(errors="surrogateescape")
-        ):
-            raise ValueError("a text in it has a zero byte")
-    except (ValueError, RecursionError) as error:  # thousands of brackets exceed Python's depth
-        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
-        raise FaceDiffError(f"{source}: not readable as JSON ({reason}); {remedy}") from error
-    check_nesting(value, source)
-    return value
-
-
-def load_json(path: Path, *, name: str = "", remedy: str = "expected a JSON file") -> Any:  # noqa: ANN401
-    """Plain data that a JSON file holds, as :func:`parse_json` reads it.
-
-    Args:
-        path: the file.
-        name: what messages call it; its path if empty.
-        remedy: how messages end.
-
-    Raises:
-        FaceDiffError: if there is no such file, or it cannot be read.
-    """
-    name = name or str(path)
-    try:
-        LIMITS.check("bytes", BYTES_OF_A_CHARACTER * path.stat().st_size, name)
-        if not path.is_file():
-            raise FaceDiffError(f"{name}: not a regular file; {remedy}")
-        return parse_json(path.read_bytes(), name, remedy=remedy)
-    except OSError as error:
-        raise FaceDiffError(f"{name}: cannot be read ({error.strerror or error}); {remedy}") from error
-
-
-def read_json(path: Path) -> dict[str, Any] | None:
-    """The object that a JSON file holds; None if there is no such file, or it holds anything else."""
-    try:
-        content = load_json(path)
-    except FaceDiffError:
-        return None
-    return content if isinstance(content, dict) else None
-
-
-def _finite(number: str) -> float:
-    value = float(number)
-    if not math.isfinite(value):
-        raise ValueError(f"the number {number[:20]} is not finite")
-    return value
-
-
-def _whole(number: str) -> int:
-    _finite(number)
-    return int(number)
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(f'the key "{next(key for key in keys if keys.count(key) > 1)}" occurs twice')
-    return found
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write an object as JSON, whole or not at all; equal objects give equal bytes."""
-    with atomic(path) as temporary:
-        # Bytes of a file name that are no UTF-8 become the escapes by which JSON names them; they come back on reading.
-        text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
-
-
-# A spreadsheet takes a cell that begins with one of these as a formula, and runs it. Names come from files of anybody,
-# so that such a cell is written with an apostrophe in front (as OWASP advises), which our own readers take away again.
-# A cell that already looks like that gets one more, so that every text is read back as it was. Numbers stay numbers.
-_FORMULA = tuple("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
-
-
-def _is_formula(text: str) -> bool:
-    return text.lstrip(" '").startswith(_FORMULA)
-
-
-def csv_cell(value: object) -> object:
-    """A cell that no spreadsheet takes as a formula: ``=cmd()`` becomes ``'=cmd()``; numbers stay as they are.
-
-    Example:
-        >>> [csv_cell(value) for value in ("-0.5", "-clip", -0.5, "A = b")]
-        ['-0.5', "'-clip", -0.5, 'A = b']
-    """
-    if not isinstance(value, str) or not _is_formula(value):
-        return value
-    try:
-        float(value)
-    except ValueError:
-        return f"'{value}"
-    return value
-
-
-def csv_text(cell: str) -> str:
-    """The text that :func:`csv_cell` made a cell of."""
-    return cell[1:] if cell.startswith("'") and _is_formula(cell) else cell
-
-
-def write_table(path: Path, table: Iterable[Iterable[object]], *, line_end: str = "\n") -> None:
-    """Write a header and rows as CSV, in cells of :func:`csv_cell`; not atomic."""
-    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream:
-        csv.writer(stream, lineterminator=line_end).writerows(map(csv_cell, row) for row in table)
-
-
-def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], *, line_end: str = "\r\n") -> None:
-    """Write rows with equal keys as CSV, whole or not at all."""
-    header = list(rows[0])
-    with atomic(path) as temporary:
-        write_table(temporary, [header, *([row[key] for key in header] for row in rows)], line_end=line_end)
-
-
-def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
-    """Rows of a CSV file from elsewhere, as lists of cells; empty lines are none.
-
-    Args:
-        path: UTF-8, with or without the mark that spreadsheets put at the beginning.
-        remedy: how messages end.
-
-    Yields:
-        the cells as :func:`csv_text` gives them; the header is the first.
-
-    Raises:
-        FaceDiffError: if the file cannot be read, or holds more rows or cells than the budget allows.
-    """
-    cells = 0
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            for number, row in enumerate(csv.reader(stream)):
-                cells += len(row)
-                LIMITS.check("entries", number, path)
-                LIMITS.check("bytes", BYTES_OF_A_CELL * cells, path)
-                if row:
-                    yield [csv_text(cell) for cell in row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
-        raise FaceDiffError(f"{path}: not readable as a UTF-8 table ({reason}); {remedy}") from error
-
-
-def read_rows(path: Path, *, remedy: str) -> Iterator[dict[str, str]]:
-    """Rows of a CSV file with a header, by column; cells that a row lacks are empty, and further ones are left out.
-
-    The arguments and errors are those of :func:`read_table`; a column that occurs twice is an error, too.
-    """
-    rows = read_table(path, remedy=remedy)
-    header = next(rows, [])
-    twice = next((name for name in header if name and header.count(name) > 1), None) if len(header) < WIDEST else ""
-    if twice is not None:
-        what = f'has the column "{twice}" twice' if twice else f"has {len(header)} columns"
-        raise FaceDiffError(f"{path}: {what}; {remedy}")
-    cells = 0
-    for row in rows:
-        cells += len(header)
-        LIMITS.check("bytes", BYTES_OF_A_CELL * cells, path)  # a short row of many columns expands
-        yield dict(zip(header, row + [""] * (len(header) - len(row)), strict=False))

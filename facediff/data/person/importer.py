@@ -37,7 +37,8 @@ from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, stable_vertices
 from facediff.mesh.alignment import chunks
 from facediff.utils import ranges
-from facediff.utils.files import check_writable, describe_files, put_in_place, scratch_folder, write_json, write_rows
+from facediff.utils.files import check_writable, describe_files, put_in_place, scratch_folder
+from facediff.utils.plain_files import write_json, write_rows
 
 MIN_SECONDS = 2.0
 SILENCE = 1e-4  # loudest sample below which a recording counts as silent

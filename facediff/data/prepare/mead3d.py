@@ -35,8 +35,9 @@ from facediff.data.prepare.runner import (
 )
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.flame import SHAPES, Flame
-from facediff.utils.files import sha256, write_rows
+from facediff.utils.files import sha256
 from facediff.utils.pickles import load_pickle
+from facediff.utils.plain_files import write_rows
 from facediff.utils.progress import track
 
 EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry", "contempt")

@@ -21,17 +21,9 @@ from facediff.data.manifest import FORMAT, load_manifest
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import run_batch
-from facediff.utils.files import (
-    atomic,
-    check_writable,
-    describe_files,
-    locked,
-    parse_json,
-    remove_partial,
-    same_sizes,
-    write_json,
-)
+from facediff.utils.files import atomic, check_writable, describe_files, locked, remove_partial, same_sizes
 from facediff.utils.jobs import processors
+from facediff.utils.plain_files import parse_json, write_json
 from facediff.utils.progress import progress_bar
 
 Precision = Literal["float32", "float64"]

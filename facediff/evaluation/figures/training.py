@@ -25,7 +25,7 @@ from facediff.evaluation.figures.page import (
     style,
 )
 from facediff.utils import ranges
-from facediff.utils.files import read_rows
+from facediff.utils.plain_files import read_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,0 +1,145 @@
+"""JSON and CSV: strict when read, in one place only, and every text comes back as it was written."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import Limits
+from facediff.utils.plain_files import load_json, parse_json, read_json, read_rows, write_rows
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"\xff\xfe\x00",
+        b'{"rate": NaN}',
+        b'{"rate": -Infinity}',
+        b'{"rate": 1e999}',
+        b"[1" + 400 * b"0" + b"]",
+        b"1" + 100_000 * b"0",
+        b'{"rate": 25, "rate": 30}',
+        b'"\\u0000"',
+        b'"\\ud800"',
+        b'{"a\\udc7f": 1}',
+        b"[" * 100_000,
+        b"[" * 100 + b"]" * 100,
+        b"[" + b"[]," * 3_000 + b"[]]",
+        b'"caf\xe9"',
+        b"{'rate': 25}",
+        b"[1] [2]",
+    ],
+    ids=lambda text: repr(text[:16]),
+)
+def test_json_that_is_not_plain_data_is_refused_by_name(
+    text: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facediff.utils.limits.LIMITS", Limits(entries=1000))
+    path = tmp_path / "about.json"
+    path.write_bytes(text)
+    with pytest.raises(FaceDiffError, match=r"about\.json") as error:
+        load_json(path)
+    assert "\n" not in str(error.value)
+    assert read_json(path) is None
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-32"])
+def test_json_of_every_unicode_encoding_is_read(encoding: str) -> None:
+    text = '{"name": "caf\u00e9 \\ud83d\\ude00 \\\\u0000", "rates": [25, 29.97, -1e-300, 10]}'
+    expected = {"name": "caf\u00e9 \U0001f600 \\u0000", "rates": [25, 29.97, -1e-300, 10]}
+    assert parse_json(text.encode(encoding), "here") == expected
+
+
+def test_json_of_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    for name in ("none.json", "pipe.json", "folder.json"):
+        (tmp_path / "folder.json").mkdir(exist_ok=True)
+        with pytest.raises(FaceDiffError, match=name):
+            load_json(tmp_path / name)
+
+
+def test_json_is_parsed_in_one_place() -> None:
+    """A second parser would have its own ideas of NaN, nesting and encodings."""
+    # These read what another part of the same process, or a process that it has started, wrote.
+    own = {"facediff/utils/plain_files.py", "facediff/synthetic/speech.py"}
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "facediff").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and (node.value.id, node.attr) in {("json", "load"), ("json", "loads"), ("json", "JSONDecoder")}
+    }
+    assert found <= own
+
+
+NAMES = [
+    "=cmd()",
+    "+1",
+    "-2+3",
+    "-clip",
+    "@SUM(A1)",
+    "\t=1",
+    "\r=1",
+    " =1",
+    "'=1",
+    "''=1",
+    "'plain",
+    "plain",
+    "-0.5",
+    "\uff1d1",
+]
+
+
+def test_names_in_tables_are_no_formulas_and_are_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "clips.csv"
+    write_rows(path, [{"clip": name, "=head": -0.5} for name in NAMES])
+    with path.open(newline="", encoding="utf-8") as stream:
+        raw = list(csv.reader(stream))
+    for cell in [cell for row in raw for cell in row]:
+        assert cell[:1] not in tuple("=@\t\r")
+        assert cell[:1] not in tuple("+-") or np.isfinite(float(cell))
+    assert list(read_rows(path, remedy="")) == [{"clip": name, "=head": "-0.5"} for name in NAMES]
+
+
+def test_tables_are_written_and_read_in_one_place() -> None:
+    # Lightning's logger writes its own columns, which a resumed run continues.
+    own = {"facediff/utils/plain_files.py", "facediff/callbacks/runs.py"}
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "facediff").rglob("*.py")
+        if re.search(r"\bcsv\.(reader|writer|DictReader|DictWriter)\b", path.read_text(encoding="utf-8"))
+    }
+    assert found <= own
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"clip\n" + b'"' + b"x" * 200_000,  # beyond what a cell may hold
+        b"clip,clip\na,b\n",
+        b"clip\ncaf\xe9\n",
+        b"\xff\xfec\x00l\x00",
+        b"clip," + b"," * 20_000 + b"\n",
+        b"clip\n" + b"a\n" * 2_000,
+        b"clip" + b",x" * 900 + b"\n" + b"a\n" * 900,
+    ],
+    ids=lambda content: repr(content[:12]),
+)
+def test_tables_that_cannot_be_read_or_expand_are_refused(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facediff.utils.plain_files.LIMITS", Limits(entries=1000, bytes=128 * 100_000))
+    (tmp_path / "clips.csv").write_bytes(content)
+    with pytest.raises(FaceDiffError, match=r"clips\.csv: "):
+        list(read_rows(tmp_path / "clips.csv", remedy="save it again"))
