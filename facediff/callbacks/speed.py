@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -17,6 +18,10 @@ from facediff.registry import checks_arguments
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
 from facediff.utils.progress import track
+
+
+Backend = Callable[..., Any]
+"""A compiler of one's own, as ``torch.compile`` takes it."""
 
 
 class SpeechFeatureCache(Callback):
@@ -81,7 +86,7 @@ class CompiledTraining(Callback):
     """
 
     @checks_arguments
-    def __init__(self, parts: Sequence[str] = ("fusion", "decoder"), backend: str = "inductor") -> None:
+    def __init__(self, parts: Sequence[str] = ("fusion", "decoder"), backend: str | Backend = "inductor") -> None:
         self.parts = list(parts)
         self.backend = backend
         self._compiled: list[nn.Module] = []

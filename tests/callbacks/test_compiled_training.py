@@ -88,7 +88,7 @@ def test_compiled_training_on_a_machine_that_cannot_compile_is_an_error(
     def backend(*_: object) -> Callable[..., object]:
         raise RuntimeError("No working C++ compiler found")
 
-    trainer = make_trainer(callbacks=[CompiledTraining(backend=backend)])  # type: ignore[arg-type]
+    trainer = make_trainer(callbacks=[CompiledTraining(backend=backend)])
     with pytest.raises(FaceDiffError, match=r"does not work on this machine \(.*C\+\+ compiler.*install a C\+\+ comp"):
         trainer.fit(make_model(), datamodule=tiny)
 
