@@ -19,7 +19,6 @@ from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
 from facediff.utils.progress import track
 
-
 Backend = Callable[..., Any]
 """A compiler of one's own, as ``torch.compile`` takes it."""
 
