@@ -84,6 +84,10 @@ class ArgumentError(FaceDiffError, ValueError):
         return _argument_error, ({name: str(value) for name, value in self.values.items()}, self.problem, self.located)
 
 
+class NotFiniteError(FaceDiffError, ValueError):
+    """Numbers that are about to be scored are NaN or infinite."""
+
+
 def _argument_error(values: Mapping[str, object], problem: str, located: bool) -> ArgumentError:
     return ArgumentError(values, problem, located=located)
 

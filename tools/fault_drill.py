@@ -263,7 +263,7 @@ def run_forked(
         sys.path[:] = [each for each in sys.path if each != ""]
         os.write(writer, b"begun ")
         try:
-            code: Any = app.main(words)
+            code: Any = app.main()  # without words: streams and signals are set up as in a process of its own
         except SystemExit as stop:
             code = stop.code
         except KeyboardInterrupt:

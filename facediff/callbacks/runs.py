@@ -202,10 +202,10 @@ def logger_versions(trainer: Trainer) -> list[Any]:
 
 
 class ResumableCSVLogger(CSVLogger):
-    """Lightning's CSV logger, except that it can continue a file, and that a kill cannot cut the file.
+    """Lightning's CSV logger, except that it can continue a file, and that a kill cannot cut or lose the file.
 
-    Lightning's deletes the file of a folder that it is given a second time, and with it the curve of a run up to the
-    point where it was stopped.
+    Lightning's deletes the file of a folder that it is given a second time as soon as it starts, and with it the curve
+    of a run up to the point where it was stopped.
 
     Attributes:
         continues: keep the file that is there.
@@ -217,12 +217,14 @@ class ResumableCSVLogger(CSVLogger):
         """Rows written so far; whatever is pending is written first."""
         self.save()
         path = Path(self.experiment.metrics_file_path)
-        return len(read_rows(path)[1]) if path.is_file() else 0
+        return len(read_rows(path)[1]) if self.experiment.begun and path.is_file() else 0
 
     def keep(self, rows: int) -> None:
         """Keep the first rows only: the steps after them will be repeated."""
         path = Path(self.experiment.metrics_file_path)
-        if self.continues and path.is_file():
+        if self.continues and not rows:  # the file may be that of a run before
+            self._experiment = _Writer(log_dir=self.log_dir)
+        elif self.continues and path.is_file():
             header, found = read_rows(path)
             write_table(path, header, found[:rows])
 
@@ -237,6 +239,22 @@ class ResumableCSVLogger(CSVLogger):
 
 
 class _Writer(ExperimentWriter):
+    """The file of an earlier run stays until the first rows replace it."""
+
+    begun = False
+
+    def _check_log_dir_exists(self) -> None:
+        """Do nothing; Lightning's deletes the file."""
+
+    def save(self) -> None:
+        """Write the rows that are pending."""
+        if self.begun:
+            super().save()
+        elif self.metrics:
+            self._record_new_keys()
+            write_table(Path(self.metrics_file_path), self.metrics_keys, self.metrics)
+            self.metrics, self.begun = [], True
+
     def _rewrite_with_new_header(self, fieldnames: list[str]) -> None:
         path = Path(self.metrics_file_path)
         write_table(path, fieldnames, read_rows(path)[1])
@@ -245,7 +263,8 @@ class _Writer(ExperimentWriter):
 class _ContinuedWriter(_Writer):
     def _check_log_dir_exists(self) -> None:
         path = Path(self.metrics_file_path)
-        if path.is_file():
+        self.begun = path.is_file()
+        if self.begun:
             self.metrics_keys = read_rows(path)[0]
 
 
@@ -256,7 +275,7 @@ def read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     return list(reader.fieldnames or []), list(reader)
 
 
-def write_table(path: Path, header: Sequence[str], rows: Sequence[Mapping[str, str]]) -> None:
+def write_table(path: Path, header: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
     """Write a CSV file whole or not at all."""
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, header)

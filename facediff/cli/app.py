@@ -146,7 +146,7 @@ def answer(words: Sequence[str]) -> int:
             f'`facediff {name}` needs the package "{error.name}", which is not installed: '
             f'run  pip install "facediff[all]"'
         )
-    except (Exception, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt, process.StoppedBySignal) as error:
         return process.report(error)
 
 

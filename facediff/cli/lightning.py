@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff import registry
+from facediff.cli.process import StoppedBySignal
 from facediff.errors import FaceDiffError, choices
 from facediff.registry import defaults, plain
 from facediff.utils.files import config_dir
@@ -87,7 +88,7 @@ def exit_statuses() -> Iterator[None]:
         if isinstance(stop.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from stop
         if type(stop).__name__ == "SIGTERMException":
-            raise SystemExit(128 + signal.SIGTERM) from stop
+            raise StoppedBySignal(signal.SIGTERM) from stop
         raise
     finally:
         if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -30,7 +30,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from facediff import registry
 from facediff.callbacks import GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
-from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored
+from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, resumable
 from facediff.cli.configs import guard_configs
 from facediff.cli.trainer_options import explained, raised_in, sentence_of
 from facediff.data import SpeechMotionDataModule
@@ -242,6 +242,8 @@ class FaceDiffCLI(LightningCLI):
         callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in named]
         if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:  # written whole, read by the one door
             trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+        if self.subcommand != "fit":  # for fit, as soon as it is known whether a run continues
+            trainer.loggers = resumable(trainer.loggers)
         return trainer
 
     def before_fit(self) -> None:

@@ -67,9 +67,17 @@ def finish_process() -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+class StoppedBySignal(SystemExit):  # noqa: N818 - like the class that it extends, it is no error
+    """A signal asks the process to end; its status is 128 and the signal's number."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+        self.sentence = f"stopped by {signal.Signals(number).name}"
+
+
 def _stop(number: int, _frame: FrameType | None) -> NoReturn:
     signal.signal(number, signal.SIG_DFL)  # the second one does not wait for anything to be tidied up
-    raise SystemExit(128 + number)
+    raise StoppedBySignal(number)
 
 
 class _StandardOutput(io.FileIO):
@@ -108,6 +116,8 @@ def report(error: BaseException) -> int:
     """
     if any(isinstance(each, KeyboardInterrupt) for each in _chain(error)):
         return fail("interrupted", INTERRUPTED)
+    if isinstance(error, StoppedBySignal):
+        return fail(error.sentence, int(str(error.code)))
     if isinstance(error, StandardOutputError):
         return error.status if error.status == READER_GONE else fail(str(error), error.status)
     if isinstance(error, FaceDiffError):

@@ -24,7 +24,7 @@ from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
-from facediff.utils.arrays import ArrayStore, open_vertices
+from facediff.utils.arrays import ArrayStore, in_range, open_vertices
 from facediff.utils.files import cache_dir
 from facediff.utils.limits import COORDINATE, LIMITS, quoted
 from facediff.utils.pickles import load_pickle
@@ -211,11 +211,11 @@ class Corpus:
             chunk = motion[first : first + CHUNK]
             with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
                 np.copyto(chunk, stored[first : first + CHUNK], casting="same_kind")
-            if not np.isfinite(chunk.sum()):
-                bad = (start + first + int(np.argmax(~np.isfinite(chunk).all((1, 2))))) * self._strides[clip.root]
+            if not in_range(chunk):
+                bad = int(np.argmax(~(np.abs(chunk) <= COORDINATE).all((1, 2))))
                 raise FaceDiffError(
-                    f"{motion_path(clip.root, clip.name)}: frame {bad} holds NaN or infinity (counted from 0); "
-                    f"remove the clip"
+                    f"{motion_path(clip.root, clip.name)}: frame {(start + first + bad) * self._strides[clip.root]} "
+                    f"holds NaN, infinity or a coordinate beyond {COORDINATE:g} (counted from 0); remove the clip"
                 )
             chunk -= template
         return torch.from_numpy(motion)

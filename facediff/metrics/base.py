@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from facediff.errors import choices
+from facediff.errors import NotFiniteError, choices
 from facediff.metrics.regions import LipPairs, Region, RegionLike, as_region
 
 # Options: the words that distinguish one definition of a metric from another.
@@ -125,11 +125,15 @@ class Clips:
         each = list(template.detach().expand(batch, vertices, 3))
         for clip, neutral in zip(self.clips, each, strict=True):
             if not bool(neutral.isfinite().all()):
-                raise ValueError(f"the template of {clip.name} holds NaN or infinity; repair or omit this clip")
+                raise NotFiniteError(f"the template of {clip.name} holds NaN or infinity; repair or omit this clip")
         return self.attach("template", each)
 
     def check_finite(self) -> None:
-        """Refuse NaN and infinity in the frames that are scored, with the first clip concerned and the side."""
+        """Refuse NaN and infinity in the frames that are scored.
+
+        Raises:
+            NotFiniteError: naming the first clip concerned and the side.
+        """
         sides = [
             (clip.name, side, motion)
             for clip in self.clips
@@ -145,7 +149,7 @@ class Clips:
         for (name, side, motion), fine in zip(sides, sums.isfinite().tolist(), strict=True):
             if not fine and not bool(motion.isfinite().all()):
                 bad = (~motion.isfinite()).flatten(1).any(1).nonzero()[0].item()
-                raise ValueError(
+                raise NotFiniteError(
                     f"the {side} of {name} holds NaN or infinity, first in frame {bad}; "
                     "a score over it would mean nothing: repair or omit this clip"
                 )

@@ -80,6 +80,8 @@ def atomic(path: Path) -> Iterator[Path]:
         _refuse_unwritable(path, where.path)
         temporary = _partial(where.path, path.suffix)
         with _new_folders(where.path.parent):
+            if not os.access(where.path.parent, os.W_OK):  # not every writer's error says so
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
             _sweep(where.path.parent)
             try:
                 yield temporary

@@ -220,3 +220,22 @@ def test_a_full_disk_leaves_the_previous_checkpoint(tmp_path: Path, monkeypatch:
         plugin.save_checkpoint({"a": torch.ones(3)}, path)
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_the_curve_of_an_earlier_run_stays_until_rows_replace_it(tmp_path: Path) -> None:
+    path = tmp_path / "run" / "version_0" / "metrics.csv"
+    for value in (1.0, 2.0):
+        logger = ResumableCSVLogger(tmp_path, name="run", version=0)
+        assert logger.rows() == 0
+        assert path.is_file() == (value == 2.0)
+        logger.log_metrics({"loss": value}, step=0)
+        assert logger.rows() == 1
+        logger.log_metrics({"loss": value, "other": 3.0}, step=1)
+        assert logger.rows() == 2
+        assert [row["loss"] for row in rows(tmp_path)] == [str(value), str(value)]
+    again = ResumableCSVLogger(tmp_path, name="run", version=0)
+    again.continues = True
+    again.keep(0)  # saved before the first row: what is there is of a run before
+    again.log_metrics({"new": 4.0}, step=0)
+    again.save()
+    assert rows(tmp_path) == [{"new": "4.0", "step": "0"}]

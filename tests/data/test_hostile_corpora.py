@@ -157,7 +157,7 @@ def test_clip_whose_name_cannot_be_printed_is_refused(name: str, tmp_path: Path)
     assert str(refused.value).removeprefix(str(tmp_path)).isprintable()
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e300])
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e300, 3e37, -3e37])
 def test_motion_that_is_not_finite_is_refused_by_frame(value: float, tmp_path: Path) -> None:
     opened = corpus(tmp_path)
     motion = np.tile(FACE.ravel(), (25, 1))

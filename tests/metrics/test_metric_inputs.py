@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from facediff.errors import NotFiniteError
 from facediff.metrics import (
     Coverage,
     FaceDynamicsDeviation,
@@ -30,8 +31,9 @@ def test_nan_and_infinity_name_the_clip(metric: SequenceMetric, side: str, bad: 
     metric.reset()
     both: dict[str, Any] = {"prediction": motion().to(dtype), "truth": motion().to(dtype)}
     both[side][1, 3, 2, 0] = bad  # outside the region of two of the metrics: refused all the same
-    with pytest.raises(ValueError, match=rf"{side} of M3_e40 holds NaN or infinity, first in frame 3"):
+    with pytest.raises(NotFiniteError, match=rf"{side} of M3_e40 holds NaN or infinity, first in frame 3") as refused:
         metric.update(**both, clip_names=["F2_e37", "M3_e40"])
+    assert isinstance(refused.value, ValueError)
     assert metric.coverage() == Coverage(0, 0, 0, 0)
     metric.update(**both, lengths=[5, 3])  # the bad frame is padding now
     assert metric.coverage() == Coverage(8, 2, 0, 0)

@@ -350,3 +350,11 @@ def test_a_lock_that_is_a_link_destroys_nothing(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="cannot be written"):
         locked(tmp_path / ".lock", "facediff test").__enter__()
     assert (tmp_path / "precious").read_text() == "precious"
+
+
+def test_a_folder_that_may_not_be_written_is_refused_before_a_writer_has_its_own_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: not (Path(path) == tmp_path and mode == os.W_OK))
+    with pytest.raises(FaceDiffError, match=r"a\.yaml"), atomic(tmp_path / "a.yaml"):
+        raise TypeError("path is not creatable")
