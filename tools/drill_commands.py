@@ -11,7 +11,7 @@ from pathlib import Path
 
 TINY = "tests.fakes.tiny.Tiny"
 RUN = "--trainer.accelerator=cpu --trainer.enable_progress_bar=false --trainer.logger.version=0"
-PAPER = f"ours corpus --method other=theirs --topology {TINY} --width 120 --dpi 80"
+PAPER = f"ours corpus --method other=theirs --topology {TINY} --width 120"
 SMALL_MODEL = """\
 seed_everything: 0
 model:
@@ -120,11 +120,12 @@ DRILLS = [
     *(
         Drill(
             "export",
-            f"ball.npz --quiet --size 64 -o out{suffix}",
-            f"ball.npz --quiet --size 64 --expressiveness 0.5 -o out{suffix}",
+            f"ball.npz --quiet {size}-o out{suffix}",
+            f"ball.npz --quiet {size}--expressiveness 0.5 -o out{suffix}",
             label=suffix,
         )
         for suffix in (".glb", ".usdc", ".pc2", ".mdd", ".npy", ".mp4", ".html")
+        for size in ["--size 64 " if suffix == ".mp4" else ""]
     ),
     Drill("export", "ball.npz --quiet -o frames.ply", label=".ply"),
     Drill(
@@ -156,10 +157,10 @@ DRILLS = [
         "ours corpus --bootstrap 10 --workers 1 --quiet --json a.json --csv a.csv",
         pieces=True,
     ),
-    Drill("figure frames", f"{PAPER} --phonemes m -o a.png", f"{PAPER} --phonemes f -o a.png"),
-    Drill("figure heatmap", f"{PAPER} -o a.png", f"{PAPER} --dpi 100 -o a.png"),
-    Drill("figure error", f"{PAPER} -o a.svg", f"{PAPER} --dpi 100 -o a.svg"),
-    Drill("figure lips", f"{PAPER} -o a.pdf", f"{PAPER} --dpi 100 -o a.pdf"),
+    Drill("figure frames", f"{PAPER} --dpi 80 --phonemes m -o a.png", f"{PAPER} --dpi 80 --phonemes f -o a.png"),
+    Drill("figure heatmap", f"{PAPER} --dpi 80 -o a.png", f"{PAPER} --dpi 100 -o a.png"),
+    Drill("figure error", f"{PAPER} --dpi 80 -o a.svg", f"{PAPER} --dpi 100 -o a.svg"),
+    Drill("figure lips", f"{PAPER} --dpi 80 -o a.pdf", f"{PAPER} --dpi 100 -o a.pdf"),
     Drill("figure training", "one=curve --width 60 --dpi 50 -o a.png", "one=curve --width 50 --dpi 50 -o a.png"),
     Drill("data prepare", "biwi biwi out --workers 1 --quiet", label="biwi", pieces=True),
     Drill("data prepare", "vocaset vocaset out --workers 1 --quiet", label="vocaset", pieces=True),

@@ -933,7 +933,7 @@ def separately(
         content = json.loads(file.read_text()) if file.exists() else "the drill was killed"
         if isinstance(content, str):
             scores = {"kill": Score()}
-            scores["kill"].note("wrong", f"{name}: the drill failed: {content[-1500:]}")
+            scores["kill"].note("wrong", f"{name}: the drill failed: …{content[-500:]}")
         else:
             scores = {fault: Score(**{**facts, "counts": Counter(facts["counts"])}) for fault, facts in content.items()}
         results[name] = scores
