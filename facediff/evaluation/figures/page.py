@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -172,7 +173,9 @@ def save(figure: Figure, path: Path) -> None:
     }
     suffix = path.suffix.lower()
     with atomic(path) as temporary:
-        figure.savefig(temporary, format=suffix[1:], dpi="figure", metadata=dates[suffix])
+        content = io.BytesIO()  # on a full disk, matplotlib's writers fail with errors that do not say so
+        figure.savefig(content, format=suffix[1:], dpi="figure", metadata=dates[suffix])
+        temporary.write_bytes(content.getbuffer())
 
 
 def line_style(number: int) -> dict[str, object]:
