@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -17,7 +16,7 @@ from facediff.errors import FaceDiffError
 from facediff.utils.arrays import in_range, open_vertices, read_arrays
 from facediff.utils.files import atomic
 from facediff.utils.limits import FRAME_RATES, LIMITS, SAMPLE_RATES, check_format, check_number, quoted
-from facediff.utils.plain_files import parse_json
+from facediff.utils.plain_files import json_text, parse_json
 
 T = TypeVar("T")
 
@@ -144,7 +143,7 @@ def write_archive(path: Path, animation: Animation) -> None:
         "sample_rate": animation.sample_rate,
         "metadata": dict(animation.metadata),
     }
-    arrays["about"] = np.array(json.dumps(about, ensure_ascii=False))
+    arrays["about"] = np.array(json_text(path, about, indent=None))
     with atomic(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, allow_pickle=False, **arrays)
 

@@ -7,9 +7,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from facediff.cli.lightning import import_corpus
+from facediff.cli.lightning import import_corpus, tell_folder
 from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed, confirm_cost
 from facediff.cli.parsing import Option
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -109,7 +110,7 @@ def adapt(
     # Pictures need a mesh, which a corpus may lack.
     made = "speech.npz" if model.assets.faces is None else "speech.mp4"
     words = ["facediff", "animate", "speech.wav", "--checkpoint", str(output), "--identity", name, "-o", made]
-    print(
+    tell(
         f"{output}: adapted to {name} by {seconds:.0f} s of motion, in {time.monotonic() - started:.0f} s; "
         f"next: {shlex.join(words)}"
     )
@@ -126,6 +127,8 @@ def adaptation_data(
     module, options = corpus_of(checkpoint, content)
     if data_root is not None:
         options["root"] = str(data_root)
+    else:
+        tell_folder(checkpoint, options)
     folder = Path(person)
     name = person_name(folder) if folder.is_dir() else person
     if name in content["hyper_parameters"].get("identities", []):

@@ -18,6 +18,7 @@ from facediff.cli.options import (
     confirm_cost,
 )
 from facediff.cli.parsing import Option, changed, refuse_idle
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -177,7 +178,7 @@ def animate(
         )
     options.check(output)
     samples_of_speech = read_recording(speech[0], windows.max_seconds)  # before the model, which takes longer to load
-    pipeline = AnimationPipeline(options)
+    pipeline = AnimationPipeline(options, seed=seed)
     seconds, size = pipeline.cost(samples_of_speech, output)
     confirm_cost(yes, "--samples, --steps or --size", seconds=seconds, size=size)
     written, animation = pipeline.write(samples_of_speech, speech[0].stem, output, seed=seed)
@@ -185,6 +186,6 @@ def animate(
     notes = "".join(f", {name}: {metadata[name]}" for name in ("edited", "procedural") if name in metadata)
     line = f"{len(animation.vertices)} frames, identity {metadata['identity']}, style of {metadata['style']}{notes}"
     for path in written:
-        print(f"{path}: {line}")
+        tell(f"{path}: {line}")
         line = "next to it"
     return 0

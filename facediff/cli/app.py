@@ -126,10 +126,10 @@ def answer(words: Sequence[str]) -> int:
         try:
             rest = words[1:] if name in GROUPS else words
             if not rest or rest[0] in HELP:  # no command, a group alone, or a flag for help in place of a command
-                print(usage(name if name in GROUPS else ""))
+                process.tell(*usage(name if name in GROUPS else "").split("\n"))
                 return 0 if words[-1:] and words[-1] in HELP else 2
             if name == "--version":
-                print(facediff.__version__)
+                process.tell(facediff.__version__)
                 return 0
             name, rest = find(words)
             return run(name, rest)

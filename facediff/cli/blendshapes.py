@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import Picture, SourceOptions, check_picture_path
 from facediff.cli.parsing import Option, changed, refuse_idle
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -65,7 +66,7 @@ def blendshapes(
         from facediff.synthetic.arkit import write_puppet_shapes as write
 
         written = write(write_puppet_shapes, source.identity)
-        print(f"{write_puppet_shapes}: neutral face and {len(written)} shapes: {', '.join(sorted(written))}")
+        tell(f"{write_puppet_shapes}: neutral face and {len(written)} shapes: {', '.join(sorted(written))}")
         return
     for option, value in (("ANIMATION", animation), ("-o", output), ("--shapes", shapes)):
         if value is None:
@@ -100,8 +101,8 @@ def blendshapes(
         from facediff.export.pictures import draw_worst_frame
 
         draw_worst_frame(show, own, found, weights)
-    print(f"{output}: {len(weights.values)} frames, {len(weights.names)} shapes")
-    print("\n".join([*found.notes, *remarks(weights, plain=plain)]))
+    tell(f"{output}: {len(weights.values)} frames, {len(weights.names)} shapes")
+    tell(*found.notes, *remarks(weights, plain=plain))
 
 
 def remarks(weights: Weights, *, plain: bool) -> list[str]:

@@ -7,6 +7,7 @@ import json as json_format
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.parsing import Option, plain_text
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices
 
 if TYPE_CHECKING:
@@ -31,16 +32,16 @@ def components(kind: Annotated[str | None, Option(metavar="KIND")] = None, *, js
             for each in chosen
             for entry in each
         ]
-        print(json_format.dumps(rows, indent=2))
+        tell(*json_format.dumps(rows, indent=2, allow_nan=False).split("\n"))
         return
     width = max((len(entry.name) for each in chosen for entry in each), default=0) + 2
     for each in chosen:
-        print(f"{each.kind}: {each.title}")
+        tell(f"{each.kind}: {each.title}")
         for entry in each:
-            print(f"  {entry.name:<{width}}{plain_text(entry.summary)}")
+            tell(f"  {entry.name:<{width}}{plain_text(entry.summary)}")
             if kind is not None:
                 for line in options_of(entry):
-                    print(f"      {line}")
+                    tell(f"      {line}")
 
 
 def options_of(entry: Entry) -> list[str]:

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Size, Workers
 from facediff.cli.parsing import Group, Option, Parameter, Parameters, parameters_of, parse
-from facediff.errors import FaceDiffError, choices
+from facediff.cli.process import tell
+from facediff.errors import FaceDiffError, choices, printable
 from facediff.utils import ranges
 
 if TYPE_CHECKING:
@@ -59,11 +60,9 @@ def check(
     find_own_module(corpus)
     report = check_folder(root, corpus, split=split, quick=quick, workers=workers, progress=not (json or quiet))
     if json:
-        print(json_format.dumps(report.state(), indent=2))
+        tell(*json_format.dumps(report.state(), indent=2, allow_nan=False).split("\n"))
     else:
-        # A file name may hold letters that the terminal's encoding does not have.
-        encoding = sys.stdout.encoding or "utf-8"
-        print(text(report).encode(encoding, errors="backslashreplace").decode(encoding))
+        tell(*text(report).split("\n"))
     return 0 if report.sound else 1
 
 
@@ -90,7 +89,7 @@ corpora: {corpora}; `facediff data prepare <corpus> --help` lists the options of
 def run(name: str, arguments: Sequence[str]) -> int:
     """``facediff data prepare``: choose the corpus, whose plan has the options, and prepare it."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(PREPARE.format(corpora=", ".join(CORPORA)))
+        tell(*PREPARE.format(corpora=", ".join(CORPORA)).split("\n"))
         return 0 if arguments else 2
     make_plan, values = read_prepare(arguments)
     return prepare(make_plan, **values)
@@ -145,9 +144,9 @@ def prepare(make_plan: Callable[[Path], Plan], *, raw: Path, out: Path, workers:
     try:
         report = carry_out(make_plan(raw), out, workers=workers, quiet=quiet)
     except KeyboardInterrupt:
-        print(f"\nstopped; the same command continues where {out} was left", file=sys.stderr)
+        print(f"\nstopped; the same command continues where {printable(out)} was left", file=sys.stderr)
         raise
-    print("\n".join(describe(report)))
+    tell(*describe(report))
     return 0 if report.sound else 1
 
 
@@ -248,7 +247,7 @@ def import_person(
         clip_seconds=clip_seconds,
         progress=not quiet and sys.stderr.isatty(),
     )
-    print("\n".join([f"{output}: {report.name}", *report.lines(read_manifest(output).get("unit"))]))
+    tell(f"{output}: {report.name}", *report.lines(read_manifest(output).get("unit")))
 
 
 # ``facediff data regions``
@@ -284,4 +283,4 @@ def regions(
 
     find_own_module(corpus)
     lines = draw_regions(root, output, corpus=corpus, lips=lips, upper_face=upper_face, size=size)
-    print("\n".join([*lines, f"written: {output}"]))
+    tell(*lines, f"written: {output}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import OutputFolder
 from facediff.cli.parsing import Option
+from facediff.cli.process import tell
 from facediff.utils import ranges
 
 if TYPE_CHECKING:
@@ -44,19 +45,19 @@ def demo(
     started = time.monotonic()
     options = [f"--data.root={data_root}"] if data_root else []
     options += [f"--trainer.max_epochs={epochs}"] if epochs else []
-    print(f"facediff demo: training on the built-in synthetic corpus ({CONFIG})", flush=True)
+    tell(f"facediff demo: training on the built-in synthetic corpus ({CONFIG})")
     logger = [f"--trainer.logger.save_dir={output}", "--trainer.logger.name=training"]
     fitted = run_cli("fit", ["--config", CONFIG, *logger, *options])
     checkpoint = output / "puppet.ckpt"
     fitted.trainer.save_checkpoint(checkpoint)
-    print(f"facediff demo: trained in {time.monotonic() - started:.0f} s; now the test", flush=True)
+    tell(f"facediff demo: trained in {time.monotonic() - started:.0f} s; now the test")
     where = ["--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={output}"]
     tested = run_cli("test", ["--ckpt_path", str(checkpoint), *where])
     videos = write_videos(output, tested.model, tested.datamodule)
-    print(f"\nfacediff demo: done in {time.monotonic() - started:.0f} s. Look at:")
+    tell("", f"facediff demo: done in {time.monotonic() - started:.0f} s. Look at:")
     for path in (*videos, output / "test_scores.csv", checkpoint):
-        print(f"  {path}")
-    print(f"Next: facediff animate speech.wav --checkpoint {checkpoint} --identity F1 -o speech.mp4")
+        tell(f"  {path}")
+    tell(f"Next: facediff animate speech.wav --checkpoint {checkpoint} --identity F1 -o speech.mp4")
 
 
 def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModule) -> list[Path]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +17,7 @@ from facediff.cli.options import (
     named_folders,
 )
 from facediff.cli.parsing import Option, refuse_idle
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -90,13 +89,14 @@ def evaluate(
     if not bootstrap:
         refuse_idle("is for intervals, of which --bootstrap 0 makes none", level=level != LEVEL, seed=seed != 0)
     if not metric:
-        refuse_idle("is for further metrics, chosen with --metric", lip_pairs=lip_pairs is not None)
+        idle = {"lip_pairs": lip_pairs is not None, "frame_rate": frame_rate is not None}
+        refuse_idle("is for further metrics, chosen with --metric", **idle)
     methods = named_folders([predictions, *(method or [])])
     check_folders(methods)
     if not truth.is_dir():
         raise FaceDiffError(f"{truth}: no such folder; expected truths, or a corpus folder")
     from facediff.utils.files import atomic
-    from facediff.utils.plain_files import write_rows
+    from facediff.utils.plain_files import json_text, write_rows
 
     json_file = Path(json) if json and json != "-" else None
     from facediff.data.corpus import read_templates
@@ -141,7 +141,7 @@ def evaluate(
         workers=workers,
         progress=not quiet,
     )
-    everything = json_format.dumps(report.as_dict(), indent=2, allow_nan=False)
+    everything = json_text(f"--json {json}", report.as_dict(), indent=2, ensure_ascii=True)
     if json_file is not None:
         with atomic(json_file) as temporary:
             temporary.write_text(everything + "\n", encoding="utf-8")
@@ -154,8 +154,6 @@ def evaluate(
         }
         write_rows(csv, [row | facts for row in report.rows()])
     if json == "-":
-        print(everything)
+        tell(*everything.split("\n"))
         return
-    # A file name may hold letters that the terminal's encoding does not have.
-    encoding = sys.stdout.encoding or "utf-8"
-    print(text(report).encode(encoding, errors="backslashreplace").decode(encoding))
+    tell(*text(report).split("\n"))

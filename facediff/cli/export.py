@@ -11,6 +11,7 @@ from facediff.cli.options import (
     with_different_names,
 )
 from facediff.cli.parsing import with_more_help
+from facediff.cli.process import tell
 
 
 def format_table() -> str:
@@ -58,5 +59,5 @@ def export(
     for written in write_animations(output, with_different_names(finished, animations), options):
         inside = [file for file in written.iterdir() if file.is_file()] if written.is_dir() else [written]
         counted = f"{len(inside)} files, " if written.is_dir() else ""
-        print(f"{written}: {counted}{sum(file.stat().st_size for file in inside) / 1e6:.2f} MB")
-    print(FORMATS[output.suffix].next_step)
+        tell(f"{written}: {counted}{sum(file.stat().st_size for file in inside) / 1e6:.2f} MB")
+    tell(FORMATS[output.suffix].next_step)

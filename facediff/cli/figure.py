@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from facediff.cli.options import File, FileOrList, Folder, FrameRate, Output, View, check_folders, named_folders
 from facediff.cli.parsing import Option, refuse_idle
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -322,7 +323,7 @@ def training(
 def report(output: Path, notes: Sequence[str] = ()) -> None:
     """Print where the figure is, and the first of the notes about it."""
     for note in notes[:NOTES]:
-        print(f"note: {note}")
+        tell(f"note: {note}")
     if len(notes) > NOTES:
-        print(f"note: likewise {len(notes) - NOTES} more")
-    print(f"written: {output}")
+        tell(f"note: likewise {len(notes) - NOTES} more")
+    tell(f"written: {output}")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff import registry
-from facediff.cli.process import StoppedBySignal
+from facediff.cli.process import StoppedBySignal, tell
 from facediff.errors import FaceDiffError, choices
 from facediff.registry import defaults, plain
 from facediff.utils.files import config_dir
@@ -171,6 +171,12 @@ def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None,
         )
 
 
+def tell_folder(path: Path, options: Mapping[str, Any]) -> None:
+    """Say which folder is read because a checkpoint, which may come from anybody, names it."""
+    if options.get("root") is not None:
+        tell(f"{path}: names the corpus folder {options['root']}, which is read")
+
+
 def change_values(words: Sequence[str], change: Callable[[str, str], str]) -> list[str]:
     """The words with ``change(flag, value)`` in place of every value, written ``--flag value`` or ``--flag=value``."""
     changed, flag = [], ""
@@ -260,5 +266,7 @@ def words_of_checkpoint(name: str, path: Path, words: Sequence[str]) -> list[str
     import_corpus(path, checkpoint, chosen, "--data=")
     if chosen in (None, (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")):
         corpus, arguments = corpus_of(path, checkpoint)
+        if not any(word.startswith(("--data.root", "--data.init_args.root")) for word in words):
+            tell_folder(path, arguments)
         config["data"] = {"class_path": f"{corpus.__module__}.{corpus.__qualname__}", "init_args": arguments}
     return ["--config", yaml.safe_dump(config, sort_keys=False)]

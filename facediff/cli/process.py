@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 import facediff
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, printable
 
 USAGE, FAULT, INTERRUPTED, READER_GONE = 2, 70, 130, 141
 """Exit statuses in addition to 0 and to 1, which means that a part of the work failed; see docs/command_line.md."""
@@ -92,6 +92,17 @@ class _StandardOutput(io.FileIO):
             raise StandardOutputError(error) from error
 
 
+def tell(*lines: object) -> None:
+    """Print lines to standard output, in which names of files may hold what is no text, or not one line.
+
+    Everything that the commands print goes this way; where standard output is a pipe, it is given out at once.
+    """
+    encoding = sys.stdout.encoding or "utf-8"
+    for line in lines:
+        print(printable(line).encode(encoding, errors="backslashreplace").decode(encoding))
+    sys.stdout.flush()
+
+
 def flush() -> None:
     """Write what has been printed, so that a failure is noticed before the process ends."""
     if sys.stdout is not None:
@@ -101,7 +112,7 @@ def flush() -> None:
 def fail(message: str, status: int = USAGE) -> int:
     """Print one sentence to standard error and give back the exit status."""
     # Names of files may hold line breaks and the codes by which terminals are controlled, or be as long as a page.
-    shown = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in message)
+    shown = printable(message)
     shown = shown if len(shown) <= LONGEST else f"{shown[:LONGEST]}…"
     with suppress(OSError, ValueError):  # standard error is closed or full: the status has to do
         print(f"facediff: error: {shown}", file=sys.stderr, flush=True)

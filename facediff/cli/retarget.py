@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import Map, Output, Picture, SourceOptions, check_picture_path
 from facediff.cli.parsing import Option
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def retarget(
 
         draw_correspondence(show, own, made, found)
         written.append(show)
-    print("\n".join([*map(str, written), *remarks(own, made, found)]))
+    tell(*written, *remarks(own, made, found))
 
 
 def remarks(animation: Animation, made: Animation, found: Correspondence) -> list[str]:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from facediff.cli.options import Checkpoint, Identity, Output
 from facediff.cli.parsing import Option
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 
 
@@ -41,5 +42,5 @@ def extract(
 
     with atomic(output) as temporary, temporary.open("wb") as stream:
         np.save(stream, vector.numpy(), allow_pickle=False)
-    print(f"{output}: style vector of {len(vector)} numbers from {', '.join(clips)}, for this checkpoint only")
-    print(f"next: facediff animate speech.wav --checkpoint {checkpoint} --style {output} -o speech.mp4")
+    tell(f"{output}: style vector of {len(vector)} numbers from {', '.join(clips)}, for this checkpoint only")
+    tell(f"next: facediff animate speech.wav --checkpoint {checkpoint} --style {output} -o speech.mp4")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import Animations, File, Output, SourceOptions, with_different_names
 from facediff.cli.parsing import Option
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 
@@ -63,7 +64,7 @@ def view(
     write_page(output, shown, max_mb=max_mb, truth=None if truth is None else 0)
     size = output.stat().st_size / 1e6
     counted = "1 animation" if len(shown) == 1 else f"{len(shown)} animations"
-    print(f"{output}: {len(shown[0].vertices)} frames of {counted}, {size:.1f} MB; open it in a browser")
+    tell(f"{output}: {len(shown[0].vertices)} frames of {counted}, {size:.1f} MB; open it in a browser")
     if open:
         import webbrowser
 

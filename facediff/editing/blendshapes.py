@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +15,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.mesh.mesh import triangle_areas
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
-from facediff.utils.plain_files import write_table
+from facediff.utils.plain_files import json_text, write_table
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -440,6 +439,7 @@ def _write_both(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]
     # Both names are checked before either file is written.
     for file in (path, path.with_suffix(".json")):
         check_writable(file)
+    text = json_text(path.with_suffix(".json"), about) + "\n"
     with atomic(path.with_suffix(".json")) as companion, atomic(path) as temporary:
         write_table(temporary, [header, *rows])
-        companion.write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        companion.write_text(text, encoding="utf-8")

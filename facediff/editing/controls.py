@@ -53,13 +53,17 @@ class AnimationControls:
             raise FaceDiffError(
                 f"--eyes {self.eyes}: no such file; expected .json or .npz (see docs/animation_controls.md)"
             )
-        procedural = (self.blinks, self.gaze, self.sway) != (None, None, None)
         for option, idle, users in (
-            ("--controls-seed", self.seed is not None and not procedural, "--blinks, --gaze or --sway"),
+            ("--controls-seed", self.seed is not None and not self.is_procedural, "--blinks, --gaze or --sway"),
             ("--eyes", self.eyes is not None and self.is_off, "--expressiveness, --blinks or --gaze"),
         ):
             if idle:
                 raise FaceDiffError(f"{option}: has no effect without {users}; give one of them, or omit it")
+
+    @property
+    def is_procedural(self) -> bool:
+        """Whether something is drawn at random: blinks, gaze or sway."""
+        return (self.blinks, self.gaze, self.sway) != (None, None, None)
 
     @property
     def is_off(self) -> bool:

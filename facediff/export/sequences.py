@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.export.format import ExportOptions, Format, Space, facts, folder_of
 from facediff.registry import export_format
+from facediff.utils.plain_files import json_text
 
 RECORD = "sequence.json"  # The file that tells a folder of frames from any other folder
 
@@ -38,7 +38,7 @@ class MeshSequence(Format):
         record["files"] = f"{path.stem}_{'#' * digits}{path.suffix}"
         if options.speech_file is not None:
             record["speech"] = options.speech_file
-        (folder / RECORD).write_bytes(json.dumps(record, ensure_ascii=False, indent=1).encode())
+        (folder / RECORD).write_bytes(json_text(path, record).encode())
 
     def encoder(self, animation: Animation, space: Space) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A function that gives a file's bytes from a frame's positions (V, 3)."""

@@ -74,6 +74,7 @@ class AnimationPipeline:
 
     Args:
         options: the choices.
+        seed: the one that recordings will be animated with; refused if it decides nothing.
 
     Raises:
         FaceDiffError: if the checkpoint, the style or another option cannot be used.
@@ -84,7 +85,7 @@ class AnimationPipeline:
         pipeline.write(read_recording(Path("speech.wav")), "speech", Path("speech.mp4"), seed=0)
     """
 
-    def __init__(self, options: AnimationOptions) -> None:
+    def __init__(self, options: AnimationOptions, *, seed: int = 0) -> None:
         from facediff.models import load_model
         from facediff.models.styles import read_styles
 
@@ -94,6 +95,11 @@ class AnimationPipeline:
             raise FaceDiffError(
                 f"--samples {options.samples}: {type(self.model).__name__} makes one animation, whatever the "
                 f"seed; omit the option"
+            )
+        controls = options.controls
+        if seed and not self.model.samples and (controls.seed is not None or not controls.is_procedural):
+            raise FaceDiffError(
+                f"--seed {seed}: {type(self.model).__name__} makes one animation, whatever the seed; omit the option"
             )
         if options.sampler is not None or options.steps is not None:
             self.model.choose_sampler(options.sampler, options.steps)
@@ -105,7 +111,7 @@ class AnimationPipeline:
         self.identity = options.identity or self.model.identities[0]
         facts = facts_of(self.model.assets, self.identity)
         corpus = self.model.assets.corpus
-        options.controls.check(facts["template"], facts["faces"], facts["regions"], f"the checkpoint's corpus {corpus}")
+        controls.check(facts["template"], facts["faces"], facts["regions"], f"the checkpoint's corpus {corpus}")
         self._correspondence: Correspondence | None = None
         self.style: Reference | Style | None = None
         if options.style:

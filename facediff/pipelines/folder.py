@@ -112,7 +112,7 @@ def _deciding_files(options: AnimationOptions) -> list[Path]:
 
 def _load_pipeline(options: AnimationOptions, seed: int, max_seconds: float | None, _command: list[str]) -> Animate:
     """Load what all recordings have in common, once in each process."""
-    pipeline = AnimationPipeline(options)
+    pipeline = AnimationPipeline(options, seed=seed)
 
     def animate(recording: Path, output: Path) -> None:
         speech = read_recording(recording, max_seconds)

@@ -41,7 +41,7 @@ def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_00
 
     import torch
 
-    pipeline = AnimationPipeline(options)
+    pipeline = AnimationPipeline(options, seed=seed)
     model = pipeline.model
     plan = model.windows
     template = model.assets.template(pipeline.identity)

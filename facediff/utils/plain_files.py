@@ -112,11 +112,31 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
+def json_text(
+    path: Path | str, content: Mapping[str, Any], *, indent: int | None = 1, ensure_ascii: bool = False
+) -> str:
+    """An object as the text of a JSON file, which has no words for numbers that are not finite.
+
+    Raises:
+        FaceDiffError: naming the file, if a number is NaN or infinite.
+    """
+    try:
+        return json.dumps(content, indent=indent, ensure_ascii=ensure_ascii, allow_nan=False)
+    except ValueError as error:
+        raise FaceDiffError(
+            f"{path}: would hold a number that is NaN or infinite; expected finite inputs, check them"
+        ) from error
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write an object as JSON, whole or not at all; equal objects give equal bytes."""
+    """Write an object as JSON, whole or not at all; equal objects give equal bytes.
+
+    Raises:
+        FaceDiffError: if a number is NaN or infinite.
+    """
+    text = json_text(path, content) + "\n"
     with atomic(path) as temporary:
         # Bytes of a file name that are no UTF-8 become the escapes by which JSON names them; they come back on reading.
-        text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 

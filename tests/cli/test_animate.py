@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from facediff.animation import read_archive
 from facediff.cli.app import main
 from facediff.data.audio import read_speech
 from facediff.mesh import read_mesh
-from facediff.models import load_model
+from facediff.models import DualPathDiffusion, load_model
 from tests.fakes.words import last_of_each
 
 
@@ -102,6 +103,27 @@ def test_bad_speech(
 def bad_reference(folder: Path) -> Path:
     np.save(folder / "other.npy", np.zeros((9, 31, 3), np.float32))
     return folder / "other.npy"
+
+
+@pytest.mark.parametrize("command", [["speech.wav"], ["-", "--stream"], ["folder"]])
+def test_a_seed_that_decides_nothing_is_refused(
+    command: list[str],
+    speech: Path,
+    checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(DualPathDiffusion, "samples", False)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    shutil.copy(speech, "folder")
+    words = ["--checkpoint", checkpoint, "-o", "out" if command == ["folder"] else "x.npy", "--seed", 3]
+    words += ["--suffix", ".npy", "--workers", 1] if command == ["folder"] else []
+    assert animate(*command, *words) in (1, 2)
+    told = capsys.readouterr()
+    assert "--seed 3" in told.out + told.err + "".join(path.read_text() for path in tmp_path.glob("out/*.csv"))
+    assert not list(tmp_path.rglob("*.npy"))
 
 
 @pytest.mark.parametrize(

@@ -142,6 +142,12 @@ def test_regions_come_from_masks_and_weights(tmp_path: Path) -> None:
     assert read_region("upper_face", 3, source="all").count == 3
 
 
+@pytest.mark.parametrize("option", [["--lip-pairs", "1-2"], ["--frame-rate", "25"]])
+def test_an_option_of_metrics_needs_a_metric(option: list[str], shared_files: Files) -> None:
+    with pytest.raises(FaceDiffError, match=option[0]):
+        evaluate(shared_files.method(), shared_files.root, *option)
+
+
 def test_metrics_with_options_or_mistakes(shared_files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--bootstrap", "0", "--json", "-", "--metric", "lip_vertex_error:squared=false"]
     words += ["--metric", "lip_opening_correlation", "--lip-pairs", "1-2,7-11"]

@@ -358,3 +358,13 @@ def test_a_folder_that_may_not_be_written_is_refused_before_a_writer_has_its_own
     monkeypatch.setattr(os, "access", lambda path, mode: not (Path(path) == tmp_path and mode == os.W_OK))
     with pytest.raises(FaceDiffError, match=r"a\.yaml"), atomic(tmp_path / "a.yaml"):
         raise TypeError("path is not creatable")
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
+def test_no_json_holds_numbers_that_json_does_not_know(number: float, tmp_path: Path) -> None:
+    path = tmp_path / "report.json"
+    write_json(path, {"rate": 1.0})
+    with pytest.raises(FaceDiffError, match="report.json"):
+        write_json(path, {"rates": [{"rate": number}]})
+    assert path.read_text() == '{\n "rate": 1.0\n}\n'
+    assert list(tmp_path.iterdir()) == [path]
