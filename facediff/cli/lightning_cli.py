@@ -130,6 +130,8 @@ IDLE_WARNINGS = (
     ".*isinstance.treespec, LeafSpec.*",
     # The throughput monitor is there for clips a second.
     ".*define a `flops_per_batch` attribute",
+    # A config without a seed gets 0, and its run folder says so.
+    "No seed found, seed set to 0",
     # Frozen layers are in evaluation mode on purpose: no dropout.
     r"Found \d+ module\(s\) in eval mode at the start of training",
 )

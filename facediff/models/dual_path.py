@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -138,7 +137,9 @@ class DualPathDiffusion(AnimationModel):
         }
         self.noise_scale: NoiseScale = noise_scale
         self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
-        self._sampler_factory: SamplerFactory = sampler
+        # Not the factory itself: jsonargparse's holds the parser, and with it the trainer and its processes, which
+        # weight averaging would copy together with the model.
+        self._sampler_options: dict[str, Any] | None = None
         self.sampler = sampler(process=self.process)
         self.sampling_space: SamplingSpace = sampling_space
         self.motion_space = motion_space(n_vertices=self.n_vertices, steps=diffusion_steps)
@@ -182,7 +183,9 @@ class DualPathDiffusion(AnimationModel):
     def rescale_noise(self, scale: float) -> None:
         """Noise motion at another scale from now on."""
         self.process = NoiseProcess(self.process.steps, self.process.schedule, scale)
-        self.sampler = self._sampler_factory(process=self.process)
+        options = self._sampler_options
+        options = self.hparams["sampler"]["init_args"] if options is None else options
+        self.sampler = type(self.sampler)(process=self.process, **options)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the measured noise scale."""
@@ -210,8 +213,8 @@ class DualPathDiffusion(AnimationModel):
         options = dict(self.hparams["sampler"]["init_args"]) if name is None else {}
         if steps is not None:
             options["steps"] = steps
-        self._sampler_factory = partial(chosen, **options)
-        self.sampler = self._sampler_factory(process=self.process)
+        self._sampler_options = options
+        self.sampler = chosen(process=self.process, **options)
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Noise each clip to a random step (algorithm 1, lines 3 and 4), then take the four losses (eq. 15 to 19)."""
