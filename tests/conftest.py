@@ -6,7 +6,7 @@ import os
 from jaxtyping import install_import_hook
 
 SHAPED = "audio_encoders speaker_encoders mesh_encoders fusions decoders layers losses samplers folding"
-SHAPED += " losses_fused"
+SHAPED += " losses_fused motion_space"
 install_import_hook([f"facediff.models.{module}" for module in SHAPED.split()], "beartype.beartype")
 
 os.environ["HF_HUB_OFFLINE"] = "1"
@@ -31,6 +31,14 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Tiny tensors are faster on one thread, and much faster where something else keeps the other cores busy.
 torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def seed_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A seed that one test sets, which Lightning keeps in the environment, is not that of the next one."""
+    for name in ("PL_GLOBAL_SEED", "PL_SEED_WORKERS"):
+        monkeypatch.setenv(name, "0")  # so that it is put back, whatever a test makes of it
+        monkeypatch.delenv(name)
 
 
 @pytest.fixture(scope="session")

@@ -33,6 +33,7 @@ from facediff.models.checkpoint import read_checkpoint
 from facediff.registry import checks_arguments
 from facediff.utils.files import atomic
 from facediff.utils.ranges import Range
+from facediff.utils.torch_files import load_tensors, open_checkpoint
 
 TRAIN = RunningStage.TRAINING
 
@@ -75,7 +76,21 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         Raises:
             FaceDiffError: if it is no checkpoint of facediff's, or names anything that is not known.
         """
+        if Path(path).name == TRANSFER and (weights := only_weights(Path(path))) is not None:
+            return weights
         return read_checkpoint(path)
+
+
+TRANSFER = ".temp.ckpt"
+"""The name under which Lightning hands weights from a forked process to the one that started it."""
+
+
+def only_weights(path: Path) -> dict[str, Any] | None:
+    """What a file holds if that is tensors by name and nothing else, which names no class and no option."""
+    with open_checkpoint(path) as (stream, name):
+        content = load_tensors(stream, name)
+    plain = isinstance(content, dict) and all(isinstance(value, torch.Tensor) for value in content.values())
+    return content if plain else None
 
 
 class Stopped(SystemExit):

@@ -239,3 +239,15 @@ def test_the_curve_of_an_earlier_run_stays_until_rows_replace_it(tmp_path: Path)
     again.log_metrics({"new": 4.0}, step=0)
     again.save()
     assert rows(tmp_path) == [{"new": "4.0", "step": "0"}]
+
+
+def test_weights_from_a_forked_process_come_back_and_nothing_else_does(tmp_path: Path) -> None:
+    plugin, path = AtomicCheckpointIO(), tmp_path / ".temp.ckpt"
+    plugin.save_checkpoint({"a": torch.ones(3)}, path)
+    assert plugin.load_checkpoint(path)["a"].tolist() == [1.0, 1.0, 1.0]
+    plugin.save_checkpoint({"a": torch.ones(3), "hyper_parameters": {"_class_path": "os.system"}}, path)
+    with pytest.raises(FaceDiffError, match=r"\.temp\.ckpt"):
+        plugin.load_checkpoint(path)
+    plugin.save_checkpoint({"a": torch.ones(3)}, tmp_path / "other.ckpt")
+    with pytest.raises(FaceDiffError, match=r"other\.ckpt"):
+        plugin.load_checkpoint(tmp_path / "other.ckpt")

@@ -321,8 +321,8 @@ def test_animate_takes_a_folder(
     for name in ("A_e01", "B_e02"):
         shutil.copy(tiny_root / "wav" / f"{name}.wav", folder)
     (folder / "broken.wav").write_text("no sound")
-    words = ["--checkpoint", str(checkpoint), "--sway", "3", "--style", "A_e02:1,B_e02:1", "--seed", "3", "--quiet"]
-    command = ["animate", str(folder), *words, "--suffix", ".npz", "--workers", "1", "-o", str(out)]
+    words = ["--checkpoint", str(checkpoint), "--sway", "3", "--style", "A_e02:1,B_e02:1", "--quiet"]
+    command = ["animate", str(folder), *words, "--seed", "3", "--suffix", ".npz", "--workers", "1", "-o", str(out)]
     assert main(command) == 1
     assert "3 recordings: 2 made, 1 failed" in capsys.readouterr().out
     seed = seed_of_recording(folder / "A_e01.wav", 3)

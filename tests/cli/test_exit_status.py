@@ -59,6 +59,7 @@ def test_signals_remove_what_is_half_written(number: signal.Signals, status: int
         "def run(*_):\n"
         "    with atomic(pathlib.Path('out.npy')) as temporary:\n"
         "        temporary.touch(); print('ready', flush=True); time.sleep(60)\n"
+        "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"  # as nohup would have it ignored
         "app.run = run; sys.argv = ['facediff', 'demo']; sys.exit(app.main())"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

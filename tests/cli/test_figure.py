@@ -181,7 +181,7 @@ WRONG = {
     "span": (["lips", "--span", "3", "1"], "--span 3 1"),
     "span without a frame": (["lips", "--span", "0.03", "0.05"], "the middle of no frame"),
     "audio": (["lips", "--audio", "gone.wav"], "gone.wav: no such sound file"),
-    "phoneme file": (["lips", "--phoneme-file", "gone.csv"], "gone.csv: not readable as phonemes"),
+    "phoneme file": (["lips", "--phoneme-file", "gone.csv"], "gone.csv: not readable as"),
     "rate": (["lips", "--frame-rate", "-3"], "--frame-rate -3"),
     "rate of zero": (["error", "--frame-rate", "0"], "--frame-rate 0"),
     "truth not there": (["figure", "error", "ours", "gone", "-o", "a.png"], "gone: no such folder"),

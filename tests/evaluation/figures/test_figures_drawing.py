@@ -167,14 +167,14 @@ def test_a_known_motion_has_the_colours_of_its_numbers(
     assert top < bottom
 
 
-def test_the_end_of_a_scale() -> None:
+def test_the_end_of_a_scale(own_material: Material, tmp_path: Path) -> None:
     values = {"a": np.array([0.001, 0.002]), "b": np.array([0.004, 0.0])}
     assert scale_end(values, 1000, None) == pytest.approx(4)
     assert scale_end(values, 1000, 2.5) == 2.5
     assert scale_end({"a": np.zeros(3)}, 1000, None) == 1
     for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(FaceDiffError, match="above 0"):
-            scale_end(values, 1000, wrong)
+        with pytest.raises(FaceDiffError, match="highest"):
+            draw_error(own_material, ["A_e06"], tmp_path / "error.png", highest=(wrong, None))
 
 
 def test_pictures_are_white_around_and_as_large_as_asked(own_material: Material) -> None:
@@ -223,7 +223,7 @@ def test_unknown_suffixes(suffix: str, tmp_path: Path) -> None:
         check_output(tmp_path / f"figure{suffix}")
 
 
-@pytest.mark.parametrize(("options", "match"), [({"width": 3}, "--width"), ({"dpi": 5000}, "--dpi")])
+@pytest.mark.parametrize(("options", "match"), [({"width": 3}, "Paper.width"), ({"dpi": 5000}, "Paper.dpi")])
 def test_paper_of_no_size(options: dict[str, int], match: str) -> None:
     with pytest.raises(FaceDiffError, match=match):
         Paper(**options)
@@ -240,13 +240,13 @@ def test_fonts(tmp_path: Path) -> None:
 def test_options_of_curves_that_cannot_be(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     for weight in (1.0, -0.1, float("nan")):
-        with pytest.raises(FaceDiffError, match="--smooth"):
+        with pytest.raises(FaceDiffError, match="smoothing"):
             draw_training(RUNS, ["val/lve"], path, smoothing=weight)
     below = {"one": {"x": Curve(np.arange(3.0), -np.arange(3.0))}}
     with pytest.raises(FaceDiffError, match="--log"):
         draw_training(below, ["x"], path, log=True)
     for span in ((1.0, 0.5), (3.0, 4.0), (-1.0, 1.0)):
-        with pytest.raises(FaceDiffError, match="--span"):
+        with pytest.raises(FaceDiffError, match="span"):
             draw_lips(LIPS, Sound(), path, span=span)
     assert list(tmp_path.iterdir()) == []
 
