@@ -515,9 +515,16 @@ def _locked_folder(folder: Path) -> Iterator[bool | None]:
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    """SHA-256 of a file's bytes, in hexadecimal.
+
+    Raises:
+        FaceDiffError: if the file cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); check who may read it") from error
 
 
 def describe_files(

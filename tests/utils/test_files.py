@@ -368,3 +368,10 @@ def test_no_json_holds_numbers_that_json_does_not_know(number: float, tmp_path: 
         write_json(path, {"rates": [{"rate": number}]})
     assert path.read_text() == '{\n "rate": 1.0\n}\n'
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_checksum_of_what_cannot_be_read_names_it(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="gone"):
+        sha256(tmp_path / "gone")
+    with pytest.raises(FaceDiffError, match=tmp_path.name):
+        sha256(tmp_path)
