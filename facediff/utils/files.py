@@ -301,8 +301,11 @@ def _try_to_write(path: Path) -> None:
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(path))
     _sweep(folder)  # of probes, since nothing else may ever be written here
     probe = folder / _partial(path).name
-    probe.touch()
-    probe.unlink()
+    try:
+        probe.touch()
+    finally:  # also where a signal ends the command right here
+        with suppress(OSError):
+            probe.unlink()
 
 
 # What killed processes leave. A partial file is named  .NAME.partial-HOST-PROCESS-START-TOKEN.SUFFIX
