@@ -85,6 +85,10 @@ def _attempt(
         if disk_full or isinstance(error, SetupError | MissingExtraError):
             return Outcome(problem=str(error), fatal=True)
         outcome = Outcome(problem=str(error))
+    except OSError as error:
+        if error.errno in NO_SPACE:
+            return Outcome(problem=f"{task}: {error.strerror}", fatal=True)
+        outcome = Outcome(problem=f"{task}: {error.strerror or error}; check that it exists and may be used")
     except Exception as error:
         if not survive_bugs:
             error.add_note(f"while working on {task}")
@@ -179,8 +183,10 @@ class FileTask:
         return record if parts and all(isinstance(part, dict) for part in parts) else None
 
     def _same_source(self, known: Mapping[str, Any]) -> bool:
-        """By path, size and time; where path or time differ, by the content."""
+        """By path, size and time; where path or time differ, by the content. What could not be read is tried again."""
         stat = _stat(self.source)
+        if not known.get("sha256"):
+            return False
         return all(known.get(name) == value for name, value in stat.items()) or (
             known.get("bytes") == stat.get("bytes") is not None and known.get("sha256") == _digest(self.source)
         )

@@ -89,8 +89,24 @@ def atomic(path: Path) -> Iterator[Path]:
                 os.replace(temporary, where.path)
                 _note_swept(where.path.parent)
             finally:
-                with suppress(OSError):  # never written, or renamed
-                    temporary.unlink()
+                discard(temporary)  # never written, or renamed, or to be given up
+
+
+def discard(path: Path) -> None:
+    """Remove a file or folder, if it is there, also where a signal ends the command while it is being removed."""
+    try:
+        _remove(path)
+    except BaseException:  # a signal; it comes once
+        _remove(path)
+        raise
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 @contextmanager
@@ -141,11 +157,12 @@ def scratch_folder(path: Path, *, private: bool = False) -> Iterator[Path]:
             unnamed = folder.with_name(f"{folder.name}{UNLOCKED}")
             unnamed.mkdir(mode=0o700 if private or where.special else 0o777)
             with _locked_folder(unnamed):
-                unnamed.rename(folder)
                 try:
+                    unnamed.rename(folder)
                     yield folder
                 finally:
-                    shutil.rmtree(folder, ignore_errors=True)
+                    discard(folder)
+                    discard(unnamed)
 
 
 def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
@@ -303,9 +320,8 @@ def _try_to_write(path: Path) -> None:
     probe = folder / _partial(path).name
     try:
         probe.touch()
-    finally:  # also where a signal ends the command right here
-        with suppress(OSError):
-            probe.unlink()
+    finally:
+        discard(probe)
 
 
 # What killed processes leave. A partial file is named  .NAME.partial-HOST-PROCESS-START-TOKEN.SUFFIX

@@ -23,6 +23,7 @@ from facediff.utils.files import (
     atomic_folder,
     check_writable,
     describe_files,
+    discard,
     locked,
     put_in_place,
     same_sizes,
@@ -375,3 +376,29 @@ def test_a_checksum_of_what_cannot_be_read_names_it(tmp_path: Path) -> None:
         sha256(tmp_path / "gone")
     with pytest.raises(FaceDiffError, match=tmp_path.name):
         sha256(tmp_path)
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_what_is_given_up_is_removed_though_a_signal_comes_meanwhile(
+    folder: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal raises wherever the command is, also at the first step of removing."""
+    path = tmp_path / "partial"
+    if folder:
+        path.mkdir()
+        (path / "part").touch()
+    else:
+        path.touch()
+    came: list[int] = []
+    whole = Path.is_dir
+
+    def is_dir(self: Path, **options: bool) -> bool:
+        if not came:
+            came.append(1)
+            raise KeyboardInterrupt
+        return whole(self, **options)
+
+    monkeypatch.setattr(Path, "is_dir", is_dir)
+    with pytest.raises(KeyboardInterrupt):
+        discard(path)
+    assert list(tmp_path.iterdir()) == []
