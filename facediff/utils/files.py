@@ -95,13 +95,13 @@ def atomic(path: Path) -> Iterator[Path]:
 def discard(path: Path) -> None:
     """Remove a file or folder, if it is there, also where a signal ends the command while it is being removed."""
     try:
-        _remove(path)
+        _remove_any(path)
     except BaseException:  # a signal; it comes once
-        _remove(path)
+        _remove_any(path)
         raise
 
 
-def _remove(path: Path) -> None:
+def _remove_any(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
