@@ -95,13 +95,13 @@ def atomic(path: Path) -> Iterator[Path]:
 def discard(path: Path) -> None:
     """Remove a file or folder, if it is there, also where a signal ends the command while it is being removed."""
     try:
-        _remove_any(path)
+        _remove(path)
     except BaseException:  # a signal; it comes once
-        _remove_any(path)
+        _remove(path)
         raise
 
 
-def _remove_any(path: Path) -> None:
+def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -427,14 +427,6 @@ def _is_running(process: int) -> bool:
     except (OSError, OverflowError):  # somebody else's process
         return True
     return True
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with suppress(OSError):
-            path.unlink()
 
 
 def remove_partial(folder: Path, stem: str = "*", *, recursive: bool = False) -> None:
