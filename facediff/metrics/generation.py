@@ -14,18 +14,17 @@ import torch
 from torch import Tensor
 
 from facediff.metrics.base import (
-    BatchOptions,
     Clip,
     Clips,
-    Inferred,
     Pooling,
     SequenceMetric,
     SequenceOptions,
     check_option,
     functional,
 )
+from facediff.metrics.one_pass import ErrorOf, one_pass
 from facediff.metrics.regions import RegionLike
-from facediff.metrics.samples import SAMPLES_GIVEN, align_samples
+from facediff.metrics.samples import OfSamples
 from facediff.registry import metric
 
 
@@ -114,35 +113,8 @@ class MotionLiveliness(RatioMetric):
         return ratio.sqrt()
 
 
-class _SamplesRatio(RatioMetric):
-    needs: ClassVar[tuple[str, ...]] = ("samples",)
-    inferred: ClassVar[Inferred] = SAMPLES_GIVEN
-
-    def __init__(
-        self, region: RegionLike | None, *, definition: str, n_samples: int, **options: Unpack[SequenceOptions]
-    ) -> None:
-        if n_samples < 2:
-            raise ValueError(f"n_samples is {n_samples}; expected at least 2")
-        super().__init__(region, definition=f"of {n_samples} samples, {definition}", **options)
-        self.n_samples = n_samples
-
-    def update(self, samples: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> None:
-        """Add a batch of sequences.
-
-        Args:
-            samples: Predictions (batch, samples, frames, vertices, 3), or of one sequence (samples, frames,
-                vertices, 3), floating point.
-            truth: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
-            **batch: Those of `BatchOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
-
-        Raises:
-            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
-        """
-        self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
-
-
 @metric.register("spread_error_ratio")
-class SpreadErrorRatio(_SamplesRatio):
+class SpreadErrorRatio(OfSamples, RatioMetric):
     """Spread over error: how far two samples are apart, as a share of how far a sample is from the truth.
 
     Σ mean_{i<j} d(x_i, x_j) / Σ mean_i d(x_i, y), with d(a, b) = Σ_t mean_v ‖a_v[t] − b_v[t]‖₂ and sums over sequences.
@@ -160,19 +132,24 @@ class SpreadErrorRatio(_SamplesRatio):
     1.0
     """
 
+    needs: ClassVar[tuple[str, ...]] = ("samples",)
     divides_by = "every sample equals the truth"
 
     def __init__(
         self, region: RegionLike | None = None, *, n_samples: int = 4, **options: Unpack[SequenceOptions]
     ) -> None:
-        words = "mean distance between two of them, over that between one and the truth, over {region}"
-        super().__init__(region, definition=words, n_samples=n_samples, **options)
+        words = f"of {n_samples} samples, mean distance between two of them, over that between one and the truth, over "
+        super().__init__(n_samples=n_samples, region=region, definition=f"{words}{{region}}", **options)
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Distances between samples, and between samples and truth, summed over frames."""
-        several, truth = _of(clip.prediction, self.indices), _of(clip.truth, self.indices)
-        between = [_apart(several[:, i], several[:, j]) for i, j in combinations(range(several.shape[1]), 2)]
-        off = [_apart(sample, truth) for sample in several.unbind(1)]
+        several, error = clip.prediction, ErrorOf(self.indices, "mean", squared=False)
+
+        def apart(one: Tensor, other: Tensor) -> Tensor:
+            return one_pass(one, other, errors=[error])[0][0] * clip.frames
+
+        between = [apart(several[:, i], several[:, j]) for i, j in combinations(range(several.shape[1]), 2)]
+        off = [apart(sample, clip.truth) for sample in several.unbind(1)]
         return torch.stack(between).mean(), torch.stack(off).mean()
 
 
@@ -181,7 +158,7 @@ Unit = Literal["frames", "sequences"]
 
 
 @metric.register("energy_score")
-class EnergyScore(SequenceMetric):
+class EnergyScore(OfSamples):
     """Energy score: a proper score of samples against the truth; no collapsed or over-dispersed model can win it.
 
     ES = mean_i ‖x_i − y‖ − ½ mean_{i≠j} ‖x_i − x_j‖, the multivariate form of the continuous ranked probability score
@@ -203,7 +180,6 @@ class EnergyScore(SequenceMetric):
 
     higher_is_better = False
     needs: ClassVar[tuple[str, ...]] = ("samples",)
-    inferred: ClassVar[Inferred] = SAMPLES_GIVEN
 
     def __init__(
         self,
@@ -215,26 +191,9 @@ class EnergyScore(SequenceMetric):
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("of", of, Unit)
-        if n_samples < 2:
-            raise ValueError(f"n_samples is {n_samples}; expected at least 2")
         words = f"energy score of {n_samples} samples, vectors being {of} of {{region}}; {{pooling}} [unit]"
-        super().__init__(definition=words, pooling=pooling, region=region, **options)
-        self.n_samples = n_samples
+        super().__init__(n_samples=n_samples, definition=words, pooling=pooling, region=region, **options)
         self.of: Unit = of
-
-    def update(self, samples: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> None:
-        """Add a batch of sequences.
-
-        Args:
-            samples: Predictions (batch, samples, frames, vertices, 3), or of one sequence (samples, frames,
-                vertices, 3), floating point.
-            truth: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
-            **batch: Those of `BatchOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
-
-        Raises:
-            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
-        """
-        self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The score of one sequence, mean over its frames."""
@@ -253,11 +212,6 @@ class EnergyScore(SequenceMetric):
 def _of(motion: Tensor, indices: Tensor | None) -> Tensor:
     """A region of motion (frames, …, vertices, 3) in float64, in memory of its own."""
     return motion.to(torch.float64, copy=True) if indices is None else motion.index_select(-2, indices).double()
-
-
-def _apart(one: Tensor, other: Tensor) -> Tensor:
-    """The mean distance of the vertices, summed over frames."""
-    return torch.linalg.vector_norm(one - other, dim=-1).mean(-1).sum()
 
 
 motion_liveliness = functional(MotionLiveliness)

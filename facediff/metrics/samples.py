@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import ClassVar, Literal, Unpack
+from typing import Any, ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
@@ -70,37 +70,24 @@ SAMPLES_GIVEN: Inferred = {"n_samples": lambda given: given["samples"].shape[-4]
 """How a function reads the number of samples from what it is given."""
 
 
-class SamplesMetric(SequenceMetric):
-    """Base of lip errors over several samples of each sequence.
+class OfSamples(SequenceMetric):
+    """Base of metrics that compare several samples of each sequence with its truth.
 
     Args:
-        lips: Lip vertices, a `Region` or indices.
-        n_samples: N, how many samples there are of each sequence; other numbers are refused.
-        squared: Whether distances are squared; the score is then in the vertices' unit squared.
+        n_samples: How many samples there are of each sequence; other numbers are refused.
+        **options: Those of the next base class.
     """
 
-    higher_is_better = False
-    needs = ("lips", "samples")
-    inferred: ClassVar[Inferred] = SAMPLES_GIVEN
-    indices: Tensor
+    fewest: ClassVar[int] = 2
+    """The smallest number of samples that have a value."""
 
-    def __init__(
-        self,
-        lips: RegionLike,
-        *,
-        n_samples: int = 10,
-        squared: bool = True,
-        pooling: Pooling = "frames",
-        **options: Unpack[SequenceOptions],
-    ) -> None:
-        if n_samples < 1:
-            raise ValueError(f"n_samples is {n_samples}; expected at least 1")
-        distance, unit = ("squared distance", "unit²") if squared else ("distance", "unit")
-        words = f"{self.words}, in each frame the largest {distance} over {{region}}; {{pooling}} [{unit}]"
-        words = words.replace("{samples}", f"{n_samples} samples")
-        super().__init__(definition=words, pooling=pooling, region=as_region(lips, "lips"), **options)
+    inferred: ClassVar[Inferred] = SAMPLES_GIVEN
+
+    def __init__(self, *, n_samples: int, **options: Any) -> None:  # noqa: ANN401 - whatever that takes
+        if n_samples < self.fewest:
+            raise ValueError(f"n_samples is {n_samples}; expected at least {self.fewest}")
+        super().__init__(**options)
         self.n_samples = n_samples
-        self.squared = squared
 
     def update(self, samples: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> None:
         """Add a batch of sequences.
@@ -115,6 +102,37 @@ class SamplesMetric(SequenceMetric):
             ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
         """
         self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
+
+
+class SamplesMetric(OfSamples):
+    """Base of lip errors over several samples of each sequence.
+
+    Args:
+        lips: Lip vertices, a `Region` or indices.
+        n_samples: N, how many samples there are of each sequence; other numbers are refused.
+        squared: Whether distances are squared; the score is then in the vertices' unit squared.
+    """
+
+    higher_is_better = False
+    needs = ("lips", "samples")
+    fewest = 1
+    indices: Tensor
+
+    def __init__(
+        self,
+        lips: RegionLike,
+        *,
+        n_samples: int = 10,
+        squared: bool = True,
+        pooling: Pooling = "frames",
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        distance, unit = ("squared distance", "unit²") if squared else ("distance", "unit")
+        words = f"{self.words}, in each frame the largest {distance} over {{region}}; {{pooling}} [{unit}]"
+        words = words.replace("{samples}", f"{n_samples} samples")
+        lip_region = as_region(lips, "lips")
+        super().__init__(n_samples=n_samples, definition=words, pooling=pooling, region=lip_region, **options)
+        self.squared = squared
 
 
 @metric.register("mean_estimate_error")

@@ -124,7 +124,8 @@ def half_hidden(
         importance: what each contributes to the variance of the motion; ``variances`` if None.
     """
     own = variances.double()
-    shares = (own if importance is None else importance.double()) / (own if importance is None else importance).sum()
+    counted = own if importance is None else importance.double()
+    shares = counted / counted.sum()
     low, high = -60.0, 60.0  # of ln b²; the share that shows rises with it
     for _ in range(100):
         middle = (low + high) / 2
