@@ -27,6 +27,7 @@ from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
 from facediff.models.inference import Inference, Prediction, WindowPlan
 from facediff.models.mesh_encoders import MeshEncoder
+from facediff.models.principal import PrincipalComponents
 from facediff.registry import COMPONENTS, component_class, defaults, describe, keeps_arguments, plain
 from facediff.utils.ranges import Range, Vertices
 
@@ -317,10 +318,13 @@ class AnimationModel(LightningModule, Inference, ABC):
         }
         # Measured on the training split once; a resumed or adapted model keeps the scale that its weights know.
         scale = self._assets.motion_scale if self._assets is not None else None
+        untrained = self._assets is None and stage == "fit"
         if scale is None and stage == "fit":
             scale = data.motion_scale()
         self.adopt(data.assets().with_motion_scale(scale))
         self.attach_mesh()
+        if untrained:
+            self.measure(data)
         if stage != "predict":
             self.evaluation.prepare(
                 self,
@@ -347,6 +351,27 @@ class AnimationModel(LightningModule, Inference, ABC):
         template = self.assets.templates[min(self.assets.templates)]
         for encoder in waiting:
             encoder.attach(mesh_hierarchy(template.numpy(), self.assets.faces.numpy(), **encoder.mesh_options))
+
+    def measure(self, data: SpeechMotionDataModule) -> None:
+        """Take from the training split what a model that was never trained needs: principal components of motion.
+
+        Args:
+            data: set up for training.
+
+        Raises:
+            FaceDiffError: if some are needed and the training motion never changes.
+        """
+        waiting = [module for module in self.modules() if isinstance(module, PrincipalComponents)]
+        if not waiting:
+            return
+        weights = self.motion_weights().flatten()
+        mean, shapes = data.principal_motion(max(module.count for module in waiting), weights)
+        for module in waiting:
+            module.attach(mean * self.scale, shapes * self.scale, weights)
+
+    def motion_weights(self) -> Float[Tensor, "vertices 3"]:
+        """What motion is multiplied by before its principal components are taken."""
+        return torch.ones(self.n_vertices, 3)
 
     # Checkpoints.
 

@@ -92,6 +92,8 @@ class DualPathDiffusion(AnimationModel):
             sampler or a network that cannot be folded runs on the vertices anyway.
         diffusion_steps: noising steps N.
         noise_schedule: ``squaredcos_cap_v2`` (the cosine schedule), ``linear`` or ``scaled_linear``.
+        noise_draws: how often a clip is noised in a training step, each time to another step with other noise; speech
+            and style are encoded once for all of them.
         noise_scale: what motion is multiplied by before it is noised; ``auto`` measures on the training split at which
             scale half of its variance shows in the schedule's middle.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
@@ -119,6 +121,7 @@ class DualPathDiffusion(AnimationModel):
         sampling_space: SamplingSpace = "folded",
         diffusion_steps: Annotated[int, Range(1, 100_000)] = 1000,
         noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
+        noise_draws: Annotated[int, Range(1, 64)] = 1,
         noise_scale: NoiseScale = 1.0,
         style_tokens: TokenForm = "levels",
         identity_dropout: Share = 0.1,
@@ -135,6 +138,7 @@ class DualPathDiffusion(AnimationModel):
             "acceleration": acceleration_weight,
             "face": face_weight,
         }
+        self.noise_draws = noise_draws
         self.noise_scale: NoiseScale = noise_scale
         self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
         # Not the factory itself: jsonargparse's holds the parser, and with it the trainer and its processes, which
@@ -161,24 +165,22 @@ class DualPathDiffusion(AnimationModel):
             nn.init.zeros_(self.network.unembed.weight)
             nn.init.zeros_(self.network.unembed.bias)
 
-    def setup(self, stage: str) -> None:
-        """Measure the training motion for a model that was never trained: its components, and how much noise hides."""
-        new = self._assets is None
-        super().setup(stage)
+    def measure(self, data: SpeechMotionDataModule) -> None:
+        """Besides principal components, how much noise hides of the training motion."""
+        super().measure(data)
         space = self.motion_space
-        if stage != "fit" or not new or not (space.principal or self.noise_scale == "auto"):
-            return
-        data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        weights = torch.ones(self.n_vertices, 3)
-        for region, weight in space.region_weights.items():
-            weights[self.assets.regions[region]] = weight
-        mean, shapes = data.principal_motion(max(PRINCIPAL, space.coordinates), weights.flatten())
-        if space.principal:
-            space.attach(mean * self.scale, shapes[: space.coordinates] * self.scale, weights.flatten())
         if self.noise_scale == "auto":
+            _, shapes = data.principal_motion(PRINCIPAL, self.motion_weights().flatten())
             variances = (shapes * self.scale).square().sum(1)
             self.rescale_noise(half_hidden(space.noised_variances(variances), variances))
         space.fit(self.process.signal)
+
+    def motion_weights(self) -> Float[Tensor, "vertices 3"]:
+        """The motion space's weights of regions."""
+        weights = super().motion_weights()
+        for region, weight in self.motion_space.region_weights.items():
+            weights[self.assets.regions[region]] = weight
+        return weights
 
     def rescale_noise(self, scale: float) -> None:
         """Noise motion at another scale from now on."""
@@ -218,48 +220,63 @@ class DualPathDiffusion(AnimationModel):
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Noise each clip to a random step (algorithm 1, lines 3 and 4), then take the four losses (eq. 15 to 19)."""
-        device, shape = batch.motion.device, (*batch.motion.shape[:2], self.motion_space.coordinates)
-        step = self.process.draw_steps(len(batch), device, generator)
+        device, count = batch.motion.device, len(batch) * self.noise_draws
+        step = self.process.draw_steps(count, device, generator)
+        shape = (count, batch.motion.shape[1], self.motion_space.coordinates)
         return self.losses_at(batch, step, unit_noise(shape, device, generator))
 
     def losses_at(
-        self, batch: Batch, step: Int[Tensor, " batch"], noise: Float[Tensor, "batch frames coordinates"]
+        self, batch: Batch, step: Int[Tensor, " draws"], noise: Float[Tensor, "draws frames coordinates"]
     ) -> dict[str, Tensor]:
         """The losses at given steps with given noise, which is overwritten.
 
         Args:
             batch: clips with their true motion.
-            step: each clip's step, counted from 0.
-            noise: unit noise.
+            step: each draw's step, counted from 0; one draw of every clip, or several of the first, of the second ….
+            noise: unit noise of every draw.
         """
+        space = self.motion_space
+        conditions, motion, mask = self.conditions(batch), batch.motion, batch.mask
+        if space.preconditioning is not None:
+            motion = space.encode(motion * self.scale)
+        draws = len(step) // len(batch)
+        if draws > 1:
+            conditions = conditions.drawn(draws)
+            motion, mask = motion.repeat_interleave(draws, 0), mask.repeat_interleave(draws, 0)
+        if space.preconditioning is not None:
+            return self._preconditioned_losses(conditions, motion, mask, step, noise, space.preconditioning)
         network = self.network
-        if self.motion_space.preconditioning is not None:
-            return self._preconditioned_losses(batch, step, noise)
         # √ᾱ M⁰ + √(1 − ᾱ) ε, as NoiseProcess.add_noise, but in place: on a processor, allocating tensors of this size
         # takes longer than the arithmetic.
         signal = self.process.signal.to(noise.device)[step][:, None, None]
-        noisy = noise.mul_((1 - signal).sqrt()).addcmul_(batch.motion.flatten(2), signal.sqrt() * self.scale)
-        decoded = network.core(network.embed(noisy), step, self.conditions(batch))
+        noisy = noise.mul_((1 - signal).sqrt()).addcmul_(motion.flatten(2), signal.sqrt() * self.scale)
+        decoded = network.core(network.embed(noisy), step, conditions)
         return fused_losses(
             decoded,
             network.unembed.weight,
             network.unembed.bias,
-            batch.motion,
-            batch.mask,
+            motion,
+            mask,
             self.assets.regions["upper_face"],
             self.loss_weights,
             scale=self.scale,
         )
 
-    def _preconditioned_losses(self, batch: Batch, step: Tensor, noise: Tensor) -> dict[str, Tensor]:
-        space, preconditioning = self.motion_space, self.motion_space.preconditioning
-        assert preconditioning is not None  # noqa: S101 - for the type checker
-        clean = space.encode(batch.motion * self.scale)
+    def _preconditioned_losses(
+        self,
+        conditions: Conditions,
+        clean: Float[Tensor, "draws frames coordinates"],
+        mask: Bool[Tensor, "draws frames"],
+        step: Int[Tensor, " draws"],
+        noise: Float[Tensor, "draws frames coordinates"],
+        scales: Preconditioning,
+    ) -> dict[str, Tensor]:
+        """The losses in a space of known variances."""
         noisy = self.process.add_noise(clean, noise, step)
-        embedded = self.network.embed(preconditioning.into[step][:, None] * noisy)
-        features = self.network.clean_motion(self.network.core(embedded, step, self.conditions(batch)))
-        predicted = preconditioning.clean(noisy, features, step)
-        return preconditioned_losses(predicted, clean, batch.mask, preconditioning.loss[step], self.loss_weights)
+        embedded = self.network.embed(scales.into[step][:, None] * noisy)
+        features = self.network.clean_motion(self.network.core(embedded, step, conditions))
+        predicted = scales.clean(noisy, features, step)
+        return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
 
     def conditions(self, batch: Batch) -> Conditions:
         """Everything that is computed once per clip; in training, identities are hidden now and then."""
@@ -361,6 +378,11 @@ class Conditions:
     def frames(self, start: int, end: int) -> Conditions:
         """The conditions of some of the frames, with nothing prepared."""
         return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end])
+
+    def drawn(self, times: int) -> Conditions:
+        """The conditions of several noisy versions of every clip, those of a clip one after the other."""
+        audio, style, mask = (value.repeat_interleave(times, 0) for value in (self.audio, self.style, self.mask))
+        return Conditions(audio, style, mask)
 
     def repeated(self, times: int) -> Conditions:
         """One clip's conditions for several samples of it, with nothing prepared; nothing is copied."""

@@ -1,4 +1,4 @@
-"""Mesh encoders: the vertices of a frame to one feature, by one linear map or by spiral convolutions."""
+"""Mesh encoders: the vertices of a frame to one feature, by a linear map of them or of components, or by spirals."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from facediff.errors import FaceDiffError
 from facediff.models.layers import Frames, Share, Width
+from facediff.models.principal import PrincipalComponents
 from facediff.registry import mesh_encoder
 from facediff.utils.ranges import Range, Vertices
 
@@ -88,6 +89,31 @@ class LinearMeshEncoder(MeshEncoder):
         """The feature of each frame."""
         check_vertices(motion, self.n_vertices)
         return self.map(motion.flatten(2))
+
+
+@mesh_encoder.register("components")
+class ComponentMeshEncoder(MeshEncoder):
+    """One linear map of a frame's principal components, each of unit variance.
+
+    In X = Linear(M_ref) on vertices, what the map learns of a movement grows with the movement's size: it sees the jaw
+    and hardly the lids and brows, by which people differ as well. Here all movements come alike.
+
+    Args:
+        dim: channels of a frame's feature; given by the model.
+        n_vertices: vertices of the mesh; given by the model.
+        count: components.
+    """
+
+    def __init__(self, *, dim: Width, n_vertices: Vertices, count: Annotated[int, Range(1, 4096)] = 64) -> None:
+        super().__init__()
+        self.n_vertices = n_vertices
+        self.components = PrincipalComponents(n_vertices, count)
+        self.map = nn.Linear(count, dim)
+
+    def forward(self, motion: Motion) -> Frames:
+        """The feature of each frame."""
+        check_vertices(motion, self.n_vertices)
+        return self.map(self.components.project(motion))
 
 
 class SpiralDown(nn.Module):

@@ -1,7 +1,7 @@
 """The motion that a diffusion model noises: all vertices, as in the paper, or principal components of the corpus.
 
 From top to bottom: the two spaces, and the preconditioning that a space with known variances makes possible. Choosing
-``components`` changes three things at once, each an option of its own:
+``components`` changes three things at once:
 
 - A frame is a few dozen numbers, whatever the mesh.
 - The noise hides the motion: vertices move together, so independent noise on thousands of them averages out, and a
@@ -14,14 +14,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Protocol
+from typing import Annotated, Protocol
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.errors import FaceDiffError
 from facediff.models.layers import Share
+from facediff.models.principal import SMALLEST, PrincipalComponents
 from facediff.models.samplers import Steps
 from facediff.registry import motion_space
 from facediff.utils.ranges import Range, Vertices
@@ -34,47 +34,29 @@ Coordinates = Float[Tensor, "batch frames coordinates"]
 
 RegionWeight = Annotated[float, Range(1e-3, 1e3)]
 
-SMALLEST = 1e-4
-"""Components below this share of the first one's deviation are treated as if they had it."""
-
 
 class MotionSpace(nn.Module, ABC):
     """A linear image of motion, in which it is noised and denoised.
-
-    Class attributes:
-        principal: whether :meth:`attach` must be called with the principal components of the training motion.
 
     Attributes:
         coordinates: numbers in a frame.
         preconditioning: the scales around the network; None if it predicts clean motion itself.
     """
 
-    principal: ClassVar[bool] = False
     coordinates: int
     preconditioning: Preconditioning | None
 
     @property
     def region_weights(self) -> Mapping[str, float]:
-        """Weights of regions, by name, in the principal components that :meth:`attach` gets."""
+        """What motion is multiplied by before its principal components are taken, by the region's name."""
         return {}
-
-    def attach(  # noqa: B027 - a space that needs no data has nothing to do
-        self, mean: Float[Tensor, " all"], shapes: Float[Tensor, "components all"], weights: Float[Tensor, " all"]
-    ) -> None:
-        """Take over the training motion's statistics.
-
-        Args:
-            mean: mean of all coordinates, 3V, scaled.
-            shapes: principal components of weighted motion, each as long as its standard deviation, largest first.
-            weights: what each coordinate was multiplied by.
-        """
 
     def noised_variances(self, variances: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
         """Variances of principal components as the noise sees them, from those of the motion."""
         return variances
 
     def fit(self, signal: Float[Tensor, " steps"]) -> None:  # noqa: B027
-        """Take over the noise process, once motion is known.
+        """Take over the noise process, once the principal components are known.
 
         Args:
             signal: ᾱ of every step.
@@ -138,11 +120,6 @@ class ComponentMotion(MotionSpace):
         lips_weight: the same for the lips.
     """
 
-    principal: ClassVar[bool] = True
-    mean: Tensor
-    basis: Tensor
-    weights: Tensor
-    deviations: Tensor
     sizes: Tensor
 
     def __init__(
@@ -159,11 +136,7 @@ class ComponentMotion(MotionSpace):
         self.coordinates = count
         self.whitening = whitening
         self._region_weights = {"upper_face": upper_face_weight, "lips": lips_weight}
-        # Shapes follow from the sizes alone, since weight averaging copies the module before a corpus is known.
-        self.register_buffer("mean", torch.zeros(3 * n_vertices))
-        self.register_buffer("basis", torch.zeros(count, 3 * n_vertices))
-        self.register_buffer("weights", torch.ones(3 * n_vertices))
-        self.register_buffer("deviations", torch.ones(count))
+        self.components = PrincipalComponents(n_vertices, count)
         self.register_buffer("sizes", torch.ones(count))
         self.preconditioning: Preconditioning = Preconditioning(steps, count)
 
@@ -172,45 +145,27 @@ class ComponentMotion(MotionSpace):
         """Those of upper face and lips."""
         return self._region_weights
 
-    def attach(
-        self, mean: Float[Tensor, " all"], shapes: Float[Tensor, "components all"], weights: Float[Tensor, " all"]
-    ) -> None:
-        """Keep mean, unit components and their deviations; components that the corpus does not have stay zero.
-
-        Raises:
-            FaceDiffError: if the training motion never changes.
-        """
-        deviations = torch.linalg.vector_norm(shapes, dim=1)
-        if not len(deviations) or not float(deviations[0]) > 0:
-            raise FaceDiffError("motion_space=components: the training motion never changes, so it has no components")
-        self.mean.copy_(mean)
-        self.weights.copy_(weights)
-        self.basis.zero_()[: len(shapes)] = shapes / deviations[:, None]
-        smallest = SMALLEST * float(deviations[0])
-        self.deviations.fill_(smallest)[: len(shapes)] = deviations.clamp_min(smallest)
-        share = self.deviations / self.deviations[0]
-        self.sizes.copy_(self.deviations[0] * share ** (1 - self.whitening))
-
     def noised_variances(self, variances: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
         """Sizes squared, of as many components as there are."""
-        return variances[0] * (variances / variances[0]).clamp_min(SMALLEST**2) ** (1 - self.whitening)
+        return self._sizes(variances.sqrt()).square()
+
+    def _sizes(self, deviations: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
+        share = (deviations / deviations[0]).clamp_min(SMALLEST)
+        return deviations[0] * share ** (1 - self.whitening)
 
     def fit(self, signal: Float[Tensor, " steps"]) -> None:
         """Precondition the network by each component's own variance."""
-        self.preconditioning.fit(signal, self.sizes.square(), (self.deviations / self.sizes).square())
+        deviations = self.components.deviations
+        self.sizes.copy_(self._sizes(deviations))
+        self.preconditioning.fit(signal, self.sizes.square(), (deviations / self.sizes).square())
 
     def encode(self, motion: Offsets) -> Coordinates:
         """Components of weighted offsets from the mean, in the sizes that are noised."""
-        with torch.autocast(motion.device.type, enabled=False):
-            centred = (motion.flatten(2) - self.mean) * self.weights
-            return centred @ self.basis.T * (self.sizes / self.deviations)
+        return self.components.project(motion) * self.sizes
 
     def decode(self, coordinates: Coordinates) -> Offsets:
         """The mean and the sum of the components."""
-        with torch.autocast(coordinates.device.type, enabled=False):
-            back = coordinates.to(self.basis.dtype) * (self.deviations / self.sizes)
-            motion = (back @ self.basis) / self.weights + self.mean
-            return motion.view(*motion.shape[:2], -1, 3)
+        return self.components.expand(coordinates / self.sizes)
 
 
 class Preconditioning(nn.Module):

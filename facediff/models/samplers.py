@@ -134,6 +134,49 @@ def half_hidden(
     return math.exp(middle / 2)
 
 
+Spacing = Literal["steps", "log_snr"]
+LastNoise = Annotated[float, Range(1e-6, 1e6)]
+
+
+def visited(process: NoiseProcess, steps: int, spacing: Spacing, last_noise: float | None) -> list[int]:
+    """Which steps of the process a sampler visits, counted from 0, from pure noise downwards.
+
+    Args:
+        process: the noise process.
+        steps: how many.
+        spacing: ``steps`` spreads them evenly over the process; ``log_snr`` over the logarithm of the signal-to-noise
+            ratio, the time of the solvers, so that few steps go to as little noise as many do.
+        last_noise: noise left at the last of them, as a deviation in the unit of the motion, √((1 − ᾱ) / ᾱ); None for
+            where the spacing itself ends.
+
+    Raises:
+        FaceDiffError: if the process has less signal than that in its noisiest step.
+    """
+    if spacing == "steps" and last_noise is None:
+        # From the end of the process, since sampling starts from pure noise; the clean end itself is no step.
+        return [round(process.steps * (steps - i) / steps) - 1 for i in range(steps)]
+    kept = process.signal.double()
+    snr = torch.log(kept / (1 - kept)) / 2  # falls from step to step
+    cleanest = 0 if last_noise is None else int((snr + math.log(last_noise)).abs().argmin())
+    if process.steps - 1 - cleanest < steps - 1:
+        raise ArgumentError(
+            {"last_noise": last_noise, "steps": steps, "diffusion_steps": process.steps},
+            f"there are {process.steps - cleanest} steps with at least that much noise; "
+            f"choose less noise or fewer sampling steps",
+        )
+    found: list[int] = []
+    for i in range(steps):
+        share = i / max(1, steps - 1)
+        if spacing == "steps":
+            nearest = round((process.steps - 1) + share * (cleanest - process.steps + 1))
+        else:
+            nearest = int((snr - (snr[-1] + share * (snr[cleanest] - snr[-1]))).abs().argmin())
+        # Each step once, and room for those that follow.
+        nearest = min(nearest, found[-1] - 1) if found else process.steps - 1
+        found.append(max(nearest, cleanest + steps - 1 - i))
+    return found
+
+
 PART = 2**21
 """How many numbers one random stream draws on a processor."""
 
@@ -180,9 +223,11 @@ class Sampler(ABC):
     Args:
         process: the noise process to reverse.
         steps: denoising steps; at most the process's own number.
+        spacing: how they are spread over the process, see :func:`visited`.
+        last_noise: noise left at the last of them, see :func:`visited`.
 
     Attributes:
-        timesteps: the steps visited, counted from 0: evenly spread, from the process's last (pure noise) downwards.
+        timesteps: the steps visited, counted from 0, from the process's last (pure noise) downwards.
         signal: ᾱ at each of them, and 1 for the clean end.
 
     Raises:
@@ -199,15 +244,16 @@ class Sampler(ABC):
     linear: ClassVar[bool] = False
     memory: ClassVar[int] = 1
 
-    def __init__(self, process: NoiseProcess, steps: int) -> None:
+    def __init__(
+        self, process: NoiseProcess, steps: int, spacing: Spacing = "steps", last_noise: float | None = None
+    ) -> None:
         if not 1 <= steps <= process.steps:
             raise ArgumentError(
                 {"steps": steps, "diffusion_steps": process.steps}, f"expected 1 to {process.steps} sampling steps"
             )
         self.process = process
         self.steps = steps
-        # From the end of the process, since sampling starts from pure noise; the clean end itself is no step.
-        self.timesteps = [round(process.steps * (steps - i) / steps) - 1 for i in range(steps)]
+        self.timesteps = visited(process, steps, spacing, last_noise)
         self.signal = [*(float(process.signal[n]) for n in self.timesteps), 1.0]
 
     def run(
@@ -259,8 +305,11 @@ class DdimSampler(Sampler):
 
     Args:
         process: the noise process; given by the model.
-        steps: denoising steps, spread evenly and starting from pure noise.
+        steps: denoising steps.
         eta: noise added per step, as a share of ancestral sampling's.
+        spacing: ``steps`` spreads them evenly over the process, ``log_snr`` over the logarithm of its signal-to-noise
+            ratio.
+        last_noise: noise left at the last of them, as a deviation in the unit of scaled motion.
 
     Raises:
         FaceDiffError: if the number of steps or eta is impossible.
@@ -268,8 +317,16 @@ class DdimSampler(Sampler):
 
     linear: ClassVar[bool] = True
 
-    def __init__(self, *, process: NoiseProcess, steps: Steps = 25, eta: Share = 0.0) -> None:
-        super().__init__(process, steps)
+    def __init__(
+        self,
+        *,
+        process: NoiseProcess,
+        steps: Steps = 25,
+        eta: Share = 0.0,
+        spacing: Spacing = "steps",
+        last_noise: LastNoise | None = None,
+    ) -> None:
+        super().__init__(process, steps, spacing, last_noise)
         self.eta = eta
 
     def update(self, i: int, noisy: Tensor, predictions: Sequence[Tensor], noise: NoiseSource) -> Tensor:
@@ -296,10 +353,20 @@ class DdpmSampler(DdimSampler):
     Args:
         process: the noise process; given by the model.
         steps: denoising steps; all of the process's if None.
+        spacing: as for ``ddim``.
+        last_noise: as for ``ddim``.
     """
 
-    def __init__(self, *, process: NoiseProcess, steps: Steps | None = None) -> None:
-        super().__init__(process=process, steps=process.steps if steps is None else steps, eta=1.0)
+    def __init__(
+        self,
+        *,
+        process: NoiseProcess,
+        steps: Steps | None = None,
+        spacing: Spacing = "steps",
+        last_noise: LastNoise | None = None,
+    ) -> None:
+        count = process.steps if steps is None else steps
+        super().__init__(process=process, steps=count, eta=1.0, spacing=spacing, last_noise=last_noise)
 
 
 @sampler.register("dpm_solver")
@@ -310,6 +377,9 @@ class DpmSolverSampler(Sampler):
         process: the noise process; given by the model.
         steps: denoising steps.
         order: order of the solver, 1 to 3.
+        spacing: ``steps`` spreads them evenly over the process, ``log_snr`` over the logarithm of its signal-to-noise
+            ratio.
+        last_noise: noise left at the last of them, as a deviation in the unit of scaled motion.
 
     Raises:
         FaceDiffError: if the number of steps or the order is impossible.
@@ -318,8 +388,16 @@ class DpmSolverSampler(Sampler):
     linear: ClassVar[bool] = True
     memory: ClassVar[int] = 3
 
-    def __init__(self, *, process: NoiseProcess, steps: Steps = 5, order: Literal[1, 2, 3] = 2) -> None:
-        super().__init__(process, steps)
+    def __init__(
+        self,
+        *,
+        process: NoiseProcess,
+        steps: Steps = 5,
+        order: Literal[1, 2, 3] = 2,
+        spacing: Spacing = "steps",
+        last_noise: LastNoise | None = None,
+    ) -> None:
+        super().__init__(process, steps, spacing, last_noise)
         self.order = order
         signal = self.signal[:-1]
         self.signal_rate = [math.sqrt(kept) for kept in signal]

@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.mesh.hierarchy import MeshHierarchy, mesh_hierarchy
-from facediff.models.mesh_encoders import MeshEncoder, SpiralMeshEncoder
+from facediff.models.mesh_encoders import ComponentMeshEncoder, MeshEncoder, SpiralMeshEncoder
+from facediff.models.principal import PrincipalComponents
 from tests.fakes.meshes import relief
 
 DIM, ROWS, COLUMNS = 7, 14, 12
@@ -40,6 +41,11 @@ def make(hierarchy: Hierarchy) -> Callable[..., MeshEncoder]:
         encoder: MeshEncoder = registry.mesh_encoder.get(name)(dim=DIM, n_vertices=VERTICES, **options)
         if not encoder.attached:
             encoder.attach(hierarchy(**encoder.mesh_options))
+        for part in encoder.modules():
+            if isinstance(part, PrincipalComponents):
+                frames = motion(1, 80)[0].flatten(1)
+                _, sizes, shapes = torch.linalg.svd(frames - frames.mean(0), full_matrices=False)
+                part.attach(frames.mean(0), sizes[:, None] * shapes / len(frames) ** 0.5, torch.ones(3 * VERTICES))
         assert encoder.attached
         return encoder
 
@@ -76,6 +82,17 @@ def test_mesh_encoder_gradient_reaches_parameters_and_motion(name: str, make: Ca
     assert inputs.grad is not None
     # Down-sampling may select vertices, but their spirals reach nearly all of the others.
     assert (inputs.grad.abs().sum((0, 1, 3)) > 0).float().mean() > 0.9
+
+
+def test_components_see_small_movements_as_large_ones(make: Callable[..., MeshEncoder]) -> None:
+    encoder = make("components")
+    assert isinstance(encoder, ComponentMeshEncoder)
+    part, names = encoder.components, range(0, 64, 9)
+    still = part.mean.view(1, 1, VERTICES, 3)
+    for k in names:  # one deviation of a component, in whatever size, is one unit of its own input of the map
+        moved = still + (part.deviations[k] * part.basis[k]).view(1, 1, VERTICES, 3)
+        change = encoder(moved) - encoder(still)
+        torch.testing.assert_close(change[0, 0], encoder.map.weight[:, k], rtol=1e-3, atol=1e-5)
 
 
 def test_mean_pooling_sees_every_vertex(make: Callable[..., MeshEncoder]) -> None:

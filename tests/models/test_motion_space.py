@@ -39,7 +39,8 @@ def components(x: Tensor, weights: Tensor | None = None, **options: Any) -> Comp
     flat = x[0].flatten(1)
     weights = torch.ones(flat.shape[1]) if weights is None else weights
     _, sizes, shapes = torch.linalg.svd((flat - flat.mean(0)) * weights, full_matrices=False)
-    space.attach(flat.mean(0), (sizes[:, None] * shapes / len(flat) ** 0.5)[: space.coordinates], weights)
+    space.components.attach(flat.mean(0), sizes[:, None] * shapes / len(flat) ** 0.5, weights)
+    space.fit(NoiseProcess().signal)
     return space
 
 
@@ -80,7 +81,6 @@ def test_losses_weigh_components_as_their_vertices(whitening: float) -> None:
     x = motion()
     other = x + 0.1 * (x - x.mean(1, keepdim=True)).flip(1)  # within the components
     space = components(x, count=5, whitening=whitening)
-    space.fit(NoiseProcess().signal)
     squared = (space.encode(other) - space.encode(x)).square() * space.preconditioning.loss[500]
     error = (other - x).square().sum((2, 3))[0]
     ratio = squared.sum(-1)[0] / error
@@ -88,7 +88,7 @@ def test_losses_weigh_components_as_their_vertices(whitening: float) -> None:
 
 
 def test_motion_that_never_changes_has_no_components() -> None:
-    with pytest.raises(FaceDiffError, match="motion_space"):
+    with pytest.raises(FaceDiffError, match="motion_space=components"):
         components(torch.zeros(1, 5, 6, 3), count=3)
 
 
@@ -202,10 +202,11 @@ def test_training_measures_components_and_noise_scale(trained: DualPathDiffusion
     space = trained.motion_space
     assert isinstance(space, ComponentMotion)
     mean, shapes = tiny.principal_motion(6)
-    torch.testing.assert_close(space.mean, mean * trained.scale)
-    torch.testing.assert_close(space.deviations[0], shapes[0].norm() * trained.scale)
+    torch.testing.assert_close(space.components.mean, mean * trained.scale)
+    torch.testing.assert_close(space.components.deviations[0], shapes[0].norm() * trained.scale)
     variances = space.sizes.square() * trained.process.scale**2
-    share = space.deviations.square() / space.deviations.square().sum()
+    share = space.components.deviations.square()
+    share = share / share.sum()
     assert float((share * variances / (variances + 1)).sum()) == pytest.approx(0.5, abs=0.02)
     assert trained.sampler.process is trained.process
     torch.testing.assert_close(space.preconditioning.skip[0, :2], torch.ones(2), rtol=0.2, atol=0)
@@ -239,7 +240,7 @@ def test_the_upper_face_can_count_more(make_model: Make, make_trainer: Callable[
     make_trainer().fit(model, datamodule=tiny)
     space = model.motion_space
     assert isinstance(space, ComponentMotion)
-    weights = space.weights.view(-1, 3)
+    weights = space.components.weights.view(-1, 3)
     upper = model.assets.regions["upper_face"]
     assert (weights[upper] == 3).all()
     assert int((weights == 3).sum()) == 3 * len(upper)

@@ -1,0 +1,84 @@
+"""Principal components of the training motion, as a part of a model that is known before the corpus is."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from facediff.errors import FaceDiffError
+
+SMALLEST = 1e-4
+"""Components below this share of the first one's deviation are treated as if they had it."""
+
+
+class PrincipalComponents(nn.Module):
+    """Motion as numbers of unit variance that are uncorrelated over the training frames, largest movement first.
+
+    A model gives every one of its modules of this class the training motion's statistics when its first training
+    begins, and keeps them in its checkpoints. Shapes follow from the sizes alone, since weight averaging copies modules
+    before a corpus is known.
+
+    Args:
+        n_vertices: vertices V.
+        count: components K; motion outside them is lost.
+
+    Attributes:
+        mean: mean of all coordinates, (3V,), scaled.
+        basis: unit components of weighted motion, (K, 3V); zero where the corpus has fewer.
+        weights: what each coordinate is multiplied by before the components are taken, (3V,).
+        deviations: the components' standard deviations, (K,).
+    """
+
+    mean: Tensor
+    basis: Tensor
+    weights: Tensor
+    deviations: Tensor
+
+    def __init__(self, n_vertices: int, count: int) -> None:
+        super().__init__()
+        self.count = count
+        self.register_buffer("mean", torch.zeros(3 * n_vertices))
+        self.register_buffer("basis", torch.zeros(count, 3 * n_vertices))
+        self.register_buffer("weights", torch.ones(3 * n_vertices))
+        self.register_buffer("deviations", torch.ones(count))
+
+    def attach(
+        self, mean: Float[Tensor, " all"], shapes: Float[Tensor, "components all"], weights: Float[Tensor, " all"]
+    ) -> None:
+        """Take over the training motion's statistics.
+
+        Args:
+            mean: mean of all coordinates, 3V, scaled.
+            shapes: principal components of weighted motion, each as long as its standard deviation, largest first;
+                those beyond ``count`` are left out.
+            weights: what each coordinate was multiplied by.
+
+        Raises:
+            FaceDiffError: if the training motion never changes.
+        """
+        shapes = shapes[: self.count]
+        deviations = torch.linalg.vector_norm(shapes, dim=1)
+        if not len(deviations) or not float(deviations[0]) > 0:
+            raise FaceDiffError(
+                "the training motion never changes, so it has no principal components, which motion_space=components "
+                "and mesh_encoder=components need; check the corpus with `facediff data check`"
+            )
+        self.mean.copy_(mean)
+        self.weights.copy_(weights)
+        self.basis.zero_()[: len(shapes)] = shapes / deviations[:, None]
+        smallest = SMALLEST * float(deviations[0])
+        self.deviations.fill_(smallest)[: len(shapes)] = deviations.clamp_min(smallest)
+
+    def project(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames components"]:
+        """Components of scaled offsets from the template, each of unit variance over the training frames."""
+        with torch.autocast(motion.device.type, enabled=False):
+            centred = (motion.flatten(2) - self.mean) * self.weights
+            return centred @ self.basis.T / self.deviations
+
+    def expand(self, components: Float[Tensor, "batch frames components"]) -> Float[Tensor, "batch frames vertices 3"]:
+        """The scaled offsets that have these components, and are the mean beside them."""
+        with torch.autocast(components.device.type, enabled=False):
+            back = components.to(self.basis.dtype) * self.deviations
+            motion = (back @ self.basis) / self.weights + self.mean
+            return motion.view(*motion.shape[:2], -1, 3)
