@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch import Tensor
 from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.models import samplers
-from facediff.models.samplers import SCHEDULES, NoiseProcess, Sampler, unit_noise
+from facediff.models.samplers import SCHEDULES, DdimSampler, DpmSolverSampler, NoiseProcess, Sampler, unit_noise
 
 
 @pytest.mark.parametrize("steps", [10, 1000])
@@ -384,6 +385,58 @@ def test_timesteps_are_as_many_as_steps_and_descend(name: str, steps: int) -> No
     assert places[0] == 999
     assert places[-1] >= 0
     assert places == sorted(set(places), reverse=True)
+
+
+def log_snr(process: NoiseProcess, places: Sequence[int]) -> np.ndarray:
+    kept = process.signal.double().numpy()[list(places)]
+    return np.log(kept / (1 - kept)) / 2
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+@pytest.mark.parametrize("steps", [2, 5, 10])
+def test_log_snr_spacing_is_even_in_the_solvers_time(scale: float, steps: int) -> None:
+    process = NoiseProcess(scale=scale)
+    places = DpmSolverSampler(process=process, steps=steps, spacing="log_snr", last_noise=0.5).timesteps
+    assert places[0] == 999
+    assert len(set(places)) == len(places) == steps
+    times = log_snr(process, places)
+    assert math.exp(-times[-1]) == pytest.approx(0.5, rel=0.05)
+    # The noisiest steps of the process lie far apart in this time, so some cannot be met exactly.
+    even = np.linspace(times[0], times[-1], steps)
+    every = log_snr(process, range(1000))
+    nearest = np.abs(every[None] - even[:, None]).min(1)
+    # Where steps of the process are rarer than those wanted, each is visited once, and the next ones move on.
+    assert (np.abs(times - even) <= nearest + 0.05)[even > every[990]].all()
+
+
+@pytest.mark.parametrize("name", ["ddim", "dpm_solver", "ddpm"])
+@pytest.mark.parametrize("spacing", ["steps", "log_snr"])
+@pytest.mark.parametrize("steps", [1, 2, 60, 600])
+@pytest.mark.parametrize("last_noise", [None, 0.01, 0.3])
+def test_any_spacing_visits_each_step_once(name: str, spacing: str, steps: int, last_noise: float | None) -> None:
+    made = registry.sampler.get(name)(process=NoiseProcess(), steps=steps, spacing=spacing, last_noise=last_noise)
+    places = made.timesteps
+    assert len(places) == steps
+    assert places[0] == 999
+    assert places == sorted(set(places), reverse=True)
+    assert places[-1] >= 0
+    if last_noise is not None and steps > 1:
+        assert math.exp(-log_snr(made.process, places[-1:])[0]) == pytest.approx(last_noise, rel=0.2)
+    assert torch.equal(
+        DpmSolverSampler(process=made.process, steps=steps, spacing=spacing, last_noise=last_noise).run(
+            lambda noisy, step: torch.ones_like(noisy), torch.randn(2, 3)
+        ),
+        torch.ones(2, 3),
+    )
+
+
+def test_all_steps_are_all_steps_whatever_the_spacing() -> None:
+    assert DdimSampler(process=NoiseProcess(50), steps=50, spacing="log_snr").timesteps == list(range(49, -1, -1))
+
+
+def test_a_sampler_cannot_end_where_too_few_steps_are_left() -> None:
+    with pytest.raises(FaceDiffError, match="last_noise"):
+        DdimSampler(process=NoiseProcess(), steps=700, last_noise=1.0)
 
 
 def test_sampler_of_another_package_implements_update_alone() -> None:
