@@ -1,5 +1,6 @@
 """Callbacks: what happens around training and testing."""
 
+from facediff.callbacks.averaging import EmaWithWarmup
 from facediff.callbacks.checkpoints import LastCheckpoint
 from facediff.callbacks.dashboard import GradientNorm, RunDescription
 from facediff.callbacks.outputs import PredictionWriter, ScoreTable
@@ -8,6 +9,7 @@ from facediff.callbacks.speed import CompiledTraining, SpeechFeatureCache
 
 __all__ = [
     "CompiledTraining",
+    "EmaWithWarmup",
     "GradientNorm",
     "LastCheckpoint",
     "PredictionWriter",

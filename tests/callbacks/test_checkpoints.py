@@ -12,14 +12,10 @@ from pathlib import Path
 import lightning.pytorch as pl
 import pytest
 import torch
-from lightning.pytorch.callbacks import (
-    EMAWeightAveraging,
-    LearningRateMonitor,
-    ModelCheckpoint,
-    ThroughputMonitor,
-)
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ThroughputMonitor
 
 from facediff import registry
+from facediff.callbacks import EmaWithWarmup
 from facediff.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint, random_states, restore_random_states
 from facediff.callbacks.runs import ResumableCSVLogger
 from facediff.data.batch import clips_in
@@ -76,7 +72,7 @@ def fit(
         logger=logger,
         default_root_dir=folder,
         callbacks=[
-            EMAWeightAveraging(decay=0.9, use_buffers=False),
+            EmaWithWarmup(decay=0.6, warmup=3.0),
             ModelCheckpoint(monitor="val/lve", filename="best"),
             LearningRateMonitor(),
             ThroughputMonitor(clips_in),

@@ -1,0 +1,54 @@
+"""The moving average of the weights, with a warm-up: validation, previews and checkpoints use the averaged weights."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import torch
+from lightning.pytorch.callbacks import WeightAveraging
+from torch import Tensor
+
+from facediff.registry import checks_arguments
+from facediff.utils.ranges import Range
+
+
+class EmaWithWarmup(WeightAveraging):
+    """Exponential moving average of the weights whose decay rises from a small value to ``decay``.
+
+    After k averaged steps the decay is min(``decay``, (1 + k) / (``warmup`` + k)), as in TensorFlow's
+    ``ExponentialMovingAverage``. A constant decay d keeps the share dⁿ of the first, untrained weights after n steps:
+    a tenth for 0.999 and 2 350 steps. With the warm-up, the average is about that of the last 1 / (``warmup`` − 1) of
+    the steps until ``decay`` is reached, so it suits a training of any length.
+
+    Buffers are not averaged but taken over: they hold constants (filters, windows), which averaging would make drift.
+
+    Args:
+        decay: the largest decay.
+        warmup: how slowly the decay rises; 1 is a constant decay.
+        device: where the averaged weights are kept; the model's own device if None.
+    """
+
+    @checks_arguments
+    def __init__(
+        self,
+        decay: Annotated[float, Range(0, 1)] = 0.999,
+        warmup: Annotated[float, Range(1, 1e9)] = 10.0,
+        device: str | None = None,
+    ) -> None:
+        self.decay = decay
+        self.warmup = warmup
+        super().__init__(device=device, use_buffers=False, avg_fn=self.averaged)
+
+    def decay_at(self, step: Tensor) -> Tensor:
+        """The decay after a number of averaged steps."""
+        return ((1 + step) / (self.warmup + step)).clamp(max=self.decay)
+
+    def averaged(self, average: Tensor, current: Tensor, step: Tensor) -> Tensor:
+        """The new average of a weight.
+
+        Args:
+            average: the average so far.
+            current: the weight after the last optimiser step.
+            step: averaged steps so far, at least 1; on the weight's device, so that nothing waits for it.
+        """
+        return torch.lerp(average, current, (1 - self.decay_at(step.double())).to(average.dtype))
