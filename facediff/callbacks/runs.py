@@ -145,7 +145,7 @@ def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any]
         words: the command line.
     """
     run = None if path is None or trainer.logger is None else run_of(path)
-    place = re.compile(r"--trainer\.logger\.(init_args\.)?(save_dir|name|version)\b")
+    place = re.compile(r"--name\b|--trainer\.logger\.(init_args\.)?(save_dir|name|version)\b")
     if run is not None and any(place.match(word) for word in words):
         run = run if os.path.realpath(run.parent) == os.path.realpath(runs_folder(trainer)) else None
     if run is not None and not content:

@@ -39,6 +39,13 @@ def check_config(path: Path | str) -> None:
         raise FaceDiffError(f"{path}: holds no options (key: value); {expected}")
 
 
+def keys_of(path: Path | str) -> set[str]:
+    """The outermost keys of a config that :func:`check_config` has let through."""
+    # The node's tree is neither expanded nor made into objects.
+    root = yaml.compose(Path(path).read_text(encoding="utf-8-sig"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    return {str(key.value) for key, _ in root.value} if isinstance(root, yaml.MappingNode) else set()
+
+
 def guard_configs(mode: str) -> None:
     """Let jsonargparse check every YAML text of a parser mode before it reads it: also files that a config names."""
     from jsonargparse import set_loader

@@ -26,7 +26,8 @@ from facediff.utils.files import config_dir
 if TYPE_CHECKING:
     from facediff.cli.lightning_cli import FaceDiffCLI
 
-OPTIONS = ("config", "model", "data", "trainer", "seed_everything", "ckpt_path", "print_config", "weights_only", "help")
+OPTIONS = ("config", "name", "model", "data", "trainer", "seed_everything", "ckpt_path")
+OPTIONS += ("print_config", "weights_only", "help")
 OWN_OPTIONS = {"validate": ("verbose",), "test": ("verbose",), "predict": ("return_predictions",)}
 """What options begin with, of every subcommand and of some."""
 
@@ -72,7 +73,7 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     if os.getcwd() not in sys.path:  # a corpus or a component may be a file of the working folder
         sys.path.append(os.getcwd())
     with exit_statuses():
-        return run_lightning_cli(name, words)
+        return run_lightning_cli(name, words, experiment_name(words) or name)
 
 
 @contextmanager
@@ -218,6 +219,24 @@ def find_config(flag: str, value: str) -> str:
     near = difflib.get_close_matches(value, known, n=1)
     hint = f'did you mean "{near[0]}"?' if near else "the bundled ones are configs/experiment/puppet.yaml and others"
     raise FaceDiffError(f"--config {value}: no such file; {hint}")
+
+
+def experiment_name(words: Sequence[str]) -> str | None:
+    """The file name, without suffix, of the first config that says what is trained, or on what; None if none does.
+
+    Configs of callbacks or loggers alone, which are given in addition to an experiment's, do not name it.
+    """
+    from facediff.cli.configs import keys_of
+
+    files: list[str] = []
+
+    def note(flag: str, value: str) -> str:
+        if flag in ("-c", "--config") and os.path.isfile(value):  # noqa: PTH113 - a text may be no path at all
+            files.append(value)
+        return value
+
+    change_values(words, note)
+    return next((Path(file).stem for file in files if {"model", "data"} & keys_of(file)), None)
 
 
 def fresh_component(flag: str, value: str) -> str:

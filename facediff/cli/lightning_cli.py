@@ -26,6 +26,7 @@ from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from omegaconf import OmegaConf
 
 from facediff import registry
 from facediff.callbacks import GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
@@ -45,11 +46,20 @@ LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a model that the data module knows."""
 
 
-def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
-    """Run a subcommand whose words are checked and complete; see :func:`facediff.cli.lightning.run_cli`."""
+def run_lightning_cli(name: str, words: Sequence[str], experiment: str) -> FaceDiffCLI:
+    """Run a subcommand whose words are checked and complete; see :func:`facediff.cli.lightning.run_cli`.
+
+    Args:
+        name: of the subcommand.
+        words: its options.
+        experiment: what runs are called unless the option ``name`` says otherwise.
+    """
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     guard_configs("omegaconf+")
-    logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "runs", "name": name}}
+    # In place of ${name}, which jsonargparse makes relative to the file that it stands in, and then does not find.
+    OmegaConf.register_resolver("experiment_name", lambda *, _root_: _root_[name]["name"], replace=True)
+    options = {"save_dir": "runs", "name": "${experiment_name:}"}
+    logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": options}
     # Lightning starts the other processes of a distributed run with the words of this one.
     argv, sys.argv = sys.argv, [sys.argv[0], name, *words]
     try:
@@ -67,6 +77,7 @@ def run_lightning_cli(name: str, words: Sequence[str]) -> FaceDiffCLI:
                 parser_kwargs={"parser_mode": "omegaconf+"},
                 save_config_callback=RunConfig,
                 save_config_kwargs={"overwrite": True},
+                experiment=experiment,
             )
     except Exception as error:
         # jsonargparse wraps what a constructor raises; our own sentence is the useful one.
@@ -219,10 +230,20 @@ def subclasses(base: type) -> list[str]:
 
 
 class FaceDiffCLI(LightningCLI):
-    """LightningCLI whose model takes its sizes from the data module."""
+    """LightningCLI whose experiment has a name, and whose model takes its sizes from the data module."""
+
+    def __init__(self, *values: Any, experiment: str, **options: Any) -> None:  # noqa: ANN401 - the base class's
+        self.experiment = experiment
+        super().__init__(*values, **options)
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Let the model take its sizes from the data module."""
+        """Add the experiment's name, and let the model take its sizes from the data module."""
+        parser.add_argument(
+            "--name",
+            type=str,
+            default=self.experiment,
+            help="name of the experiment, and of the folder below runs/ that its runs are in",
+        )
         for name in LINKS:
             parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
 

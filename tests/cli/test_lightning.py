@@ -239,6 +239,39 @@ def test_a_component_chosen_by_name_starts_from_its_own_defaults(
 def test_every_shipped_experiment_is_parsed(config: str, capsys: pytest.CaptureFixture[str]) -> None:
     printed = print_config("--config", f"configs/experiment/{config}", capsys=capsys)
     assert printed["model"]["init_args"]["dim"]  # type: ignore[index]
+    assert printed["trainer"]["logger"]["init_args"]["name"] == config.removesuffix(".yaml")  # type: ignore[index]
+
+
+NAMED: dict[str, tuple[list[str], str]] = {
+    "a file of the user's": (["--config", "mine.yaml"], "mine"),
+    "the first of several files": (["--config", "mine.yaml", "--config", "other.yaml"], "mine"),
+    "a file of callbacks before it": (["--config", "extra.yaml", "--config", "mine.yaml"], "mine"),
+    "the option": (["--config", "mine.yaml", "--name=third"], "third"),
+    "a name in the file": (["--config", "named.yaml"], "chosen"),
+    "the logger's own": (["--config", "mine.yaml", "--trainer.logger.init_args.name=own"], "own"),
+    "no file": (["--model=DualPathDiffusion", "--data=Puppet"], "fit"),
+    "a list of loggers": (["--config", "configs/experiment/puppet.yaml", "--config", "loggers.yaml"], "puppet"),
+    "Weights & Biases": (["--config", "mine.yaml", "--config", "configs/logger/wandb.yaml"], "mine"),
+}
+
+
+@pytest.mark.parametrize("case", NAMED)
+def test_runs_carry_the_name_of_their_experiment(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mine = "model: DualPathDiffusion\ndata: Puppet\n"
+    loggers = "trainer:\n  logger:\n" + "".join(
+        f"    - class_path: lightning.pytorch.loggers.{kind}Logger\n      init_args: {{save_dir: runs}}\n"
+        for kind in ("CSV", "TensorBoard")
+    )
+    files = {"mine": mine, "other": mine, "named": f"name: chosen\n{mine}", "loggers": loggers}
+    for name, text in {**files, "extra": "trainer: {max_epochs: 3}\n"}.items():
+        (tmp_path / f"{name}.yaml").write_text(text)
+    words, expected = NAMED[case]
+    logger = print_config(*words, capsys=capsys)["trainer"]["logger"]  # type: ignore[index]
+    first = logger[0] if isinstance(logger, list) else logger
+    assert first["init_args"]["name"] == expected
 
 
 def test_configs_are_short() -> None:
@@ -255,7 +288,7 @@ def test_sub_configs_and_interpolation_with_a_flag_over_a_file(
         "    warmup_steps: ${trainer.max_epochs}\ndata: Puppet\ntrainer: {max_epochs: 7, accelerator: cpu}\n"
     )
     assert fit("--trainer.max_epochs=2", config=str(tmp_path / "mine.yaml")) == 0
-    made = tmp_path / "runs/fit/version_0/checkpoints/last.ckpt"
+    made = tmp_path / "runs/mine/version_0/checkpoints/last.ckpt"
     hparams = torch.load(made, weights_only=True)["hyper_parameters"]
     assert hparams["decoder"]["init_args"]["num_layers"] == 3
     # The file says 7; the flag must win also where its value is interpolated.
@@ -269,7 +302,7 @@ def test_wandb_offline_asks_nothing(fit: Fit, tmp_path: Path, monkeypatch: pytes
     logger = ["--config", "configs/logger/wandb.yaml"]
     assert fit(*logger) == 0
     assert len(list(tmp_path.glob("runs/wandb/offline-run-*/*.wandb"))) == 1
-    assert (tmp_path / "runs/experiment/version_0/checkpoints/best.ckpt").exists()
+    assert (tmp_path / "runs/puppet/version_0/checkpoints/best.ckpt").exists()
 
 
 def test_two_processes_train_together(tiny_root: Path, tmp_path: Path) -> None:
