@@ -82,6 +82,8 @@ class StyleTransformer(Decoder):
         num_heads: attention heads; ``dim / num_heads`` must be even for the rotary positions.
         feed_forward_factor: hidden width of the feed-forward as a multiple of ``dim``.
         dropout: dropout everywhere.
+        final_norm: one more LayerNorm after the last block, usual for pre-norm blocks. The paper's figure has none, and
+            without it the size of each frame's motion passes to the last map.
     """
 
     def __init__(
@@ -93,12 +95,13 @@ class StyleTransformer(Decoder):
         num_heads: Heads = 4,
         feed_forward_factor: Annotated[int, Range(1, 64)] = 4,
         dropout: Share = 0.1,
+        final_norm: bool = True,
     ) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(
             Block(dim, style_dim, num_heads, feed_forward_factor * dim, dropout) for _ in range(num_layers)
         )
-        self.norm = nn.LayerNorm(dim)
+        self.norm = nn.LayerNorm(dim) if final_norm else nn.Identity()
 
     def forward(
         self, fused: Frames, style: Tokens, mask: FrameMask, prepared: DecoderConstants | None = None
