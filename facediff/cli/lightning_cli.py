@@ -248,7 +248,14 @@ class FaceDiffCLI(LightningCLI):
             parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
 
     def before_instantiate_classes(self) -> None:
-        """Decide whether wandb uploads before anything starts it."""
+        """Check the experiment's name, and decide whether wandb uploads before anything starts it.
+
+        Raises:
+            ArgumentError: if the name is not that of a folder below that of all runs.
+        """
+        name = self._get(self.config, "name")
+        if not name or not name.isprintable() or os.path.isabs(name) or ".." in Path(name).parts:
+            raise ArgumentError({"name": name}, "expected the name of a folder for the runs", located=True)
         settle_wandb_mode(self.config[str(self.subcommand)].trainer)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:  # noqa: ANN401
