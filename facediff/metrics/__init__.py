@@ -24,7 +24,8 @@ class's docstring has the formula, its source, its unit, and what about it is a 
 - loudness: `ClipSpeechLipCorrelation` and `FrameSpeechLipCorrelation` (SLCC)
 - several samples: `MeanEstimateError`, `CoverageError`, `SampleDiversity`
 - does it generate: `MotionLiveliness`, `SpreadErrorRatio`, `EnergyScore`
-- several identities: `IdentityDiversity`, `StyleRetrievalAccuracy`
+- the eyes: `BlinkRate`, `BlinkRateRatio`
+- several identities: `IdentityDiversity`, `StyleRetrievalAccuracy`, `NearestSpeakerAccuracy`
 - speed: `RealTimeFactor`
 
 Lengths or masks say what is padding, which is never read. NaN and infinity are refused with the clip's name.
@@ -46,6 +47,10 @@ from facediff.metrics.by_name import Context as Context
 from facediff.metrics.by_name import Request as Request
 from facediff.metrics.by_name import feed as feed
 from facediff.metrics.by_name import parse as parse
+from facediff.metrics.eyes import BlinkRate as BlinkRate
+from facediff.metrics.eyes import BlinkRateRatio as BlinkRateRatio
+from facediff.metrics.eyes import blink_rate as blink_rate
+from facediff.metrics.eyes import blink_rate_ratio as blink_rate_ratio
 from facediff.metrics.generation import EnergyScore as EnergyScore
 from facediff.metrics.generation import MotionLiveliness as MotionLiveliness
 from facediff.metrics.generation import RatioMetric as RatioMetric
@@ -69,6 +74,7 @@ from facediff.metrics.protocols import ProtocolMetrics as ProtocolMetrics
 from facediff.metrics.protocols import Summary as Summary
 from facediff.metrics.protocols import protocol as protocol
 from facediff.metrics.regions import TOPOLOGIES as TOPOLOGIES
+from facediff.metrics.regions import EyelidPairs as EyelidPairs
 from facediff.metrics.regions import LipPairs as LipPairs
 from facediff.metrics.regions import Region as Region
 from facediff.metrics.regions import Topology as Topology
@@ -91,7 +97,10 @@ from facediff.metrics.speech import speech_intensity as speech_intensity
 from facediff.metrics.speed import RealTimeFactor as RealTimeFactor
 from facediff.metrics.speed import device_name as device_name
 from facediff.metrics.speed import real_time_factor as real_time_factor
+from facediff.metrics.style import NearestSpeakerAccuracy as NearestSpeakerAccuracy
+from facediff.metrics.style import SpeakerGallery as SpeakerGallery
 from facediff.metrics.style import StyleRetrievalAccuracy as StyleRetrievalAccuracy
+from facediff.metrics.style import nearest_speaker_accuracy as nearest_speaker_accuracy
 from facediff.metrics.style import style_retrieval_accuracy as style_retrieval_accuracy
 from facediff.metrics.timing import LipWarpingDistance as LipWarpingDistance
 from facediff.metrics.timing import TemporalMisalignment as TemporalMisalignment

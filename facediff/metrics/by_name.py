@@ -22,6 +22,8 @@ NEEDS: dict[str, str] = {
     "lips": "the lip vertices",
     "upper_face": "the upper-face vertices",
     "lip_pairs": "pairs of inner-lip vertices",
+    "lid_pairs": "pairs of eyelid vertices",
+    "gallery": "recordings of all speakers",
     "template": "each speaker's neutral face",
     "closures": "the times of bilabial phonemes",
     "speech": "the speech of each clip",
@@ -33,7 +35,8 @@ NEEDS: dict[str, str] = {
 }
 """What a metric may need, in words.
 
-The first three come as the constructor's ``lips``, ``upper`` and ``pairs``; ``speech`` as ``sample_rate`` and
+The regions come as the constructor's ``lips`` and ``upper``, either sort of pairs as ``pairs`` (with
+``frames_per_second`` for eyelids), recordings as ``gallery``; ``speech`` as ``sample_rate`` and
 ``frames_per_second``, ``identities`` as ``n_identities``, ``time`` as ``hardware``. With each batch come ``template``
 (of absolute vertices) or ``offsets_from``, ``closures``, ``waveform``, ``identities``, ``samples``, ``predictions`` (in
 several styles), ``embeddings`` with ``labels``, and ``computing`` with ``speech``, both in seconds.

@@ -8,7 +8,7 @@ sequence with the one recorded truth.
 from __future__ import annotations
 
 from itertools import combinations
-from typing import ClassVar, Literal, Unpack
+from typing import Any, ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
@@ -34,12 +34,13 @@ class RatioMetric(SequenceMetric):
     The mean of each sequence's own ratio would be ruled by the sequences in which hardly anything happens.
     """
 
+    unit: ClassVar[str] = "1"
+    divides_by: ClassVar[str] = "the denominator is zero on every sequence"
     parts: Tensor
 
-    def __init__(
-        self, region: RegionLike | None = None, *, definition: str, **options: Unpack[SequenceOptions]
-    ) -> None:
-        super().__init__(definition=f"{definition}; ratio of sums over all sequences [1]", region=region, **options)
+    def __init__(self, region: RegionLike | None = None, *, definition: str, **options: Any) -> None:  # noqa: ANN401 - the next base's
+        words = f"{definition}; ratio of sums over all sequences [{self.unit}]"
+        super().__init__(definition=words, region=region, **options)
         self.add_state("parts", torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
         self._latest_parts: list[Tensor] = []
 
@@ -78,8 +79,6 @@ class RatioMetric(SequenceMetric):
             self.leave_synchronised_state()
             raise ValueError(f"{type(self).__name__} would divide by zero: {self.divides_by}")
         return self.finish(self.parts[0] / self.parts[1])
-
-    divides_by: ClassVar[str] = "the denominator is zero on every sequence"
 
 
 @metric.register("motion_liveliness")

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
@@ -245,6 +245,8 @@ class LipPairs:
         ValueError: If there is no pair, or they are not as described.
     """
 
+    what: ClassVar[str] = "lip pairs"
+
     name: str
     pairs: tuple[tuple[int, int], ...] = field(repr=False)
     duplicates: int = field(default=0, compare=False)
@@ -252,14 +254,15 @@ class LipPairs:
     def __post_init__(self) -> None:
         """Check the pairs."""
         if not self.pairs:
-            raise ValueError(f"lip pairs {self.name!r} are empty; give at least one pair of vertices")
+            raise ValueError(f"{self.what} {self.name!r} are empty; give at least one pair of vertices")
         for first, second in self.pairs:
             if first < 0:
-                raise ValueError(f"lip pairs {self.name!r} hold the index {first}; indices count from 0 upwards")
+                raise ValueError(f"{self.what} {self.name!r} hold the index {first}; indices count from 0 upwards")
             if first == second:
-                raise ValueError(f"lip pairs {self.name!r} pair vertex {first} with itself")
+                raise ValueError(f"{self.what} {self.name!r} pair vertex {first} with itself")
         if list(self.pairs) != sorted({(min(pair), max(pair)) for pair in self.pairs}):
-            raise ValueError(f"lip pairs {self.name!r} are not sorted and distinct; use LipPairs.from_pairs")
+            name = type(self).__name__
+            raise ValueError(f"{self.what} {self.name!r} are not sorted and distinct; use {name}.from_pairs")
 
     def __str__(self) -> str:
         """Name, number of pairs and hash, as printed next to a score."""
@@ -295,12 +298,12 @@ class LipPairs:
         largest = max(second for _, second in self.pairs)
         if largest >= n_vertices:
             raise ValueError(
-                f"lip pairs {self} hold the index {largest}, a mesh of {n_vertices} vertices ends at "
+                f"{self.what} {self} hold the index {largest}, a mesh of {n_vertices} vertices ends at "
                 f"{n_vertices - 1}; use the pairs of the motion's own topology"
             )
 
     @classmethod
-    def from_pairs(cls, name: str, pairs: Iterable[Iterable[int]] | Tensor) -> LipPairs:
+    def from_pairs(cls, name: str, pairs: Iterable[Iterable[int]] | Tensor) -> Self:
         """Pairs in any order, repeated or not, either vertex first.
 
         Args:
@@ -315,12 +318,12 @@ class LipPairs:
         """
         given = [list(pair) for pair in (pairs.tolist() if isinstance(pairs, Tensor) else pairs)]
         if any(len(pair) != 2 or any(type(index) is not int for index in pair) for pair in given):
-            raise ValueError(f"lip pairs {name!r} must be pairs of two whole numbers, vertex indices")
+            raise ValueError(f"{cls.what} {name!r} must be pairs of two whole numbers, vertex indices")
         distinct = sorted({(min(pair), max(pair)) for pair in given})
         return cls(name, tuple(distinct), duplicates=len(given) - len(distinct))
 
     @classmethod
-    def from_file(cls, path: str | PathLike[str], *, name: str | None = None) -> LipPairs:
+    def from_file(cls, path: str | PathLike[str], *, name: str | None = None) -> Self:
         """Pairs of a text file: indices separated by commas, blanks or line ends, each two of them a pair.
 
         Args:
@@ -338,6 +341,15 @@ class LipPairs:
             return cls.from_pairs(name or path.stem, zip(indices[::2], indices[1::2], strict=True))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
+
+
+class EyelidPairs(LipPairs):
+    """Named pairs of an upper and a lower eyelid vertex, of one eye or of both, likewise.
+
+    Their distance shows how far the eyes are open.
+    """
+
+    what: ClassVar[str] = "eyelid pairs"
 
 
 LipPairsLike = LipPairs | Iterable[Iterable[int]] | Tensor

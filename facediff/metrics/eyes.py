@@ -1,0 +1,165 @@
+"""Blinks: how often the lids shut, a minute or as a share of the truth's.
+
+The opening of the eyes is read off pairs of an upper and a lower eyelid vertex, as that of the mouth is off pairs of
+lip vertices. How far they are shut is a share of the sequence's own usual opening, so that heavy lids or a squint do
+not count as half a blink.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, Unpack
+
+import torch
+from torch import Tensor
+
+from facediff.metrics.base import Clip, SequenceOptions, check_option, functional
+from facediff.metrics.generation import RatioMetric
+from facediff.metrics.mouth import OpeningMetric
+from facediff.metrics.regions import EyelidPairs, LipPairs, LipPairsLike
+from facediff.registry import metric
+
+CLOSED, REOPENED = 0.5, 0.3
+"""Shares of the usual opening: a blink begins where the lids are shut by more than the first, and the next one may only
+begin after they were shut by less than the second. Puppet's blinks are the same for 0.4 to 0.6 and 0.2 to 0.4."""
+
+
+def count_blinks(opening: Tensor, *, closed: float = CLOSED, reopened: float = REOPENED) -> Tensor:
+    """How often the eyes shut in a series of their openings (frames,): a whole number, as a float64 scalar.
+
+    The lids are shut by c[t] = 1 − o[t] / median(o). A blink is counted where c rises above ``closed`` for the first
+    time since it was below ``reopened``; two limits, so that lids which tremble at one of them do not count again and
+    again. Eyes that are shut in the first frame are a blink; eyes that are never open have none.
+
+    >>> import torch
+    >>> count_blinks(torch.tensor([1.0, 1.0, 0.2, 0.6, 0.3, 1.0, 1.0, 0.1, 1.0, 1.0])).item()
+    2.0
+    """
+    shut = 1.0 - opening.double() / opening.double().quantile(0.5)
+    marks = (shut > closed).long() - (shut < reopened).long()
+    marks = marks[marks != 0]  # what lies between the limits changes nothing
+    return ((marks[1:] > 0) & (marks[:-1] < 0)).sum().double() + (marks[:1] > 0).sum()
+
+
+class BlinkMetric(OpeningMetric, RatioMetric):
+    """Base of metrics that count blinks.
+
+    Args:
+        pairs: Upper and lower eyelid vertices, `EyelidPairs` or pairs of indices.
+        closed: Share of the usual opening by which the lids must be shut for a blink to begin.
+        reopened: Share by which they may still be shut for another blink to be possible.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ("lid_pairs",)
+
+    def __init__(
+        self,
+        pairs: LipPairsLike,
+        *,
+        definition: str,
+        closed: float = CLOSED,
+        reopened: float = REOPENED,
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        if not 0 <= reopened <= closed < 1:
+            raise ValueError(f"closed is {closed:g} and reopened {reopened:g}; expected 0 <= reopened <= closed < 1")
+        if not isinstance(pairs, EyelidPairs):
+            bare = pairs.pairs if isinstance(pairs, LipPairs) else pairs
+            pairs = EyelidPairs.from_pairs("eyelid pairs", bare)
+        words = (
+            f"{definition}, a blink being a rise of 1 − opening / median opening of the sequence above {closed:g} "
+            f"after it was below {reopened:g}, an opening the mean distance of {{pairs}}"
+        )
+        super().__init__(pairs, definition=words, **options)
+        self.closed = closed
+        self.reopened = reopened
+
+    def blinks(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        """Blinks of prediction and truth."""
+        predicted, true = (
+            count_blinks(series, closed=self.closed, reopened=self.reopened) for series in self.openings(clip)
+        )
+        return predicted, true
+
+
+@metric.register("blink_rate_ratio")
+class BlinkRateRatio(BlinkMetric):
+    """Blink rate ratio: blinks of the prediction over blinks of the truth, summed over all sequences.
+
+    1 is as often as the truth, 0 somebody who never blinks. It does not ask for blinks at the same moments: speech does
+    not say when. Definition and limits are ours.
+
+    >>> import torch
+    >>> opening = torch.ones(2, 50)
+    >>> opening[0, 20:24] = opening[1, 10:13] = opening[1, 30:33] = 0.1
+    >>> once, twice = opening[:, :, None, None] * torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    >>> blink_rate_ratio(once, twice, [(0, 1)]).item()
+    0.5
+    """
+
+    divides_by = "nobody blinks in the truth"
+
+    def __init__(
+        self,
+        pairs: LipPairsLike,
+        *,
+        closed: float = CLOSED,
+        reopened: float = REOPENED,
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        words = "blinks of the prediction over blinks of the truth"
+        super().__init__(pairs, definition=words, closed=closed, reopened=reopened, **options)
+
+    def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        """Blinks of either side of one sequence."""
+        return self.blinks(clip)
+
+
+Blinker = Literal["prediction", "truth"]
+"""Whose blinks are counted."""
+
+
+@metric.register("blink_rate")
+class BlinkRate(BlinkMetric):
+    """Blink rate: blinks a minute, over all sequences. People who talk blink about 15 to 20 times.
+
+    Args:
+        frames_per_second: Of the motion.
+        of: ``"prediction"`` or ``"truth"``.
+
+    >>> import torch
+    >>> opening = torch.ones(150)
+    >>> opening[20:25] = opening[90:95] = 0.0
+    >>> motion = opening[:, None, None] * torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    >>> round(blink_rate(motion, motion, [(0, 1)], frames_per_second=25).item(), 9)  # 2 in 6 seconds
+    20.0
+    """
+
+    unit = "a minute"
+
+    def __init__(
+        self,
+        pairs: LipPairsLike,
+        *,
+        frames_per_second: float | None = None,
+        of: Blinker = "prediction",
+        closed: float = CLOSED,
+        reopened: float = REOPENED,
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        check_option("of", of, Blinker)
+        if frames_per_second is None or not frames_per_second > 0:
+            raise ValueError(f"frames_per_second is {frames_per_second}; a rate a minute needs the motion's, above 0")
+        words = f"blinks of the {of} over minutes at {frames_per_second:g} frames a second"
+        super().__init__(pairs, definition=words, closed=closed, reopened=reopened, **options)
+        self.frames_per_second = frames_per_second
+        self.of: Blinker = of
+
+    def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        """Blinks of one side of one sequence, and how many minutes it lasts."""
+        predicted, true = self.blinks(clip)
+        minutes = torch.full_like(true, clip.frames / (60 * self.frames_per_second))
+        return (predicted if self.of == "prediction" else true), minutes
+
+
+blink_rate = functional(BlinkRate)
+blink_rate_ratio = functional(BlinkRateRatio)
