@@ -33,6 +33,9 @@ from facediff.utils.plain_files import read_table
 MOTION_FOLDERS = ("vertices_npy", "vertex")
 """Where projects keep absolute vertices; the second is ProbTalk3D's."""
 
+LIP_PAIRS, EYELID_PAIRS = "regions/inner_lip_pairs.txt", "regions/eyelid_pairs.txt"
+"""Where a corpus lists pairs of an upper and a lower vertex of the inner lips, and of the eyelids."""
+
 CHUNK = 8
 """Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
 
@@ -239,8 +242,8 @@ class Corpus:
         return mesh
 
     def read_pairs(self, file: str) -> Tensor | None:
-        """Vertex pairs (P, 2) of a file in ``regions/``, one ``upper, lower`` a line; None if there is no such file."""
-        path = self.root / "regions" / file
+        """Vertex pairs (P, 2) of a file below the folder, one ``upper, lower`` a line; None if it does not exist."""
+        path = self.root / file
         if not path.is_file():
             return None
         try:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from facediff.data.batch import Assets, Batch, Reference, Sample, collate
-from facediff.data.corpus import Clip, Corpus, find_region, parse_name, read_manifest
+from facediff.data.corpus import EYELID_PAIRS, LIP_PAIRS, Clip, Corpus, find_region, parse_name, read_manifest
 from facediff.data.dataset import (
     BatchDataset,
     ClipBatches,
@@ -95,6 +95,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         lips: file that lists the vertices of the lips, e.g. ``regions/lve.txt`` or ``FLAME_masks.pkl:lips``, or
             ``all``; the corpus's usual one if None.
         upper_face: the same for the upper face.
+        eyelid_pairs: file that lists pairs of an upper and a lower eyelid vertex, for blinks;
+            ``regions/eyelid_pairs.txt`` if None.
     """
 
     corpus_name: ClassVar[str]
@@ -131,6 +133,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         train_identities: Annotated[list[str], Range(items=(1, 1_000_000))] | None = None,
         lips: str | None = None,
         upper_face: str | None = None,
+        eyelid_pairs: str | None = None,
     ) -> None:
         super().__init__()
         if not str(root):
@@ -148,6 +151,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             name: self.region_sources[name] if chosen is None else (chosen,)
             for name, chosen in (("lips", lips), ("upper_face", upper_face))
         }
+        self.eyelid_file = eyelid_pairs
         self.extra_identities = list(extra_identities or [])
         self.train_identities = None if train_identities is None else list(train_identities)
         self.identities = [*map(person_name, self.people), *self.extra_identities, *type(self).identities]
@@ -349,10 +353,22 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                     name: find_region(self.root, sources, name, self.n_vertices, self.region_help).tensor()
                     for name, sources in self.regions.items()
                 },
-                inner_lip_pairs=corpus.read_pairs("inner_lip_pairs.txt"),
+                inner_lip_pairs=corpus.read_pairs(LIP_PAIRS),
                 references=references,
             )
         return self._assets
+
+    def eyelid_pairs(self) -> Tensor | None:
+        """Pairs of an upper and a lower eyelid vertex (P, 2) by which blinks are seen; None if nobody has listed any.
+
+        Raises:
+            FaceDiffError: if the file that was chosen does not exist, or is not that.
+        """
+        file = self.eyelid_file or EYELID_PAIRS
+        found = self.corpus.read_pairs(file)
+        if found is None and self.eyelid_file is not None:
+            raise FaceDiffError(f"data.eyelid_pairs: {self.root / file}: no such file; expected pairs of vertices")
+        return found
 
     # What is measured on the training motion before training.
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from facediff import registry
 from facediff import synthetic as puppet
 from facediff.data.corpus import Clip
 from facediff.data.datamodule import Count, SpeechMotionDataModule
 from facediff.mesh import Mesh
 from facediff.synthetic.face import build_face
+from facediff.synthetic.rig import eyelid_pairs
 from facediff.utils.files import cache_dir
 from facediff.utils.ranges import Range
 
@@ -64,6 +69,11 @@ class Puppet(SpeechMotionDataModule):
         """Make the corpus if it does not exist; called on one process only."""
         if not puppet.is_complete(self.root, seed=self.seed):
             puppet.generate(self.root, seed=self.seed)
+
+    def eyelid_pairs(self) -> Tensor | None:
+        """Those of the corpus folder, or of the mesh itself where the folder was made before it had such a file."""
+        found = super().eyelid_pairs()
+        return torch.from_numpy(np.stack(eyelid_pairs(build_face()), 1)) if found is None else found
 
     def split_of(self, clip: Clip) -> str | None:
         """By speaker and sentence number, like BIWI."""

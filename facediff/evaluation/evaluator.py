@@ -12,13 +12,12 @@ import torch
 from torch import Tensor
 
 from facediff.data.audio import SAMPLE_RATE, read_speech
-from facediff.data.corpus import ALL, read_manifest
+from facediff.data.corpus import ALL, LIP_PAIRS, read_manifest
 from facediff.data.phonemes import closures, phonemes_file, read_phonemes
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import (
     DEFAULT_PATTERNS,
     OWN,
-    PAIRS_FILE,
     TRUTH_PATTERN,
     NamePattern,
     Pair,
@@ -106,7 +105,7 @@ def evaluate(
         stored = read_manifest(corpus).get("frame_rate")
         frame_rate = stored / truth_stride if isinstance(stored, int | float) and stored > 0 else None
     needed = {need for request in requests for need in request.needs}
-    if lip_pairs is None and "lip_pairs" in needed and corpus is not None and (corpus / PAIRS_FILE).is_file():
+    if lip_pairs is None and "lip_pairs" in needed and corpus is not None and (corpus / LIP_PAIRS).is_file():
         lip_pairs = read_pairs(None, corpus, n_vertices)
     material = Material(corpus if requests else None, frame_rate, sorted({name.subject for name in names.values()}))
     context = material.context(lips, upper_face, lip_pairs, templated=bool(templates), every_condition=identity == ALL)

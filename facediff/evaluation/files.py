@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from facediff.data.corpus import ALL, MOTION_FOLDERS, find_region, read_templates
+from facediff.data.corpus import ALL, LIP_PAIRS, MOTION_FOLDERS, find_region, read_templates
 from facediff.errors import FaceDiffError
 from facediff.metrics import TOPOLOGIES, LipPairs, Region
 from facediff.utils.arrays import open_vertices
@@ -288,9 +288,6 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
     return region
 
 
-PAIRS_FILE = "regions/inner_lip_pairs.txt"  # Where a corpus has its pairs of inner-lip vertices
-
-
 def read_pairs(source: str | None, corpus: Path | None, n_vertices: int) -> LipPairs:
     """Pairs of an upper and a lower lip vertex.
 
@@ -302,10 +299,10 @@ def read_pairs(source: str | None, corpus: Path | None, n_vertices: int) -> LipP
     Raises:
         FaceDiffError: if no pairs are given or found, or they do not belong to this mesh.
     """
-    if source is None and corpus is not None and (corpus / PAIRS_FILE).is_file():
-        source = str(corpus / PAIRS_FILE)
+    if source is None and corpus is not None and (corpus / LIP_PAIRS).is_file():
+        source = str(corpus / LIP_PAIRS)
     if source is None:
-        where = f"{corpus / PAIRS_FILE}: no such file" if corpus is not None else "the truth is no corpus folder"
+        where = f"{corpus / LIP_PAIRS}: no such file" if corpus is not None else "the truth is no corpus folder"
         raise FaceDiffError(
             f"{where}; give --lip-pairs, a file with one upper and one lower lip vertex a line, or pairs such as "
             f"3531-3504 (the middle of FLAME's lips)"

@@ -16,7 +16,7 @@ from facediff.errors import FaceDiffError
 from facediff.synthetic.face import build_face
 from facediff.synthetic.geometry import Array
 from facediff.synthetic.motion import FRAME_RATE, analyse, generate_weights, segments_of, visemes_of
-from facediff.synthetic.rig import Rig, build_rig, lip_pairs
+from facediff.synthetic.rig import Rig, build_rig, eyelid_pairs, lip_pairs
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.synthetic.speech import SENTENCES, Phoneme, speak
 from facediff.utils import SAMPLE_RATE
@@ -213,9 +213,9 @@ def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
     write_ply(folder / "PUPPET.ply", mean, mesh.faces, mesh.colours)
     for name, index in regions().items():
         (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, index.tolist())) + "\n")
-    pairs = zip(*(side.tolist() for side in lip_pairs(mesh)), strict=True)
-    lines = [f"{upper}, {lower}\n" for upper, lower in pairs]
-    (folder / "regions" / "inner_lip_pairs.txt").write_text("".join(lines))
+    for file, sides in (("inner_lip_pairs.txt", lip_pairs(mesh)), ("eyelid_pairs.txt", eyelid_pairs(mesh))):
+        pairs = zip(*(side.tolist() for side in sides), strict=True)
+        (folder / "regions" / file).write_text("".join(f"{upper}, {lower}\n" for upper, lower in pairs))
     table = [["clip", "subject", "sentence", "mood", "voice", "text"]]
     for clip in chosen:
         voice, text = SPEAKERS[clip.identity].voice.name, SENTENCES[clip.number - 1]

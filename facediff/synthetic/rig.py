@@ -100,6 +100,13 @@ def lip_pairs(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.concatenate([mesh.mirror[top[:0:-1]], top]), np.concatenate([mesh.mirror[bottom[:0:-1]], bottom])
 
 
+def eyelid_pairs(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Facing vertices of the lids' edges, (upper, lower), of both eyes without the corners."""
+    ring = mesh.groups["eye_0"]  # from the inner corner over the upper lid to the outer one, and back below
+    upper, lower = ring[1:8], ring[:8:-1]
+    return np.concatenate([upper, mesh.mirror[upper]]), np.concatenate([lower, mesh.mirror[lower]])
+
+
 def lip_side(mesh: Mesh, canonical: Array) -> Array:
     """How far each vertex belongs to the jaw's side of the mouth: 0 upper lip, 1 lower lip, shape (V,)."""
     x, y = np.abs(canonical[:, 0]), canonical[:, 1]

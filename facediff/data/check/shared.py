@@ -242,7 +242,9 @@ def _check_region(
 
 
 def check_pairs(opened: Corpus, findings: Findings) -> None:
-    """Check the pairs of vertices on the inner lips, where a corpus has them."""
-    path = opened.root / "regions" / "inner_lip_pairs.txt"
-    with findings.guard("region_broken", path, opened.root):
-        opened.read_pairs(path.name)
+    """Check the pairs of vertices on the inner lips and the eyelids, where a corpus has them."""
+    from facediff.data.corpus import EYELID_PAIRS, LIP_PAIRS
+
+    for file in (LIP_PAIRS, EYELID_PAIRS):
+        with findings.guard("region_broken", opened.root / file, opened.root):
+            opened.read_pairs(file)

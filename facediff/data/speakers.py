@@ -1,0 +1,82 @@
+"""What recordings say of each speaker's motion: the mean face of a speaker, and the mean motion of each recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from facediff.data.corpus import Clip
+from facediff.errors import FaceDiffError
+from facediff.metrics import SpeakerGallery
+
+if TYPE_CHECKING:
+    from facediff.data.datamodule import SpeechMotionDataModule
+
+MOST = 64
+"""Recordings of a speaker that are read at most, evenly spread over their names; those of corpora with more of them
+would take minutes to read, and say no more."""
+
+
+class MeanFaces:
+    """The mean face of each speaker: the mean offset from the template over all frames of their training clips.
+
+    A speaker without training clips has the mean of all training speakers' mean faces.
+
+    Args:
+        data: the corpus.
+
+    Raises:
+        FaceDiffError: if nobody has a training clip.
+    """
+
+    def __init__(self, data: SpeechMotionDataModule) -> None:
+        by_speaker: dict[str, list[Clip]] = {}
+        for clip in data.clips("train"):
+            by_speaker.setdefault(clip.identity, []).append(clip)
+        if not by_speaker:
+            raise FaceDiffError(f"{data.root}: no training clip, of which the speakers' mean faces are made")
+        self.faces: dict[str, Tensor] = {}
+        for speaker, clips in by_speaker.items():
+            total, frames = torch.zeros(data.n_vertices, 3, dtype=torch.float64), 0
+            for clip in spread(clips):
+                motion = data.corpus.read_motion(clip)
+                total += motion.sum(0, dtype=torch.float64)
+                frames += len(motion)
+            self.faces[speaker] = (total / frames).float()
+        self.of_all = torch.stack(list(self.faces.values())).mean(0)
+
+    def of(self, speakers: Sequence[str]) -> Tensor:
+        """Their mean faces, offsets (speakers, V, 3)."""
+        return torch.stack([self.faces.get(speaker, self.of_all) for speaker in speakers])
+
+
+def speaker_gallery(data: SpeechMotionDataModule, speakers: Sequence[str]) -> SpeakerGallery:
+    """Recordings outside the evaluated splits of the speakers who have any, each with its speaker's number.
+
+    Args:
+        data: the corpus.
+        speakers: their names, by number.
+
+    Raises:
+        FaceDiffError: if there are not two speakers with such recordings.
+    """
+    candidates = data.reference_policy().candidates
+    means, numbers = [], []
+    for number, speaker in enumerate(speakers):
+        usable = [clip for clip in candidates.get(speaker, []) if data.find_split(clip) in ("train", None)]
+        for clip in spread(usable):
+            means.append(data.corpus.read_motion(clip).mean(0))
+            numbers.append(number)
+    if len({*numbers}) < 2:
+        raise FaceDiffError(f"{data.root}: recordings outside the test splits are of less than two speakers")
+    return SpeakerGallery(torch.stack(means), tuple(numbers))
+
+
+def spread(clips: Sequence[Clip]) -> list[Clip]:
+    """At most :data:`MOST` of the clips, evenly spread."""
+    if len(clips) <= MOST:
+        return list(clips)
+    return [clips[int(place)] for place in torch.linspace(0, len(clips) - 1, MOST).round()]
