@@ -21,15 +21,21 @@ from facediff.utils.plain_files import write_rows
 from facediff.utils.ranges import Range
 from facediff.utils.tables import format_table
 
-METHOD_NAMES = {"model": "model", "still": "still face", "shuffled": "model, shuffled speech"}
+METHOD_NAMES = {
+    "model": "model",
+    "still": "still face",
+    "mean_face": "speaker's mean face",
+    "shuffled": "model, shuffled speech",
+}
 
 
 class ScoreTable(Callback):
     """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
 
-    Next to the model are scored a face that never moves, and the model given another sentence's speech. Weights &
-    Biases gets the table of sequences as ``test/sequences``, with sound and a picture of the errors for the worst
-    clips, and the protocol's definition in the run's config.
+    Next to the model are scored a face that never moves, the mean face of each speaker's training clips, which does not
+    move either, and the model given another sentence's speech. Weights & Biases gets the table of sequences as
+    ``test/sequences``, with sound and a picture of the errors for the worst clips, and the protocol's definition in the
+    run's config.
 
     Args:
         file: name of the CSV file in the run's folder; None writes none.

@@ -236,15 +236,15 @@ class AnimationModel(LightningModule, Inference, ABC):
         self.log_dict(self.evaluation.scalars("val"), prog_bar=False, sync_dist=True)
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
-        """Score generated motion, a still face, and the model's motion for another sentence's speech."""
+        """Score generated motion, faces that do not move, and the model's motion for another sentence's speech."""
         split = self.evaluation.splits[dataloader_idx]
         for name, view in conditioned(batch, self.unseen_identity, self.identities, self.assets.references):
             self.evaluation.score(self, split, view, name)
             if view.decoy_audio is not None:
                 decoy = replace(view, audio=view.decoy_audio, features=None)
                 self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), view, name)
-        # Two yardsticks: the model with speech that does not belong to the clip, and a face that does not move.
-        self.evaluation.update(split, "still", torch.zeros_like(batch.motion), batch)
+        # Further yardsticks: the model with speech that does not belong to the clip, and faces that do not move.
+        self.evaluation.score_baselines(split, batch)
 
     def on_test_epoch_end(self) -> None:
         """Log ``<split>/lve`` and so on; the table is printed by the callback ``ScoreTable``."""
@@ -331,7 +331,7 @@ class AnimationModel(LightningModule, Inference, ABC):
                 ["val"] if stage in ("fit", "validate") else data.test_splits,
                 # The model itself is moved to its device later; a process without clips must have its metrics there.
                 self.trainer.strategy.root_device,
-                data.root,
+                data,
             )
 
     def attach_mesh(self) -> None:

@@ -1,4 +1,4 @@
-"""What a test scores: the model, a face that never moves, and the model given another sentence's speech."""
+"""What a test scores: the model, two faces that never move, and the model given another sentence's speech."""
 
 from __future__ import annotations
 
@@ -6,19 +6,30 @@ import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from facediff.data import Assets, Batch, Reference
+from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.audio import SAMPLE_RATE
 from facediff.data.batch import pad
+from facediff.data.corpus import EYELID_PAIRS
 from facediff.data.phonemes import closures, phonemes_file, read_phonemes
+from facediff.data.speakers import MeanFaces, speaker_gallery
 from facediff.errors import ArgumentError, FaceDiffError
-from facediff.metrics import Context, LipPairs, ProtocolMetrics, Region, SequenceMetric, device_name, feed, protocol
+from facediff.metrics import (
+    Context,
+    EyelidPairs,
+    LipPairs,
+    ProtocolMetrics,
+    Region,
+    SequenceMetric,
+    device_name,
+    feed,
+    protocol,
+)
 from facediff.metrics.by_name import parse_all
 from facediff.models.inference import Inference
 
@@ -68,8 +79,9 @@ def with_identity(batch: Batch, index: int, reference: Reference) -> Batch:
     )
 
 
-METHODS = ("model", "still", "shuffled")
-"""Who is scored: the model, a face that never moves, the model given another sentence's speech."""
+METHODS = ("model", "still", "mean_face", "shuffled")
+"""Who is scored: the model; a face that never moves from its template, or from the mean of its speaker's training
+clips; the model given another sentence's speech."""
 
 OF_THE_MODEL = {"samples", "conditions", "style", "time"}
 """Needs that only the model meets: metrics that have one are not taken of a still face or of shuffled speech."""
@@ -85,6 +97,18 @@ def regions_of(assets: Assets) -> dict[str, Region]:
         )
         for name, indices in assets.regions.items()
     }
+
+
+def eyelid_pairs_of(data: SpeechMotionDataModule) -> EyelidPairs | None:
+    """A corpus's pairs of eyelid vertices, for metrics."""
+    pairs = data.eyelid_pairs()
+    return None if pairs is None else EyelidPairs.from_pairs(f"{data.corpus_name}/eyelids", pairs)
+
+
+def closures_of(data: SpeechMotionDataModule, clip: str) -> list[tuple[int, int]]:
+    """The frames in which a clip's lips close for p, b and m; empty where its phonemes are not known."""
+    file = phonemes_file(data.root, clip)
+    return [] if file is None else closures(read_phonemes(file), data.frame_rate)
 
 
 class Evaluation:
@@ -111,12 +135,14 @@ class Evaluation:
         self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}
         self.chosen: dict[str, dict[str, dict[str, Metric]]] = {}
         self._sequences: list[dict[str, Any]] = []
-        self._corpus = Path()
-        self._frame_rate = 0.0
+        self._data: SpeechMotionDataModule | None = None
+        self._mean_faces: MeanFaces | None = None
         self._speakers: list[str] = []
 
-    def prepare(self, model: Inference, splits: Sequence[str], device: torch.device, root: Path) -> None:
-        """Make empty metrics for the corpus in the folder ``root``, on the device where processes reduce them.
+    def prepare(
+        self, model: Inference, splits: Sequence[str], device: torch.device, data: SpeechMotionDataModule
+    ) -> None:
+        """Make empty metrics for a corpus, on the device where processes reduce them.
 
         Raises:
             FaceDiffError: if the corpus or the model lacks something that a metric needs.
@@ -125,15 +151,15 @@ class Evaluation:
         regions = regions_of(assets)
         self.splits = list(splits)
         self._sequences = []
-        self._corpus = root
-        self._frame_rate = assets.frame_rate
+        self._data = data
+        self._mean_faces = None
         self._speakers = sorted(assets.templates)
         methods = METHODS if self.splits != ["val"] else METHODS[:1]
         self.metrics = {
             split: {each: self.protocol.build(regions["lips"], regions["upper_face"]).to(device) for each in methods}
             for split in self.splits
         }
-        context = self._context(model, regions, device) if self.requests else Context()
+        context = self._context(model, regions, device, data) if self.requests else Context()
         self.chosen = {
             split: {
                 method: {
@@ -146,7 +172,9 @@ class Evaluation:
             for split in self.splits
         }
 
-    def _context(self, model: Inference, regions: Mapping[str, Region], device: torch.device) -> Context:
+    def _context(
+        self, model: Inference, regions: Mapping[str, Region], device: torch.device, data: SpeechMotionDataModule
+    ) -> Context:
         """What the corpus and the model have for metrics, and why they lack the rest."""
         assets, name = model.assets, type(model).__name__
         has: dict[str, dict[str, Any]] = {
@@ -159,7 +187,11 @@ class Evaluation:
         }
         if assets.inner_lip_pairs is not None:
             has["lip_pairs"] = {"pairs": LipPairs.from_pairs(f"{assets.corpus}/inner lips", assets.inner_lip_pairs)}
-        if (self._corpus / "phonemes").is_dir():
+        if "lid_pairs" in self.needs and (lids := eyelid_pairs_of(data)) is not None:
+            has["lid_pairs"] = {"pairs": lids, "frames_per_second": assets.frame_rate}
+        if "gallery" in self.needs:
+            has["gallery"] = {"gallery": speaker_gallery(data, self._speakers)}
+        if (data.root / "phonemes").is_dir():
             has["closures"] = {}
         if model.samples:
             has["samples"] = {}
@@ -172,7 +204,9 @@ class Evaluation:
                     has["style"] = {}
         missing = {
             "lip_pairs": "the corpus has no regions/inner_lip_pairs.txt",
-            "closures": f"{self._corpus / 'phonemes'}: no such folder",
+            "lid_pairs": f"the corpus has no {EYELID_PAIRS}; list pairs of an upper and a lower eyelid vertex there, "
+            "or in the file that data.eyelid_pairs names",
+            "closures": f"{data.root / 'phonemes'}: no such folder",
             "samples": f"{name} is deterministic",
             "conditions": "the corpus has no style references of two training identities",
             "style": f"{name} has no style encoder",
@@ -208,6 +242,15 @@ class Evaluation:
                 inputs["embeddings"] = model.encode_style(motion, batch.mask)
                 inputs["labels"] = self._numbers(batch)
         self.update(split, "model", motion, batch, identity, inputs)
+
+    def score_baselines(self, split: str, batch: Batch) -> None:
+        """Add the scores of two faces that do not move: the template, and the mean of the speaker's training clips."""
+        self.update(split, "still", torch.zeros_like(batch.motion), batch)
+        if self._mean_faces is None and self._data is not None and self._data.clips("train"):
+            self._mean_faces = MeanFaces(self._data)
+        if self._mean_faces is not None:  # else there is no row, as with shuffled speech
+            faces = self._mean_faces.of(batch.identity_names).to(batch.motion)
+            self.update(split, "mean_face", faces[:, None] * batch.mask[..., None, None], batch)
 
     def _clock(self, model: Inference) -> float:
         """Seconds; work on a GPU is waited for where a metric asks how long inference took."""
@@ -271,10 +314,8 @@ class Evaluation:
         }
         if "identities" in self.needs:
             inputs["identities"] = self._numbers(batch)
-        if "closures" in self.needs:
-            files = [phonemes_file(self._corpus, clip) for clip in batch.names]
-            rate = self._frame_rate
-            inputs["closures"] = [[] if file is None else closures(read_phonemes(file), rate) for file in files]
+        if "closures" in self.needs and self._data is not None:
+            inputs["closures"] = [closures_of(self._data, clip) for clip in batch.names]
         return inputs
 
     def sequences(self) -> list[dict[str, Any]]:

@@ -29,6 +29,7 @@ def rich(tiny_root: Path, tmp_path: Path) -> Tiny:
     root = tmp_path / "rich"
     shutil.copytree(tiny_root, root)
     (root / "regions" / "inner_lip_pairs.txt").write_text("0, 1\n2, 3\n")
+    (root / "regions" / "eyelid_pairs.txt").write_text("6, 12\n7, 13\n")
     (root / "phonemes").mkdir()
     for wav in (root / "wav").glob("*.wav"):
         (root / "phonemes" / f"{wav.stem}.csv").write_text("start,end,ipa\n0.0,0.1,m\n0.1,0.2,a\n0.2,0.3,b\n")
@@ -36,6 +37,8 @@ def rich(tiny_root: Path, tmp_path: Path) -> Tiny:
 
 
 def chosen(name: str) -> str:
+    if name.startswith("blink"):
+        return f"{name}:closed=0.1,reopened=0.05"  # the corner of the tiny face that counts as its eyes opens wide
     return f"{name}:n_samples=2" if name in SEVERAL else name
 
 

@@ -109,7 +109,7 @@ def test_test_scores_the_model_next_to_a_still_face_and_shuffled_speech(
     with (tmp_path / "test_scores.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["split"], row["method"]) for row in rows] == [
-        (split, method) for split in ("test_a", "test_b") for method in ("model", "still", "shuffled")
+        (split, method) for split in ("test_a", "test_b") for method in ("model", "still", "mean_face", "shuffled")
     ]
     still = next(row for row in rows if row["method"] == "still" and row["split"] == "test_a")
     assert float(still["lve"]) == pytest.approx(scores["test_a/still/lve"])
@@ -117,6 +117,23 @@ def test_test_scores_the_model_next_to_a_still_face_and_shuffled_speech(
     largest = [s.motion[:, :12].double().square().sum(-1).amax(1) for s in tiny.dataset("test_a")]
     assert float(still["lve"]) == pytest.approx(float(torch.cat(largest).mean()), rel=1e-6)
     assert int(still["frames"]) == sum(len(values) for values in largest)
+
+
+def test_test_scores_the_mean_face_of_the_training_clips(
+    make_model: Make, tiny: Tiny, make_trainer: MakeTrainer
+) -> None:
+    scores = {}
+    for part in make_trainer().test(make_model(motion_scale="none"), datamodule=tiny, verbose=False):
+        scores |= part
+    stored = {clip.name: tiny.corpus.read_motion(clip).double() for clip in tiny.corpus.clips.values()}
+    faces = {
+        person: torch.cat([stored[f"{person}_e{number:02d}"] for number in range(1, 5)]).mean(0) for person in "AB"
+    }
+    faces["C"] = (faces["A"] + faces["B"]) / 2  # nobody has trained on C
+    for split, people in (("test_a", "AB"), ("test_b", "C")):
+        clips = [(faces[person], stored[f"{person}_e{number:02d}"]) for person in people for number in (6, 7)]
+        largest = torch.cat([(clip - face)[:, :12].square().sum(-1).amax(1) for face, clip in clips])
+        assert scores[f"{split}/mean_face/lve"] == pytest.approx(largest.mean().item(), rel=1e-5)
 
 
 def test_predictions_are_written_as_the_field_names_them(
