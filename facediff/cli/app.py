@@ -40,6 +40,7 @@ COMMANDS = {
     "test": Command("facediff.cli.lightning:lightning", "score a model on the test splits"),
     "predict": Command("facediff.cli.lightning:lightning", "write a model's motion for a split"),
     "evaluate": Command("facediff.cli.evaluate:evaluate", "score anybody's predicted motion files by named protocols"),
+    "yardsticks": Command("facediff.cli.yardsticks:yardsticks", "does a model generate? every score that tells"),
     "figure frames": Command("facediff.cli.figure:frames", "faces of truth and methods at chosen moments"),
     "figure heatmap": Command("facediff.cli.figure:heatmap", "mean and deviation of motion at every vertex"),
     "figure error": Command("facediff.cli.figure:error", "error at every vertex"),

@@ -136,16 +136,27 @@ class Inference(ABC):
             FaceDiffError: as :meth:`animate`.
         """
         clip = self.clip_of(audio, identity, style)
-        # Long speech is a stream that happens to be known: the same windows, the same noise, the same motion.
-        if self.windows.in_one_pass(clip.motion.shape[1], self.frame_rate):
-            motions = self.generate_samples(clip, seeds, progress=progress)
-        else:
-            motions = torch.cat(list(SpeechStream(self, clip, seeds=seeds).parts(clip.audio[0], progress=progress)), 1)
+        motions = self.sample_clip(clip, seeds, progress=progress)
         trained = identity if int(clip.identity[0]) >= 0 else "unknown"
         return [
             Prediction(clip.names[0], trained, clip.reference_names[0], (motion + clip.template).cpu())
             for motion in motions
         ]
+
+    def sample_clip(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> Motion:
+        """Several samples of one clip of any length.
+
+        Args:
+            clip: a batch of one clip; ``motion`` gives the number of frames only.
+            seeds: one for each sample.
+            progress: as :meth:`animate` takes it.
+        """
+        frames = clip.motion.shape[1]
+        # Long speech is a stream that happens to be known: the same windows, the same noise, the same motion.
+        if self.windows.in_one_pass(frames, self.frame_rate):
+            return self.generate_samples(clip, seeds, progress=progress)
+        stream = SpeechStream(self, clip, seeds=seeds)
+        return torch.cat(list(stream.parts(clip.audio[0], frames=frames, progress=progress)), 1)
 
     @torch.inference_mode()
     def stream(

@@ -1,0 +1,177 @@
+"""``facediff yardsticks``: does a model generate? Every score that tells, from one command."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from facediff.cli.lightning import import_corpus, tell_folder
+from facediff.cli.options import Corpus, Folder, Seed
+from facediff.cli.parsing import Option
+from facediff.cli.process import tell
+from facediff.errors import FaceDiffError
+from facediff.utils import ranges
+
+if TYPE_CHECKING:
+    from facediff.data import SpeechMotionDataModule
+    from facediff.models.yardsticks import Yardsticks
+
+SPLITS = ("val", "test_a", "test_b")
+
+
+def yardsticks(
+    checkpoints: Annotated[list[Path], Option(metavar="CHECKPOINT", reads=True)],
+    *,
+    samples: Annotated[ranges.Samples, Option(metavar="N")] = 10,
+    references: Annotated[ranges.Samples, Option(metavar="N")] = 2,
+    sampler: Annotated[str | None, Option(metavar="NAME")] = None,
+    steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
+    split: Annotated[list[str] | None, Option(metavar="NAME")] = None,
+    clips: Annotated[ranges.Samples | None, Option(metavar="N")] = None,
+    against: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
+    data_root: Folder = None,
+    corpus: Corpus = None,
+    eyelid_pairs: Annotated[str | None, Option(metavar="FILE")] = None,
+    device: str = "cpu",
+    seed: Seed = 0,
+    json: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
+    csv: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
+    quiet: bool = False,
+) -> None:
+    """Measure trained models by all that tells a generator from a regressor, on their corpus's test splits.
+
+    Liveliness, spread over error, blinks, FDD, LVE of one sample, of the mean and of the best of several (as shares of
+    a still face's and of the speaker's mean face's), energy scores, closures at p, b and m, whether the reference
+    carries the speaker, and speed. Several checkpoints, such as three training seeds, give means and standard
+    deviations.
+
+    For example:
+      facediff yardsticks demo/puppet.ckpt
+      facediff yardsticks a.ckpt b.ckpt c.ckpt --sampler ddpm --steps 1000 --samples 4 --json abc.json
+      facediff yardsticks new.ckpt --against abc.json
+
+    Args:
+        checkpoints: trained models (.ckpt) of one corpus
+        samples: samples of each clip, two at least
+        references: samples of each clip with each of up to eight references and labels
+        sampler: sampler by name; see `facediff components sampler`
+        steps: denoising steps of the sampler
+        split: val, test_a or test_b; repeatable (default: all test splits)
+        clips: clips of a split at most, evenly spread, for a quick look (default: all)
+        against: a checkpoint, or a file of --json, whose values are printed next to these with the ratios
+        data_root: where the corpus is, if not where it was in training
+        corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class
+        eyelid_pairs: file of the corpus folder with pairs of eyelid vertices (default: regions/eyelid_pairs.txt)
+        device: cpu, cuda …
+        seed: of the first sample; the others follow
+        json: write everything as JSON
+        csv: write one row for each split and yardstick
+        quiet: no progress bar
+    """
+    for path in [*checkpoints, *([] if against is None else [against])]:
+        if not path.is_file():
+            raise FaceDiffError(f"{path}: no such file; expected a checkpoint that `facediff fit` has written")
+    if len({*map(str, checkpoints)}) < len(checkpoints):
+        raise FaceDiffError("a checkpoint is given twice; give each once")
+    for name in split or ():
+        if name not in SPLITS:
+            raise FaceDiffError(f"--split {name}: there is no such split; expected one of {', '.join(SPLITS)}")
+    if against is not None and against.suffix == ".json":
+        from facediff.utils.plain_files import load_json
+
+        stored = load_json(against, name=f"--against {against}")
+    from dataclasses import replace
+
+    from facediff.models.checkpoint import load_model
+    from facediff.models.yardsticks import Sampling, means_of, measure
+    from facediff.utils.plain_files import write_json, write_rows
+    from facediff.utils.progress import progress_bar
+
+    sampling = Sampling(samples, references, sampler, steps, seed)
+    known = means_of(stored, f"--against {against}") if against is not None and against.suffix == ".json" else {}
+    data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)
+    splits = list(dict.fromkeys(split)) if split else data.test_splits
+    others = [] if against is None or known else [against]
+    counts = [min(len(data.clips(name)), clips or 10**9) for name in splits]
+    total = sum(counts) * (len(checkpoints) + len(others))
+    with progress_bar("clips", total, shown=not quiet) as step:
+
+        def results(paths: list[Path]) -> Yardsticks:
+            models = {str(path): partial(load_model, path, device) for path in paths}
+            return measure(models, data, splits=splits, sampling=sampling, most_clips=clips, step=step)
+
+        found = results(checkpoints)
+        if others:
+            other = results(others)
+            known = {name: {each: other.mean(name, each) for each in own} for name, own in other.values.items()}
+    if against is not None:
+        found = replace(found, against=known, against_name=str(against))
+    if json is not None:
+        write_json(json, found.as_dict())
+    if csv is not None:
+        write_rows(csv, found.rows())
+    tell(*text(found).split("\n"))
+
+
+def corpus_of_checkpoint(
+    checkpoint: Path, data_root: Path | None, corpus: str | None, eyelid_pairs: str | None
+) -> SpeechMotionDataModule:
+    """The corpus that a checkpoint was trained on.
+
+    Raises:
+        FaceDiffError: if its class is not known, or its folder is not there.
+    """
+    from facediff.models.checkpoint import corpus_of, read_checkpoint
+
+    content = read_checkpoint(checkpoint)
+    import_corpus(checkpoint, content, corpus, "--corpus ")
+    module, options = corpus_of(checkpoint, content)
+    if data_root is not None:
+        options["root"] = str(data_root)
+    else:
+        tell_folder(checkpoint, options)
+    if eyelid_pairs is not None:
+        options["eyelid_pairs"] = eyelid_pairs
+    data = module(**options)
+    data.prepare_data()
+    if not data.root.is_dir():
+        raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
+    return data
+
+
+def text(found: Yardsticks) -> str:
+    """The yardsticks as a table, one row each, with what they were taken over."""
+    from facediff.models.yardsticks import YARDSTICKS
+    from facediff.utils.tables import format_table
+
+    kind = "SYNTHETIC corpus" if found.synthetic else "corpus"
+    counts = ", ".join(f"{count} of {split}" for split, count in found.clips.items())
+    drawn = f"{found.samples} samples each" if found.samples > 1 else "one motion each, since it has no noise: spread 0"
+    lines = [f"{kind} {found.corpus}; clips: {counts}; {drawn}; {found.sampler}"]
+    if len(found.checkpoints) > 1:
+        lines.append(f"mean ± standard deviation over {len(found.checkpoints)} checkpoints")
+    if found.against_name:
+        lines.append(f"in brackets: the ratio to {found.against_name}")
+    rows = []
+    for name in YARDSTICKS:
+        cells: list[str | None] = []
+        for split in found.values:
+            mean, deviation = found.mean(split, name), found.deviation(split, name)
+            cell = None if mean is None else number(mean)
+            if cell is not None and deviation is not None:
+                cell += f" ± {number(deviation)}"
+            other = found.against.get(split, {}).get(name)
+            if cell is not None and mean is not None and other:
+                cell += f" [{mean / other:.3f}]"
+            cells.append(cell)
+        if any(cell is not None for cell in cells):
+            rows.append([found.title(name), *cells])
+    lines.append(format_table(["", *found.values], rows))
+    lines += [f"no value: {found.title(name)}: {reason}" for name, reason in found.missing.items()]
+    return "\n".join(lines)
+
+
+def number(value: float) -> str:
+    """A number with three digits after the point, or in powers of ten where that would show nothing."""
+    return f"{value:.3f}" if value == 0 or 0.01 <= abs(value) < 1000 else f"{value:.3e}"
