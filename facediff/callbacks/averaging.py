@@ -51,4 +51,4 @@ class EmaWithWarmup(WeightAveraging):
             current: the weight after the last optimiser step.
             step: averaged steps so far, at least 1; on the weight's device, so that nothing waits for it.
         """
-        return torch.lerp(average, current, (1 - self.decay_at(step.double())).to(average.dtype))
+        return torch.lerp(average, current, (1 - self.decay_at(step.float())).to(average.dtype))

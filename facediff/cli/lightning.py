@@ -26,8 +26,10 @@ from facediff.utils.files import config_dir
 if TYPE_CHECKING:
     from facediff.cli.lightning_cli import FaceDiffCLI
 
-OPTIONS = ("config", "name", "model", "data", "trainer", "seed_everything", "ckpt_path")
-OPTIONS += ("print_config", "weights_only", "help")
+OPTIONS = (
+    *("config", "name", "model", "data", "trainer", "seed_everything", "ckpt_path"),
+    *("print_config", "weights_only", "help"),
+)
 OWN_OPTIONS = {"validate": ("verbose",), "test": ("verbose",), "predict": ("return_predictions",)}
 """What options begin with, of every subcommand and of some."""
 

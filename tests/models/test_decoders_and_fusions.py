@@ -35,6 +35,15 @@ MASK = torch.ones(1, FRAMES, dtype=torch.bool)
 STYLE = torch.randn(1, 3, 6, generator=torch.Generator().manual_seed(0))
 
 
+def test_the_last_norm_takes_each_frames_size_away_and_can_be_left_out() -> None:
+    fused = torch.randn(1, FRAMES, DIM) * torch.linspace(1, 9, FRAMES)[:, None]
+    with_norm, without = (StyleTransformer(dim=DIM, style_dim=6, num_layers=0, final_norm=f) for f in (True, False))
+    assert torch.equal(without(fused, STYLE, MASK), fused)
+    assert not list(without.parameters())
+    sizes = with_norm(fused, STYLE, MASK).square().mean(-1).sqrt()
+    torch.testing.assert_close(sizes, torch.ones_like(sizes), rtol=1e-3, atol=0)
+
+
 def test_decoder_frame_sees_past_and_future(decoder: nn.Module) -> None:
     assert reach(lambda x: decoder(x, STYLE, MASK)).all()
 
