@@ -59,6 +59,7 @@ IN_CONFIGS: dict[str, Any] = {
     f"{MODEL}.motion_scale": "none",
     f"{MODEL}.motion_space.class_path": "facediff.registry.motion_space.vertices",
     f"{MODEL}.noise_scale": 1.0,
+    f"{MODEL}.noise_draws": 1,
     f"{MODEL}.style_tokens": "single",
     f"{MODEL}.identity_dropout": 0.0,
     f"{MODEL}.fusion.init_args.rotary": False,
