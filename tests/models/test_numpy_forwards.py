@@ -244,3 +244,90 @@ def test_the_core_adds_the_step_before_the_norm() -> None:
         expected.append(decoded(f, tokens[i].numpy(), under(w, "decoder"), 1))
     for row, length, value in zip(made.detach().numpy(), LENGTHS, expected, strict=True):
         np.testing.assert_allclose(row[:length], value, rtol=1e-4, atol=1e-4)  # the step's angles are float32
+
+
+def gru_layer(x: Array, w: dict[str, Array], layer: int, suffix: str) -> Array:
+    part = {name.replace(f"_l{layer}", "_l0"): value for name, value in w.items() if f"_l{layer}" in name}
+    return gru(x, part, suffix)
+
+
+def test_the_recurrent_decoder_is_a_modulated_norm() -> None:
+    """Two bidirectional layers; then the norm of states plus input, scaled and shifted by the mean style token."""
+    module = shaken(registry.decoder.gru(dim=DIM, style_dim=6, num_layers=2))
+    w = weights(module)
+    x, mask = batch()
+    tokens = torch.randn(len(LENGTHS), 3, 6)
+    expected = []
+    for row, n, token in zip(x, LENGTHS, tokens, strict=True):
+        hidden = row[:n].numpy()
+        for layer in range(2):
+            forward = gru_layer(hidden, under(w, "gru"), layer, "")
+            backward = gru_layer(hidden[::-1], under(w, "gru"), layer, "_reverse")[::-1]
+            hidden = np.concatenate([forward, backward], -1)
+        scale, shift = np.split(linear(token.numpy().mean(0), under(w, "modulation")), 2)
+        expected.append(norm(hidden + row[:n].numpy(), under(w, "norm")) * (1 + scale) + shift)
+    compare(module(x, tokens, mask), expected)
+    compare(module(x, tokens, mask, module.prepare(tokens, mask)), expected)
+
+
+def mel(audio: Array, frames: int, module: nn.Module, w: dict[str, Array]) -> Array:
+    """One clip: spectra of 25 ms every 10 ms, convolutions at 50 steps a second, interpolation to the frames."""
+    wave = (audio - audio.mean()) / np.sqrt(audio.var() + 1e-7)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(400) / 400)
+    count = max(2, len(wave) // 160)
+    spectra = np.zeros((count, 64))
+    for i in range(count):
+        places = 160 * i - 200 + np.arange(400)
+        inside = (places >= 0) & (places < len(wave))
+        piece = np.where(inside, wave[np.clip(places, 0, len(wave) - 1)], 0.0) * window
+        power = np.abs(np.fft.rfft(piece, 512)) ** 2
+        spectra[i] = np.log(module.filters.numpy().astype("f8") @ power + 1e-5)
+    x = (spectra + 2.0) / 4.0
+
+    def convolved(x: Array, part: dict[str, Array], *, stride: int, pad: int, dilation: int) -> Array:
+        padded = np.pad(x, ((pad, pad), (0, 0)))
+        taps = part["weight"].shape[2]
+        steps = (len(padded) - dilation * (taps - 1) - 1) // stride + 1
+        out = np.tile(part["bias"], (steps, 1))
+        for t in range(steps):
+            for tap in range(taps):
+                out[t] += part["weight"][:, :, tap] @ padded[t * stride + tap * dilation]
+        return out
+
+    steps = max(1, count // 2)
+    x = gelu(convolved(x, under(w, "stem"), stride=2, pad=1, dilation=1))[:steps]
+    for i, dilation in enumerate((1, 2, 4, 1)):
+        block = under(w, f"blocks.{i}")
+        hidden = convolved(
+            norm(x, under(block, "norm")), under(block, "conv"), stride=1, pad=2 * dilation, dilation=dilation
+        )
+        x = x + linear(gelu(hidden), under(block, "mix"))
+    x = linear(norm(x, under(w, "out.0")), under(w, "out.1"))
+    wanted, centres = (np.arange(frames) + 0.5) / frames, (np.arange(steps) + 0.5) / steps
+    return np.stack([np.interp(wanted, centres, channel) for channel in x.T], -1)
+
+
+def test_the_mel_encoder_is_log_mel_spectra_and_convolutions() -> None:
+    torch.set_default_dtype(torch.float32)  # the Fourier transform is taken in float32
+    module = registry.audio_encoder.mel(dim=DIM, hidden_dim=12, num_layers=4).eval()
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    samples, frames = (9600, 4815, 700), (15, 11, 2)
+    waves = torch.zeros(3, 9600)
+    for row, n in zip(waves, samples, strict=True):
+        row[:n] = 0.3 + 0.2 * torch.randn(n)
+    made = module(waves, torch.tensor(samples), torch.tensor(frames)).detach().numpy()
+    w = {name: value.astype("f8") for name, value in weights(module).items()}
+    for row, wave, n, count in zip(made, waves, samples, frames, strict=True):
+        expected = mel(wave[:n].double().numpy(), count, module, w)
+        np.testing.assert_allclose(row[:count], expected, rtol=2e-3, atol=2e-3)
+        assert not row[count:].any()
+    # The level of a whole recording instead of a clip's own.
+    with module.at_level(0.1, 0.5):
+        levelled = module(waves, torch.tensor(samples), torch.tensor(frames)).detach().numpy()
+    whole = module.standardise
+    module.standardise = lambda audio, lengths: (audio - 0.1) / 0.5 * (torch.arange(9600) < lengths[:, None])
+    again = module(waves, torch.tensor(samples), torch.tensor(frames)).detach().numpy()
+    np.testing.assert_allclose(levelled, again, rtol=1e-4, atol=1e-4)
+    module.standardise = whole
