@@ -1,0 +1,169 @@
+"""Long speech window by window against a loop in NumPy, with a model that says what it heard; and its noise."""
+
+from __future__ import annotations
+
+import zlib
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from facediff.data import Batch, Sample, collate
+from facediff.models.audio_encoders import AudioEncoder
+from facediff.models.inference import ClipNoise, FramePlan, Inference, SpeechStream, Window, WindowNoise, WindowPlan
+
+PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames
+HOP, FRAMES, SHARED, BEFORE, AFTER = 20, 30, 10, 12, 5
+CPU = torch.device("cpu")
+Array = np.ndarray
+
+
+class Ear(AudioEncoder):
+    """Hears nothing by itself; it knows how loud a stream is."""
+
+    def forward(self, audio: Tensor, audio_lengths: Tensor, frame_lengths: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+class Echo(Inference):
+    """The motion of a frame is the mean of its standardised speech, and where in the heard speech it lies."""
+
+    frame_rate = 25.0
+    windows = PLAN
+    device = CPU
+    speech_encoder = Ear()
+    assets: Any = SimpleNamespace()
+
+    def encode_style(self, reference: Tensor, mask: Tensor) -> Tensor:
+        return reference.new_zeros(len(reference), 2)
+
+    def generate_clips(self, batch: Batch, *, seed: int = 0, progress: object = None) -> Tensor:
+        frames = batch.motion.shape[1]
+        assert batch.frame_lengths.tolist() == [frames]
+        assert batch.audio_lengths.tolist() == [batch.audio.shape[1]]
+        heard = self.speech_encoder.standardise(batch.audio, batch.audio_lengths)[0]
+        values = heard.view(frames, 640).mean(1) + 0.1 * torch.arange(frames) + 0.003 * frames
+        return values.view(1, frames, 1, 1).expand(1, frames, 2, 3)
+
+
+def clip() -> Batch:
+    face = torch.zeros(2, 3)
+    sample = Sample(torch.zeros(640), torch.zeros(1, 2, 3), face, 0, torch.zeros(3, 2, 3), "a", "A", "", "a")
+    return collate([sample])
+
+
+def expected(speech: Array, total: int) -> Array:
+    """The same by hand: what each window hears, how loud it takes it to be, and the blend of two windows."""
+    speech = np.pad(speech, (0, max(0, total * 640 - len(speech))))
+    out, before, index = np.zeros(0), None, 0
+    while True:
+        start = index * HOP
+        left = total - start
+        if before is not None and left <= SHARED:
+            return np.concatenate([out, before[:left]])
+        last = left <= FRAMES
+        frames = left if last else FRAMES
+        heard = min(total, start + FRAMES + AFTER)
+        context = min(BEFORE, start)
+        known = speech[: heard * 640]
+        scaled = (known - known.mean()) / max(known.std(), 0.003)
+        values = scaled[(start - context) * 640 :].reshape(-1, 640).mean(1)
+        values = (values + 0.1 * np.arange(len(values)) + 0.003 * len(values))[context : context + frames]
+        if before is not None:
+            share = np.arange(SHARED) / SHARED
+            share = 3 * share**2 - 2 * share**3
+            values[:SHARED] = (1 - share) * before + share * values[:SHARED]
+        if last:
+            return np.concatenate([out, values])
+        out, before, index = np.concatenate([out, values[:HOP]]), values[-SHARED:], index + 1
+
+
+@pytest.mark.parametrize("frames", [3, 29, 30, 31, 35, 49, 50, 51, 60, 61, 83, 120])
+@pytest.mark.parametrize("loudness", [0.2, 0.0005], ids=["speech", "pause"])
+def test_long_speech_is_the_loop_over_windows(frames: int, loudness: float) -> None:
+    random = np.random.default_rng(frames)
+    # Not cut at a frame's end, of another mean, and louder towards the end.
+    speech = loudness * (0.5 + random.standard_normal(frames * 640 + 200) * np.linspace(0.5, 2, frames * 640 + 200))
+    stream, place, parts = SpeechStream(Echo(), clip(), seeds=[0, 1]), 0, []
+    for size in (100, 19_000, 641, 7_000, 10**6):
+        parts.append(stream.feed(torch.from_numpy(speech[place : place + size]).float()))
+        place += size
+    made = torch.cat([*parts, stream.finish()], 1)
+    assert made.shape == (2, frames, 2, 3)
+    assert stream.frames == frames
+    wanted = np.broadcast_to(expected(speech, frames)[None, :, None, None], made.shape)
+    np.testing.assert_allclose(made.numpy(), wanted, rtol=1e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("wanted", [59, 61, 64])
+def test_long_speech_may_be_told_how_many_frames_it_lasts(wanted: int) -> None:
+    """Speech that is a little too short or too long for its frames is padded or cut."""
+    speech = 0.2 * np.random.default_rng(0).standard_normal(60 * 640)
+    made = torch.cat(list(SpeechStream(Echo(), clip()).parts(torch.from_numpy(speech).float(), frames=wanted)), 1)
+    np.testing.assert_allclose(made[0, :, 0, 0].numpy(), expected(speech, wanted), rtol=1e-3, atol=2e-3)
+
+
+def test_a_microphones_noise_is_not_amplified() -> None:
+    """Below the deviation of a quiet room the level is that of the room."""
+    speech = 1e-4 * np.random.default_rng(0).standard_normal(30 * 640)
+    stream = SpeechStream(Echo(), clip())
+    made = torch.cat([stream.feed(torch.from_numpy(speech).float()), stream.finish()], 1)[0, :, 0, 0].numpy()
+    # 0.1 a frame from where it lies; the speech itself adds next to nothing.
+    np.testing.assert_allclose(made, 0.1 * np.arange(30) + 0.003 * 30, rtol=0, atol=1e-2)
+
+
+def test_windows_lie_a_hop_apart() -> None:
+    plan = PLAN.in_frames(25.0)
+    assert plan == FramePlan(FRAMES, SHARED, BEFORE, AFTER)
+    assert plan.hop == HOP
+    windows = [Window(plan, index, FRAMES) for index in range(4)]
+    assert [(w.start, w.end, w.context, w.shared, w.kept) for w in windows] == [
+        (0, 30, 0, 0, 10),
+        (20, 50, 12, 10, 10),
+        (40, 70, 12, 10, 10),
+        (60, 90, 12, 10, 10),
+    ]
+    assert Window(plan, 1, 7).end == 27
+    assert [PLAN.in_one_pass(frames, 25.0) for frames in (50, 51)] == [True, False]
+    assert PLAN.look_ahead == pytest.approx(1.4)
+
+
+def test_clip_noise_is_unit_gaussian_by_name_and_seed() -> None:
+    like = torch.empty(3, 200, 50)
+    noise = ClipNoise(["a", "b", "a"], [200, 150, 200], [0, 0, 1], CPU)
+    first, second = noise(like), noise(like)
+    for made in (first, second):
+        assert float(made[1, 150:].abs().max()) == 0
+        flat = torch.stack([made[0, :150], made[1, :150], made[2, :150]]).flatten(1).double()
+        assert float(flat.mean(1).abs().max()) < 5 / 7500**0.5
+        assert float((torch.cov(flat) - torch.eye(3)).abs().max()) < 5 * (2 / 7500) ** 0.5
+    assert not torch.equal(first, second)
+    # A clip's noise is the same alone, and the same on every machine of this kind.
+    assert torch.equal(ClipNoise(["b"], [150], [0], CPU)(torch.empty(1, 150, 50))[0], first[1, :150])
+    stream = torch.Generator().manual_seed(zlib.crc32(b"a") + 1)
+    assert torch.equal(torch.randn(200, 50, generator=stream), first[2])
+
+
+def test_window_noise_continues_that_of_the_window_before() -> None:
+    plan, like = PLAN.in_frames(25.0), torch.empty(2, FRAMES, 400)
+    made = []
+    for index in range(4):
+        noise = WindowNoise("a", Window(plan, index, FRAMES), [5, 6], CPU)
+        made.append([noise(like) for _ in range(3)])
+    for old, new in zip(made, made[1:], strict=False):
+        for step in range(3):
+            assert torch.equal(old[step][:, -SHARED:], new[step][:, :SHARED])
+    # Frames of the speech, steps and seeds are independent, and of unit variance.
+    for step in range(3):
+        whole = torch.cat([made[0][step], *(window[step][:, SHARED:] for window in made[1:])], 1)
+        assert whole.shape == (2, 90, 400)
+        flat = torch.cat([*whole, *made[0][(step + 1) % 3]]).double()
+        assert float((flat @ flat.T / 400 - torch.eye(len(flat))).abs().max()) < 6.5 * (2 / 400) ** 0.5
+    # Where the speech ends does not matter to what comes before.
+    for index in (0, 2):
+        short = WindowNoise("a", Window(plan, index, 17), [5, 6], CPU)(torch.empty(2, 17, 400))
+        assert torch.equal(short, made[index][0][:, :17])
+    assert not torch.equal(WindowNoise("b", Window(plan, 0, FRAMES), [5, 6], CPU)(like), made[0][0])
