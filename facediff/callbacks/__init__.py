@@ -1,5 +1,6 @@
 """Callbacks: what happens around training and testing."""
 
+from facediff.callbacks.augmentation import InventedSpeakers
 from facediff.callbacks.averaging import EmaWithWarmup
 from facediff.callbacks.checkpoints import LastCheckpoint
 from facediff.callbacks.dashboard import GradientNorm, RunDescription
@@ -11,6 +12,7 @@ __all__ = [
     "CompiledTraining",
     "EmaWithWarmup",
     "GradientNorm",
+    "InventedSpeakers",
     "LastCheckpoint",
     "PredictionWriter",
     "RunDescription",

@@ -1,0 +1,37 @@
+"""Other truths of a clip: those that the corpus's own generator draws, alike in the lips and not in the upper face."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("espeakng_loader")
+
+from facediff.synthetic.corpus import generate
+from tools.yardsticks_of_truth import OtherTruths, other_truth
+
+
+def test_the_first_truth_is_the_corpus_and_others_differ_in_the_upper_face(tmp_path: Path) -> None:
+    root = tmp_path / "corpus"
+    generate(root, only=("F1_e29",), progress=False)
+    vertices = np.load(root / "vertices_npy" / "F1_e29.npy").reshape(-1, 1008, 3)
+    template = pickle.loads((root / "templates.pkl").read_bytes(), encoding="latin1")["F1"]  # noqa: S301 - made here
+    recorded = vertices - template
+    np.testing.assert_allclose(other_truth("F1_e29", 0).numpy(), recorded, atol=2e-6)
+    other = other_truth("F1_e29", 3).numpy()
+    assert other.shape == recorded.shape
+    lips, upper = (
+        np.array(re.findall(r"\d+", (root / "regions" / f"{name}.txt").read_text()), dtype=int)
+        for name in ("lve", "fdd")
+    )
+
+    def share(region: np.ndarray) -> float:
+        gap, own = other[:, region] - recorded[:, region], recorded[:, region]
+        return float(np.square(gap).mean() / np.square(own - own.mean(0)).mean())
+
+    assert share(lips) < 0.05 < 0.5 < share(upper)
+    assert OtherTruths.samples

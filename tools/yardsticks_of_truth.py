@@ -1,0 +1,116 @@
+"""What a perfect generator gets on Puppet's yardsticks: other truths of the same speech, as a table.
+
+The built-in corpus draws blinks, drift and habits of the brows at random, so it can be asked for another truth of the
+same sentence by the same speaker. Scored like samples of a model, these are the best that a model can be: no score
+below is reached by drawing from the right distribution, and some of them are not where one might expect them. FDD of
+single clips, for instance, cannot vanish, since the clip that was recorded is one of many.
+
+    $ python tools/yardsticks_of_truth.py
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from facediff.data import Batch, Puppet
+from facediff.models.base import AnimationModel
+from facediff.models.yardsticks import YARDSTICKS, Sampling, Yardsticks, measure
+from facediff.synthetic.corpus import clips, generate_clip, rig_of
+from facediff.utils.files import atomic
+
+SKIPPED = ("mve_", "nearest", "real_time")
+"""Yardsticks that ask for the motion of another reference, or for a time."""
+
+
+class OtherTruths(AnimationModel):
+    """Draws another truth of a clip's speech for every seed, in place of a model's samples."""
+
+    samples: ClassVar[bool] = True
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Nothing is learnt."""
+        raise NotImplementedError
+
+    def generate_clips(self, batch: Batch, *, seed: int = 0, progress: Any = None) -> Tensor:  # noqa: ANN401
+        """Motion of every clip."""
+        motion = torch.zeros_like(batch.motion)
+        for row, name in enumerate(batch.names):
+            drawn = other_truth(name, seed + 1)  # the corpus itself is of seed 0
+            motion[row, : len(drawn)] = drawn
+        return motion
+
+    def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Any = None) -> Tensor:  # noqa: ANN401
+        """Several truths of one clip."""
+        return torch.cat([self.generate_clips(clip, seed=seed) for seed in seeds])
+
+
+@lru_cache(maxsize=1024)
+def other_truth(name: str, seed: int) -> Tensor:
+    """Offsets from the template (frames, vertices, 3) of a clip, with its random part drawn anew."""
+    clip = next(each for each in clips() if each.name == name)
+    rig = rig_of(clip.identity)
+    weights = generate_clip(clip, seed)[1]
+    still = rig.pose(torch.zeros(1, weights.shape[1]).numpy())
+    return torch.from_numpy(rig.pose(weights) - still).float()
+
+
+def measured(root: Path | None = None, samples: int = 10, most_clips: int | None = None) -> Yardsticks:
+    """The yardsticks of other truths.
+
+    Args:
+        root: the corpus; the user's cache if None.
+        samples: of each clip.
+        most_clips: clips of a split; all if None.
+    """
+    data = Puppet(root=root) if root is not None else Puppet()
+    data.prepare_data()
+    data.setup("fit")
+    data.setup("test")
+
+    def load() -> AnimationModel:
+        model = OtherTruths(
+            n_vertices=data.n_vertices, identities=data.identities, frame_rate=data.frame_rate, motion_scale="none"
+        )
+        model.adopt(data.assets())
+        return model.eval()
+
+    sampling = Sampling(samples=samples, references=1)
+    return measure({"another truth": load}, data, sampling=sampling, most_clips=most_clips)
+
+
+def table(found: Yardsticks) -> str:
+    """Markdown: a row for each yardstick, a column for each split."""
+    lines = ["| yardstick | " + " | ".join(found.values) + " |", "|---|" + "---|" * len(found.values)]
+    for name in YARDSTICKS:
+        values = [found.mean(split, name) for split in found.values]
+        if name.startswith(SKIPPED) or None in values:
+            continue
+        lines.append(f"| {found.title(name)} | " + " | ".join(f"{value:.4g}" for value in values if value is not None))
+        lines[-1] += " |"
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data-root", type=Path, help="where the corpus is (default: the user's cache folder)")
+    parser.add_argument("--samples", type=int, default=10, help="other truths of each clip (default: 10)")
+    parser.add_argument("--clips", type=int, help="clips of a split (default: all)")
+    parser.add_argument("--output", type=Path, help="also write the table to this file")
+    given = parser.parse_args(arguments)
+    text = table(measured(given.data_root, given.samples, given.clips))
+    print(text)
+    if given.output is not None:
+        with atomic(given.output) as partial:
+            partial.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
