@@ -8,7 +8,7 @@ Training computes the same numbers in one pass over the vertices: :mod:`facediff
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -129,3 +129,42 @@ def preconditioned_losses(
         terms[name] = (squared * valid).sum() / valid.sum().clamp_min(1)
         gap, valid = gap[:, 1:] - gap[:, :-1], valid[:, 1:] & valid[:, :-1]
     return {**terms, "loss": torch.stack([weights[name] * term for name, term in terms.items()]).sum()}
+
+
+def style_contrast(styles: Float[Tensor, "clips dim"], identities: Sequence[str], temperature: float = 0.1) -> Scalar:
+    """Pulls styles of one identity together and those of different identities apart.
+
+    For every style, the mean negative log-probability of picking another one of the same identity among all others,
+    with cosine similarities over the temperature as logits (supervised contrast, Khosla et al. 2020, eq. 2). Pulling
+    alone would be satisfied by one style for everybody. 0 if nobody has two styles.
+
+    Args:
+        styles: style vectors.
+        identities: whose they are.
+        temperature: how sharp the choice is.
+    """
+    same = torch.tensor([[one == other for other in identities] for one in identities], device=styles.device)
+    own = torch.eye(len(identities), dtype=torch.bool, device=styles.device)
+    same &= ~own
+    directions = torch.nn.functional.normalize(styles.float(), dim=1)
+    # A style is not compared with itself. Its logit of −∞ takes it out of the softmax; what the logarithm then makes of
+    # it is set to 0, since −∞ times the mask's 0 would be NaN.
+    logits = (directions @ directions.T / temperature).masked_fill(own, -torch.inf)
+    chances = logits.log_softmax(1).masked_fill(own, 0.0)
+    counts = same.sum(1)
+    # Nobody has two styles, or all styles are of one identity: there is nothing to choose between.
+    if not counts.any() or bool(same.logical_or(own).all()):
+        return styles.new_zeros(())
+    each = -(chances * same).sum(1) / counts.clamp_min(1)
+    return each[counts > 0].mean()
+
+
+def style_identity_loss(logits: Float[Tensor, "clips identities"], identity: Int[Tensor, " clips"]) -> Scalar:
+    """Mean cross-entropy of telling whose a style is; clips of unseen speakers (−1) do not count.
+
+    Args:
+        logits: of a linear map of the style vectors.
+        identity: index of each clip's identity.
+    """
+    total = F.cross_entropy(logits.float(), identity, ignore_index=-1, reduction="sum")
+    return total / (identity >= 0).sum().clamp_min(1)

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Batch, collate
 from facediff.models import Style, StyleContentDisentanglement, load_model
+from facediff.models.losses import style_contrast
 from facediff.models.style_content.losses import (
     Alignments,
     MotionDistance,
@@ -26,7 +27,6 @@ from facediff.models.style_content.losses import (
     dynamics_distance,
     pair_up,
     relative_distance,
-    style_contrast,
 )
 from facediff.models.style_content.network import MotionDecoder, WindowedTransformer
 from tests.fakes.tiny import SEEN, VERTICES, Tiny

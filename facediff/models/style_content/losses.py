@@ -6,7 +6,6 @@ compare, and at last how two recordings of one sentence are aligned in time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,36 +121,6 @@ def relative_distance(
     # then have the distance 2, and equal ones 0.
     spread = kept.var(0, correction=0).mean() + other.var(0, correction=0).mean()
     return 2 * (kept - other).square().mean() / (spread + EPSILON)
-
-
-def style_contrast(
-    styles: Float[Tensor, "clips dim"], identities: Sequence[str], temperature: float = 0.1
-) -> Float[Tensor, ""]:
-    """Pulls styles of one identity together and those of different identities apart.
-
-    For every style, the mean negative log-probability of picking another one of the same identity among all others,
-    with cosine similarities over the temperature as logits (supervised contrast, Khosla et al. 2020, eq. 2). Pulling
-    alone would be satisfied by one style for everybody. 0 if nobody has two styles.
-
-    Args:
-        styles: style vectors.
-        identities: whose they are.
-        temperature: how sharp the choice is.
-    """
-    same = torch.tensor([[one == other for other in identities] for one in identities], device=styles.device)
-    own = torch.eye(len(identities), dtype=torch.bool, device=styles.device)
-    same &= ~own
-    directions = torch.nn.functional.normalize(styles.float(), dim=1)
-    # A style is not compared with itself. Its logit of −∞ takes it out of the softmax; what the logarithm then makes of
-    # it is set to 0, since −∞ times the mask's 0 would be NaN.
-    logits = (directions @ directions.T / temperature).masked_fill(own, -torch.inf)
-    chances = logits.log_softmax(1).masked_fill(own, 0.0)
-    counts = same.sum(1)
-    # Nobody has two styles, or all styles are of one identity: there is nothing to choose between.
-    if not counts.any() or bool(same.logical_or(own).all()):
-        return styles.new_zeros(())
-    each = -(chances * same).sum(1) / counts.clamp_min(1)
-    return each[counts > 0].mean()
 
 
 def dynamics_distance(

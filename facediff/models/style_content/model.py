@@ -21,6 +21,7 @@ from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel, Decay
 from facediff.models.inference import Progress
 from facediff.models.layers import Heads, Weight, Width
+from facediff.models.losses import style_contrast
 from facediff.models.mesh_encoders import MeshEncoderFactory, SpiralMeshEncoder
 from facediff.models.speaker_encoders import LstmStyle, StyleEncoderFactory
 from facediff.models.style_content.losses import (
@@ -30,7 +31,6 @@ from facediff.models.style_content.losses import (
     dynamics_distance,
     pair_up,
     relative_distance,
-    style_contrast,
 )
 from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
 from facediff.utils.ranges import Range
