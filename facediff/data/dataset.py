@@ -241,7 +241,7 @@ def evened(batches: list[list[int]], world_size: int) -> list[list[int]]:
     return batches
 
 
-ReferenceChoice = Literal["same_subject", "self"]
+ReferenceChoice = Literal["same_subject", "any_mood", "self"]
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,8 @@ class ReferencePolicy:
     Attributes:
         candidates: clips that may serve, by identity; never a clip of an evaluated split where there are others.
         same: clip attributes that target and reference share where possible, e.g. the mood.
-        choice: another clip of the same speaker, or (in training only) the target itself.
+        choice: another clip of the same speaker or, in training only, such a clip whatever its mood
+            (``any_mood``), or the target itself (``self``).
         max_frames: longest reference; longer clips are cut to a window.
     """
 
@@ -266,8 +267,8 @@ class ReferencePolicy:
             if len(self.candidates.get(clip.identity, [])) < 2:
                 self.eligible(clip)
 
-    def eligible(self, target: Clip) -> list[Clip]:
-        """The clips that may serve ``target``, the best matching ones, never ``target`` itself.
+    def eligible(self, target: Clip, *, any_mood: bool = False) -> list[Clip]:
+        """The clips that may serve ``target``, never ``target`` itself; the best matching ones unless ``any_mood``.
 
         Raises:
             FaceDiffError: if the speaker has no other clip outside the evaluated splits.
@@ -278,6 +279,8 @@ class ReferencePolicy:
                 f"clip {target.name}: {target.identity} has no other clip that could be its style reference; add clips "
                 f"outside the test sentences, or train with data.reference=self"
             )
+        if any_mood:
+            return others
         alike = [c for c in others if all(c.attributes.get(k) == target.attributes.get(k) for k in self.same)]
         return alike or others
 
@@ -359,7 +362,7 @@ class MotionDataset(Dataset[Sample]):
     def _reference(self, clip: Clip, random: torch.Generator) -> Clip:
         if self.training and self.policy.choice == "self":
             return clip
-        eligible = self.policy.eligible(clip)
+        eligible = self.policy.eligible(clip, any_mood=self.training and self.policy.choice == "any_mood")
         if self.training:
             return eligible[int(torch.randint(len(eligible), (), generator=random))]
         return eligible[zlib.crc32(clip.name.encode()) % len(eligible)]

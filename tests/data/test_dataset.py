@@ -10,7 +10,7 @@ import soundfile
 import torch
 
 from facediff.data import collate
-from facediff.data.dataset import MotionDataset
+from facediff.data.dataset import MotionDataset, Pick
 from facediff.errors import FaceDiffError
 from tests.fakes.tiny import Tiny, write_tiny
 
@@ -59,6 +59,21 @@ def test_the_reference_shares_the_targets_mood(tiny: Tiny) -> None:
     for split in ("train", "test_a", "test_b"):
         for sample in tiny.dataset(split):
             assert clips[sample.reference_name].attributes["mood"] == clips[sample.name].attributes["mood"]
+
+
+def test_references_of_any_mood_are_for_training_only(tiny_root: Path) -> None:
+    data = Tiny(root=str(tiny_root), reference="any_mood")
+    clips = data.corpus.clips
+
+    def same_mood(training: bool) -> set[bool]:
+        samples = [data.dataset("train", training=training).sample(Pick(0, seed)) for seed in range(20)]
+        assert all(sample.reference_name.startswith("A_") for sample in samples)
+        assert all(sample.reference_name != sample.name for sample in samples)
+        mood = clips[samples[0].name].attributes["mood"]
+        return {clips[sample.reference_name].attributes["mood"] == mood for sample in samples}
+
+    assert same_mood(training=True) == {True, False}
+    assert same_mood(training=False) == {True}
 
 
 def test_self_reference_is_for_training_only(tiny_root: Path) -> None:
