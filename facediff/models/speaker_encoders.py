@@ -52,8 +52,7 @@ class IdentityEncoder(nn.Module, ABC):
         """Encode.
 
         Args:
-            identity: index into the training identities, or −1 for an unseen speaker, who gets the mean of the
-                training identities' features.
+            identity: index into the training identities, or −1 for an unseen speaker.
         """
 
 
@@ -76,9 +75,18 @@ class HierarchicalIdentity(IdentityEncoder):
         dim: the model's channels; given by the model.
         n_identities: number of training identities; given by the model.
         level_dim: channels of each level; ``dim`` if None.
+        unseen: what an unseen speaker gets, and a training clip whose identity is hidden: the ``mean`` over all
+            identities' features, or a feature of its own that is ``learnt`` from hidden identities.
     """
 
-    def __init__(self, *, dim: Width, n_identities: Count, level_dim: Width | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        dim: Width,
+        n_identities: Count,
+        level_dim: Width | None = None,
+        unseen: Literal["mean", "learnt"] = "mean",
+    ) -> None:
         super().__init__()
         width = dim if level_dim is None else level_dim
         self.coarse = nn.Embedding(n_identities, width)
@@ -86,6 +94,9 @@ class HierarchicalIdentity(IdentityEncoder):
         self.fine = nn.Embedding(n_identities, width)
         self.attention = nn.Linear(3 * width, 3)
         self.norm = nn.LayerNorm(3 * width)
+        # Normalised as the identities' features are. The mean over them is smaller than any of them and moves whenever
+        # one of them does; nothing is learnt of it but through them.
+        self.unseen = nn.Parameter(torch.randn(3 * width)) if unseen == "learnt" else None
         self.token_dims = (width, width, width)
 
     def level_weights(self) -> Float[Tensor, "identities 3"]:
@@ -93,12 +104,13 @@ class HierarchicalIdentity(IdentityEncoder):
         return self.attention(torch.cat(self._tables(), dim=-1)).softmax(-1)
 
     def forward(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identity_dim"]:
-        """F_id of each clip; the mean over all identities for an unseen speaker."""
-        # Of every identity, not of the batch's alone: an unseen speaker gets the mean over all of them.
+        """F_id of each clip; an unseen speaker gets the mean over all identities, or what was learnt for that."""
+        # Of every identity, not of the batch's alone: an unseen speaker may get the mean over all of them.
         weights = self.level_weights().unbind(-1)
         weighted = [weight[:, None] * table for weight, table in zip(weights, self._tables(), strict=True)]
         features = self.norm(torch.cat(weighted, dim=-1))  # eq. 11
-        return torch.where((identity >= 0)[:, None], features[identity.clamp_min(0)], features.mean(0, keepdim=True))
+        unseen = features.mean(0) if self.unseen is None else self.norm(self.unseen)
+        return torch.where((identity >= 0)[:, None], features[identity.clamp_min(0)], unseen[None])
 
     def _tables(self) -> list[Tensor]:
         return [self.coarse.weight, self.mid.weight, self.fine.weight]
