@@ -68,6 +68,8 @@ def animate(
     samples: Annotated[ranges.Samples, Option(metavar="N")] = 1,
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
     steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
+    expressivity: Annotated[str | None, Option(metavar="E")] = None,
+    guidance: Annotated[str | None, Option(metavar="SCALES")] = None,
     seed: Seed = 0,
     device: str = "cpu",
     precision: Literal["32", "bf16"] = "32",
@@ -101,6 +103,10 @@ def animate(
         samples: how many animations, with seeds one after another
         sampler: sampler by name; see `facediff components sampler`
         steps: denoising steps of the sampler
+        expressivity: 0 for the mean of what the model finds possible, 1 for a sample, up to 2 for more than that; or by
+            region, lips=0.5,upper_face=1.2 (default: the checkpoint's, usually 1)
+        guidance: follow conditions more than the model would by itself, style=1.5,speech=1.2,identity=1.3, where it was
+            trained for that (default: the checkpoint's, usually 1)
         seed: seed of the noise
         device: cpu, cuda …
         precision: bf16 multiplies in 16 bits, where the processor is faster at it; the motion differs a little
@@ -148,6 +154,8 @@ def animate(
         samples=samples,
         sampler=sampler,
         steps=steps,
+        expressivity=expressivity,
+        guidance=guidance,
         device=device,
         precision=precision,
         window=windows.window,

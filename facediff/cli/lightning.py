@@ -36,7 +36,10 @@ OWN_OPTIONS = {"validate": ("verbose",), "test": ("verbose",), "predict": ("retu
 REPEATABLE = ("-c", "--config", "--trainer.callbacks", "--trainer.logger", "--trainer.plugins", "--print_config")
 """What options begin with that add to what is there."""
 
-FREE = ("sampler", "sampling_space", "unseen_identity", "protocol", "metrics")
+FREE = (
+    *("sampler", "sampling_space", "expressivity", "speech_guidance", "identity_guidance", "style_guidance"),
+    *("unseen_identity", "protocol", "metrics"),
+)
 """Constructor arguments of a model that may differ from its checkpoint's; no weights depend on them."""
 
 

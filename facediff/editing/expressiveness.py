@@ -19,11 +19,16 @@ FALL_OFF = 0.06
 HIGHEST = 4.0  # Motion more than this many times as large does not look like a face's any more
 
 
-def read_factors(words: str) -> dict[str, float]:
+def read_factors(words: str, option: str = "--expressiveness", highest: float = HIGHEST) -> dict[str, float]:
     """Factors by region from the command line: ``1.2`` (all), or ``upper_face=1.5,lips=0.9``.
 
+    Args:
+        words: what was typed.
+        option: after which option, for errors.
+        highest: the largest factor.
+
     Raises:
-        FaceDiffError: if the words are neither, a name comes twice, or a factor is not in 0 … 4.
+        FaceDiffError: if the words are neither, a name comes twice, or a factor is not in 0 … ``highest``.
 
     Example:
         >>> read_factors("upper_face=1.5,all=1.1")
@@ -33,15 +38,15 @@ def read_factors(words: str) -> dict[str, float]:
     for word in words.split(","):
         name, equals, number = word.rpartition("=")
         name = name.strip() if equals else ALL
-        expected = f"a factor from 0 to {HIGHEST:g} (1.2), or factors by region (upper_face=1.5,lips=0.9)"
+        expected = f"a factor from 0 to {highest:g} (1.2), or factors by region (upper_face=1.5,lips=0.9)"
         if not name:
-            raise FaceDiffError(f"--expressiveness {words}: expected {expected}")
+            raise FaceDiffError(f"{option} {words}: expected {expected}")
         try:
-            factor = Range(0, HIGHEST).read(name, number.strip())
+            factor = Range(0, highest).read(name, number.strip())
         except FaceDiffError as error:
-            raise FaceDiffError(f"--expressiveness {words}: expected {expected}") from error
+            raise FaceDiffError(f"{option} {words}: expected {expected}") from error
         if name in factors:
-            raise FaceDiffError(f"--expressiveness {words}: names {name} twice; give one factor for it")
+            raise FaceDiffError(f"{option} {words}: names {name} twice; give one factor for it")
         factors[name] = factor
     return factors
 

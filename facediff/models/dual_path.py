@@ -8,9 +8,9 @@ chosen by name have files of their own; docs/method.md says where each equation 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.decoders import Decoder, DecoderFactory, StyleTransformer
@@ -35,9 +35,9 @@ from facediff.models.folding import (
     unchanged,
 )
 from facediff.models.fusions import BidirectionalCrossAttention, Fusion, FusionFactory
-from facediff.models.inference import ClipNoise, Progress, Window, WindowNoise, WindowOverlap
+from facediff.models.inference import ClipNoise, Expressivity, Progress, Window, WindowNoise, WindowOverlap
 from facediff.models.layers import Share, Weight, Width, frame_mask
-from facediff.models.losses import preconditioned_losses
+from facediff.models.losses import preconditioned_losses, style_contrast, style_identity_loss
 from facediff.models.losses_fused import fused_losses
 from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoder, MeshEncoderFactory
 from facediff.models.motion_space import MotionSpaceFactory, Preconditioning, VertexMotion
@@ -57,6 +57,7 @@ from facediff.models.speaker_encoders import (
     StyleEncoderFactory,
     TcnGruTransformer,
 )
+from facediff.utils import ranges
 from facediff.utils.ranges import Range, mismatch
 
 TokenForm = Literal["levels", "single"]
@@ -66,6 +67,8 @@ NoiseScale = NumericScale | Literal["auto"]
 NOISE_SCALE_KEY = "facediff_noise_scale"
 PRINCIPAL = 64
 """Components by which the noise scale is measured."""
+CONDITIONS = ("speech", "identity", "style")
+"""What motion is conditioned on, in the order in which guidance adds it."""
 
 
 @registry.model.register("DualPathDiffusion")
@@ -98,9 +101,21 @@ class DualPathDiffusion(AnimationModel):
             scale half of its variance shows in the schedule's middle.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
         identity_dropout: share of training clips whose identity is hidden, so that unseen speakers can be animated.
+        style_dropout: share of training clips whose dynamic style is hidden, so that the style can guide.
+        speech_dropout: share of training clips whose speech is hidden, together with whatever else may be hidden, so
+            that speech can guide.
+        speech_guidance: how much more than it has learnt the model follows the speech; 1 or, with ``speech_dropout``,
+            another scale.
+        identity_guidance: the same for the identity, with ``identity_dropout``.
+        style_guidance: the same for the dynamic style, with ``style_dropout``.
+        expressivity: 0 for the mean prediction, 1 for a sample, and anything between and up to 2.
         velocity_weight: λ_vel.
         acceleration_weight: λ_acc.
         face_weight: λ_face.
+        style_identity_weight: of telling the training identity from the dynamic style, by a linear map that is used in
+            training only; lets the style hold the person in addition to the mood.
+        style_contrast_weight: of pulling the dynamic styles of an identity's clips together, whatever their mood, and
+            those of different identities apart.
         options: those of every model, see :class:`facediff.models.AnimationModel`.
     """
 
@@ -125,13 +140,24 @@ class DualPathDiffusion(AnimationModel):
         noise_scale: NoiseScale = 1.0,
         style_tokens: TokenForm = "levels",
         identity_dropout: Share = 0.1,
+        style_dropout: Share = 0.0,
+        speech_dropout: Share = 0.0,
+        speech_guidance: ranges.GuidanceScale = 1.0,
+        identity_guidance: ranges.GuidanceScale = 1.0,
+        style_guidance: ranges.GuidanceScale = 1.0,
+        expressivity: ranges.Expressivity = 1.0,
         velocity_weight: Weight = 0.003,
         acceleration_weight: Weight = 0.003,
         face_weight: Weight = 0.0005,
+        style_identity_weight: Weight = 0.0,
+        style_contrast_weight: Weight = 0.0,
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(**options)
         self.identity_dropout = identity_dropout
+        self.style_dropout = style_dropout
+        self.speech_dropout = speech_dropout
+        self.expressivity: Expressivity = expressivity
         self.loss_weights = {
             "reconstruction": 1.0,
             "velocity": velocity_weight,
@@ -139,6 +165,7 @@ class DualPathDiffusion(AnimationModel):
             "face": face_weight,
         }
         self.noise_draws = noise_draws
+        self.style_weights = {"style_identity": style_identity_weight, "style_contrast": style_contrast_weight}
         self.noise_scale: NoiseScale = noise_scale
         self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
         # Not the factory itself: jsonargparse's holds the parser, and with it the trainer and its processes, which
@@ -159,7 +186,20 @@ class DualPathDiffusion(AnimationModel):
             fusion=fusion(dim=dim),
             decoder=decoder(dim=dim, style_dim=dim),
             token_form=style_tokens,
+            speech_may_hide=speech_dropout > 0,
+            style_may_hide=style_dropout > 0,
         )
+        for name, weight in self.style_weights.items():
+            if weight and not style.token_dims:
+                raise ArgumentError({f"{name}_weight": weight}, "there is no dynamic style; choose a style_encoder")
+        self.style_identity = nn.Linear(sum(style.token_dims), len(self.identities)) if style_identity_weight else None
+        self.guidance = dict.fromkeys(CONDITIONS, 1.0)
+        scales = {"speech": speech_guidance, "identity": identity_guidance, "style": style_guidance}
+        for name, scale in scales.items():
+            try:
+                self.choose_guidance({name: scale})
+            except FaceDiffError as error:
+                raise ArgumentError({f"{name}_guidance": scale}, str(error)) from error
         if self.motion_space.preconditioning is not None:
             # Training starts from the posterior mean without speech, and not from random motion added to it.
             nn.init.zeros_(self.network.unembed.weight)
@@ -206,7 +246,10 @@ class DualPathDiffusion(AnimationModel):
     def personal_modules(self) -> list[nn.Module]:
         """The identity's and the dynamic style's encoders, and how both are presented to the decoder."""
         network = self.network
-        parts = (network.identity_encoder, network.mesh_encoder, network.style_encoder, network.style_tokens)
+        parts = (
+            *(network.identity_encoder, network.mesh_encoder, network.style_encoder, network.style_tokens),
+            self.style_identity,
+        )
         return [part for part in parts if part is not None]
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
@@ -217,6 +260,64 @@ class DualPathDiffusion(AnimationModel):
             options["steps"] = steps
         self._sampler_options = options
         self.sampler = chosen(process=self.process, **options)
+
+    def choose_expressivity(self, expressivity: Expressivity) -> None:
+        """Go from the mean prediction (0) to a sample (1) or beyond; checkpoints keep what the model was made with.
+
+        Raises:
+            FaceDiffError: if it is out of range, or not one number for each vertex.
+        """
+        numbers = expressivity.flatten().tolist() if isinstance(expressivity, Tensor) else [expressivity]
+        if isinstance(expressivity, Tensor) and expressivity.shape != (self.n_vertices,):
+            raise FaceDiffError(
+                f"expressivity: has the shape {tuple(expressivity.shape)}; expected one number, or one for each of "
+                f"{self.n_vertices} vertices"
+            )
+        wrong = [(number, word) for number in numbers if (word := mismatch(ranges.Expressivity, number)) is not None]
+        if wrong:
+            raise FaceDiffError(f"expressivity {wrong[0][0]}: out of range; expected {wrong[0][1]}")
+        self.expressivity = expressivity
+
+    @property
+    def guidable(self) -> list[str]:
+        """The conditions that were hidden now and then in training, so that the model knows motion without them."""
+        network = self.network
+        shares = {
+            "speech": self.speech_dropout,
+            "identity": self.identity_dropout if network.identity_encoder.token_dims else 0.0,
+            "style": self.style_dropout if network.style_encoder.token_dims else 0.0,
+        }
+        return [name for name in CONDITIONS if shares[name] > 0]
+
+    def choose_guidance(self, scales: Mapping[str, float]) -> None:
+        """Follow conditions more (above 1) or less from now on; checkpoints keep what the model was made with.
+
+        Raises:
+            FaceDiffError: if a scale is out of range, or the model was trained without hiding such a condition.
+        """
+        for name, scale in scales.items():
+            if name not in CONDITIONS:
+                raise FaceDiffError(f'guidance: there is no condition "{name}": {choices(name, CONDITIONS)}')
+            if (expected := mismatch(ranges.GuidanceScale, scale)) is not None:
+                raise FaceDiffError(f"guidance: {name}={scale} is out of range; expected {expected}")
+            if scale != 1 and name not in self.guidable:
+                raise FaceDiffError(
+                    f"guidance: {name}={scale:g} needs a model that knows motion without it; train one with "
+                    f"model.{name}_dropout=0.1"
+                )
+        self.guidance |= scales
+
+    def views(self) -> dict[tuple[str, ...], float]:
+        """Which conditions are hidden in the predictions that guidance combines, and the share of each.
+
+        With the conditions c₁ … c_K that can be hidden and their scales w₁ … w_K, the prediction is
+        G(∅) + Σ_k w_k [G(c₁ … c_k) − G(c₁ … c_{k−1})] (incremental guidance; Sun et al. 2024, DiffPoseTalk, after Ho
+        and Salimans 2022). Predictions whose share is zero are not computed: with all scales 1 there is one.
+        """
+        names = self.guidable
+        scales = [1.0, *(self.guidance[name] for name in names), 0.0]
+        found = {tuple(names[given:]): scales[given] - scales[given + 1] for given in range(len(names) + 1)}
+        return {hidden: share for hidden, share in found.items() if share}
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Noise each clip to a random step (algorithm 1, lines 3 and 4), then take the four losses (eq. 15 to 19)."""
@@ -240,11 +341,25 @@ class DualPathDiffusion(AnimationModel):
         if space.preconditioning is not None:
             motion = space.encode(motion * self.scale)
         draws = len(step) // len(batch)
+        drawn = conditions
         if draws > 1:
-            conditions = conditions.drawn(draws)
+            drawn = conditions.drawn(draws)
             motion, mask = motion.repeat_interleave(draws, 0), mask.repeat_interleave(draws, 0)
         if space.preconditioning is not None:
-            return self._preconditioned_losses(conditions, motion, mask, step, noise, space.preconditioning)
+            found = self._preconditioned_losses(drawn, motion, mask, step, noise, space.preconditioning)
+        else:
+            found = self._vertex_losses(drawn, motion, mask, step, noise)
+        return self._with_style_losses(found, batch, conditions)
+
+    def _vertex_losses(
+        self,
+        conditions: Conditions,
+        motion: Float[Tensor, "draws frames vertices 3"],
+        mask: Bool[Tensor, "draws frames"],
+        step: Int[Tensor, " draws"],
+        noise: Float[Tensor, "draws frames coordinates"],
+    ) -> dict[str, Tensor]:
+        """The losses on the vertices."""
         network = self.network
         # √ᾱ M⁰ + √(1 − ᾱ) ε, as NoiseProcess.add_noise, but in place: on a processor, allocating tensors of this size
         # takes longer than the arithmetic.
@@ -278,15 +393,52 @@ class DualPathDiffusion(AnimationModel):
         predicted = scales.clean(noisy, features, step)
         return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
 
-    def conditions(self, batch: Batch) -> Conditions:
-        """Everything that is computed once per clip; in training, identities are hidden now and then."""
-        identity = batch.identity
-        if self.training and self.identity_dropout:
-            # Index −1 stands for an unseen speaker. Clips that are shown under it teach the model to take the person
-            # from the style alone.
-            hidden = torch.rand(identity.shape, device=identity.device) < self.identity_dropout
-            identity = identity.masked_fill(hidden, -1)
-        return self.network.conditions(batch, identity, self.style_of(batch))
+    def _with_style_losses(self, found: dict[str, Tensor], batch: Batch, conditions: Conditions) -> dict[str, Tensor]:
+        """The terms of the dynamic style, where they are asked for, and the sum with them."""
+        weights, style = self.style_weights, conditions.dynamic
+        assert style is not None  # noqa: S101 - for the type checker
+        terms: dict[str, Tensor] = {}
+        if self.style_identity is not None:
+            terms["style_identity"] = style_identity_loss(self.style_identity(style), batch.identity)
+        if weights["style_contrast"]:
+            own = self.encode_style(batch.motion, batch.mask)
+            terms["style_contrast"] = style_contrast(torch.cat([style, own]), batch.identity_names * 2)
+        loss = found["loss"]
+        for name, term in terms.items():
+            loss = loss + weights[name] * term
+        return {**found, **terms, "loss": loss}
+
+    def conditions(self, batch: Batch, *, guided: bool = False) -> Conditions:
+        """Everything that is computed once per clip; in training, conditions are hidden now and then.
+
+        Args:
+            batch: the clips.
+            guided: follow the conditions as :meth:`choose_guidance` says; else as the model has learnt to.
+        """
+        views: dict[tuple[str, ...], float] = self.views() if guided else {(): 1.0}
+        hidden = self.hide(len(batch)) if self.training else Hidden()
+        if [*views] != [()]:
+            hidden = Hidden(*(self._in_views(name, views, len(batch)) for name in CONDITIONS))
+        made = self.network.conditions(batch, batch.identity, self.style_of(batch), hidden)
+        return replace(made, shares=tuple(views.values()))
+
+    def hide(self, clips: int) -> Hidden:
+        """Which conditions of which training clips are hidden.
+
+        Clips whose identity is hidden teach the model to take the person from the style alone.
+        """
+        shares = {"identity": self.identity_dropout, "style": self.style_dropout, "speech": self.speech_dropout}
+        drawn = {
+            name: torch.rand(clips, device=self.device) < share if share else None for name, share in shares.items()
+        }
+        # Guidance starts from the motion without any of the conditions that can be hidden, which would hardly ever be
+        # seen if each were drawn by itself.
+        if (silent := drawn["speech"]) is not None:
+            drawn = {name: None if each is None else each | silent for name, each in drawn.items()}
+        return Hidden(**drawn)
+
+    def _in_views(self, name: str, views: Mapping[tuple[str, ...], float], clips: int) -> Tensor:
+        return torch.tensor([name in hidden for hidden in views], device=self.device).repeat_interleave(clips)
 
     def encode_style(
         self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
@@ -302,17 +454,20 @@ class DualPathDiffusion(AnimationModel):
 
         All noise of a clip follows from the seed and its name: its motion does not depend on the rest of the batch.
         """
-        noise = ClipNoise(batch.names, batch.frame_lengths.tolist(), [seed] * len(batch), self.device)
-        return self.sample(self.conditions(batch), noise, progress=progress)
+        lengths = batch.frame_lengths.tolist()
+        noise = ClipNoise(batch.names, lengths, [seed] * len(batch), self.device)
+        of_mean = ClipNoise(mean_names(batch), lengths, [0] * len(batch), self.device)
+        return self.sample(self.conditions(batch, guided=True), noise, of_mean, progress=progress)
 
     @torch.no_grad()
     def generate_samples(
         self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None
     ) -> Float[Tensor, "samples frames vertices 3"]:
         """The same for several seeds: speech and style are encoded once."""
-        lengths = clip.frame_lengths.tolist() * len(seeds)
-        noise = ClipNoise(clip.names * len(seeds), lengths, seeds, self.device)
-        return self.sample(self.conditions(clip).repeated(len(seeds)), noise, progress=progress)
+        lengths = clip.frame_lengths.tolist()
+        noise = ClipNoise(clip.names * len(seeds), lengths * len(seeds), seeds, self.device)
+        of_mean = ClipNoise(mean_names(clip), lengths, [0], self.device)
+        return self.sample(self.conditions(clip, guided=True), noise, of_mean, samples=len(seeds), progress=progress)
 
     @torch.no_grad()
     def generate_window(
@@ -320,39 +475,93 @@ class DualPathDiffusion(AnimationModel):
     ) -> tuple[Float[Tensor, "samples frames vertices 3"], list[Tensor]]:
         """The same for a window of long speech, blended in every denoising step with the window before it."""
         # The speech before the window is encoded with it but not animated: features at its start depend on it.
-        conditions = self.conditions(clip).frames(window.context, window.context + window.frames)
+        conditions = self.conditions(clip, guided=True).frames(window.context, window.context + window.frames)
         overlap_blend = WindowOverlap(before, window.kept)
         noise = WindowNoise(clip.names[0], window, seeds, self.device)
-        return self.sample(conditions.repeated(len(seeds)), noise, blend=overlap_blend), overlap_blend.features
+        of_mean = WindowNoise(mean_names(clip)[0], window, [0], self.device)
+        motion = self.sample(conditions, noise, of_mean, samples=len(seeds), blend=overlap_blend)
+        return motion, overlap_blend.features
 
     def sample(
-        self, conditions: Conditions, unit: NoiseSource, *, blend: Blend = unchanged, progress: Progress | None = None
+        self,
+        conditions: Conditions,
+        unit: NoiseSource,
+        of_mean: NoiseSource,
+        *,
+        samples: int = 1,
+        blend: Blend = unchanged,
+        progress: Progress | None = None,
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Run the sampler from noise to motion, in offsets from the template.
 
         Args:
-            conditions: of the clips, the samples of one clip, or a window.
-            unit: gives unit noise.
+            conditions: of the clips, of one clip, or of a window.
+            unit: gives unit noise, for every clip and sample.
+            of_mean: gives the unit noise from which the mean is predicted, for every clip.
+            samples: how many of one clip.
             blend: changes the features of every step.
             progress: wraps the iteration over steps.
         """
-        # A sampler that clips or thresholds acts on vertices, and no fold can follow it.
-        folded = self.sampling_space == "folded" and self.sampler.linear
-        space = self.network.prepare_for_inference(
-            conditions,
-            self.process.steps,
-            folded=folded,
-            blend=blend,
-            preconditioning=self.motion_space.preconditioning,
-        )
-        rows, frames = conditions.mask.shape
+        expressivity = self.expressivity
+        whole = not isinstance(expressivity, Tensor)
+        mean = None if whole and expressivity == 1 else self._mean(conditions, of_mean, blend)
+        if mean is not None and whole and expressivity == 0:
+            return mean.expand(samples * len(mean), -1, -1, -1)
+        conditions = conditions.repeated(samples)
+        space = self._space(conditions, blend)
 
         def noise(like: Tensor) -> Tensor:
             return space.noise(unit(like))
 
-        start = noise(torch.empty(rows, frames, space.width, device=self.device, dtype=next(self.parameters()).dtype))
-        sample = self.sampler.run(space.denoise, start, noise=noise, progress=progress)
+        sample = self.sampler.run(space.denoise, noise(self._empty(space, conditions)), noise=noise, progress=progress)
+        motion = self._motion(space, sample)
+        if mean is None:
+            return motion
+        share = expressivity.to(motion)[:, None] if isinstance(expressivity, Tensor) else expressivity
+        return mean + share * (motion - mean)
+
+    def _mean(self, conditions: Conditions, of_mean: NoiseSource, blend: Blend) -> Tensor:
+        """The mean of motion under the conditions, one for each clip."""
+        # At the last step nothing of the motion is left in the noise, so the prediction that errs least is the mean of
+        # all motions that the conditions allow. A network lets some of the noise through all the same, nearly linearly:
+        # between noise and its negative that cancels (2 evaluations leave 1/20 of the variance of one). The noise is
+        # the mean's own, so that a clip has one mean whatever the seed.
+        space = self._space(conditions, blend)
+        noise = space.noise(of_mean(self._empty(space, conditions)))
+        ends = [self._motion(space, space.denoise(start, self.process.steps - 1)) for start in (noise, -noise)]
+        return (ends[0] + ends[1]) / 2
+
+    def _space(self, conditions: Conditions, blend: Blend) -> Space:
+        """Where to sample under some conditions."""
+        # A sampler that clips or thresholds acts on vertices, and no fold can follow it.
+        folded = self.sampling_space == "folded" and self.sampler.linear
+        preconditioning = self.motion_space.preconditioning
+        return self.network.prepare_for_inference(
+            conditions, self.process.steps, folded=folded, blend=blend, preconditioning=preconditioning
+        )
+
+    def _empty(self, space: Space, conditions: Conditions) -> Tensor:
+        """A state of the space with no values yet."""
+        rows, frames = conditions.mask.shape
+        shape = (rows // len(space.shares), frames, space.width)
+        return torch.empty(shape, device=self.device, dtype=next(self.parameters()).dtype)
+
+    def _motion(self, space: Space, sample: Tensor) -> Float[Tensor, "batch frames vertices 3"]:
+        """Offsets from the template."""
         return self.motion_space.decode(space.motion(sample)) / self.scale
+
+
+def mean_names(batch: Batch) -> list[str]:
+    """Names of the noise from which clips' means are predicted: other noise than that of any sample."""
+    return [f"{name}/mean" for name in batch.names]
+
+
+class Hidden(NamedTuple):
+    """Which clips lack which condition, by True; None if no clip does."""
+
+    speech: Bool[Tensor, " batch"] | None = None
+    identity: Bool[Tensor, " batch"] | None = None
+    style: Bool[Tensor, " batch"] | None = None
 
 
 @dataclass(frozen=True)
@@ -366,6 +575,9 @@ class Conditions:
         fusion: what the fusion prepared for inference.
         decoder: what the decoder prepared for inference.
         step_table: the embedding of each step; None if steps are embedded as they come.
+        shares: under guidance the rows are all clips, then all clips with some conditions hidden, and so on; this is
+            what the prediction of each of these parts contributes.
+        dynamic: F_dyn of the clips, as it was encoded; None where conditions were changed.
     """
 
     audio: Float[Tensor, "batch frames dim"]
@@ -374,18 +586,24 @@ class Conditions:
     fusion: object = None
     decoder: object = None
     step_table: Float[Tensor, "steps dim"] | None = None
+    shares: tuple[float, ...] = (1.0,)
+    dynamic: Float[Tensor, "batch dynamic_dim"] | None = None
 
     def frames(self, start: int, end: int) -> Conditions:
         """The conditions of some of the frames, with nothing prepared."""
-        return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end])
+        return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end], shares=self.shares)
 
     def drawn(self, times: int) -> Conditions:
         """The conditions of several noisy versions of every clip, those of a clip one after the other."""
         audio, style, mask = (value.repeat_interleave(times, 0) for value in (self.audio, self.style, self.mask))
-        return Conditions(audio, style, mask)
+        return Conditions(audio, style, mask, shares=self.shares)
 
     def repeated(self, times: int) -> Conditions:
-        """One clip's conditions for several samples of it, with nothing prepared; nothing is copied."""
+        """One clip's conditions for several samples of it, with nothing prepared; nothing is copied without need."""
+        if times == 1:
+            return self
+        if len(self.shares) > 1:
+            return self.drawn(times)
         audio, style = (value.expand(times, -1, -1) for value in (self.audio, self.style))
         return Conditions(audio, style, self.mask.expand(times, -1))
 
@@ -407,6 +625,8 @@ class DualPathNetwork(nn.Module):
         fusion: F_a and F_m to F_am.
         decoder: F_fused and style tokens to F_dec.
         token_form: how F_s is presented to the decoder.
+        speech_may_hide: learn what stands for speech that is not given.
+        style_may_hide: the same for the dynamic style.
     """
 
     def __init__(
@@ -421,6 +641,8 @@ class DualPathNetwork(nn.Module):
         fusion: Fusion,
         decoder: Decoder,
         token_form: TokenForm,
+        speech_may_hide: bool = False,
+        style_may_hide: bool = False,
     ) -> None:
         super().__init__()
         self.coordinates = coordinates
@@ -435,10 +657,17 @@ class DualPathNetwork(nn.Module):
         self.fused_norm = nn.LayerNorm(dim)
         self.decoder = decoder
         self.unembed = nn.Linear(dim, coordinates)
+        # Only where they are trained, so that other checkpoints have no weights for them.
+        self.no_speech = nn.Parameter(torch.zeros(dim)) if speech_may_hide else None
+        self.no_style = nn.Parameter(torch.zeros(sum(style_encoder.token_dims))) if style_may_hide else None
         self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
 
     def conditions(
-        self, batch: Batch, identity: Int[Tensor, " batch"], dynamic_style: Float[Tensor, "batch dynamic_dim"]
+        self,
+        batch: Batch,
+        identity: Int[Tensor, " batch"],
+        dynamic_style: Float[Tensor, "batch dynamic_dim"],
+        hidden: Hidden = Hidden(),  # noqa: B008 - it cannot be changed
     ) -> Conditions:
         """Everything that is computed once per clip.
 
@@ -446,11 +675,25 @@ class DualPathNetwork(nn.Module):
             batch: its speech, or cached features of it, and its lengths.
             identity: identity indices, −1 for unknown.
             dynamic_style: F_dyn, as :meth:`dynamic_style` gives it.
+            hidden: conditions that are not given; for a multiple of the clips, which are then repeated as a whole.
         """
         cached = batch.cached_features or ()
         audio = self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached)
+        mask, encoded = frame_mask(batch.frame_lengths, audio.shape[1]), dynamic_style
+        times = max((len(each) for each in hidden if each is not None), default=len(batch)) // len(batch)
+        if times > 1:
+            audio, mask = audio.repeat(times, 1, 1), mask.repeat(times, 1)
+            identity, dynamic_style = identity.repeat(times), dynamic_style.repeat(times, 1)
+        if hidden.identity is not None:
+            identity = identity.masked_fill(hidden.identity, -1)  # an unseen speaker
+        # Chosen among given and learnt features, and not only where one is hidden: under several processes every weight
+        # needs a gradient in every step.
+        if hidden.speech is not None and self.no_speech is not None:
+            audio = torch.where(hidden.speech[:, None, None], self.no_speech.to(audio), audio)
+        if hidden.style is not None and self.no_style is not None:
+            dynamic_style = torch.where(hidden.style[:, None], self.no_style.to(dynamic_style), dynamic_style)
         style = torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1)  # eq. 14
-        return Conditions(audio, self.style_tokens(style), frame_mask(batch.frame_lengths, audio.shape[1]))
+        return Conditions(audio, self.style_tokens(style), mask, dynamic=encoded)
 
     def dynamic_style(
         self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
@@ -531,8 +774,10 @@ class DualPathNetwork(nn.Module):
         fusion, decoder = self.fusion.prepare(audio, mask), self.decoder.prepare(style, mask)
         ready = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
         if preconditioning is not None:
-            return PreconditionedSpace(self, ready, preconditioning, blend)
-        return VertexSpace(self, ready, blend) if product is None else FoldedSpace(self, ready, product, blend)
+            return PreconditionedSpace(self, ready, preconditioning, blend, ready.shares)
+        if product is None:
+            return VertexSpace(self, ready, blend, ready.shares)
+        return FoldedSpace(self, ready, product, blend, ready.shares)
 
 
 class StyleTokens(nn.Module):

@@ -76,21 +76,39 @@ class Space(ABC):
 
     Args:
         network: predicts clean motion.
-        conditions: what it is conditioned on, with everything else that is constant over the denoising steps.
+        conditions: what it is conditioned on, with everything else that is constant over the denoising steps. Under
+            guidance, all clips with their conditions, then all clips with some of them hidden, and so on.
         width: numbers in a frame of the image.
         blend: changes the features that the network gives in every step.
+        shares: what each of these predictions contributes to the guided one; they add up to one.
     """
 
-    def __init__(self, network: Network, conditions: object, width: int, blend: Blend = unchanged) -> None:
+    def __init__(
+        self,
+        network: Network,
+        conditions: object,
+        width: int,
+        blend: Blend = unchanged,
+        shares: Sequence[float] = (1.0,),
+    ) -> None:
         self.network = network
         self.conditions = conditions
         self.width = width
         self.blend = blend
+        self.shares = shares
 
     def features(self, embedded: Frames, step: int) -> Frames:
-        """The network's blended last features of embedded noisy motion, at a step counted from 0."""
-        steps = torch.full((len(embedded),), step, device=embedded.device)
-        return self.blend(self.network.core(embedded, steps, self.conditions))
+        """The network's last features of embedded noisy motion, guided, at a step counted from 0."""
+        views = len(self.shares)
+        rows = embedded if views == 1 else embedded.repeat(views, 1, 1)
+        steps = torch.full((len(rows),), step, device=rows.device)
+        features = self.network.core(rows, steps, self.conditions)
+        if views == 1:
+            return features
+        # A combination of features is the same one of predictions, since the last map is affine and the shares add up
+        # to one. In 16 bits, a large difference of near numbers would be mostly rounding.
+        wide = features.to(torch.promote_types(features.dtype, torch.float32))
+        return torch.stack([share * part for share, part in zip(self.shares, wide.chunk(views), strict=True)]).sum(0)
 
     @abstractmethod
     def noise(self, unit: State) -> State:
@@ -108,8 +126,10 @@ class Space(ABC):
 class VertexSpace(Space):
     """Motion itself; needs nothing of the network or the sampler."""
 
-    def __init__(self, network: Network, conditions: object, blend: Blend = unchanged) -> None:
-        super().__init__(network, conditions, network.coordinates, blend)
+    def __init__(
+        self, network: Network, conditions: object, blend: Blend = unchanged, shares: Sequence[float] = (1.0,)
+    ) -> None:
+        super().__init__(network, conditions, network.coordinates, blend, shares)
 
     def noise(self, unit: State) -> State:
         """Unit noise as it is."""
@@ -117,7 +137,7 @@ class VertexSpace(Space):
 
     def denoise(self, state: State, step: int) -> State:
         """M̂⁰."""
-        return self.network.clean_motion(self.features(self.network.embed(state), step))
+        return self.network.clean_motion(self.blend(self.features(self.network.embed(state), step)))
 
     def motion(self, sample: State) -> ScaledMotion:
         """The sample as it is."""
@@ -132,10 +152,18 @@ class FoldedSpace(Space):
         conditions: as :class:`Space` takes them.
         fold: the products of both maps.
         blend: as :class:`Space` takes it.
+        shares: as :class:`Space` takes them.
     """
 
-    def __init__(self, network: Network, conditions: object, fold: Fold, blend: Blend = unchanged) -> None:
-        super().__init__(network, conditions, len(fold.offset), blend)
+    def __init__(
+        self,
+        network: Network,
+        conditions: object,
+        fold: Fold,
+        blend: Blend = unchanged,
+        shares: Sequence[float] = (1.0,),
+    ) -> None:
+        super().__init__(network, conditions, len(fold.offset), blend, shares)
         self.fold = fold
         self._last: tuple[Tensor, Tensor] | None = None  # features and prediction of the latest step
 
@@ -148,7 +176,7 @@ class FoldedSpace(Space):
         """E M̂⁰ = E U h + E b."""
         # The bias e of the first map is no part of y, which would not obey the recursion with it.
         bias = self.network.embed.bias
-        features = self.features(state if bias is None else state + bias, step)
+        features = self.blend(self.features(state if bias is None else state + bias, step))
         # In the weights' own precision: errors of the state add up over the steps.
         with torch.autocast(features.device.type, enabled=False):
             prediction = nn.functional.linear(features.to(state.dtype), self.fold.product, self.fold.offset)
@@ -179,12 +207,18 @@ class PreconditionedSpace(Space):
         conditions: as :class:`Space` takes them.
         preconditioning: the scales around the network.
         blend: changes the predictions of every step.
+        shares: as :class:`Space` takes them.
     """
 
     def __init__(
-        self, network: Network, conditions: object, preconditioning: Preconditioning, blend: Blend = unchanged
+        self,
+        network: Network,
+        conditions: object,
+        preconditioning: Preconditioning,
+        blend: Blend = unchanged,
+        shares: Sequence[float] = (1.0,),
     ) -> None:
-        super().__init__(network, conditions, network.coordinates, blend)
+        super().__init__(network, conditions, network.coordinates, blend, shares)
         self.preconditioning = preconditioning
 
     def noise(self, unit: State) -> State:
@@ -195,7 +229,7 @@ class PreconditionedSpace(Space):
         """M̂⁰."""
         steps = torch.full((len(state),), step, device=state.device)
         scaled = self.preconditioning.into[step] * state
-        features = self.network.core(self.network.embed(scaled), steps, self.conditions)
+        features = self.features(self.network.embed(scaled), step)
         # The prediction is blended, not the features: the noisy motion is a part of it.
         return self.blend(self.preconditioning.clean(state, self.network.clean_motion(features), steps))
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -32,6 +33,9 @@ BatchMotion = Float[Tensor, "batch frames vertices 3"]
 
 Motion = Float[Tensor, "seeds frames vertices 3"]
 """One motion for each seed, of one clip."""
+
+Expressivity = float | Float[Tensor, " vertices"]
+"""How far motion goes from the mean prediction (0) to a sample (1) and beyond; one number, or one for each vertex."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +81,13 @@ class Inference(ABC):
     Attributes:
         frame_rate: motion frames a second.
         windows: how speech is cut that is too long for one pass; may be changed at any time.
+        expressivity: how far motion goes from the mean prediction to a sample, see :meth:`choose_expressivity`.
     """
 
     samples: ClassVar[bool] = False
     frame_rate: float
     windows: WindowPlan
+    expressivity: Expressivity = 1.0
 
     def animate(
         self,
@@ -90,6 +96,7 @@ class Inference(ABC):
         identity: str,
         style: Reference | Style | None = None,
         seed: int = 0,
+        expressivity: Expressivity | None = None,
         progress: Progress | None = None,
     ) -> Prediction:
         """Animate a known face with new speech.
@@ -99,11 +106,12 @@ class Inference(ABC):
             identity: whose face and identity; any speaker of the training corpus, also one not trained on.
             style: reference motion, or a style vector made by this model; the speaker's default one if None.
             seed: seed of the noise; equal seeds give equal motion on one machine.
+            expressivity: as :meth:`choose_expressivity` takes it, for this call alone; the model's own if None.
             progress: wraps the iteration over sampling steps, or over the seconds of long speech.
 
         Raises:
-            FaceDiffError: if the identity is unknown, the reference does not fit the topology, or the speech is
-                shorter than a frame.
+            FaceDiffError: if the identity is unknown, the reference does not fit the topology, the speech is shorter
+                than a frame, or the model has no such expressivity.
 
         Example:
             >>> model = facediff.models.load_model(Path("demo/puppet.ckpt"))  # doctest: +SKIP
@@ -111,7 +119,9 @@ class Inference(ABC):
             >>> model.animate(speech, identity="F1", seed=3).vertices.shape  # doctest: +SKIP
             torch.Size([150, 1008, 3])
         """
-        return self.animate_samples(audio, identity=identity, style=style, seeds=[seed], progress=progress)[0]
+        return self.animate_samples(
+            audio, identity=identity, style=style, seeds=[seed], expressivity=expressivity, progress=progress
+        )[0]
 
     @torch.inference_mode()
     def animate_samples(
@@ -121,6 +131,7 @@ class Inference(ABC):
         identity: str,
         style: Reference | Style | None = None,
         seeds: Sequence[int],
+        expressivity: Expressivity | None = None,
         progress: Progress | None = None,
     ) -> list[Prediction]:
         """Several samples for the same speech, one for each seed; the speech is encoded once.
@@ -130,13 +141,15 @@ class Inference(ABC):
             identity: as :meth:`animate` takes it.
             style: as :meth:`animate` takes it.
             seeds: one for each sample.
+            expressivity: as :meth:`animate` takes it.
             progress: as :meth:`animate` takes it.
 
         Raises:
             FaceDiffError: as :meth:`animate`.
         """
         clip = self.clip_of(audio, identity, style)
-        motions = self.sample_clip(clip, seeds, progress=progress)
+        with self.expressed(expressivity):
+            motions = self.sample_clip(clip, seeds, progress=progress)
         trained = identity if int(clip.identity[0]) >= 0 else "unknown"
         return [
             Prediction(clip.names[0], trained, clip.reference_names[0], (motion + clip.template).cpu())
@@ -166,6 +179,7 @@ class Inference(ABC):
         style: Reference | Style | None = None,
         seeds: Sequence[int] = (0,),
         plan: WindowPlan | None = None,
+        expressivity: Expressivity | None = None,
     ) -> SpeechStream:
         """Animate speech of any length while it arrives.
 
@@ -174,15 +188,24 @@ class Inference(ABC):
             style: as :meth:`animate` takes it.
             seeds: one for each sample.
             plan: how speech is cut; shorter windows give frames sooner. :attr:`windows` if None.
+            expressivity: as :meth:`animate` takes it.
 
         Raises:
             FaceDiffError: as :meth:`animate`.
         """
         # The speech is not known yet; a clip of one silent frame carries the face and the style.
         frame = torch.zeros(samples_for(1, self.frame_rate), device=self.device)
-        return SpeechStream(self, self.clip_of(frame, identity, style), seeds=seeds, plan=plan)
+        with self.expressed(expressivity):
+            return SpeechStream(self, self.clip_of(frame, identity, style), seeds=seeds, plan=plan)
 
-    def generate(self, batch: Batch, *, seed: int = 0, progress: Progress | None = None) -> BatchMotion:
+    def generate(
+        self,
+        batch: Batch,
+        *,
+        seed: int = 0,
+        expressivity: Expressivity | None = None,
+        progress: Progress | None = None,
+    ) -> BatchMotion:
         """Motion for the batch's speech, identity and reference; its true motion is not looked at.
 
         Clips that last longer than ``windows.above`` are generated by windows, all others in one pass.
@@ -190,8 +213,17 @@ class Inference(ABC):
         Args:
             batch: clips; ``motion`` gives the number of frames only.
             seed: seed of the noise; a clip's noise depends on it and on the clip's name, not on the other clips.
+            expressivity: as :meth:`animate` takes it.
             progress: wraps the iteration over steps, or over the seconds of long speech, e.g. in a progress bar.
+
+        Raises:
+            FaceDiffError: if the model has no such expressivity.
         """
+        with self.expressed(expressivity):
+            return self._generate(batch, seed, progress)
+
+    def _generate(self, batch: Batch, seed: int, progress: Progress | None) -> BatchMotion:
+        """Short clips together, each long one by windows."""
         lengths = batch.frame_lengths.tolist()
         short = [i for i, frames in enumerate(lengths) if self.windows.in_one_pass(frames, self.frame_rate)]
         if len(short) == len(lengths):
@@ -265,6 +297,51 @@ class Inference(ABC):
             FaceDiffError: if the model does not sample, or there is no such sampler.
         """
         raise FaceDiffError(f"{type(self).__name__} does not sample: omit --sampler and --steps")
+
+    def choose_expressivity(self, expressivity: Expressivity) -> None:
+        """Go from the mean prediction (0) to a full sample (1) or beyond, for all that follows.
+
+        Motion is mean + expressivity · (sample − mean). The mean is what speech, identity and style determine; what
+        they leave open, a sample draws at random.
+
+        Args:
+            expressivity: from 0 to 2; one number, or one for each vertex.
+
+        Raises:
+            FaceDiffError: if it is not 1 and the model makes no samples, or it is out of range.
+        """
+        if not isinstance(expressivity, Tensor) and expressivity == 1:
+            return
+        raise FaceDiffError(
+            f"expressivity: {type(self).__name__} makes one animation and no samples around a mean; omit the option"
+        )
+
+    @contextmanager
+    def expressed(self, expressivity: Expressivity | None) -> Iterator[None]:
+        """Within it, motion has another expressivity; None leaves it as it is.
+
+        Raises:
+            FaceDiffError: as :meth:`choose_expressivity`.
+        """
+        before = self.expressivity
+        if expressivity is not None:
+            self.choose_expressivity(expressivity)
+        try:
+            yield
+        finally:
+            if expressivity is not None:
+                self.expressivity = before
+
+    def choose_guidance(self, scales: Mapping[str, float]) -> None:
+        """Follow some conditions more than the model would by itself, for all that follows.
+
+        Args:
+            scales: by condition; 1 follows it as the model has learnt to.
+
+        Raises:
+            FaceDiffError: if the model knows no motion without such a condition, or a scale is out of range.
+        """
+        raise FaceDiffError(f"guidance: {type(self).__name__} cannot be guided; omit the option")
 
     # How a model generates motion. Only the first method has to be written for every model.
 
@@ -485,7 +562,7 @@ class SpeechStream:
     A frame is certain once its window, but for the frames that this window shares with the next, and the speech after
     that window have been heard: :attr:`WindowPlan.look_ahead` seconds later at most. The result depends on the speech,
     the plan and the seeds only, not on how the speech was cut into pieces, and not on what comes after the look-ahead:
-    it is the same for a file and for a microphone.
+    it is the same for a file and for a microphone. It keeps the expressivity that the model has when it is made.
 
     Each window's speech is standardised by mean and deviation of all speech heard up to the end of that window.
 
@@ -507,6 +584,7 @@ class SpeechStream:
     ) -> None:
         self.model = model
         self.seeds = list(seeds)
+        self.expressivity = model.expressivity
         self.plan = (plan or model.windows).in_frames(model.frame_rate)
         self.frames = 0
         with torch.inference_mode():
@@ -614,7 +692,8 @@ class SpeechStream:
         speech = self._speech[first - self._dropped : last - self._dropped]
         clip = with_speech(self.clip, speech, heard - start)
         # A window that is mostly a pause, standardised by itself, would turn its noise into loud speech.
-        with self.model.speech_encoder.at_level(self._level.mean, max(self._level.deviation, QUIETEST)):
+        level = self.model.speech_encoder.at_level(self._level.mean, max(self._level.deviation, QUIETEST))
+        with level, self.model.expressed(self.expressivity):
             motion, self._tail = self.model.generate_window(clip, window, self.seeds, self._tail)
         self._held = motion[:, -self.plan.overlap :]
         return motion

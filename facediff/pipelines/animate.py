@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -45,6 +45,8 @@ class AnimationOptions:
     samples: ranges.Samples = 1
     sampler: str | None = None
     steps: ranges.Steps | None = None
+    expressivity: str | None = None
+    guidance: str | None = None
     device: str = "cpu"
     precision: Literal["32", "bf16"] = "32"
     window: ranges.Window | None = None
@@ -57,6 +59,21 @@ class AnimationOptions:
 
     def __post_init__(self) -> None:
         ranges.check_fields(self)
+        _ = self.expressivity_factors, self.guidance_scales
+
+    @property
+    def expressivity_factors(self) -> dict[str, float]:
+        """Expressivity by region; ``all`` stands for every vertex that no other name covers."""
+        if self.expressivity is None:
+            return {}
+        from facediff.editing.expressiveness import read_factors
+
+        return read_factors(self.expressivity, "--expressivity", ranges.EXPRESSIVITY.most)
+
+    @property
+    def guidance_scales(self) -> dict[str, float]:
+        """Scales of guidance by condition."""
+        return {} if self.guidance is None else read_scales(self.guidance)
 
     def check(self, output: Path) -> None:
         """Refuse what can be refused before a model is loaded."""
@@ -103,6 +120,8 @@ class AnimationPipeline:
             )
         if options.sampler is not None or options.steps is not None:
             self.model.choose_sampler(options.sampler, options.steps)
+        if options.guidance is not None:
+            self.model.choose_guidance(options.guidance_scales)
         usual = self.model.windows
         seconds = usual.seconds if options.window is None else options.window
         overlap = min(usual.overlap, seconds / 2) if options.overlap is None else options.overlap
@@ -110,12 +129,35 @@ class AnimationPipeline:
         self.model.windows.in_frames(self.model.frame_rate)
         self.identity = options.identity or self.model.identities[0]
         facts = facts_of(self.model.assets, self.identity)
-        corpus = self.model.assets.corpus
-        controls.check(facts["template"], facts["faces"], facts["regions"], f"the checkpoint's corpus {corpus}")
+        name = f"the checkpoint's corpus {self.model.assets.corpus}"
+        controls.check(facts["template"], facts["faces"], facts["regions"], name)
+        if options.expressivity is not None:
+            self._choose_expressivity(facts["template"], facts["regions"], name)
         self._correspondence: Correspondence | None = None
         self.style: Reference | Style | None = None
         if options.style:
             self.style = read_styles(options.style, self.identity, self.model, template=options.style_template)
+
+    def _choose_expressivity(
+        self, template: npt.NDArray[np.floating], regions: Mapping[str, npt.NDArray[np.integer]], name: str
+    ) -> None:
+        """Take over the expressivity of a face (V, 3) with regions, which errors call ``name``."""
+        from facediff.editing.expressiveness import ALL, region_factors
+
+        factors = self.options.expressivity_factors
+        if not self.model.samples and {*factors.values()} != {1.0}:
+            raise FaceDiffError(
+                f"--expressivity {self.options.expressivity}: {type(self.model).__name__} makes one animation and no "
+                f"samples around a mean; omit the option"
+            )
+        if {*factors} == {ALL}:
+            self.model.choose_expressivity(factors[ALL])
+            return
+        import torch
+
+        # A region's number fades into the rest as those of expressiveness do, so that no edge is visible.
+        of_vertices = region_factors(template, regions, factors, name)
+        self.model.choose_expressivity(torch.from_numpy(of_vertices).float())
 
     def cost(self, speech: npt.NDArray[np.float32], output: Path) -> tuple[float, float]:
         """Roughly the seconds on two processor cores, and the bytes, that :meth:`write` takes for some speech (S,)."""
@@ -249,8 +291,33 @@ class AnimationPipeline:
         }
         if sampler is not None:
             metadata["sampler"] = f"{type(sampler).__name__}, {sampler.steps} steps"
+        for option in ("expressivity", "guidance"):
+            if (chosen := getattr(self.options, option)) is not None:
+                metadata[option] = chosen
         facts = facts_of(assets, self.identity)
         return Animation(name=name, vertices=motion, speech=speech, metadata=metadata, **facts)
+
+
+def read_scales(words: str) -> dict[str, float]:
+    """Scales of guidance from the command line.
+
+    Raises:
+        FaceDiffError: if the words are none, a condition comes twice, or a scale is out of range.
+
+    Example:
+        >>> read_scales("style=1.5,speech=1.2")
+        {'style': 1.5, 'speech': 1.2}
+    """
+    scales: dict[str, float] = {}
+    for word in words.split(","):
+        name, equals, number = word.partition("=")
+        if not equals or not name.strip() or name.strip() in scales:
+            raise FaceDiffError(
+                f"--guidance {ranges.shown(words)}: expected each condition once with its scale, such as "
+                f"style=1.5,speech=1.2"
+            )
+        scales[name.strip()] = ranges.GUIDANCE_SCALE.read(f"--guidance {name.strip()}", number.strip())
+    return scales
 
 
 def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[np.float32]:

@@ -225,9 +225,14 @@ ClipLength = Annotated[float, Range(1, 600)]
 Duration = Annotated[float, Range(0.001, 604_800)]
 """Seconds that something lasts; a week at most."""
 Epochs = Annotated[int, Range(1, 100_000)]
+EXPRESSIVITY = Range(0, 2)
+Expressivity = Annotated[float, EXPRESSIVITY]
+"""From the mean prediction (0) to a sample (1) and beyond."""
 Factor = Annotated[float, Range(1e-9, 1e9)]
 """What lengths are multiplied by, or the end of a scale."""
 FrameRate = Annotated[float, Range(*FRAME_RATES)]
+GUIDANCE_SCALE = Range(0, 10)
+GuidanceScale = Annotated[float, GUIDANCE_SCALE]
 GazeAngle = Annotated[float, Range(0, 20, above=True)]
 LearningRate = Annotated[float, Range(0, 1, above=True)]
 Level = Annotated[float, Range(0.01, 0.9999)]

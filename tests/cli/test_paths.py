@@ -23,7 +23,8 @@ from facediff.utils.files import atomic, atomic_folder, put_in_place
 LIGHTNING = {"fit", "validate", "test", "predict"}
 
 NO_PATHS = {
-    *("accelerator", "clip", "clips", "corpus", "device", "expressiveness", "font", "identity", "kind", "labels"),
+    *("accelerator", "clip", "clips", "corpus", "device", "expressiveness", "expressivity", "font", "guidance"),
+    *("identity", "kind", "labels"),
     *("metric", "name", "output_unit", "pattern", "phonemes", "protocol", "region", "sampler", "scalar", "split"),
     *("subjects", "suffix", "topology", "truth_pattern", "unit"),
 }

@@ -1,0 +1,111 @@
+"""What lets the dynamic style hold the person: terms of the loss, and a learnt feature of hidden identities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from facediff import registry
+from facediff.data import Batch, collate
+from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion
+from facediff.models.adaptation import with_extra_identities
+from facediff.models.losses import style_contrast, style_identity_loss
+from facediff.models.speaker_encoders import HierarchicalIdentity
+from tests.fakes.tiny import SEEN, Tiny
+
+Ready = Callable[..., DualPathDiffusion]
+
+
+@pytest.fixture
+def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
+    def make(**options: object) -> DualPathDiffusion:
+        model = make_model(**options)
+        model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+        return model.eval()
+
+    return make
+
+
+@pytest.fixture
+def batch(tiny: Tiny) -> Batch:
+    """Two clips of A and two of B."""
+    dataset = tiny.dataset("train")
+    return collate([dataset[place] for place in (0, 2, 5, 7)])
+
+
+def losses(model: DualPathDiffusion, batch: Batch) -> dict[str, torch.Tensor]:
+    return model.losses(batch, torch.Generator().manual_seed(0))
+
+
+def test_style_identity_loss_is_cross_entropy_of_known_speakers() -> None:
+    logits = np.random.default_rng(0).standard_normal((4, 3))
+    chances = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
+    expected = -np.log([chances[0, 2], chances[2, 0], chances[3, 1]]).mean()
+    found = style_identity_loss(torch.from_numpy(logits).float(), torch.tensor([2, -1, 0, 1]))
+    assert float(found) == pytest.approx(expected, rel=1e-5)
+    assert float(style_identity_loss(torch.ones(2, 3), torch.tensor([-1, -1]))) == 0
+
+
+@pytest.mark.parametrize("space", [registry.motion_space.vertices, partial(registry.motion_space.components, count=4)])
+def test_style_terms_are_added_with_their_weights(ready: Ready, batch: Batch, space: object) -> None:
+    plain = ready(motion_space=space)
+    model = ready(motion_space=space, style_identity_weight=0.3, style_contrast_weight=0.7)
+    assert set(model.load_state_dict(plain.state_dict(), strict=False).missing_keys) == {
+        "style_identity.weight",
+        "style_identity.bias",
+    }
+    before, found = losses(plain, batch), losses(model, batch)
+    style = model.encode_style(batch.reference, batch.reference_mask)
+    own = model.encode_style(batch.motion, batch.mask)
+    identity = style_identity_loss(model.style_identity(style), batch.identity)
+    contrast = style_contrast(torch.cat([style, own]), batch.identity_names * 2)
+    torch.testing.assert_close(found["style_identity"], identity)
+    torch.testing.assert_close(found["style_contrast"], contrast)
+    assert contrast.item() > 0
+    torch.testing.assert_close(found["loss"], before["loss"] + 0.3 * identity + 0.7 * contrast)
+    assert set(found) == {*before, "style_identity", "style_contrast"}
+
+
+def test_style_terms_reach_the_style_encoder_though_the_style_is_hidden(ready: Ready, batch: Batch) -> None:
+    model = ready(style_identity_weight=1.0, style_dropout=1.0, identity_dropout=0.0).train()
+    found = losses(model, batch)
+    assert not any(p.grad is not None for p in model.network.style_encoder.parameters())
+    found["loss"].backward()
+    assert any(p.grad is not None and bool(p.grad.any()) for p in model.network.style_encoder.parameters())
+
+
+def test_the_classifier_is_personal_and_grows_with_a_new_speaker(ready: Ready) -> None:
+    model = ready(style_identity_weight=1.0)
+    assert model.style_identity in model.personal_modules()
+    grown = with_extra_identities(model, ["C", *SEEN])
+    weight = model.style_identity.weight
+    torch.testing.assert_close(grown.style_identity.weight, torch.cat([weight.mean(0, keepdim=True), weight]))
+
+
+@pytest.mark.parametrize("term", ["style_identity_weight", "style_contrast_weight"])
+def test_style_terms_need_a_style(make_model: Callable[..., DualPathDiffusion], term: str) -> None:
+    with pytest.raises(FaceDiffError, match=term):
+        make_model(style_encoder=registry.style_encoder.none, **{term: 1.0})
+
+
+def test_an_unseen_speaker_may_get_a_learnt_feature() -> None:
+    torch.manual_seed(0)
+    encoder = HierarchicalIdentity(dim=8, n_identities=4, level_dim=3, unseen="learnt")
+    nn.init.normal_(encoder.norm.weight)
+    nn.init.normal_(encoder.norm.bias)
+    found = encoder(torch.tensor([-1, 1]))
+    given = encoder.unseen.detach().numpy().astype(np.float64)
+    normed = (given - given.mean()) / np.sqrt(given.var() + 1e-5)
+    expected = normed * encoder.norm.weight.detach().numpy() + encoder.norm.bias.detach().numpy()
+    np.testing.assert_allclose(found[0].detach().numpy(), expected, atol=1e-5)
+    plain = HierarchicalIdentity(dim=8, n_identities=4, level_dim=3)
+    assert plain.load_state_dict(encoder.state_dict(), strict=False).unexpected_keys == ["unseen"]
+    torch.testing.assert_close(plain(torch.tensor([1]))[0], found[1])
+    found[0].sum().backward()
+    assert not encoder.coarse.weight.grad.any(), "hidden clips teach no identity's own feature"
