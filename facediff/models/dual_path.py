@@ -415,18 +415,23 @@ class DualPathDiffusion(AnimationModel):
             batch: the clips.
             guided: follow the conditions as :meth:`choose_guidance` says; else as the model has learnt to.
         """
-        views: dict[tuple[str, ...], float] = self.views() if guided else {(): 1.0}
-        hidden = self.hide(len(batch)) if self.training else Hidden()
-        if [*views] != [()]:
+        network, identity = self.network, batch.identity
+        hidden = self.hide(len(identity)) if self.training else Hidden()
+        if hidden.identity is not None:
+            # Index −1 stands for an unseen speaker. Clips that are shown under it teach the model to take the person
+            # from the style alone.
+            identity, hidden = identity.masked_fill(hidden.identity, -1), hidden._replace(identity=None)
+        views = self.views() if guided else {}
+        if [*views] not in ([], [()]):
             hidden = Hidden(*(self._in_views(name, views, len(batch)) for name in CONDITIONS))
-        made = self.network.conditions(batch, batch.identity, self.style_of(batch), hidden)
-        return replace(made, shares=tuple(views.values()))
+            made = network.conditions(batch, identity, self.style_of(batch), hidden)
+            return replace(made, shares=tuple(views.values()))
+        if hidden.speech is None and hidden.style is None:
+            return network.conditions(batch, identity, self.style_of(batch))
+        return network.conditions(batch, identity, self.style_of(batch), hidden)
 
     def hide(self, clips: int) -> Hidden:
-        """Which conditions of which training clips are hidden.
-
-        Clips whose identity is hidden teach the model to take the person from the style alone.
-        """
+        """Which conditions of which training clips are hidden."""
         shares = {"identity": self.identity_dropout, "style": self.style_dropout, "speech": self.speech_dropout}
         drawn = {
             name: torch.rand(clips, device=self.device) < share if share else None for name, share in shares.items()
