@@ -1,6 +1,5 @@
 """Callbacks: what happens around training and testing."""
 
-from facediff.callbacks.augmentation import InventedSpeakers
 from facediff.callbacks.averaging import EmaWithWarmup
 from facediff.callbacks.checkpoints import LastCheckpoint
 from facediff.callbacks.dashboard import GradientNorm, RunDescription
@@ -12,7 +11,6 @@ __all__ = [
     "CompiledTraining",
     "EmaWithWarmup",
     "GradientNorm",
-    "InventedSpeakers",
     "LastCheckpoint",
     "PredictionWriter",
     "RunDescription",

@@ -36,6 +36,7 @@ from facediff.models.folding import (
 )
 from facediff.models.fusions import BidirectionalCrossAttention, Fusion, FusionFactory
 from facediff.models.inference import ClipNoise, Expressivity, Progress, Window, WindowNoise, WindowOverlap
+from facediff.models.invented_speakers import InventedSpeakers
 from facediff.models.layers import Share, Weight, Width, frame_mask
 from facediff.models.losses import preconditioned_losses, style_contrast, style_identity_loss
 from facediff.models.losses_fused import fused_losses
@@ -101,6 +102,9 @@ class DualPathDiffusion(AnimationModel):
             scale half of its variance shows in the schedule's middle.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
         identity_dropout: share of training clips whose identity is hidden, so that unseen speakers can be animated.
+        invented_speakers: share of training clips whose motion and style reference are multiplied by the same random
+            gains under a hidden identity, so that the style path learns more speakers than the corpus has.
+        invented_gain: standard deviation of the logarithm of these gains.
         style_dropout: share of training clips whose dynamic style is hidden, so that the style can guide.
         speech_dropout: share of training clips whose speech is hidden, together with whatever else may be hidden, so
             that speech can guide.
@@ -140,6 +144,8 @@ class DualPathDiffusion(AnimationModel):
         noise_scale: NoiseScale = 1.0,
         style_tokens: TokenForm = "levels",
         identity_dropout: Share = 0.1,
+        invented_speakers: Share = 0.0,
+        invented_gain: Annotated[float, Range(0, 1)] = 0.1,
         style_dropout: Share = 0.0,
         speech_dropout: Share = 0.0,
         speech_guidance: ranges.GuidanceScale = 1.0,
@@ -155,6 +161,8 @@ class DualPathDiffusion(AnimationModel):
     ) -> None:
         super().__init__(**options)
         self.identity_dropout = identity_dropout
+        made = InventedSpeakers(self.n_vertices, invented_speakers, invented_gain) if invented_speakers else None
+        self.invented_speakers = made
         self.style_dropout = style_dropout
         self.speech_dropout = speech_dropout
         self.expressivity: Expressivity = expressivity
@@ -321,6 +329,8 @@ class DualPathDiffusion(AnimationModel):
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Noise each clip to a random step (algorithm 1, lines 3 and 4), then take the four losses (eq. 15 to 19)."""
+        if self.training and self.invented_speakers is not None:
+            batch = self.invented_speakers(batch, self.scale)
         device, count = batch.motion.device, len(batch) * self.noise_draws
         step = self.process.draw_steps(count, device, generator)
         shape = (count, batch.motion.shape[1], self.motion_space.coordinates)
