@@ -97,8 +97,8 @@ def test_only_a_share_of_the_clips_is_changed_and_none_in_place() -> None:
 def test_a_model_invents_in_training_alone(
     make_model: Make,
     make_trainer: Callable[..., pl.Trainer],
-    tiny: Any,
-    tmp_path: Any,  # noqa: ANN401
+    tiny: Tiny,
+    tmp_path: Path,
 ) -> None:
     model = make_model(invented_speakers=1.0, identity_dropout=0.0)
     trainer = make_trainer(max_steps=2, limit_val_batches=1)
