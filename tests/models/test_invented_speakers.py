@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
@@ -14,6 +15,7 @@ from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.invented_speakers import COMPONENTS, InventedSpeakers
+from tests.fakes.tiny import Tiny
 
 VERTICES, SCALE = 40, 25.0
 Make = Callable[..., Any]
