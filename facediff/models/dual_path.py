@@ -116,6 +116,9 @@ class DualPathDiffusion(AnimationModel):
         velocity_weight: λ_vel.
         acceleration_weight: λ_acc.
         face_weight: λ_face.
+        face_weight_unit: ``scaled`` takes it for the scaled motion that the network sees; ``corpus`` for motion in the
+            corpus's unit. L_face is linear in the motion and the other terms are quadratic, so that the scale divides
+            the share of L_face; ``corpus`` gives it back.
         style_identity_weight: of telling the training identity from the dynamic style, by a linear map that is used in
             training only; lets the style hold the person in addition to the mood.
         style_contrast_weight: of pulling the dynamic styles of an identity's clips together, whatever their mood, and
@@ -155,6 +158,7 @@ class DualPathDiffusion(AnimationModel):
         velocity_weight: Weight = 0.003,
         acceleration_weight: Weight = 0.003,
         face_weight: Weight = 0.0005,
+        face_weight_unit: Literal["scaled", "corpus"] = "scaled",
         style_identity_weight: Weight = 0.0,
         style_contrast_weight: Weight = 0.0,
         **options: Any,  # noqa: ANN401
@@ -172,6 +176,7 @@ class DualPathDiffusion(AnimationModel):
             "acceleration": acceleration_weight,
             "face": face_weight,
         }
+        self.face_weight_unit = face_weight_unit
         self.noise_draws = noise_draws
         self.style_weights = {"style_identity": style_identity_weight, "style_contrast": style_contrast_weight}
         self.noise_scale: NoiseScale = noise_scale
@@ -371,6 +376,7 @@ class DualPathDiffusion(AnimationModel):
     ) -> dict[str, Tensor]:
         """The losses on the vertices."""
         network = self.network
+        face = self.loss_weights["face"] * (self.scale if self.face_weight_unit == "corpus" else 1.0)
         # √ᾱ M⁰ + √(1 − ᾱ) ε, as NoiseProcess.add_noise, but in place: on a processor, allocating tensors of this size
         # takes longer than the arithmetic.
         signal = self.process.signal.to(noise.device)[step][:, None, None]
@@ -383,7 +389,7 @@ class DualPathDiffusion(AnimationModel):
             motion,
             mask,
             self.assets.regions["upper_face"],
-            self.loss_weights,
+            {**self.loss_weights, "face": face},
             scale=self.scale,
         )
 
