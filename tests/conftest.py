@@ -116,3 +116,27 @@ def hubert_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     HubertModel(config).save_pretrained(folder)
     logging.enable_progress_bar()
     return folder
+
+
+@pytest.fixture(scope="session")
+def ctc_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wav2vec 2.0 with a CTC head over 29 letters in miniature, of the published shape, with random weights."""
+    from transformers import Wav2Vec2Config, Wav2Vec2ForCTC
+    from transformers.utils import logging
+
+    folder = tmp_path_factory.mktemp("ctc")
+    config = Wav2Vec2Config(
+        vocab_size=29,
+        hidden_size=16,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        intermediate_size=24,
+        conv_dim=(8,) * 7,
+        num_conv_pos_embeddings=8,
+        num_conv_pos_embedding_groups=4,
+    )
+    torch.manual_seed(0)
+    logging.disable_progress_bar()
+    Wav2Vec2ForCTC(config).save_pretrained(folder)
+    logging.enable_progress_bar()
+    return folder

@@ -1,4 +1,4 @@
-"""Audio encoders: a small one trained from scratch, and pretrained HuBERT (dual-path paper, section 1.2)."""
+"""Audio encoders: one trained from scratch, pretrained HuBERT (dual-path paper, section 1.2), a frozen recogniser."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
-    from transformers import HubertModel
+    from transformers import HubertModel, PreTrainedModel
 
 
 Waves = Float[Tensor, "batch samples"]
@@ -300,14 +300,8 @@ class HubertEncoder(AudioEncoder):
         """A hash of the frozen weights, the configuration and the number of frozen layers; None with SpecAugment."""
         if self.hubert.config.apply_spec_augment:
             return None
-        # Neither where the weights came from nor how they are trained changes the features.
-        config = {k: v for k, v in self.hubert.config.to_dict().items() if k not in ("_name_or_path", "layerdrop")}
-        digest = hashlib.sha256(json.dumps([self.frozen_layers, EDGE, config], sort_keys=True, default=str).encode())
-        for name in self._frozen:
-            for key, value in sorted(self.hubert.get_submodule(name).state_dict().items()):
-                digest.update(f"{name}.{key}.{value.dtype}".encode())
-                digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
-        return digest.hexdigest()
+        parts = {name: self.hubert.get_submodule(name) for name in self._frozen}
+        return fingerprint(self.frozen_layers, self.hubert.config.to_dict(), parts)
 
     def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
         """Hidden states below the first layer that is trained, at 50 steps a second."""
@@ -374,43 +368,176 @@ def by_length(padded: Tensor, lengths: Tensor, encode: Callable[[Tensor], Tensor
     return nn.utils.rnn.pad_sequence(ordered, batch_first=True), steps
 
 
+def fingerprint(layers: int, config: dict[str, Any], parts: dict[str, nn.Module]) -> str:
+    """A hash of all that decides the features of a frozen network: its configuration and the weights of its parts."""
+    # Neither where the weights came from nor how they are trained changes the features.
+    kept = {key: value for key, value in config.items() if key not in ("_name_or_path", "layerdrop")}
+    digest = hashlib.sha256(json.dumps([layers, EDGE, kept], sort_keys=True, default=str).encode())
+    for name, part in parts.items():
+        for key, value in sorted(part.state_dict().items()):
+            digest.update(f"{name}.{key}.{value.dtype}".encode())
+            digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+@audio_encoder.register("ctc")
+class CtcEncoder(AudioEncoder):
+    """Logits of a frozen speech recogniser: a pretrained HuBERT, wav2vec 2.0 or WavLM with its CTC head.
+
+    What the recogniser hears of a voice is mostly gone in its logits over letters, so they suit a model that takes
+    content from speech (Chai et al., style-content disentanglement, whose recogniser gave 29 logits 50 times a
+    second). The 50 steps a second are interpolated to the motion's frames, or kept where a model asks for 50 a second.
+
+    Args:
+        dim: channels of the result, a linear map of the logits; given by the model.
+        source: a name on the Hugging Face hub or a directory that ``from_pretrained`` reads.
+        config: the recogniser's configuration as plain data; if given, the weights are not read from ``source`` but
+            left for a checkpoint to fill in. Checkpoints use it, so that they need no access to ``source``.
+
+    Raises:
+        FaceDiffError: if ``source`` cannot be read, or is no such recogniser.
+        MissingExtraError: if transformers is not installed.
+    """
+
+    checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere
+
+    def __init__(
+        self, *, dim: Width, source: str = "facebook/wav2vec2-base-960h", config: dict[str, Any] | None = None
+    ) -> None:
+        super().__init__()
+        self.recogniser = load_recogniser(source, config)
+        self.recogniser.requires_grad_(False)
+        self.train()
+        self.out = nn.Linear(self.recogniser.config.vocab_size, dim)
+
+    def checkpoint_init_args(self) -> dict[str, Any]:
+        """What a checkpoint stores in place of ``source``: the configuration as plain data."""
+        return {"config": self.recogniser.config.to_dict()}
+
+    def train(self, mode: bool = True) -> CtcEncoder:
+        """Training mode for the linear map alone: the recogniser runs without dropout and SpecAugment."""
+        super().train(mode)
+        self.recogniser.eval()
+        return self
+
+    def frozen_key(self) -> str | None:
+        """A hash of the recogniser's weights and configuration."""
+        return fingerprint(-1, self.recogniser.config.to_dict(), {"recogniser": self.recogniser})
+
+    @torch.no_grad()
+    def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
+        """The logits, at 50 steps a second."""
+        return by_length(
+            self.standardise(audio, audio_lengths), audio_lengths, lambda wave: self.recogniser(with_edges(wave)).logits
+        )
+
+    def forward(
+        self,
+        audio: Waves,
+        audio_lengths: Lengths,
+        frame_lengths: Lengths,
+        features: Features | None = None,
+        feature_lengths: Lengths | None = None,
+    ) -> Frames:
+        """Encode; see :class:`AudioEncoder`."""
+        if features is None or feature_lengths is None:
+            features, feature_lengths = self.frozen_features(audio, audio_lengths)
+        return interpolate_frames(self.out(features), feature_lengths, frame_lengths)
+
+
+# Pretrained networks: from a directory, from the hub, or from a plain configuration whose weights a checkpoint has.
+
+
 def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
     """A HuBERT from a directory, from the hub, or from a plain configuration without weights."""
     try:
         from transformers import HubertConfig, HubertModel
-        from transformers.utils import logging
     except ImportError as error:
         raise MissingExtraError("transformers", "train", "the hubert audio encoder") from error
     if config is not None:
-        # A configuration may name code on the hub (an attention kernel, a model class) in keys of its own.
-        known = HubertConfig().to_dict()
-        return HubertModel(HubertConfig.from_dict({key: value for key, value in config.items() if key in known}))
-    # A path that does not exist would be taken for a name on the hub and fail with a puzzling message.
+        return HubertModel(known_options(HubertConfig, config))
+    return load_pretrained(HubertModel, source, "HuBERT")
+
+
+def load_recogniser(source: str, config: dict[str, Any] | None) -> PreTrainedModel:
+    """A network with a CTC head from a directory, from the hub, or from a plain configuration without weights."""
+    try:
+        import transformers
+    except ImportError as error:
+        raise MissingExtraError("transformers", "train", "the ctc audio encoder") from error
+    if config is None:
+        check_source(source)
+        try:
+            kind = transformers.PretrainedConfig.get_config_dict(os.path.expanduser(source))[0].get("model_type")
+        except Exception as error:  # the hub's errors are of many classes
+            raise unreadable(source, "a recogniser", error) from error
+    else:
+        kind = config.get("model_type")
+    if kind not in RECOGNISERS:
+        raise FaceDiffError(
+            f'audio_encoder.source: "{source}" is of the type {kind}; expected a recogniser with a CTC head of the '
+            f"type {', '.join(RECOGNISERS)}, such as facebook/wav2vec2-base-960h"
+        )
+    network: type[PreTrainedModel] = getattr(transformers, f"{RECOGNISERS[kind]}ForCTC")
+    if config is not None:
+        return network(known_options(getattr(transformers, f"{RECOGNISERS[kind]}Config"), config))
+    return load_pretrained(network, source, "recogniser with a CTC head")
+
+
+RECOGNISERS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
+"""Types of pretrained networks that hear 16 kHz and may have a CTC head, and how their classes' names begin."""
+
+
+def known_options(kind: Any, config: dict[str, Any]) -> Any:  # noqa: ANN401 - one of transformers' configurations
+    """A configuration from plain data, of which only options that every such configuration has are taken."""
+    # A configuration may name code on the hub (an attention kernel, a model class) in keys of its own.
+    known = kind().to_dict()
+    return kind.from_dict({key: value for key, value in config.items() if key in known})
+
+
+def check_source(source: str) -> None:
+    """Refuse a directory that does not exist: it would be taken for a name on the hub, with a puzzling message."""
     if (source.startswith((".", "/", "~")) or source.count("/") > 1) and not Path(source).expanduser().is_dir():
         raise FaceDiffError(
             f"audio_encoder.source: no directory {source}; expected one with config.json and model.safetensors, "
             f"or a name on the Hugging Face hub such as facebook/hubert-base-ls960"
         )
+
+
+def unreadable(source: str, what: str, error: Exception) -> FaceDiffError:
+    """What is reported where a source cannot be loaded."""
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return FaceDiffError(
+        f'audio_encoder.source: cannot load {what} from "{source}" ({reason}); give a directory '
+        f"that holds config.json and model.safetensors, or go online once to fetch it"
+    )
+
+
+def load_pretrained(network: Any, source: str, what: str) -> Any:  # noqa: ANN401 - one of transformers' models
+    """A complete network from a directory or from the hub.
+
+    Raises:
+        FaceDiffError: if it cannot be read, or some of its weights are not there.
+    """
+    from transformers.utils import logging
+
+    check_source(source)
     bar = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     try:
-        model, info = HubertModel.from_pretrained(
+        model, info = network.from_pretrained(
             os.path.expanduser(source), use_safetensors=None, output_loading_info=True, dtype=torch.float32
         )
     except Exception as error:  # a broken file makes safetensors, pickle and transformers raise anything
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise FaceDiffError(
-            f'audio_encoder.source: cannot load HuBERT from "{source}" ({reason}); give a directory '
-            f"that holds config.json and model.safetensors, or go online once to fetch it"
-        ) from error
+        raise unreadable(source, what, error) from error
     finally:
         if bar:
             logging.enable_progress_bar()
     # The mask embedding is absent from checkpoints that were fine-tuned without SpecAugment; it has no other use.
-    missing = sorted(set(info["missing_keys"]) - {"masked_spec_embed"})
+    missing = sorted(key for key in info["missing_keys"] if not key.endswith("masked_spec_embed"))
     if missing:
         raise FaceDiffError(
-            f'audio_encoder.source: "{source}" holds no complete HuBERT ({len(missing)} weights are missing, '
+            f'audio_encoder.source: "{source}" holds no complete {what} ({len(missing)} weights are missing, '
             f"the first is {missing[0]}); its config.json and model.safetensors must belong together"
         )
     # from_pretrained leaves evaluation mode on, and Lightning trains modules in the mode that it finds them in.

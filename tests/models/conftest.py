@@ -36,12 +36,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 @pytest.fixture
-def make(hubert_source: Path) -> Make:
+def make(hubert_source: Path, ctc_source: Path) -> Make:
     """A small component by kind and name, with reproducible weights."""
+    sources = {"hubert": hubert_source, "ctc": ctc_source}
 
     def build(kind: str, name: str, seed: int = 0, **options: Any) -> nn.Module:  # noqa: ANN401
-        if name == "hubert":
-            options = {"source": str(hubert_source), **options}
+        if name in sources:
+            options = {"source": str(sources[name]), **options}
         torch.manual_seed(seed)
         module: nn.Module = registry.COMPONENTS[kind].get(name)(**SIZES[kind], **options)
         return module
