@@ -41,6 +41,10 @@ class Sample:
         features: the clip's speech, encoded by the frozen part of the audio encoder; None where it is not cached.
         repeated: whether another process scores the same clip, so that this one must not.
         style: a style vector to be used instead of encoding ``reference``.
+        window: the first frame that counts and the one after the last, where ``motion`` has frames around a training
+            window; None where all frames count.
+        partner_frames: for each frame that of the neighbour in the batch which goes with it, both counted in the
+            samples; −1 where it lies outside the neighbour's sample. None where the two were not aligned.
     """
 
     audio: Float[Tensor, " samples"]
@@ -56,6 +60,8 @@ class Sample:
     features: Float[Tensor, "steps channels"] | None = None
     repeated: bool = False
     style: Float[Tensor, " style_dim"] | None = None
+    window: tuple[int, int] | None = None
+    partner_frames: Int[Tensor, " frames"] | None = None
 
 
 @dataclass
@@ -84,11 +90,21 @@ class Batch:
     feature_lengths: Int[Tensor, " batch"] | None = None
     repeated: bool = False
     style: Float[Tensor, "batch style_dim"] | None = None
+    window: Int[Tensor, "batch 2"] | None = None
+    partner_frames: Int[Tensor, "batch frames"] | None = None
 
     @property
     def mask(self) -> Bool[Tensor, "batch frames"]:
         """True on valid frames."""
         return torch.arange(self.motion.shape[1], device=self.motion.device) < self.frame_lengths[:, None]
+
+    @property
+    def window_mask(self) -> Bool[Tensor, "batch frames"]:
+        """True on the valid frames that count: those of training windows, without the frames around them."""
+        if self.window is None:
+            return self.mask
+        frames = torch.arange(self.motion.shape[1], device=self.motion.device)
+        return self.mask & (frames >= self.window[:, :1]) & (frames < self.window[:, 1:])
 
     @property
     def reference_mask(self) -> Bool[Tensor, "batch reference_frames"]:
@@ -123,6 +139,7 @@ class Batch:
             "motion": self.frame_lengths,
             "reference": self.reference_lengths,
             "features": self.feature_lengths,
+            "partner_frames": self.frame_lengths,
         }
         picked: dict[str, Any] = {}
         for name, value in vars(self).items():
@@ -157,6 +174,8 @@ def collate(samples: Sequence[Sample]) -> Batch:
     features = [s.features for s in samples if s.features is not None]
     styles = [s.style for s in samples if s.style is not None]
     cached = len(features) == len(samples)
+    windows = [s.window for s in samples if s.window is not None]
+    aligned = any(s.partner_frames is not None for s in samples)
     return Batch(
         audio=pad([s.audio for s in samples]),
         audio_lengths=torch.tensor([len(s.audio) for s in samples]),
@@ -175,7 +194,15 @@ def collate(samples: Sequence[Sample]) -> Batch:
         feature_lengths=torch.tensor([len(f) for f in features]) if cached else None,
         repeated=samples[0].repeated,
         style=torch.stack(styles) if len(styles) == len(samples) else None,
+        window=torch.tensor(windows) if len(windows) == len(samples) else None,
+        partner_frames=_pad_partners(samples) if aligned else None,
     )
+
+
+def _pad_partners(samples: Sequence[Sample]) -> Int[Tensor, "batch frames"]:
+    """The samples' partner frames; −1 on padding and for samples that are not aligned."""
+    rows = [torch.full((len(s.motion),), -1) if s.partner_frames is None else s.partner_frames for s in samples]
+    return pad_sequence(rows, batch_first=True, padding_value=-1)
 
 
 # What a checkpoint keeps of its corpus, so that it animates a face without the corpus.

@@ -6,6 +6,7 @@ a mesh file with the faces, and optionally ``clips.csv`` with further columns pe
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -78,6 +79,12 @@ class Clip:
     def number(self) -> int:
         """The sentence's number: the last two characters, as in every project of the field; −1 if it has none."""
         return int(self.sentence[-2:]) if self.sentence[-2:].isdecimal() else -1
+
+    @property
+    def words(self) -> str:
+        """What is said: the words of the column ``text`` of ``clips.csv`` if there is one, else the sentence."""
+        words = re.findall(r"[^\W_]+", self.attributes.get("text", "").casefold())
+        return " ".join(words) or self.sentence
 
 
 NameParser = Callable[[str], Clip | None]

@@ -20,6 +20,7 @@ from torch.utils.data import DataLoader
 from facediff.data.batch import Assets, Batch, Reference, Sample, collate
 from facediff.data.corpus import EYELID_PAIRS, LIP_PAIRS, Clip, Corpus, find_region, parse_name, read_manifest
 from facediff.data.dataset import (
+    Aligner,
     BatchDataset,
     ClipBatches,
     FeatureSlot,
@@ -75,6 +76,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     Attributes:
         pair_sentences: whether neighbours in training batches speak the same sentence; a model that learns from such
             pairs sets it in its ``setup``.
+        window_context: frames before and after a training window that samples come with; a model that sees further
+            than the window sets it in its ``setup``.
+        aligner: lets the windows of two neighbours that speak the same sentence begin at the same sound; set likewise.
 
     Args:
         root: the corpus folder.
@@ -83,6 +87,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             this many frames once they are padded.
         num_workers: loader processes.
         window: longest training window in frames; whole clips if None.
+        windows_per_clip: how many windows an epoch takes of each clip; None for as many as fill the clip.
         reference: where a training target's style reference comes from: another clip of the same speaker, where
             possible with the same attributes (such as the mood), or the target itself.
         reference_frames: longest style reference, in frames.
@@ -97,6 +102,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         upper_face: the same for the upper face.
         eyelid_pairs: file that lists pairs of an upper and a lower eyelid vertex, for blinks;
             ``regions/eyelid_pairs.txt`` if None.
+        face: the same for the face, of which a model may be asked to see nothing else, e.g.
+            ``FLAME_masks.pkl:face``; the corpus has no such region if None.
     """
 
     corpus_name: ClassVar[str]
@@ -125,6 +132,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         max_frames_per_batch: Count | None = None,
         num_workers: Annotated[int, Range(0, 256)] = 0,
         window: Count | None = None,
+        windows_per_clip: Count | None = 1,
         reference: ReferenceChoice = "same_subject",
         reference_frames: Count = 100,
         predict_split: Split | None = None,
@@ -134,6 +142,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         lips: str | None = None,
         upper_face: str | None = None,
         eyelid_pairs: str | None = None,
+        face: str | None = None,
     ) -> None:
         super().__init__()
         if not str(root):
@@ -143,6 +152,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.max_frames_per_batch = max_frames_per_batch
         self.num_workers = num_workers
         self.window = window
+        self.windows_per_clip = windows_per_clip
         self.reference: ReferenceChoice = reference
         self.reference_frames = reference_frames
         self.predict_split = predict_split
@@ -152,6 +162,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             for name, chosen in (("lips", lips), ("upper_face", upper_face))
         }
         self.eyelid_file = eyelid_pairs
+        if face is not None:
+            self.regions["face"] = (face,)
         self.extra_identities = list(extra_identities or [])
         self.train_identities = None if train_identities is None else list(train_identities)
         self.identities = [*map(person_name, self.people), *self.extra_identities, *type(self).identities]
@@ -168,6 +180,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             )
         self.features = FeatureSlot()
         self.pair_sentences = False
+        self.window_context = (0, 0)
+        self.aligner: Aligner | None = None
         self._assets: Assets | None = None
 
     options_path = "data"
@@ -223,6 +237,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def expected_clips(cls) -> dict[str, list[str]]:
         """The clips of a complete corpus by split; empty where the corpus has no fixed list."""
         return {}
+
+    def words_of(self, clip: Clip) -> str:
+        """What a clip says: clips of which it is equal have the same words, so that they can be aligned in time."""
+        return clip.words
 
     def default_reference(self, clips: list[Clip]) -> Clip:
         """The one of an identity's clips whose style is used when no other is chosen."""
@@ -294,14 +312,20 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
         A speaker with clips in evaluated splits only is given another of these clips, never the target itself.
         """
-        candidates: dict[str, list[Clip]] = {}
         evaluated: dict[str, list[Clip]] = {}
         for clip in self.corpus.clips.values():
-            chosen = candidates if self.find_split(clip) in ("train", None) else evaluated
-            chosen.setdefault(clip.identity, []).append(clip)
+            evaluated.setdefault(clip.identity, []).append(clip)
         return ReferencePolicy(
-            {**evaluated, **candidates}, self.reference_attributes, self.reference, self.reference_frames
+            {**evaluated, **self.known_clips()}, self.reference_attributes, self.reference, self.reference_frames
         )
+
+    def known_clips(self) -> dict[str, list[Clip]]:
+        """Each speaker's clips outside the evaluated splits, by speaker; speakers who have none are left out."""
+        found: dict[str, list[Clip]] = {}
+        for clip in self.corpus.clips.values():
+            if self.find_split(clip) in ("train", None):
+                found.setdefault(clip.identity, []).append(clip)
+        return found
 
     def dataset(self, split: str, *, training: bool = False) -> MotionDataset:
         """The samples of a split: whole clips with fixed references, or (``training``) random windows and references.
@@ -326,6 +350,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             window=self.window if training else None,
             decoys=split.startswith("test"),
             features=self.features,
+            words=[self.words_of(clip) for clip in clips],
+            context=self.window_context if training and self.window is not None else (0, 0),
+            aligner=self.aligner if training and self.pair_sentences else None,
         )
 
     def assets(self) -> Assets:
@@ -450,7 +477,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             seed=int(os.environ.get("PL_GLOBAL_SEED", "0")),
             rank=trainer.global_rank if trainer is not None else 0,
             world_size=trainer.world_size if trainer is not None else 1,
-            groups=[clip.sentence for clip in samples.clips] if self.pair_sentences else None,
+            groups=[self.words_of(clip) for clip in samples.clips] if self.pair_sentences else None,
+            copies=self._copies(samples) if training else None,
         )
         # The sampler yields whole batches, so the loader must not batch again.
         loader = ResumableLoader(
@@ -458,6 +486,14 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         )
         loader.progress = self._progress
         return loader
+
+    def _copies(self, samples: MotionDataset) -> list[int]:
+        """How often an epoch takes each clip, each time another window of it."""
+        if self.window is None:
+            return [1] * len(samples)
+        if self.windows_per_clip is not None:
+            return [self.windows_per_clip] * len(samples)
+        return [-(-self.corpus.frames(clip) // self.window) for clip in samples.clips]
 
     def _progress(self) -> tuple[int, int]:
         """Epoch and completed batches of the training that is running."""

@@ -6,7 +6,7 @@ import hashlib
 import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -94,7 +94,8 @@ class ClipBatches(DistributedSampler[list[Pick]]):
 
     With ``groups``, training batches are made of pairs of neighbours: clips 2k and 2k + 1 of a batch are of one group
     (for example one sentence) as far as there are such clips. A clip that is left over is paired with one that already
-    has a partner.
+    has a partner. With ``copies``, an epoch takes a clip several times, with other random choices each time; no pair
+    has a clip twice.
 
     Args:
         lengths: frames of every clip; used with ``max_frames`` only.
@@ -105,6 +106,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         rank: this process.
         world_size: number of processes.
         groups: for each clip what pairs have in common; None for no pairs.
+        copies: how often an epoch of training takes each clip; once if None.
     """
 
     def __init__(
@@ -118,6 +120,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         rank: int = 0,
         world_size: int = 1,
         groups: Sequence[str] | None = None,
+        copies: Sequence[int] | None = None,
     ) -> None:
         clips: Any = range(len(lengths))  # only its length is used
         super().__init__(clips, num_replicas=world_size, rank=rank, shuffle=training, seed=seed)
@@ -126,6 +129,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         self.max_frames = max_frames
         self.training = training
         self.groups = list(groups) if groups is not None and training else None
+        self.copies = list(copies) if copies is not None and training else [1] * len(lengths)
         self.resume_epoch, self.resume_batch = 0, 0
 
     def __len__(self) -> int:
@@ -139,7 +143,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         for place in range(self.rank + done * self.num_replicas, len(batches), self.num_replicas):
             # Clips are repeated only where every batch is a single clip, so places past the last clip repeat one.
             repeated = not self.training and place >= len(self.lengths)
-            yield [Pick(i, self._hash(i) if self.training else 0, repeated) for i in batches[place]]
+            yield [Pick(*self._pick(unit), repeated) for unit in batches[place]]
 
     def resume(self, epoch: int, batch: int) -> None:
         """Continue in an epoch after some of its batches; later epochs are complete."""
@@ -149,17 +153,37 @@ class ClipBatches(DistributedSampler[list[Pick]]):
     def _hash(self, what: object) -> int:
         return zlib.crc32(f"{self.seed}:{self.epoch}:{what}".encode())
 
-    def _batches(self, generator: torch.Generator) -> list[list[int]]:
+    def _pick(self, place: int) -> tuple[int, int]:
+        """The clip at a place, and the seed of its random choices: places past the clips' number are their copies."""
+        copy, index = divmod(place, len(self.lengths))
+        return index, self._hash(f"{index}:{copy}" if copy else index) if self.training else 0
+
+    def _units(self, generator: torch.Generator) -> list[list[int]]:
+        """Clips, or pairs of them, in the order in which batches take them; a copy of a clip has a place of its own."""
         count = len(self.lengths)
-        order = torch.randperm(count, generator=generator).tolist() if self.training else list(range(count))
-        units = [[index] for index in order] if self.groups is None else paired(order, self.groups, generator)
+        if not self.training:
+            return [[index] for index in range(count)]
+        units: list[list[int]] = []
+        for copy in range(max(self.copies, default=1)):
+            there = [
+                index for index in torch.randperm(count, generator=generator).tolist() if self.copies[index] > copy
+            ]
+            chosen = [[index] for index in there] if self.groups is None else paired(there, self.groups, generator)
+            units += [[copy * count + index for index in unit] for unit in chosen]
+        if max(self.copies, default=1) > 1:
+            units = [units[i] for i in torch.randperm(len(units), generator=generator).tolist()]
+        return units
+
+    def _batches(self, generator: torch.Generator) -> list[list[int]]:
+        units = self._units(generator)
         if self.max_frames is None:
             each = max(1, self.batch_size // (1 if self.groups is None else 2))
             return [sum(units[i : i + each], []) for i in range(0, len(units), each)]
         # Lengths are rounded up to buckets. Otherwise the number of batches would depend on which clips the shuffle
         # puts together, and the length of an epoch would change.
         width = max(1, self.max_frames // BUCKETS)
-        rounded = [-(-max(self.lengths[i] for i in unit) // width) * width for unit in units]
+        count = len(self.lengths)
+        rounded = [-(-max(self.lengths[i % count] for i in unit) // width) * width for unit in units]
         batches: list[list[int]] = []
         for place in sorted(range(len(units)), key=lambda k: rounded[k]):  # stable: random within a bucket
             if batches and rounded[place] * (len(batches[-1]) + len(units[place])) <= self.max_frames:
@@ -285,6 +309,11 @@ class ReferencePolicy:
         return alike or others
 
 
+Aligner = Callable[[Tensor, int, Tensor, int], Tensor]
+"""For each frame of one recording that of another which goes with it, indices (frames,). It takes the speech
+(samples,) and the number of frames of the one and of the other."""
+
+
 FeatureReader = Callable[[Clip], Tensor | None]
 """Returns the cached features (steps, channels) of a whole clip's speech, or None."""
 
@@ -305,6 +334,9 @@ class MotionDataset(Dataset[Sample]):
         window: longest training window in frames; whole clips if None.
         decoys: give every clip the speech of another sentence in addition to its own.
         features: returns cached features of the speech, if there are any.
+        words: what each clip says, where that is not its sentence; clips that say the same can be aligned.
+        context: frames before and after a training window that are read with it.
+        aligner: lets the windows of two clips that say the same begin at the same sound; None leaves them to chance.
     """
 
     corpus: Corpus
@@ -316,6 +348,10 @@ class MotionDataset(Dataset[Sample]):
     window: int | None = None
     decoys: bool = False
     features: FeatureReader | None = None
+    words: list[str] | None = None
+    context: tuple[int, int] = (0, 0)
+    aligner: Aligner | None = None
+    _alignments: dict[tuple[int, int], Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Number of clips."""
@@ -325,33 +361,86 @@ class MotionDataset(Dataset[Sample]):
         """Read one clip from disk; in training, window and reference depend on torch's global generator."""
         return self.sample(Pick(index, int(torch.randint(2**31, ())) if self.training else 0))
 
-    def sample(self, pick: Pick) -> Sample:
-        """Read one clip from disk, with a window and a reference that follow from a seed."""
+    def sample(self, pick: Pick, begin: int | None = None) -> Sample:
+        """Read one clip from disk, with a window and a reference that follow from a seed.
+
+        Args:
+            pick: the clip and the seed.
+            begin: where the window begins, if that is known already.
+        """
         index, random = pick.index, torch.Generator().manual_seed(pick.seed)
         clip = self.clips[index]
         frames = self.corpus.frames(clip)
         start, stop = self._window(frames, self.window, random)
+        if begin is not None:
+            start, stop = begin, begin + stop - start
+        # A training window comes with the frames around it, as far as the clip has them.
+        first, last = max(0, start - self.context[0]), min(frames, stop + self.context[1])
         source = self._reference(clip, random)
-        first, last = self._window(self.corpus.frames(source), self.policy.max_frames, random)
+        earliest, latest = self._window(self.corpus.frames(source), self.policy.max_frames, random)
         return Sample(
-            audio=self.corpus.read_audio(clip, start, stop),
-            motion=self.corpus.read_motion(clip, start, stop),
+            audio=self.corpus.read_audio(clip, first, last),
+            motion=self.corpus.read_motion(clip, first, last),
             template=self.corpus.template(clip),
             identity=self.identities.index(clip.identity) if clip.identity in self.identities else UNKNOWN_IDENTITY,
-            reference=self.corpus.read_motion(source, first, last),
+            reference=self.corpus.read_motion(source, earliest, latest),
             name=clip.name,
             identity_name=clip.identity,
-            sentence=clip.sentence,
+            sentence=self.says(index),
             reference_name=source.name,
-            decoy_audio=self._decoy(index, stop - start) if self.decoys else None,
-            features=self._features(clip, start, stop, frames),
+            decoy_audio=self._decoy(index, last - first) if self.decoys else None,
+            features=self._features(clip, first, last, frames),
             repeated=pick.repeated,
+            window=(start - first, stop - first) if any(self.context) else None,
         )
+
+    def says(self, index: int) -> str:
+        """What a clip says: clips of which it is equal have the same words."""
+        return self.clips[index].sentence if self.words is None else self.words[index]
+
+    def pair(self, one: Pick, other: Pick) -> list[Sample]:
+        """Two neighbours of a batch; if they say the same, their windows begin at the same sound.
+
+        The first clip's window is random, the second one's begins at the frame that goes with the first one's.
+        """
+        alike = one.index != other.index and self.says(one.index) == self.says(other.index)
+        if self.aligner is None or self.window is None or not alike:
+            return [self.sample(one), self.sample(other)]
+        picks = (one, other)
+        counts = [self.corpus.frames(self.clips[pick.index]) for pick in picks]
+        paths = [self._path(self.aligner, *each) for each in ((one.index, other.index), (other.index, one.index))]
+        start, _ = self._window(counts[0], self.window, torch.Generator().manual_seed(one.seed))
+        # A window near the end of the second clip is moved back, so that it has its full length.
+        begins = [start, max(0, min(int(paths[0][start]), counts[1] - self.window))]
+        samples = [self.sample(pick, begin) for pick, begin in zip(picks, begins, strict=True)]
+        # Where each sample begins in its clip: before its window, if it comes with the frames around it.
+        firsts = [
+            begin - (0 if sample.window is None else sample.window[0])
+            for begin, sample in zip(begins, samples, strict=True)
+        ]
+        for mine, theirs in ((0, 1), (1, 0)):
+            first, frames = firsts[mine], len(samples[mine].motion)
+            places = paths[mine][first : first + frames] - firsts[theirs]
+            outside = (places < 0) | (places >= len(samples[theirs].motion))
+            samples[mine] = replace(samples[mine], partner_frames=places.masked_fill(outside, -1))
+        return samples
+
+    def _path(self, aligner: Aligner, index: int, other: int) -> Tensor:
+        """For each frame of a whole clip the frame of another one that says the same; computed once."""
+        if (index, other) not in self._alignments:
+            clips = [self.clips[index], self.clips[other]]
+            counts = [self.corpus.frames(clip) for clip in clips]
+            audio = [self.corpus.read_audio(clip, 0, count) for clip, count in zip(clips, counts, strict=True)]
+            self._alignments[index, other] = aligner(audio[0], counts[0], audio[1], counts[1])
+        return self._alignments[index, other]
 
     def frames(self) -> list[int]:
         """Frames of every sample."""
         counts = [self.corpus.frames(clip) for clip in self.clips]
-        return counts if self.window is None else [min(count, self.window) for count in counts]
+        if self.window is None:
+            return counts
+        longest = self.window + sum(self.context)
+        return [min(count, longest) for count in counts]
 
     def _window(self, frames: int, longest: int | None, random: torch.Generator) -> tuple[int, int]:
         if longest is None or frames <= longest:
@@ -402,4 +491,7 @@ class BatchDataset(Dataset[list[Sample]]):
         """The picked clips; a bare number, which Lightning asks for when it overfits on a few batches, is one clip."""
         if isinstance(picks, int):
             return [self.samples[picks]]
-        return [self.samples.sample(pick) for pick in picks]
+        if self.samples.aligner is None:
+            return [self.samples.sample(pick) for pick in picks]
+        pairs = [self.samples.pair(*picks[i : i + 2]) for i in range(0, len(picks) - 1, 2)]
+        return [*sum(pairs, []), *(self.samples.sample(pick) for pick in picks[2 * len(pairs) :])]

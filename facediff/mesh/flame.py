@@ -295,7 +295,8 @@ def read_masks(path: Path, names: str) -> list[int]:
 
     Args:
         path: a pickle that holds a dict from mask to indices, or a single list of indices.
-        names: masks, several joined by "+" ("lips", "forehead+eye_region"); the whole list if empty.
+        names: masks, several joined by "+" ("lips", "forehead+eye_region"), or without the vertices of others after "-"
+            ("face-left_eyeball-right_eyeball"); the whole list if empty.
 
     Raises:
         FaceDiffError: if the file holds something else, or has no mask of that name.
@@ -303,14 +304,22 @@ def read_masks(path: Path, names: str) -> list[int]:
     loaded = load_pickle(path)
     if names and not isinstance(loaded, dict):
         raise FaceDiffError(f"{path}: expected a dict from mask to vertex indices, got {type(loaded).__name__}")
-    wanted = names.split("+") if names else []
-    for name in wanted:
+    wanted, unwanted = [], []
+    for part in names.split("+") if names else []:
+        # A mask may have a hyphen in its own name.
+        first, *others = [part] if part in loaded else part.split("-")
+        wanted.append(first)
+        unwanted += others
+    for name in [*wanted, *unwanted]:
         if name not in loaded:
             raise FaceDiffError(f'{path}: has no mask "{name}": {choices(name, list(map(str, loaded)))}')
     try:
-        arrays = [np.asarray(mask) for mask in ([loaded[name] for name in wanted] if names else [loaded])]
+        chosen = [loaded[name] for name in [*wanted, *unwanted]] if names else [loaded]
+        arrays = [np.asarray(mask) for mask in chosen]
     except ValueError as error:
         raise FaceDiffError(f"{path}: expected lists of vertex indices ({error})") from error
     if any(array.ndim != 1 or not np.issubdtype(array.dtype, np.integer) for array in arrays):
         raise FaceDiffError(f"{path}: expected lists of whole numbers, the vertex indices")
-    return [int(index) for array in arrays for index in array]
+    count = len(wanted) if names else 1
+    without = {int(index) for array in arrays[count:] for index in array}
+    return [int(index) for array in arrays[:count] for index in array if int(index) not in without]
