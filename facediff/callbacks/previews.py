@@ -222,7 +222,8 @@ class SamplingPreview(Callback):
     def _clip(self, trainer: Trainer, model: AnimationModel, sample: Sample, folder: Path, epochs: int) -> ClipPreview:
         precision = trainer.precision_plugin.forward_context()
         with borrowed(model, self.sampler, self.steps), precision, torch.inference_mode():
-            motion = model.generate(collate([sample]).to(model.device), seed=self.seed)[0].float().cpu()
+            clip = model.with_person_styles(collate([sample]).to(model.device))
+            motion = model.generate(clip, seed=self.seed)[0].float().cpu()
         scale = self._scale or default_error_scale([sample])
         return draw_clip(model, sample, motion, folder, epochs, error_scale=scale, size=self.size, view=self.view)
 

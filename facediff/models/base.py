@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal, Self
@@ -19,39 +19,61 @@ from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
-from facediff.data import Assets, Batch, SpeechMotionDataModule
-from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY
+from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
+from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, pad
 from facediff.errors import FaceDiffError
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
-from facediff.models.inference import Inference, Prediction, WindowPlan
+from facediff.models.inference import Inference, Prediction, Style, WindowPlan
+from facediff.models.layers import frame_mask
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.principal import PrincipalComponents
 from facediff.registry import COMPONENTS, component_class, defaults, describe, keeps_arguments, plain
+from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.plain_options import is_name, is_plain_text
 from facediff.utils.ranges import Range, Vertices
 
-Schedule = Literal["constant", "cosine"]
+Schedule = Literal["constant", "cosine", "exponential"]
+StyleSource = Literal["reference", "person"]
 MotionScale = Literal["unit", "none"]
 Decay = Annotated[float, Range(0, 1000)]
 
+
+STYLES_KEY = "facediff_styles"
+"""Where a checkpoint keeps the speakers' style vectors, if they are of all their motion."""
 
 DIVERGENCE_INTERVAL = 50
 """Steps between two looks at the loss on an accelerator."""
 
 
-def lr_factor(step: int, *, total: int, warmup_steps: int, schedule: Schedule) -> float:
+def lr_factor(
+    step: int,
+    *,
+    total: int,
+    warmup_steps: int,
+    schedule: Schedule,
+    epoch_steps: int = 1,
+    decay: float = 0.9,
+    decay_epoch: int = 30,
+) -> float:
     """What the learning rate is multiplied by at an optimiser step.
 
     Args:
         step: the step, counted from 0.
         total: steps of the whole training.
         warmup_steps: steps over which the factor rises from zero.
-        schedule: constant, or half a cosine down to zero at the end.
+        schedule: constant; half a cosine down to zero at the end; or exponential, which multiplies by ``decay`` in
+            every epoch from ``decay_epoch`` on.
+        epoch_steps: steps of an epoch.
+        decay: the factor of an epoch.
+        decay_epoch: the first epoch with the factor, counted from 0 as Lightning counts.
     """
     warm = min(1.0, (step + 1) / max(1, warmup_steps))
     if schedule == "constant":
         return warm
+    if schedule == "exponential":
+        return warm * decay ** max(0, step // max(1, epoch_steps) - decay_epoch + 1)
     return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / max(1, total))))
 
 
@@ -75,7 +97,9 @@ class AnimationModel(LightningModule, Inference, ABC):
             leaves it as it is.
         learning_rate: AdamW's learning rate.
         weight_decay: AdamW's weight decay.
-        lr_schedule: constant, or a cosine down to zero at the end of training.
+        lr_schedule: constant, a cosine down to zero at the end of training, or ``exponential``.
+        lr_decay: what ``exponential`` multiplies the learning rate by in every epoch from ``lr_decay_epoch`` on.
+        lr_decay_epoch: the first epoch that it does so, counted from 0.
         warmup_steps: optimiser steps over which the learning rate rises from zero.
         protocol: the metrics' protocol for validation and test.
         metrics: further metrics for validation and test, by name with their options, such as
@@ -83,6 +107,9 @@ class AnimationModel(LightningModule, Inference, ABC):
         unseen_identity: which identity unseen speakers are tested with: none, with their own style (``style_only``),
             each training identity in turn with the mean of the scores (``each_seen``), or their own, once the model is
             adapted to them (``adapted``).
+        style_source: the style that speakers have in validation, test and prediction, and by default in animation: of
+            one ``reference`` clip, or of all motion of the ``person`` outside the evaluated clips, as the mean of the
+            style vectors of stretches of ``data.reference_frames``. Checkpoints then keep every speaker's vector.
     """
 
     @keeps_arguments
@@ -96,10 +123,13 @@ class AnimationModel(LightningModule, Inference, ABC):
         learning_rate: Annotated[float, Range(0, 1000)] = 1e-4,
         weight_decay: Decay = 0.05,
         lr_schedule: Schedule = "constant",
+        lr_decay: Annotated[float, Range(0, 1, above=True)] = 0.9,
+        lr_decay_epoch: Annotated[int, Range(0, 10**9)] = 30,
         warmup_steps: Annotated[int, Range(0, 10**9)] = 0,
         protocol: str = "paper",
         metrics: Sequence[str] = (),
         unseen_identity: IdentityPolicy = "style_only",
+        style_source: StyleSource = "reference",
     ) -> None:
         super().__init__()
         self.n_vertices = n_vertices
@@ -110,6 +140,8 @@ class AnimationModel(LightningModule, Inference, ABC):
         self.learning_rate = float(learning_rate)
         self.weight_decay = float(weight_decay)
         self.lr_schedule = lr_schedule
+        self.lr_decay = float(lr_decay)
+        self.lr_decay_epoch = lr_decay_epoch
         self.warmup_steps = warmup_steps
         self.unseen_identity: IdentityPolicy = unseen_identity
         self.protocol = protocol
@@ -117,6 +149,9 @@ class AnimationModel(LightningModule, Inference, ABC):
         self.windows = WindowPlan()
         self.data_source: dict[str, str] = {}
         self._assets: Assets | None = None
+        self.style_source: StyleSource = style_source
+        self.person_styles: dict[str, Style] = {}
+        self._styles_of_step: int | None = None  # the step whose weights gave the vectors
 
     @functools.cached_property
     def evaluation(self) -> Evaluation:
@@ -161,6 +196,27 @@ class AnimationModel(LightningModule, Inference, ABC):
         """A batch's own style vectors, or else those of its references."""
         return self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
 
+    def default_style(self, identity: str) -> Reference | Style:
+        """The style of all of an identity's motion if the model keeps it, else its stored reference.
+
+        Raises:
+            FaceDiffError: if it has neither.
+        """
+        return self.person_styles.get(identity) or super().default_style(identity)
+
+    def with_person_styles(self, batch: Batch) -> Batch:
+        """The batch with the style of all motion of each clip's speaker, where the model uses it and knows it."""
+        known = [self.person_styles.get(name) for name in batch.identity_names]
+        if not any(known) or batch.style is not None:
+            return batch
+        with torch.no_grad():
+            style = self.style_of(batch).clone()
+        names = list(batch.reference_names)
+        for clip, found in enumerate(known):
+            if found is not None:
+                style[clip], names[clip] = found.vector.to(style), found.name
+        return replace(batch, style=style, reference_names=names)
+
     def personal_modules(self) -> list[nn.Module]:
         """The parts that hold identity and style; ``facediff adapt --train person`` trains them alone."""
         return []
@@ -193,7 +249,15 @@ class AnimationModel(LightningModule, Inference, ABC):
         if self.lr_schedule == "constant" and not self.warmup_steps:
             return optimizer
         total = int(self.trainer.estimated_stepping_batches)
-        factor = functools.partial(lr_factor, total=total, warmup_steps=self.warmup_steps, schedule=self.lr_schedule)
+        factor = functools.partial(
+            lr_factor,
+            total=total,
+            warmup_steps=self.warmup_steps,
+            schedule=self.lr_schedule,
+            epoch_steps=math.ceil(self.trainer.num_training_batches / self.trainer.accumulate_grad_batches),
+            decay=self.lr_decay,
+            decay_epoch=self.lr_decay_epoch,
+        )
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
@@ -222,13 +286,57 @@ class AnimationModel(LightningModule, Inference, ABC):
                 f"corpus with `facediff data check`"
             )
 
+    def on_validation_epoch_start(self) -> None:
+        """Take the styles of all motion by the weights that are validated; weight averaging has put its own in."""
+        self.encode_people()
+
+    def on_test_epoch_start(self) -> None:
+        """Take the styles of all motion of the speakers that are tested."""
+        self.encode_people()
+
+    def on_predict_epoch_start(self) -> None:
+        """Take the styles of all motion of the speakers that are predicted."""
+        self.encode_people()
+
+    def encode_people(self, weights: Mapping[str, Tensor] | None = None) -> None:
+        """Take every speaker's style from all of their motion, if that is what the model uses.
+
+        The motion is cut into stretches as long as a style reference; a speaker's style is the mean of the stretches'
+        vectors, weighted by their frames. Clips of the evaluated splits are never among them.
+
+        Args:
+            weights: the weights to encode with, by the names of the state dict; the present ones if None.
+        """
+        step = int(self.trainer.global_step)
+        if self.style_source != "person" or self._styles_of_step == step:
+            return
+        data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        encoder, given = StyleEncoding(self), {f"model.{name}": value for name, value in (weights or {}).items()}
+        modes = [(module, module.training) for module in self.modules()]
+        self.eval()
+        styles: dict[str, Style] = {}
+        with torch.no_grad():
+            for name, clips in data.known_clips().items():
+                total, frames = torch.zeros(()), 0
+                for clip in clips if name in data.corpus.templates else []:
+                    parts = torch.split(data.corpus.read_motion(clip).to(self.device), data.reference_frames)
+                    lengths = torch.tensor([len(part) for part in parts], device=self.device)
+                    mask = frame_mask(lengths, int(lengths.max()))
+                    vectors = torch.func.functional_call(encoder, given, (pad(parts), mask)).float()
+                    total, frames = total + (vectors * lengths[:, None]).sum(0).cpu(), frames + int(lengths.sum())
+                if frames and total.numel():
+                    styles[name] = Style(f"all motion of {name} ({len(clips)} clips)", total / frames)
+        for module, mode in modes:
+            module.training = mode
+        self.person_styles, self._styles_of_step = styles, step
+
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss with fixed random numbers, so that epochs compare, and the protocol's metrics of generated motion."""
         # The same steps and noise in every epoch; otherwise the curve would show their chance.
         losses = self.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
-        self.evaluation.score(self, "val", batch)
+        self.evaluation.score(self, "val", self.with_person_styles(batch))
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics as ``val/mve`` …."""
@@ -238,7 +346,9 @@ class AnimationModel(LightningModule, Inference, ABC):
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Score generated motion, faces that do not move, and the model's motion for another sentence's speech."""
         split = self.evaluation.splits[dataloader_idx]
-        for name, view in conditioned(batch, self.unseen_identity, self.identities, self.assets.references):
+        batch = self.with_person_styles(batch)
+        styles: dict[str, Reference | Style] = {**self.assets.references, **self.person_styles}
+        for name, view in conditioned(batch, self.unseen_identity, self.identities, styles):
             self.evaluation.score(self, split, view, name)
             if view.decoy_audio is not None:
                 decoy = replace(view, audio=view.decoy_audio, features=None)
@@ -253,6 +363,7 @@ class AnimationModel(LightningModule, Inference, ABC):
 
     def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> list[Prediction]:
         """Absolute vertices of every clip of the batch."""
+        batch = self.with_person_styles(batch)
         vertices = self.generate(batch, seed=0) + batch.template[:, None]
         names = [self.identities[i] if i >= 0 else "unknown" for i in batch.identity.tolist()]
         return [
@@ -307,6 +418,7 @@ class AnimationModel(LightningModule, Inference, ABC):
 
     def setup(self, stage: str) -> None:
         """Take the assets from the data module; a checkpoint's own replace them when it is loaded."""
+        self._styles_of_step = None
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, SpeechMotionDataModule):
             raise FaceDiffError("facediff's models train and test on a SpeechMotionDataModule; pass datamodule=…")
@@ -394,12 +506,18 @@ class AnimationModel(LightningModule, Inference, ABC):
         checkpoint[FORMAT_KEY] = FORMAT
         checkpoint[ASSETS_KEY] = self.assets.state()
         checkpoint[DATA_SOURCE_KEY] = self.data_source
+        if self.style_source == "person":
+            # Of the weights that are saved: weight averaging has replaced the present ones in the checkpoint by now.
+            if self._trainer is not None and isinstance(self.trainer.datamodule, SpeechMotionDataModule):  # type: ignore[attr-defined]
+                self.encode_people(checkpoint["state_dict"])
+            checkpoint[STYLES_KEY] = {name: (style.name, style.vector) for name, style in self.person_styles.items()}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the assets from the checkpoint."""
         if ASSETS_KEY in checkpoint:
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
             self.data_source = checkpoint.get(DATA_SOURCE_KEY, {})
+            self.person_styles = read_person_styles(checkpoint.get(STYLES_KEY, {}))
 
     @classmethod
     def load_from_checkpoint(
@@ -418,3 +536,43 @@ class AnimationModel(LightningModule, Inference, ABC):
         with checked_file(checkpoint_path) as stream:
             made: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
         return made
+
+
+class StyleEncoding(nn.Module):
+    """A model's style encoder as a module, so that it can be called with other weights than the model has.
+
+    Args:
+        model: the model.
+    """
+
+    def __init__(self, model: AnimationModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, reference: Tensor, mask: Tensor) -> Tensor:
+        """Style vectors, as :meth:`AnimationModel.encode_style` gives them."""
+        return self.model.encode_style(reference, mask)
+
+
+def read_person_styles(state: object) -> dict[str, Style]:
+    """The styles of all motion of each speaker, from a checkpoint.
+
+    Raises:
+        FaceDiffError: if they are anything but finite vectors of one length, by speaker.
+    """
+    if not isinstance(state, dict):
+        raise FaceDiffError(f"its styles are {quoted(state)}; expected vectors by speaker. The file is damaged")
+    styles: dict[str, Style] = {}
+    for name, value in state.items():
+        fits = is_name(name) and isinstance(value, list | tuple) and len(value) == 2 and isinstance(value[0], str)
+        vector = value[1] if fits and is_plain_text(value[0]) else None
+        if not isinstance(vector, Tensor) or vector.ndim != 1 or not bool(vector.isfinite().all()):
+            raise FaceDiffError(
+                f"its style of {quoted(name)} is {quoted(value)}; expected a name and a finite vector. The file is "
+                f"damaged"
+            )
+        styles[name] = Style(value[0], vector.float())
+    LIMITS.check("identities", len(styles), STYLES_KEY)
+    if len({len(style.vector) for style in styles.values()}) > 1:
+        raise FaceDiffError("its styles of speakers differ in length; expected one length. The file is damaged")
+    return styles

@@ -31,7 +31,7 @@ from facediff.metrics import (
     protocol,
 )
 from facediff.metrics.by_name import parse_all
-from facediff.models.inference import Inference
+from facediff.models.inference import Inference, Style
 
 IdentityPolicy = Literal["style_only", "each_seen", "adapted"]
 """Which identity unseen speakers are tested with. ``style_only``: none, with the style of their own reference.
@@ -40,7 +40,7 @@ released test scripts do. ``adapted``: their own, which the model must have been
 
 
 def conditioned(
-    batch: Batch, policy: IdentityPolicy, identities: Sequence[str], references: Mapping[str, Reference]
+    batch: Batch, policy: IdentityPolicy, identities: Sequence[str], references: Mapping[str, Reference | Style]
 ) -> list[tuple[str, Batch]]:
     """The batches to score in place of one, each with the name of the identity that its unseen speakers get.
 
@@ -67,8 +67,15 @@ def conditioned(
     return found
 
 
-def with_identity(batch: Batch, index: int, reference: Reference) -> Batch:
+def with_identity(batch: Batch, index: int, reference: Reference | Style) -> Batch:
     """The batch as if all clips were of one training identity, with that identity's style."""
+    if isinstance(reference, Style):
+        return replace(
+            batch,
+            identity=batch.identity.new_full((len(batch),), index),
+            style=reference.vector.to(batch.reference).expand(len(batch), -1),
+            reference_names=[reference.name] * len(batch),
+        )
     motion = reference.motion.to(batch.reference)
     return replace(
         batch,
@@ -76,6 +83,7 @@ def with_identity(batch: Batch, index: int, reference: Reference) -> Batch:
         reference=pad([motion] * len(batch)),
         reference_lengths=batch.reference_lengths.new_full((len(batch),), len(motion)),
         reference_names=[reference.clip] * len(batch),
+        style=None,
     )
 
 
@@ -195,7 +203,7 @@ class Evaluation:
             has["closures"] = {}
         if model.samples:
             has["samples"] = {}
-        if len(self._styles(assets)) > 1:
+        if len(self._styles(model)) > 1:
             has["conditions"] = {}
         if "style" in self.needs:
             still = torch.zeros(1, 1, assets.n_vertices, 3, device=model.device)
@@ -214,10 +222,11 @@ class Evaluation:
         return Context(has, missing)
 
     @staticmethod
-    def _styles(assets: Assets) -> dict[int, Reference]:
-        """Style references of the training identities that have one, by index."""
-        references = assets.references
-        return {place: references[name] for place, name in enumerate(assets.identities) if name in references}
+    def _styles(model: Inference) -> dict[int, Reference | Style]:
+        """Styles of the training identities that have a stored reference, by index."""
+        assets = model.assets
+        known = [(place, name) for place, name in enumerate(assets.identities) if name in assets.references]
+        return {place: model.default_style(name) for place, name in known}
 
     def score(self, model: Inference, split: str, batch: Batch, identity: str = "") -> None:
         """Generate a batch's motion, and whatever else metrics need of the model, and add its scores.
@@ -236,7 +245,7 @@ class Evaluation:
                 more = [model.generate(batch, seed=seed) for seed in range(1, count)]
                 inputs["samples"] = torch.stack([motion, *more], 1)
             if "conditions" in self.needs:
-                views = [with_identity(batch, place, each) for place, each in self._styles(model.assets).items()]
+                views = [with_identity(batch, place, each) for place, each in self._styles(model).items()]
                 inputs["predictions"] = torch.stack([model.generate(view, seed=0) for view in views], 1)
             if "style" in self.needs:
                 inputs["embeddings"] = model.encode_style(motion, batch.mask)

@@ -276,7 +276,7 @@ class Inference(ABC):
         )
         return collate([sample]).to(self.device)
 
-    def default_style(self, identity: str) -> Reference:
+    def default_style(self, identity: str) -> Reference | Style:
         """The stored reference of an identity.
 
         Raises:
