@@ -6,6 +6,7 @@ compare, and at last how two recordings of one sentence are aligned in time.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,6 +108,13 @@ def relative_error(motion: Motion, truth: Motion, mask: Mask) -> Float[Tensor, "
     return frame_mean((motion - truth).square().mean((2, 3)), mask) / (size + EPSILON)
 
 
+def squared_distance(
+    values: Float[Tensor, "batch frames dim"], others: Float[Tensor, "batch frames dim"], mask: Mask
+) -> Float[Tensor, ""]:
+    """Mean squared difference on valid frames, as it is; 0 if there is none."""
+    return frame_mean((values - others).square().mean(2), mask)
+
+
 def relative_distance(
     values: Float[Tensor, "batch frames dim"], others: Float[Tensor, "batch frames dim"], mask: Mask
 ) -> Float[Tensor, ""]:
@@ -121,6 +129,21 @@ def relative_distance(
     # then have the distance 2, and equal ones 0.
     spread = kept.var(0, correction=0).mean() + other.var(0, correction=0).mean()
     return 2 * (kept - other).square().mean() / (spread + EPSILON)
+
+
+def style_distance(styles: Float[Tensor, "clips dim"], identities: Sequence[str]) -> Float[Tensor, ""]:
+    """Mean squared difference of two styles of one identity, over all such pairs; 0 if nobody has two styles.
+
+    Args:
+        styles: style vectors.
+        identities: whose they are.
+    """
+    count = len(identities)
+    pairs = [(i, k) for i in range(count) for k in range(i + 1, count) if identities[i] == identities[k]]
+    if not pairs:
+        return styles.new_zeros(())
+    one, other = torch.tensor(pairs, device=styles.device).T
+    return (styles[one] - styles[other]).square().mean()
 
 
 def dynamics_distance(
@@ -197,6 +220,12 @@ def pair_up(batch: Batch, alignments: Alignments | None) -> Pairing:
             partner[clip], partner[clip + 1] = clip + 1, clip
     places = torch.zeros(count, frames, dtype=torch.long)
     aligned = torch.zeros(count, frames, dtype=torch.bool)
+    if alignments is not None and batch.partner_frames is not None:
+        # Windows of clips, which the data set has aligned already: it has heard the whole clips.
+        places = batch.partner_frames.cpu().clamp_min(0)
+        aligned = (batch.partner_frames >= 0).cpu() & (partner != torch.arange(count))[:, None]
+        device = batch.motion.device
+        return Pairing(partner.to(device), places.to(device), aligned.to(device) & batch.window_mask)
     for clip, other in enumerate(partner.tolist()):
         same = clip != other and batch.sentences[clip] == batch.sentences[other]
         if alignments is not None and same and batch.names[clip] != batch.names[other]:
@@ -218,17 +247,29 @@ class Alignments:
         self.frame_rate = frame_rate
         self._found: dict[tuple[str, str], Tensor] = {}
 
+    def __call__(self, speech: Tensor, frames: int, other: Tensor, other_frames: int) -> Tensor:
+        """For each frame of one recording the frame of another one, indices (frames,).
+
+        Args:
+            speech: of the one recording, (samples,) at 16 kHz.
+            frames: motion frames of it.
+            other: speech of the other.
+            other_frames: motion frames of the other.
+        """
+        return torch.from_numpy(
+            align(cepstra(speech, frames, self.frame_rate), cepstra(other, other_frames, self.frame_rate))
+        )
+
     def frames(self, batch: Batch, clip: int, other: int) -> Tensor:
         """For each valid frame of a clip of the batch the frame of another one, indices (frames,)."""
         names = (batch.names[clip], batch.names[other])
         if names not in self._found:
-            features = [self._features(batch, each) for each in (clip, other)]
-            self._found[names] = torch.from_numpy(align(*features))
+            self._found[names] = self(*self._recording(batch, clip), *self._recording(batch, other))
         return self._found[names]
 
-    def _features(self, batch: Batch, clip: int) -> npt.NDArray[np.float64]:
+    def _recording(self, batch: Batch, clip: int) -> tuple[Tensor, int]:
         audio = batch.audio[clip, : int(batch.audio_lengths[clip])].float().cpu()
-        return cepstra(audio, int(batch.frame_lengths[clip]), self.frame_rate)
+        return audio, int(batch.frame_lengths[clip])
 
 
 def align(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:

@@ -7,6 +7,7 @@ D turns both into motion again, whether the content comes from motion or from sp
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -15,12 +16,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from facediff import registry
-from facediff.data import Batch, SpeechMotionDataModule
+from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel, Decay
 from facediff.models.inference import Progress
-from facediff.models.layers import Heads, Weight, Width
+from facediff.models.layers import Heads, Weight, Width, frame_mask
 from facediff.models.losses import style_contrast
 from facediff.models.mesh_encoders import MeshEncoderFactory, SpiralMeshEncoder
 from facediff.models.speaker_encoders import LstmStyle, StyleEncoderFactory
@@ -31,6 +32,8 @@ from facediff.models.style_content.losses import (
     dynamics_distance,
     pair_up,
     relative_distance,
+    squared_distance,
+    style_distance,
 )
 from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
 from facediff.utils.ranges import Range
@@ -56,6 +59,7 @@ class StyleContentDisentanglement(AnimationModel):
         mesh_encoder: motion to one feature per frame, made once for content and once for style.
         style_encoder: these features to the style vector.
         window_seconds: length of the speech window around each frame.
+        speech_rate: speech features a second that the window is made of; as many as motion has frames if None.
         speech_layers: encoder layers over the window.
         speech_heads: attention heads of these.
         decoder_channels: channels of the decoder's three convolutions.
@@ -65,16 +69,28 @@ class StyleContentDisentanglement(AnimationModel):
         basis_start: the basis starts from the principal components of the training motion, or at random.
         content_scale: ``clip`` removes mean and spread over a clip from the content of motion, by which a speaker
             would be recognised; ``free`` leaves it as it is.
+        vertices: what the encoders see and the losses compare: all vertices, or the corpus's region ``face``
+            (``data.face``), e.g. without FLAME's eyeballs. The decoder moves all of them.
         aligned_pairs: where two speakers say the same sentence, supervise a swap of their styles with the other's
             recording, aligned in time; else, and everywhere if False, by the encoders' consistency.
+        aligned_windows: with ``data.window``, let the windows of two clips that say the same begin at the same sound,
+            so that they are aligned pairs as whole clips are; else windows are never aligned.
+        window_context: with ``data.window``, read the frames around a training window that the decoder's kernels and
+            the speech windows reach; they are seen, and no loss counts them. Else a window is like a clip of its own.
         swap_region: the vertices where such a recording supervises.
         reconstruction_weight: of motion from its own content and style.
         swap_weight: of motion from its own content and the partner's style.
         cycle_weight: of swapping twice.
         swap_dynamics_weight: of the swapped upper face's spread over time against the partner's.
         speech_weight: factor of the same terms with content from speech.
+        speech_style: the style that content from speech is decoded with in training: of another clip of the speaker,
+            as in animation, or the clip's own, as content from motion is.
+        content_pull: how contents are compared: their mean squared difference as a share of their variance, or as it
+            is (``squared``).
+        style_pull: how an identity's styles are pulled together: against all other identities' (``contrast``), or by
+            their mean squared difference alone (``squared``).
         recording_content_weight: pulls the contents of two aligned recordings of a sentence together.
-        identity_style_weight: pulls the styles of an identity's clips together, and those of different ones apart.
+        identity_style_weight: pulls the styles of an identity's clips together; see ``style_pull``.
         speech_content_weight: pulls content from speech to content from motion.
         position_weight: of positions within each comparison of motions.
         velocity_weight: of velocities within it.
@@ -93,6 +109,7 @@ class StyleContentDisentanglement(AnimationModel):
         mesh_encoder: MeshEncoderFactory = SpiralMeshEncoder,
         style_encoder: StyleEncoderFactory = LstmStyle,
         window_seconds: Annotated[float, Range(0, 10)] = 0.64,
+        speech_rate: Annotated[float, Range(1, 1000)] | None = None,
         speech_layers: Annotated[int, Range(0, 256)] = 3,
         speech_heads: Heads = 4,
         decoder_channels: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (64, 128, 256),
@@ -101,13 +118,19 @@ class StyleContentDisentanglement(AnimationModel):
         basis_size: Width = 50,
         basis_start: Literal["pca", "random"] = "pca",
         content_scale: Literal["clip", "free"] = "clip",
+        vertices: Literal["all", "face"] = "all",
         aligned_pairs: bool = True,
+        aligned_windows: bool = False,
+        window_context: bool = False,
         swap_region: Literal["lower_face", "face"] = "lower_face",
         reconstruction_weight: Weight = 1.0,
         swap_weight: Weight = 3.0,
         cycle_weight: Weight = 1.0,
         swap_dynamics_weight: Weight = 3.0,
         speech_weight: Weight = 2.0,
+        speech_style: Literal["other_clip", "own"] = "other_clip",
+        content_pull: Literal["relative", "squared"] = "relative",
+        style_pull: Literal["contrast", "squared"] = "contrast",
         recording_content_weight: Weight = 5.0,
         identity_style_weight: Weight = 10.0,
         speech_content_weight: Weight = 5.0,
@@ -127,7 +150,13 @@ class StyleContentDisentanglement(AnimationModel):
                 "expected one number of channels and one of taps for each convolution",
             )
         self.basis_start = basis_start
+        self.vertices = vertices
         self.aligned_pairs = aligned_pairs
+        self.aligned_windows = aligned_windows
+        self.window_context = window_context
+        self.speech_style = speech_style
+        self.content_distance = relative_distance if content_pull == "relative" else squared_distance
+        self.style_pull = style_contrast if style_pull == "contrast" else style_distance
         self.swap_region = swap_region
         self.weights = {
             "reconstruction": reconstruction_weight,
@@ -153,7 +182,7 @@ class StyleContentDisentanglement(AnimationModel):
                 in_dim=dim,
                 dim=dim,
                 out_dim=content_dim,
-                window=max(1, round(window_seconds * self.frame_rate)),
+                window=max(1, round(window_seconds * (speech_rate or self.frame_rate))),
                 num_heads=speech_heads,
                 num_layers=speech_layers,
             ),
@@ -167,6 +196,9 @@ class StyleContentDisentanglement(AnimationModel):
                 basis_size=basis_size,
             ),
             standardise_content=content_scale == "clip",
+            speech_rate=speech_rate,
+            frame_rate=self.frame_rate,
+            n_vertices=self.n_vertices if vertices == "face" else None,
         )
 
     def personal_modules(self) -> list[nn.Module]:
@@ -180,24 +212,57 @@ class StyleContentDisentanglement(AnimationModel):
         data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         if stage == "fit":
             data.pair_sentences = True
+            data.aligner = self.alignments if self.aligned_pairs and self.aligned_windows else None
+            data.window_context = self.context_frames() if self.window_context else (0, 0)
             if new and self.basis_start == "pca":
                 mean, shapes = data.principal_motion(self.network.decoder.basis.in_features)
                 self.network.decoder.start_from(mean * self.scale, shapes * self.scale)
+            if self.distance.lip_gap and self.assets.inner_lip_pairs is None:
+                print(
+                    f"note: lip_gap_weight has no effect: {data.root} has no regions/inner_lip_pairs.txt",
+                    flush=True,
+                )
+
+    def adopt(self, assets: Assets) -> None:
+        """Take over a corpus's assets, and which vertices are the face.
+
+        Raises:
+            FaceDiffError: if they do not fit, or no region says what the face is.
+        """
+        super().adopt(assets)
+        visible = self.network.visible
+        if visible is not None:
+            if "face" not in assets.regions:
+                raise FaceDiffError(
+                    f"vertices=face: {assets.corpus} has no region face; set data.face to a file that lists its "
+                    f"vertices, e.g. --data.face=FLAME_masks.pkl:face"
+                )
+            visible.zero_()[assets.regions["face"].to(visible.device)] = 1.0
+
+    def context_frames(self) -> tuple[int, int]:
+        """Frames before and after a frame that its motion from speech and from content depends on."""
+        speech, ratio = self.network.speech_content, self.network.speech_rate / self.frame_rate
+        before = max(self.network.decoder.past_frames, math.ceil(speech.before / ratio))
+        return before, math.ceil((speech.window - 1 - speech.before) / ratio)
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Reconstruction, swap and cycle with content of motion and of speech, and distances of contents and styles."""
-        network, motion, mask = self.network, batch.motion * self.scale, batch.mask
+        network, motion = self.network, batch.motion * self.scale
         pairing = pair_up(batch, self.alignments if self.aligned_pairs and self.alignment_allowed() else None)
-        content, style = network.content(motion, mask), network.style(motion, mask)
-        # Speech is decoded with the style of another clip of the speaker, as it will be in inference.
+        content, style = network.content(motion, batch.mask), self.style_of_window(batch, motion)
         usual = network.style(batch.reference * self.scale, batch.reference_mask)
         spoken = network.content_of_speech(batch)
         terms = {
-            "recording_content": relative_distance(content, pairing.of_partner(content), pairing.aligned),
-            "identity_style": style_contrast(torch.cat([style, usual]), batch.identity_names * 2),
-            "speech_content": relative_distance(content, spoken, mask),
+            "recording_content": self.content_distance(content, pairing.of_partner(content), pairing.aligned),
+            "identity_style": self.style_pull(torch.cat([style, usual]), batch.identity_names * 2),
+            "speech_content": self.content_distance(content, spoken, batch.window_mask),
         }
-        for prefix, said, own in (("", content, style), ("speech_", spoken, usual)):
+        # Speech is decoded with the style of another clip of the speaker, as it will be in inference, unless asked not
+        # to be.
+        for prefix, said, own in (
+            ("", content, style),
+            ("speech_", spoken, style if self.speech_style == "own" else usual),
+        ):
             made = self.branch_losses(batch, motion, pairing, said, own, style)
             terms |= {f"{prefix}{name}": term for name, term in made.items()}
         terms["loss"] = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
@@ -216,33 +281,51 @@ class StyleContentDisentanglement(AnimationModel):
             own: the style (B, style_dim) with which C_i must give M_i.
             style: S_i of the motion (B, style_dim); S_j is that of the partner.
         """
-        network, mask, partner = self.network, batch.mask, pairing.partner
+        # All valid frames are seen; those that count are fewer where a training window comes with the frames around it.
+        network, mask, counted, partner = self.network, batch.mask, batch.window_mask, pairing.partner
         # D(C_i, S_i) ≈ M_i
-        terms = {"reconstruction": self.distance_to(batch, self.decode_scaled(content, own, mask), motion, mask)}
+        terms = {"reconstruction": self.distance_to(batch, self.decode_scaled(content, own, mask), motion, counted)}
         apart = partner != torch.arange(len(partner), device=partner.device)
         if not apart.any():  # nobody to swap with: it saves two thirds of the work while one speaker alone is learnt
             return {**terms, **dict.fromkeys(("swap", "swap_dynamics", "cycle"), motion.new_zeros(()))}
         # D(C_i, S_j) is the partner's motion where both say the same sentence, in the timing of i. Where they do not,
         # no true motion exists, and content and style that are encoded again must be those that went in.
         swapped = self.decode_scaled(content, style[partner], mask)
-        again, style_again = network.content(swapped, mask), network.style(swapped, mask)
+        again, style_again = network.content(swapped, mask), self.style_of_window(batch, swapped)
         lower = self.lower_face() if self.swap_region == "lower_face" else None
         terms["swap"] = self.distance_to(batch, swapped, pairing.of_partner(motion), pairing.aligned, lower)
         free = pairing.unaligned
-        terms["swap"] = terms["swap"] + relative_distance(again, content.detach(), mask & free[:, None])
+        terms["swap"] = terms["swap"] + relative_distance(again, content.detach(), counted & free[:, None])
         wanted = style[partner].detach()
         terms["swap"] = terms["swap"] + relative_distance(style_again[:, None], wanted[:, None], free[:, None])
         # Nobody blinks at the same time as another, so the upper face has the partner's spread over time, not motion.
         upper = self.assets.regions["upper_face"].to(motion.device)
-        terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], mask, mask[partner], apart, upper)
+        terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], counted, counted[partner], apart, upper)
         # Swapped back, D(E_C(D(C_i, S_j)), E_S(D(C_j, S_i))) ≈ M_i
         back = self.decode_scaled(again, style_again[partner], mask)
-        terms["cycle"] = self.distance_to(batch, back, motion, mask)
+        terms["cycle"] = self.distance_to(batch, back, motion, counted)
         return terms
 
     def alignment_allowed(self) -> bool:
-        """Whether the clips of a training batch are whole: two windows of a sentence may hold different words."""
-        return self.training and self._trainer is not None and self.trainer.datamodule.window is None  # type: ignore[attr-defined]
+        """Whether two clips of a training batch that say the same hold the same words.
+
+        Whole clips do; two windows may not, unless the data set makes them begin at the same sound.
+        """
+        if not self.training or self._trainer is None:
+            return False
+        data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        return data.window is None or data.aligner is not None
+
+    def style_of_window(self, batch: Batch, motion: Tensor) -> Float[Tensor, "batch style_dim"]:
+        """The style of a batch's scaled motion, of the frames that count alone."""
+        if batch.window is None:
+            return self.network.style(motion, batch.mask)
+        # The encoder reads a sequence from its first frame, so the windows are brought to the front.
+        first, lengths = batch.window[:, 0], batch.window_mask.sum(1)
+        places = first[:, None] + torch.arange(int(lengths.max()), device=motion.device)
+        rows = torch.arange(len(motion), device=motion.device)[:, None]
+        cut = motion[rows, places.clamp_max(motion.shape[1] - 1)]
+        return self.network.style(cut, frame_mask(lengths, places.shape[1]))
 
     def distance_to(
         self, batch: Batch, motion: Tensor, truth: Tensor, mask: Tensor, vertices: Tensor | None = None
@@ -253,15 +336,22 @@ class StyleContentDisentanglement(AnimationModel):
             motion,
             truth,
             mask,
-            vertices=vertices,
+            vertices=self.face() if vertices is None else vertices,
             rest=batch.template * self.scale,
             pairs=None if pairs is None else pairs.to(motion.device),
             upper=self.assets.regions["upper_face"].to(motion.device) if vertices is None else None,
         )
 
+    def face(self) -> Tensor | None:
+        """Indices of the vertices that the losses compare; None for all."""
+        return self.assets.regions["face"].to(self.device) if self.vertices == "face" else None
+
     def lower_face(self) -> Tensor:
-        """Indices of the vertices outside the upper face."""
+        """Indices of the vertices that the losses compare, outside the upper face."""
         lower = torch.ones(self.n_vertices, dtype=torch.bool)
+        if self.vertices == "face":
+            lower[:] = False
+            lower[self.assets.regions["face"]] = True
         lower[self.assets.regions["upper_face"]] = False
         return lower.nonzero()[:, 0].to(self.device)
 

@@ -32,7 +32,12 @@ class DisentanglementNetwork(nn.Module):
         speech_content: features of speech to content.
         decoder: content and style to motion, D.
         standardise_content: remove mean and spread over a clip's time from the content of motion.
+        speech_rate: speech features a second; as many as motion has frames if None.
+        frame_rate: motion frames a second.
+        n_vertices: vertices of which :attr:`visible` says whether the encoders see them; they see all if None.
     """
+
+    visible: Tensor | None
 
     def __init__(
         self,
@@ -44,6 +49,9 @@ class DisentanglementNetwork(nn.Module):
         speech_content: WindowedTransformer,
         decoder: MotionDecoder,
         standardise_content: bool,
+        speech_rate: float | None = None,
+        frame_rate: float = 25.0,
+        n_vertices: int | None = None,
     ) -> None:
         super().__init__()
         self.content_encoder = content_encoder
@@ -53,12 +61,17 @@ class DisentanglementNetwork(nn.Module):
         self.speech_content = speech_content
         self.decoder = decoder
         self.standardise_content = standardise_content
+        self.speech_rate = frame_rate if speech_rate is None else speech_rate
+        self.frame_rate = frame_rate
+        # 1 for vertices that the encoders see, else 0. It follows from the corpus's regions, which a checkpoint keeps,
+        # so it is not saved with the weights.
+        self.register_buffer("visible", None if n_vertices is None else torch.ones(n_vertices), persistent=False)
 
     def content(
         self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch frames content_dim"]:
         """Content of motion; zero on padding."""
-        content = self.content_encoder(motion) * mask[..., None]
+        content = self.content_encoder(self.seen(motion)) * mask[..., None]
         if not self.standardise_content:
             return content
         # How far somebody opens the mouth is style, not content. Removing each channel's mean and spread over the clip
@@ -72,12 +85,20 @@ class DisentanglementNetwork(nn.Module):
         self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
         """Style vector of a motion."""
-        return self.style_encoder(self.style_frames(motion), mask)
+        return self.style_encoder(self.style_frames(self.seen(motion)), mask)
+
+    def seen(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames vertices 3"]:
+        """The motion of the vertices that the encoders see; zero elsewhere."""
+        return motion if self.visible is None else motion * self.visible[:, None]
 
     def content_of_speech(self, batch: Batch) -> Float[Tensor, "batch frames content_dim"]:
         """Content of a batch's speech, or of cached features of it."""
         cached = batch.cached_features or ()
-        return self.speech_content(self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached))
+        # The encoder gives features at any rate, as if motion had so many frames.
+        ratio = self.speech_rate / self.frame_rate
+        steps = (batch.frame_lengths * ratio).round().long().clamp_min(1) if ratio != 1 else batch.frame_lengths
+        features = self.audio_encoder(batch.audio, batch.audio_lengths, steps, *cached)
+        return self.speech_content(features, batch.motion.shape[1], ratio)
 
 
 class MotionDecoder(nn.Module):
@@ -165,14 +186,16 @@ class MotionDecoder(nn.Module):
 class WindowedTransformer(nn.Module):
     """For every frame an encoder over the features around it, and a decoder that asks with the middle one.
 
-    The window of frame t holds frames t − ⌊W/2⌋ … t − ⌊W/2⌋ + W − 1, with zeros past the ends of the clip; the query is
-    the encoded feature of frame t itself (style-content disentanglement, "speech animation network").
+    There may be more speech features a second than frames: the middle of frame t's window is the feature m that falls
+    on the frame's centre, m = ⌊(t + ½) · features a frame⌋. The window holds features m − ⌊W/2⌋ … m − ⌊W/2⌋ + W − 1,
+    with zeros past the ends of the clip; the query is the encoded feature m itself (style-content disentanglement,
+    "speech animation network").
 
     Args:
         in_dim: channels of the speech features.
         dim: channels inside.
         out_dim: channels of the content.
-        window: frames W around each frame.
+        window: features W around each frame.
         num_heads: attention heads.
         num_layers: encoder layers; one decoder layer follows.
         dropout: dropout everywhere.
@@ -198,22 +221,43 @@ class WindowedTransformer(nn.Module):
         self.query = WindowLayer(dim, num_heads, dropout)
         self.out = nn.Sequential(nn.LayerNorm(dim), nn.Linear(dim, out_dim))
 
-    def windows(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames window dim"]:
-        """Each frame's neighbours, zeros past the ends."""
+    def windows(
+        self, features: Float[Tensor, "batch steps dim"], frames: int | None = None, ratio: float = 1.0
+    ) -> Float[Tensor, "batch frames window dim"]:
+        """Each frame's neighbours, zeros past the ends.
+
+        Args:
+            features: of the speech.
+            frames: frames of motion; as many as features if None.
+            ratio: features a frame.
+        """
         after = self.window - 1 - self.before
         padded = nn.functional.pad(features, (0, 0, self.before, after))
-        return padded.unfold(1, self.window, 1).transpose(2, 3)
+        around = padded.unfold(1, self.window, 1)
+        if ratio != 1 or frames not in (None, features.shape[1]):
+            count = features.shape[1] if frames is None else frames
+            middles = ((torch.arange(count, device=features.device) + 0.5) * ratio).floor().long()
+            # Rounding may leave a clip one feature short of its last frame's.
+            around = around[:, middles.clamp_max(features.shape[1] - 1)]
+        return around.transpose(2, 3)
 
-    def forward(self, features: Float[Tensor, "batch frames in_dim"]) -> Float[Tensor, "batch frames out_dim"]:
-        """Content of every frame; features are zero on padding, which then is like the silence past a clip's end."""
-        batch, frames, _ = features.shape
+    def forward(
+        self, features: Float[Tensor, "batch steps in_dim"], frames: int | None = None, ratio: float = 1.0
+    ) -> Float[Tensor, "batch frames out_dim"]:
+        """Content of every frame; features are zero on padding, which then is like the silence past a clip's end.
+
+        Args:
+            features: of the speech.
+            frames: frames of motion; as many as features if None.
+            ratio: features a frame.
+        """
         # Every frame's window is a sequence of its own, so that long clips cost time in proportion to their length.
-        source = self.windows(features).flatten(0, 1)
-        x = self.embed(source) + self.positions
+        windows = self.windows(features, frames, ratio)
+        x = self.embed(windows.flatten(0, 1)) + self.positions
         for layer in self.layers:
             x = layer(x, x)
         middle = x[:, self.before : self.before + 1]
-        return self.out(self.query(middle, x)).view(batch, frames, -1)
+        return self.out(self.query(middle, x)).view(*windows.shape[:2], -1)
 
 
 class WindowLayer(nn.Module):

@@ -1,0 +1,348 @@
+"""The second method against NumPy (float64): content, style, speech branch, and every term of its objective.
+
+The spiral convolutions and the decoder have theirs in test_mesh_encoder and test_style_content.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facediff import registry
+from facediff.data import Batch, collate
+from facediff.models import StyleContentDisentanglement
+from facediff.models.style_content.losses import align, cepstra, pair_up
+from facediff.models.style_content.network import WindowedTransformer
+from tests.fakes.tiny import SEEN, VERTICES, Tiny
+
+Array = np.ndarray
+SCALE = 100.0
+CLOSE = {"rtol": 2e-3, "atol": 2e-5}
+"""The model computes in float32."""
+
+
+def make(**options: object) -> StyleContentDisentanglement:
+    torch.manual_seed(0)
+    usual: dict[str, object] = {
+        "n_vertices": VERTICES,
+        "identities": SEEN,
+        "frame_rate": 25.0,
+        "dim": 16,
+        "content_dim": 8,
+        "speech_layers": 1,
+        "decoder_channels": (16, 16, 16),
+        "decoder_hidden": (16, 16),
+        "basis_size": 6,
+        "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0),
+        "mesh_encoder": partial(registry.mesh_encoder.spiral, channels=(4, 4), spiral_length=5),
+        "style_encoder": partial(registry.style_encoder.lstm, style_dim=4),
+    }
+    return StyleContentDisentanglement(**{**usual, **options})  # type: ignore[arg-type]
+
+
+def ready(tiny: Tiny, **options: object) -> StyleContentDisentanglement:
+    """A model whose weights are all random, so that no term vanishes, with the corpus's assets."""
+    model = make(**options)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    model.adopt(tiny.assets().with_motion_scale(SCALE))
+    model.attach_mesh()
+    model.alignment_allowed = lambda: True  # type: ignore[method-assign]
+    return model
+
+
+def double(tensor: torch.Tensor) -> Array:
+    return tensor.detach().double().numpy()
+
+
+def sigmoid(x: Array) -> Array:
+    return 1 / (1 + np.exp(-x))
+
+
+def test_style_is_the_last_state_of_an_lstm(tiny: Tiny) -> None:
+    """Chai et al.: intermediate features of each frame, then an LSTM; the state after the last frame is the style."""
+    model = ready(tiny)
+    network = model.network
+    motion, lengths = torch.randn(2, 9, VERTICES, 3), (9, 6)
+    mask = torch.arange(9)[None] < torch.tensor(lengths)[:, None]
+    w = {name: double(value) for name, value in network.style_encoder.lstm.state_dict().items()}
+    frames = double(network.style_frames(motion))
+    for row, length in enumerate(lengths):
+        hidden, cell = np.zeros(4), np.zeros(4)
+        for x in frames[row, :length]:
+            gates = w["weight_ih_l0"] @ x + w["bias_ih_l0"] + w["weight_hh_l0"] @ hidden + w["bias_hh_l0"]
+            put, forget, candidate, out = np.split(gates, 4)
+            cell = sigmoid(forget) * cell + sigmoid(put) * np.tanh(candidate)
+            hidden = sigmoid(out) * np.tanh(cell)
+        np.testing.assert_allclose(double(network.style(motion, mask))[row], hidden, **CLOSE)
+
+
+@pytest.mark.parametrize("scale", ["clip", "free"])
+def test_content_is_a_map_of_each_frame_and_may_lose_mean_and_spread(tiny: Tiny, scale: str) -> None:
+    model = ready(tiny, content_scale=scale)
+    motion, lengths = torch.randn(2, 9, VERTICES, 3), (9, 6)
+    mask = torch.arange(9)[None] < torch.tensor(lengths)[:, None]
+    made = double(model.network.content(motion, mask))
+    for row, length in enumerate(lengths):
+        content = double(model.network.content_encoder(motion[row : row + 1]))[0, :length]
+        if scale == "clip":
+            content = (content - content.mean(0)) / np.sqrt(content.var(0) + 1e-5)
+        np.testing.assert_allclose(made[row, :length], content, **CLOSE)
+        assert not made[row, length:].any()
+
+
+ERF = np.vectorize(math.erf)
+
+
+def norm(x: Array, w: dict[str, Array], name: str) -> Array:
+    centred = x - x.mean(-1, keepdims=True)
+    return centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * w[f"{name}.weight"] + w[f"{name}.bias"]
+
+
+def linear(x: Array, w: dict[str, Array], name: str) -> Array:
+    return x @ w[f"{name}.weight"].T + w[f"{name}.bias"]
+
+
+def layer(x: Array, context: Array, w: dict[str, Array], name: str, heads: int) -> Array:
+    """Pre-norm attention and a feed-forward part, each added to what it got."""
+    query = linear(norm(x, w, f"{name}.norm"), w, f"{name}.attention.query")
+    key, value = np.split(linear(norm(context, w, f"{name}.norm"), w, f"{name}.attention.key_value"), 2, -1)
+    mixed = []
+    for q, k, v in zip(*(np.split(part, heads, -1) for part in (query, key, value)), strict=True):
+        scores = np.exp(q @ k.T / math.sqrt(q.shape[1]))
+        mixed.append(scores / scores.sum(1, keepdims=True) @ v)
+    x = x + linear(np.concatenate(mixed, -1), w, f"{name}.attention.out")
+    hidden = linear(norm(x, w, f"{name}.feed_forward.0"), w, f"{name}.feed_forward.1.0")
+    hidden = 0.5 * hidden * (1 + ERF(hidden / math.sqrt(2)))
+    return x + linear(hidden, w, f"{name}.feed_forward.1.3")
+
+
+@pytest.mark.parametrize(
+    ("window", "ratio", "steps", "frames"), [(7, 1.0, 10, 10), (8, 5 / 3, 17, 10), (32, 5 / 3, 20, 12)]
+)
+def test_the_speech_branch_asks_with_the_middle_step(window: int, ratio: float, steps: int, frames: int) -> None:
+    """For every frame the W features around its centre, zeros past the ends, encoded; the middle one is the query."""
+    torch.manual_seed(1)
+    part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=window, num_heads=2, num_layers=2)
+    with torch.no_grad():
+        for parameter in part.parameters():
+            parameter.add_(0.3 * torch.randn_like(parameter))
+    features = torch.randn(1, steps, 6)
+    w = {name: double(value) for name, value in part.state_dict().items()}
+    made = double(part(features, frames, ratio))[0]
+    for frame in range(frames):
+        middle = min(math.floor((frame + 0.5) * ratio), steps - 1)
+        source = np.zeros((window, 6))
+        for place in range(window):
+            step = middle - window // 2 + place
+            if 0 <= step < steps:
+                source[place] = double(features)[0, step]
+        x = linear(source, w, "embed") + w["positions"]
+        for number in range(2):
+            x = layer(x, x, w, f"layers.{number}", 2)
+        answer = layer(x[window // 2 : window // 2 + 1], x, w, "query", 2)
+        expected = linear(norm(answer, w, "out.0"), w, "out.1")[0]
+        np.testing.assert_allclose(made[frame], expected, rtol=1e-4, atol=1e-4)
+
+
+# The objective, written out from its formulas: the networks are called, everything between them is NumPy.
+
+
+class Objective:
+    """The terms of a batch, in float64."""
+
+    def __init__(self, model: StyleContentDisentanglement, batch: Batch) -> None:
+        self.model, self.network, self.batch = model, model.network, batch
+        self.truth = double(batch.motion) * SCALE
+        self.counted = double(batch.window_mask).astype(bool)
+        pairing = pair_up(batch, model.alignments)
+        self.partner, self.places = pairing.partner.tolist(), pairing.frames.numpy()
+        self.aligned = pairing.aligned.numpy()
+
+    def content(self, motion: Array) -> Array:
+        return double(self.network.content(torch.tensor(motion).float(), self.batch.mask))
+
+    def style(self, motion: Array) -> Array:
+        """Of the frames that count, one clip at a time."""
+        rows = [torch.tensor(motion[i][self.counted[i]][None]).float() for i in range(len(motion))]
+        return np.stack(
+            [double(self.network.style(row, torch.ones(row.shape[:2], dtype=torch.bool)))[0] for row in rows]
+        )
+
+    def decode(self, content: Array, style: Array) -> Array:
+        flat = self.network.decoder(torch.tensor(content).float(), torch.tensor(style).float(), self.batch.mask)
+        return double(flat).reshape(*content.shape[:2], VERTICES, 3)
+
+    def compare(self, motion: Array, truth: Array, frames: Array, vertices: Array) -> float:
+        """Position 1, velocity 5, gap between the inner lips 1."""
+        positions, velocities, gaps = [], [], []
+        rest, pairs = double(self.batch.template) * SCALE, double(self.model.assets.inner_lip_pairs).astype(int)
+        for i in range(len(motion)):
+            gap = []
+            for each in (motion[i] + rest[i], truth[i] + rest[i]):
+                gap.append(np.sqrt(((each[:, pairs[:, 0]] - each[:, pairs[:, 1]]) ** 2).sum(-1) + 1e-6))
+            for t in np.flatnonzero(frames[i]):
+                error = motion[i, t, vertices] - truth[i, t, vertices]
+                positions.append((error**2).mean())
+                gaps.append(((gap[0][t] - gap[1][t]) ** 2).mean())
+                if t and frames[i, t - 1]:
+                    before = motion[i, t - 1, vertices] - truth[i, t - 1, vertices]
+                    velocities.append(((error - before) ** 2).mean())
+        means = [float(np.mean(values)) if values else 0.0 for values in (positions, velocities, gaps)]
+        return means[0] + 5 * means[1] + means[2]
+
+    def relative(self, values: Array, others: Array) -> float:
+        """2 ‖a − b‖² / (var a + var b), means over frames and channels; (frames, channels) each."""
+        if len(values) < 2:
+            return 0.0
+        spread = values.var(0).mean() + others.var(0).mean()
+        return float(2 * ((values - others) ** 2).mean() / (spread + 1e-6))
+
+    def of_partner(self, values: Array) -> Array:
+        return np.stack([values[self.partner[i], self.places[i]] for i in range(len(values))])
+
+    def branch(self, content: Array, own: Array, style: Array) -> dict[str, float]:
+        everything = np.arange(VERTICES)
+        lower = np.setdiff1d(everything, double(self.model.assets.regions["upper_face"]).astype(int))
+        terms = {"reconstruction": self.compare(self.decode(content, own), self.truth, self.counted, everything)}
+        # Swapped: the content of i with the style of its partner j, who said it so.
+        swapped = self.decode(content, style[self.partner])
+        terms["swap"] = self.compare(swapped, self.of_partner(self.truth), self.aligned, lower)
+        again, style_again = self.content(swapped), self.style(swapped)
+        free = [i for i in range(len(content)) if self.partner[i] != i and not self.aligned[i].any()]
+        if free:
+            chosen = [(again[i][self.counted[i]], content[i][self.counted[i]]) for i in free]
+            terms["swap"] += self.relative(*(np.concatenate(each) for each in zip(*chosen, strict=True)))
+            terms["swap"] += self.relative(style_again[free], style[self.partner][free])
+        # Twice swapped: back to what it was.
+        back = self.decode(again, style_again[self.partner])
+        terms["cycle"] = self.compare(back, self.truth, self.counted, everything)
+        return terms
+
+    def terms(self, *, squared: bool, own_style: bool) -> dict[str, float]:
+        batch, count = self.batch, len(self.batch)
+        content, style = self.content(self.truth), self.style(self.truth)
+        spoken = double(self.network.content_of_speech(batch))
+        references = double(batch.reference) * SCALE
+        usual = double(self.network.style(torch.tensor(references).float(), batch.reference_mask))
+
+        def pull(values: Array, others: Array, frames: Array) -> float:
+            if squared:
+                return float(((values - others)[frames] ** 2).mean()) if frames.any() else 0.0
+            return self.relative(values[frames], others[frames])
+
+        styles, names = np.concatenate([style, usual]), batch.identity_names * 2
+        apart = [
+            ((styles[i] - styles[k]) ** 2).mean()
+            for i in range(2 * count)
+            for k in range(i + 1, 2 * count)
+            if names[i] == names[k]
+        ]
+        found = {
+            "recording_content": pull(content, self.of_partner(content), self.aligned),
+            "speech_content": pull(content, spoken, self.counted),
+            **({"identity_style": float(np.mean(apart))} if squared else {}),
+        }
+        found |= self.branch(content, style, style)
+        speech = self.branch(spoken, style if own_style else usual, style)
+        return found | {f"speech_{name}": value for name, value in speech.items()}
+
+
+def clips(data: Tiny, *names: str) -> Batch:
+    dataset = data.dataset("train")
+    order = [clip.name for clip in dataset.clips]
+    return collate([dataset[order.index(name)] for name in names])
+
+
+def test_every_term_of_whole_clips_is_its_formula(tiny: Tiny) -> None:
+    """Two pairs: one that says the same, one that does not."""
+    model, batch = ready(tiny), clips(tiny, "A_e01", "B_e01", "A_e02", "B_e03")
+    with torch.no_grad():
+        made = model.losses(batch)
+    expected = Objective(model, batch).terms(squared=False, own_style=False)
+    assert expected["swap"] > 0
+    for name, value in expected.items():
+        assert float(made[name]) == pytest.approx(value, rel=2e-3, abs=1e-6), name
+    weights = {"reconstruction": 1, "swap": 3, "cycle": 1, "swap_dynamics": 3}
+    weights |= {f"speech_{name}": 2 * weight for name, weight in weights.items()}
+    weights |= {"recording_content": 5, "identity_style": 10, "speech_content": 5}
+    total = sum(weight * float(made[name]) for name, weight in weights.items())
+    assert float(made["loss"]) == pytest.approx(total, rel=1e-5)
+
+
+PUBLISHED: dict[str, object] = {
+    "content_scale": "free",
+    "content_pull": "squared",
+    "style_pull": "squared",
+    "speech_style": "own",
+    "identity_style_weight": 1.0,
+    "swap_dynamics_weight": 0.0,
+    "speech_rate": 50.0,
+    "window_context": True,
+    "aligned_windows": True,
+}
+
+
+def test_every_term_of_aligned_windows_is_its_formula(tiny_root: Path) -> None:
+    """Windows of 8 frames with the frames around them, in the published setting; no loss counts a frame outside."""
+    data = Tiny(root=str(tiny_root), window=8, batch_size=4)
+    model = ready(data, **PUBLISHED)
+    data.pair_sentences, data.aligner, data.window_context = True, model.alignments, model.context_frames()
+    assert data.window_context == (8, 8), "taps 5, 3 and 3 before; half of 32 steps at 50 a second on either side"
+    samples = next(iter(data.train_dataloader()))
+    batch = samples if isinstance(samples, Batch) else collate(samples)
+    assert batch.window is not None
+    assert batch.partner_frames is not None
+    assert batch.motion.shape[1] > 8
+    with torch.no_grad():
+        made = model.losses(batch)
+    expected = Objective(model, batch).terms(squared=True, own_style=True)
+    assert expected["recording_content"] > 0
+    for name, value in expected.items():
+        assert float(made[name]) == pytest.approx(value, rel=2e-3, abs=1e-6), name
+    weights = {"reconstruction": 1, "swap": 3, "cycle": 1}
+    weights |= {f"speech_{name}": 2 * weight for name, weight in weights.items()}
+    weights |= {"recording_content": 5, "identity_style": 1, "speech_content": 5}
+    total = sum(weight * float(made[name]) for name, weight in weights.items())
+    assert float(made["loss"]) == pytest.approx(total, rel=1e-5)
+
+
+def test_partner_frames_are_those_of_the_whole_clips(tiny_root: Path) -> None:
+    """A window's partner frames, put back into the clips, are the alignment that the whole clips have."""
+    data = Tiny(root=str(tiny_root), window=8)
+    data.pair_sentences, data.aligner, data.window_context = True, make().alignments, (3, 2)
+    dataset = data.dataset("train", training=True)
+    order = [clip.name for clip in dataset.clips]
+    pick = partial(replace, next(iter(data._loader("train", training=True).sampler))[0])  # type: ignore[call-overload]
+    for seed in range(5):
+        one, other = dataset.pair(
+            pick(index=order.index("A_e04"), seed=seed), pick(index=order.index("B_e04"), seed=seed + 9)
+        )
+        whole = {clip.name: data.corpus.read_motion(clip) for clip in dataset.clips}
+        for mine, theirs in ((one, other), (other, one)):
+            begins = [
+                next(
+                    t for t in range(len(whole[s.name])) if torch.equal(whole[s.name][t : t + len(s.motion)], s.motion)
+                )
+                for s in (mine, theirs)
+            ]
+            audio = [
+                data.corpus.read_audio(c, 0, len(whole[c.name]))
+                for s in (mine, theirs)
+                for c in dataset.clips
+                if c.name == s.name
+            ]
+            features = [cepstra(a, len(whole[s.name]), 25.0) for a, s in zip(audio, (mine, theirs), strict=True)]
+            path = align(*features)[begins[0] : begins[0] + len(mine.motion)] - begins[1]
+            path[(path < 0) | (path >= len(theirs.motion))] = -1
+            assert mine.partner_frames is not None
+            np.testing.assert_array_equal(mine.partner_frames, path)
+            assert mine.window is not None
+            assert mine.window[1] - mine.window[0] == 8
