@@ -354,8 +354,8 @@ def test_three_processes_score_as_one_does(
         (mine,) = (tmp_path / "one").rglob(name)
         (theirs,) = (tmp_path / "three").rglob(name)
         one, three = (list(csv.DictReader(path.read_text().splitlines())) for path in (mine, theirs))
-        # Two splits by three methods; four clips of test A and two of test B, each with three methods.
-        assert len(one) == len(three) == {"test_scores.csv": 6, "test_sequences.csv": 18}[name]
+        # Two splits by four methods; four clips of test A and two of test B, each with four methods.
+        assert len(one) == len(three) == {"test_scores.csv": 8, "test_sequences.csv": 24}[name]
         for row, other in zip(one, three, strict=True):
             for column, value in row.items():
                 if column in ("mve", "lve", "fdd"):
@@ -404,4 +404,4 @@ def test_wandb_gets_the_sequences_and_the_protocol(
     assert main(words) == 0
     wandb.finish()
     columns = ["split", "method", "clip", "identity", "frames", "mve", "lve", "fdd", "audio", "error"]
-    assert logged == {"columns": columns, "rows": 18}
+    assert logged == {"columns": columns, "rows": 24}
