@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -37,6 +38,8 @@ def evaluate(
     lips: FileOrList = None,
     upper_face: FileOrList = None,
     lip_pairs: FileOrList = None,
+    eyelid_pairs: FileOrList = None,
+    by: Annotated[Sequence[str] | None, Option(metavar="NAME,…")] = None,
     frame_rate: FrameRate = None,
     topology: Annotated[str | None, Option(metavar="NAME")] = None,
     n_vertices: Annotated[ranges.Vertices | None, Option(metavar="V")] = None,
@@ -70,6 +73,8 @@ def evaluate(
         lips: the lips: index file, FLAME_masks.pkl:lips, weights.txt>0.1, or all
         upper_face: the upper face, likewise
         lip_pairs: pairs of inner-lip vertices: a file, or 3531-3504,… (default: the corpus's)
+        eyelid_pairs: pairs of eyelid vertices, for blinks, likewise
+        by: group scores by attributes of clips too: columns of the corpus's clips.csv, such as emotion,intensity
         frame_rate: frames per second of the predictions (default: as the corpus's manifest.json says)
         topology: biwi, vocaset, mead3d or multiface: unusual regions are pointed out
         n_vertices: vertices of the mesh (default: as the templates have)
@@ -89,7 +94,11 @@ def evaluate(
     if not bootstrap:
         refuse_idle("is for intervals, of which --bootstrap 0 makes none", level=level != LEVEL, seed=seed != 0)
     if not metric:
-        idle = {"lip_pairs": lip_pairs is not None, "frame_rate": frame_rate is not None}
+        idle = {
+            "lip_pairs": lip_pairs is not None,
+            "eyelid_pairs": eyelid_pairs is not None,
+            "frame_rate": frame_rate is not None,
+        }
         refuse_idle("is for further metrics, chosen with --metric", **idle)
     methods = named_folders([predictions, *(method or [])])
     check_folders(methods)
@@ -104,6 +113,7 @@ def evaluate(
     from facediff.evaluation import evaluate as score
     from facediff.evaluation.evaluator import find_protocols, needs_upper_face
     from facediff.evaluation.files import count_vertices, find_truths, read_pairs
+    from facediff.metrics import EyelidPairs
 
     protocols, metrics = find_protocols(protocol or ["paper"], topology), metric or []
     truth, corpus = find_truths(truth)
@@ -129,7 +139,9 @@ def evaluate(
         protocols=protocols,
         metrics=metrics,
         lip_pairs=None if lip_pairs is None else read_pairs(lip_pairs, corpus, n_vertices),
+        eyelid_pairs=None if eyelid_pairs is None else read_pairs(eyelid_pairs, corpus, n_vertices, EyelidPairs),
         corpus=corpus,
+        by=by or (),
         frame_rate=frame_rate,
         patterns=pattern or DEFAULT_PATTERNS,
         truth_pattern=truth_pattern or TRUTH_PATTERN,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from facediff.data.audio import SAMPLE_RATE, read_speech
-from facediff.data.corpus import ALL, LIP_PAIRS, read_manifest
+from facediff.data.corpus import ALL, EYELID_PAIRS, LIP_PAIRS, read_manifest
 from facediff.data.phonemes import closures, phonemes_file, read_phonemes
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import (
@@ -26,9 +26,10 @@ from facediff.evaluation.files import (
     pair_up,
     read_pairs,
 )
+from facediff.evaluation.groups import attributes_of
 from facediff.evaluation.report import Bootstrap, MethodTable, Report
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
-from facediff.metrics import Context, LipPairs, Protocol, Region, protocol
+from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, protocol
 from facediff.metrics.by_name import parse_all
 from facediff.utils import ranges
 
@@ -45,7 +46,9 @@ def evaluate(
     protocols: Sequence[str | Protocol] = ("paper",),
     metrics: Sequence[str] = (),
     lip_pairs: LipPairs | None = None,
+    eyelid_pairs: LipPairs | None = None,
     corpus: Path | None = None,
+    by: Sequence[str] = (),
     frame_rate: ranges.FrameRate | None = None,
     topology: str | None = None,
     patterns: Sequence[str] = DEFAULT_PATTERNS,
@@ -74,8 +77,10 @@ def evaluate(
         metrics: further metrics, each the name of a registered one, which may be followed by options:
             ``temporal_misalignment:at=path,smoothing=1.5``. What they need in addition is found in ``corpus``.
         lip_pairs: pairs of inner-lip vertices; those of the corpus if None.
+        eyelid_pairs: pairs of eyelid vertices, by which blinks are seen; those of the corpus if None.
         corpus: corpus folder of the truth, whose ``wav``, ``phonemes``, ``regions/inner_lip_pairs.txt`` and
             ``manifest.json`` are used where a metric needs them.
+        by: attributes of clips, columns of the corpus's ``clips.csv``, by which scores are grouped too.
         frame_rate: frames per second of the predictions; that of the corpus's ``manifest.json`` if None.
         topology: name of the mesh (``biwi``, ``vocaset`` …), to have unusual regions pointed out.
         patterns: how predictions may be named; see :class:`facediff.evaluation.files.NamePattern`.
@@ -107,8 +112,12 @@ def evaluate(
     needed = {need for request in requests for need in request.needs}
     if lip_pairs is None and "lip_pairs" in needed and corpus is not None and (corpus / LIP_PAIRS).is_file():
         lip_pairs = read_pairs(None, corpus, n_vertices)
+    if eyelid_pairs is None and "lid_pairs" in needed and corpus is not None and (corpus / EYELID_PAIRS).is_file():
+        eyelid_pairs = read_pairs(None, corpus, n_vertices, EyelidPairs)
     material = Material(corpus if requests else None, frame_rate, sorted({name.subject for name in names.values()}))
-    context = material.context(lips, upper_face, lip_pairs, templated=bool(templates), every_condition=identity == ALL)
+    context = material.context(
+        lips, upper_face, lip_pairs, eyelid_pairs, templated=bool(templates), every_condition=identity == ALL
+    )
     chosen = {request.text: request.build(context) for request in requests}
     scorer = Scorer(
         settings,
@@ -132,6 +141,7 @@ def evaluate(
         MethodTable(method, str(methods[method]), pairs, missing, found.get(method, {}), scorer.columns)
         for method, (pairs, missing) in paired.items()
     ]
+    attributes = attributes_of(corpus, names_of(paired), by) if by else {}
     definitions = {setting.name: setting.describe() for setting in settings}
     if chosen:
         words = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in chosen.items()]
@@ -147,11 +157,17 @@ def evaluate(
         resamples=bootstrap,
         level=level,
         seed=seed,
-        methods=[table.result(sampling) for table in tables],
+        methods=[table.result(sampling, attributes) for table in tables],
+        groups=[group for table in tables for group in table.groups(attributes)],
         comparisons=[row for table in tables[1:] for row in table.compare(tables[0], sampling)],
         unnamed_truths=unnamed_truths,
         remarks=scorer.remarks,
     )
+
+
+def names_of(paired: Mapping[str, tuple[Sequence[Pair], object]]) -> set[str]:
+    """Names of the truths' files."""
+    return {pair.truth.path.stem for pairs, _ in paired.values() for pair in pairs}
 
 
 def needs_upper_face(protocols: Sequence[Protocol], metrics: Sequence[str]) -> bool:
@@ -174,6 +190,7 @@ class Material:
         lips: Region,
         upper_face: Region | None,
         lip_pairs: LipPairs | None,
+        eyelid_pairs: LipPairs | None,
         *,
         templated: bool,
         every_condition: bool,
@@ -184,6 +201,7 @@ class Material:
         for need, there, arguments in (
             ("upper_face", upper_face is not None, {"upper": upper_face}),
             ("lip_pairs", lip_pairs is not None, {"pairs": lip_pairs}),
+            ("lid_pairs", eyelid_pairs is not None, {"pairs": eyelid_pairs, "frames_per_second": self.frame_rate}),
             ("template", templated, {}),
             ("closures", self._has("phonemes"), {}),
             ("speech", self._has("wav"), rates),
@@ -193,11 +211,14 @@ class Material:
                 has[need] = arguments
         rate = "" if self.frame_rate else " and give --frame-rate"
         in_test = "is known to `facediff test --model.metrics=[…]` only"
+        are_known = in_test.replace("is", "are", 1)
         return Context(
             has,
             {
                 "upper_face": "give --upper-face FILE, or --regions FOLDER with fdd.txt",
                 "lip_pairs": "give --lip-pairs FILE",
+                "lid_pairs": "give --eyelid-pairs FILE",
+                "gallery": f"recordings outside the test splits {are_known}",
                 "template": "give --templates FILE",
                 "closures": f"score against a corpus folder with phonemes/{rate}",
                 "speech": f"score against a corpus folder with wav/{rate}",

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from facediff.data.corpus import ALL, LIP_PAIRS, MOTION_FOLDERS, find_region, read_templates
+from facediff.data.corpus import ALL, EYELID_PAIRS, LIP_PAIRS, MOTION_FOLDERS, find_region, read_templates
 from facediff.errors import FaceDiffError
-from facediff.metrics import TOPOLOGIES, LipPairs, Region
+from facediff.metrics import TOPOLOGIES, EyelidPairs, LipPairs, Region
 from facediff.utils.arrays import open_vertices
 from facediff.utils.ranges import Range
 
@@ -288,31 +288,40 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
     return region
 
 
-def read_pairs(source: str | None, corpus: Path | None, n_vertices: int) -> LipPairs:
-    """Pairs of an upper and a lower lip vertex.
+PAIR_FILES: dict[type[LipPairs], tuple[str, str, str]] = {
+    LipPairs: (LIP_PAIRS, "--lip-pairs", "lip"),
+    EyelidPairs: (EYELID_PAIRS, "--eyelid-pairs", "eyelid"),
+}
+"""Where a corpus has pairs, the option that names another file, and of what they are."""
+
+
+def read_pairs(source: str | None, corpus: Path | None, n_vertices: int, kind: type[LipPairs] = LipPairs) -> LipPairs:
+    """Pairs of an upper and a lower lip or eyelid vertex.
 
     Args:
         source: a text file of pairs, or the pairs themselves, ``3531-3504,1-2``; the corpus's file if None.
         corpus: the corpus folder.
         n_vertices: vertices of the mesh.
+        kind: of the lips or of the eyelids.
 
     Raises:
         FaceDiffError: if no pairs are given or found, or they do not belong to this mesh.
     """
-    if source is None and corpus is not None and (corpus / LIP_PAIRS).is_file():
-        source = str(corpus / LIP_PAIRS)
+    file, option, what = PAIR_FILES[kind]
+    if source is None and corpus is not None and (corpus / file).is_file():
+        source = str(corpus / file)
     if source is None:
-        where = f"{corpus / LIP_PAIRS}: no such file" if corpus is not None else "the truth is no corpus folder"
+        where = f"{corpus / file}: no such file" if corpus is not None else "the truth is no corpus folder"
         raise FaceDiffError(
-            f"{where}; give --lip-pairs, a file with one upper and one lower lip vertex a line, or pairs such as "
+            f"{where}; give {option}, a file with one upper and one lower {what} vertex a line, or pairs such as "
             f"3531-3504 (the middle of FLAME's lips)"
         )
     try:
         if not Path(source).is_file() and all(c.isdecimal() or c in "-," for c in source):
-            pairs = LipPairs.from_pairs("given", [[int(i) for i in pair.split("-")] for pair in source.split(",")])
+            pairs = kind.from_pairs("given", [[int(i) for i in pair.split("-")] for pair in source.split(",")])
         else:
-            pairs = LipPairs.from_file(source)
+            pairs = kind.from_file(source)
         pairs.check(n_vertices)
     except ValueError as error:
-        raise FaceDiffError(f"--lip-pairs {source}: {error}") from error
+        raise FaceDiffError(f"{option} {source}: {error}") from error
     return pairs

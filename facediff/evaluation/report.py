@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -60,12 +60,13 @@ class SequenceScores:
     # ``<protocol>/<metric>`` to value; the mean over conditions where there are several; None where the metric has no
     # value on the clip.
     scores: dict[str, float | None]
+    attributes: dict[str, str] = field(default_factory=dict)  # by which scores are grouped, such as the emotion
 
     def row(self) -> dict[str, Any]:
         """The same in one flat row for a table."""
         row = asdict(self) | {"conditions": " ".join(self.conditions)}
-        scores = row.pop("scores")
-        return row | scores
+        scores, attributes = row.pop("scores"), row.pop("attributes")
+        return attributes | row | scores
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,16 @@ class Comparison:
 
 
 @dataclass(frozen=True)
+class Group:
+    """The scores of one method over clips whose attributes are equal."""
+
+    method: str
+    attributes: dict[str, str]
+    sequences: int
+    scores: dict[str, float | None]  # ``<protocol>/<metric>`` to value; None where no clip of the group has one
+
+
+@dataclass(frozen=True)
 class Report:
     """What an evaluation found."""
 
@@ -109,6 +120,7 @@ class Report:
     seed: int
     methods: list[MethodResult]  # the results, in the order asked for
     comparisons: list[Comparison]  # every further method against the first
+    groups: list[Group]  # scores by the attributes asked for, method by method
     unnamed_truths: list[str]  # files among the truths whose names do not fit the pattern
     remarks: list[str]  # whether the regions are those in use on the topology, if one was named
 
@@ -130,6 +142,7 @@ class Report:
             "bootstrap": {"resamples": self.resamples, "level": self.level, "seed": self.seed},
             "methods": [asdict(method) for method in self.methods],
             "comparisons": [asdict(comparison) for comparison in self.comparisons],
+            "groups": [asdict(group) for group in self.groups],
             "unnamed_truths": self.unnamed_truths,
         }
 
@@ -245,7 +258,27 @@ class MethodTable:
         self.weights: Array = np.where(np.isnan(values), 0.0, weights)
         self.values: Array = np.nan_to_num(values)
 
-    def result(self, bootstrap: Bootstrap) -> MethodResult:
+    def groups(self, attributes: Mapping[str, dict[str, str]]) -> list[Group]:
+        """The scores of clips with equal attributes, by the name of the truth's file; pooled as over all clips."""
+        rows: dict[tuple[str, ...], list[int]] = {}
+        for place, (pair, _) in enumerate(self.rows):
+            if pair.truth.path.stem in attributes:
+                rows.setdefault(tuple(attributes[pair.truth.path.stem].values()), []).append(place)
+        found = []
+        for key in sorted(rows):
+            chosen = rows[key]
+            names = attributes[self.rows[chosen[0]][0].truth.path.stem]
+            scores = {
+                column.name: None if math.isnan(value) else value
+                for column, value in zip(
+                    self.columns, pooled(self.values[chosen], self.weights[chosen]).tolist(), strict=True
+                )
+                if column.metric not in self.rows[0][1].states
+            }
+            found.append(Group(self.name, dict(zip(names, key, strict=True)), len(chosen), scores))
+        return found
+
+    def result(self, bootstrap: Bootstrap, attributes: Mapping[str, dict[str, str]] | None = None) -> MethodResult:
         """The scores with their intervals, and the values of each clip."""
         totals = self._totals()
         intervals = bootstrap.intervals(bootstrap.scores(self.values, self.weights), len(self.columns))
@@ -267,7 +300,10 @@ class MethodTable:
                     self.columns, totals, intervals, self.weights.T, strict=True
                 )
             ],
-            [self._sequence(pair, scores) for pair, scores in self.rows],
+            [
+                replace(self._sequence(pair, scores), attributes=(attributes or {}).get(pair.truth.path.stem, {}))
+                for pair, scores in self.rows
+            ],
             self.missing,
         )
 
@@ -370,7 +406,7 @@ def text(report: Report) -> str:
     lines += report.remarks
     for name in report.protocols:
         title = "further metrics" if name == METRICS else f"protocol {name}"
-        lines += ["", title, *_scores(report, name), *_comparisons(report, name)]
+        lines += ["", title, *_scores(report, name), *_comparisons(report, name), *_groups(report, name)]
     if any(score.interval for method in report.methods for score in method.scores):
         lines += [
             "",
@@ -398,6 +434,25 @@ def _scores(report: Report, protocol: str) -> list[str]:
         rows.append([method.name, *cells, str(scores[0].frames), str(scores[0].sequences)])
     metrics = [score.metric for score in report.methods[0].scores if score.protocol == protocol]
     return format_table(["", *metrics, "frames", "sequences"], rows).splitlines()
+
+
+def _groups(report: Report, protocol: str) -> list[str]:
+    """Scores by the attributes asked for; those of groups side by side, method by method."""
+    by = list(report.groups[0].attributes) if report.groups else []
+    names = [name for name in (report.groups[0].scores if by else ()) if name.partition("/")[0] == protocol]
+    if not names:
+        return []
+    rows = [
+        [
+            *(group.attributes[name] or "-" for name in by),
+            group.method,
+            *(None if group.scores[name] is None else f"{group.scores[name]:.4e}" for name in names),
+            str(group.sequences),
+        ]
+        for group in sorted(report.groups, key=lambda group: tuple(group.attributes.values()))
+    ]
+    head = [*by, "", *(name.partition("/")[2] for name in names), "sequences"]
+    return [f"by {', '.join(by)}", *format_table(head, rows, left=len(by) + 1).splitlines()]
 
 
 def _comparisons(report: Report, protocol: str) -> list[str]:

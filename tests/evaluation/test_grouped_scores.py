@@ -1,0 +1,81 @@
+"""Scores by attributes of clips, against means over the rows of the clips."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from facediff.evaluation import text
+from facediff.evaluation.groups import attributes_of
+from tests.evaluation.conftest import LENGTHS, Files, write_corpus
+
+MOODS = {"A_e01": "calm", "A_e02": "calm", "A_e03": "lively", "B_C_e01": "lively", "B_C_e02": "calm"}
+
+
+@pytest.fixture
+def moody(tmp_path: Path) -> Files:
+    files = write_corpus(tmp_path / "moody")
+    lines = ["clip,mood,loud", *(f"{clip},{mood},{len(mood)}" for clip, mood in MOODS.items())]
+    (files.root / "clips.csv").write_text("\n".join(lines))
+    return files
+
+
+def test_groups_are_pooled_as_the_whole_is(moody: Files) -> None:
+    report = moody.evaluate(
+        "ours", "theirs", corpus=moody.root, by=["mood"], metrics=["mean_vertex_error:squared=true"]
+    )
+    assert [(group.method, group.attributes["mood"], group.sequences) for group in report.groups] == [
+        (method, mood, count) for method in ("ours", "theirs") for mood, count in (("calm", 3), ("lively", 2))
+    ]
+    for group in report.groups:
+        method = next(each for each in report.methods if each.name == group.method)
+        rows = [row for row in method.sequences if row.attributes == group.attributes]
+        frames = [LENGTHS[row.clip] for row in rows]
+        for name, pooled in (
+            ("paper/lve", True),
+            ("paper/fdd", False),
+            ("metrics/mean_vertex_error:squared=true", True),
+        ):
+            values = [row.scores[name] for row in rows]
+            assert group.scores[name] == pytest.approx(np.average(values, weights=frames if pooled else None))
+    assert "by mood" in text(report)
+    assert report.as_dict()["groups"][0]["attributes"] == {"mood": "calm"}
+
+
+def test_an_attribute_that_no_clip_has_is_refused(moody: Files) -> None:
+    with pytest.raises(FaceDiffError, match=r"--by mod: .*mood"):
+        moody.evaluate(corpus=moody.root, by=["mod"])
+
+
+def test_names_of_3dmead_and_biwi_say_emotions() -> None:
+    mead = attributes_of(None, ["M003_001_4_1"], ["emotion", "intensity"])
+    assert mead == {"M003_001_4_1": {"emotion": "fear", "intensity": "2"}}
+    found = attributes_of(None, ["F2_e37", "F2_37"], ["emotion"])
+    assert [each["emotion"] for each in found.values()] == ["emotional", "neutral"]
+
+
+def test_the_command_groups_and_its_rows_have_the_attributes(
+    moody: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evaluate", str(moody.method()), str(moody.root), "--bootstrap", "0", "--by", "mood,loud"]
+    assert main([*words, "--csv", str(tmp_path / "rows.csv")]) == 0
+    assert "by mood, loud" in capsys.readouterr().out
+    with (tmp_path / "rows.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert {row["clip"]: row["mood"] for row in rows} == MOODS
+    assert [row["loud"] for row in rows] == [str(len(MOODS[row["clip"]])) for row in rows]
+
+
+def test_blinks_are_counted_in_files(moody: Files) -> None:
+    (moody.root / "regions" / "eyelid_pairs.txt").write_text("0, 5\n13, 18\n")
+    metrics = ["blink_rate:closed=0.02,reopened=0.01", "blink_rate_ratio:closed=0.02,reopened=0.01"]
+    report = moody.evaluate(corpus=moody.root, metrics=metrics, frame_rate=25.0)
+    scores = {score.metric: score.value for score in report.methods[0].scores}
+    assert all(scores[name] > 0 for name in metrics)
+    with pytest.raises(FaceDiffError, match="--eyelid-pairs"):
+        moody.evaluate(metrics=metrics)
