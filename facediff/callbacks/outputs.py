@@ -39,6 +39,7 @@ class ScoreTable(Callback):
 
     Args:
         file: name of the CSV file in the run's folder; None writes none.
+        groups_file: name of the CSV file with the scores by ``model.score_by``; None writes none.
         sequences_file: name of the CSV file with one row per clip and method; None writes none.
         media_clips: how many clips get sound and picture, the worst by LVE of all processes. They are predicted once
             more, by the first process alone, one at a time; nothing is kept in memory during the test.
@@ -50,10 +51,12 @@ class ScoreTable(Callback):
         file: str | None = "test_scores.csv",
         sequences_file: str | None = "test_sequences.csv",
         media_clips: Annotated[int, Range(0, 10_000)] = 8,
+        groups_file: str | None = "test_scores_by.csv",
     ) -> None:
         self.file = file
         self.sequences_file = sequences_file
         self.media_clips = media_clips
+        self.groups_file = groups_file
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print and write; runs before the model logs and empties its metrics."""
@@ -61,6 +64,7 @@ class ScoreTable(Callback):
             return
         evaluation = pl_module.evaluation
         rows = [row for split in evaluation.splits for row in evaluation.rows(split)]
+        groups = [row for split in evaluation.splits for row in evaluation.groups(split)]
         sequences = evaluation.sequences()
         folder = trainer.log_dir  # asked for on every process: the answer is broadcast
         if not trainer.is_global_zero:
@@ -68,7 +72,12 @@ class ScoreTable(Callback):
         assets = pl_module.assets
         chosen = [request.text for request in evaluation.requests]
         print(describe_scores(rows, assets.corpus, synthetic=assets.synthetic, metrics=chosen))
+        if groups:
+            print(describe_groups(groups, evaluation.score_by))
         print(evaluation.describe())
+        if groups and self.groups_file and folder:
+            write_rows(Path(folder) / self.groups_file, groups)
+            print(f"written: {Path(folder) / self.groups_file}")
         if self.file and folder:
             # Regions become the columns <region>_vertices and <region>_hash.
             flat = []
@@ -129,6 +138,25 @@ def describe_scores(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool,
         values = [[name, *(None if row[name] is None else f"{row[name]:.4e}" for row in rows)] for name in metrics]
         lines += ["", format_table(["metric", *methods], values)]
     return "\n".join(lines)
+
+
+def describe_groups(rows: list[dict[str, Any]], by: Sequence[str]) -> str:
+    """The scores of groups of clips as text, one row per split, group and method."""
+    names = [name for name in ("mve", "lve", "fdd", "fdd_absolute") if name in rows[0]]
+    head = ["split", *by, "method", *map(str.upper, names), "frames", "clips"]
+    order = sorted(rows, key=lambda row: (row["split"], *(row[name] for name in by)))  # stable: methods keep theirs
+    body = [
+        [
+            row["split"],
+            *(row[name] or "-" for name in by),
+            METHOD_NAMES[row["method"]],
+            *(None if row[name] is None else f"{row[name]:.4e}" for name in names),
+            row["frames"],
+            row["sequences"],
+        ]
+        for row in order
+    ]
+    return f"\nby {', '.join(by)}\n{format_table(head, body, left=2 + len(by))}"
 
 
 class PredictionWriter(BasePredictionWriter):

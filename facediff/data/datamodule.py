@@ -70,6 +70,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         region_sources: files that list the vertices of the regions, in order of preference.
         region_help: where to get such files.
         reference_attributes: what a style reference shares with its target where possible.
+        score_attributes: columns of the table of test scores of single clips; ``reference_attributes`` unless stated.
         licence: the terms under which the corpus is distributed.
         obtain: how to obtain the corpus.
 
@@ -120,6 +121,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     }
     region_help: ClassVar[str] = ""
     reference_attributes: ClassVar[tuple[str, ...]] = ()
+    score_attributes: ClassVar[tuple[str, ...]] = ()
     licence: ClassVar[str] = "unknown"
     obtain: ClassVar[str] = ""
 
@@ -189,6 +191,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
         """Let every corpus keep its constructor's arguments."""
         super().__init_subclass__(**words)
+        if "score_attributes" not in vars(cls) and "reference_attributes" in vars(cls):
+            cls.score_attributes = cls.reference_attributes
         if "__init__" in vars(cls):
             cls.__init__ = keeps_arguments(cls.__init__)  # type: ignore[method-assign]
 

@@ -46,6 +46,7 @@ class Mead3D(SpeechMotionDataModule):
         "FLAME_masks.pkl from flame.is.tue.mpg.de."
     )
     reference_attributes: ClassVar[tuple[str, ...]] = ("emotion",)
+    score_attributes: ClassVar[tuple[str, ...]] = ("emotion", "intensity")
     licence: ClassVar[str] = "MEAD and FLAME licences: non-commercial research"
     obtain: ClassVar[str] = (
         "3DMEAD is MEAD (wywu.github.io/projects/MEAD) with the reconstructions that EMOTE's authors distribute (see "

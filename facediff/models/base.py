@@ -110,6 +110,9 @@ class AnimationModel(LightningModule, Inference, ABC):
         style_source: the style that speakers have in validation, test and prediction, and by default in animation: of
             one ``reference`` clip, or of all motion of the ``person`` outside the evaluated clips, as the mean of the
             style vectors of stretches of ``data.reference_frames``. Checkpoints then keep every speaker's vector.
+        validation_samples: samples of each validation clip for ``val/energy``, the score by which the bundled trainers
+            choose the best checkpoint; with 1 it is a distance, which a mean face may win.
+        score_by: clip attributes, such as ``[emotion,intensity]``, by which test scores are printed and written too.
     """
 
     @keeps_arguments
@@ -130,6 +133,8 @@ class AnimationModel(LightningModule, Inference, ABC):
         metrics: Sequence[str] = (),
         unseen_identity: IdentityPolicy = "style_only",
         style_source: StyleSource = "reference",
+        validation_samples: Annotated[int, Range(1, 1000)] = 2,
+        score_by: Sequence[str] = (),
     ) -> None:
         super().__init__()
         self.n_vertices = n_vertices
@@ -146,6 +151,8 @@ class AnimationModel(LightningModule, Inference, ABC):
         self.unseen_identity: IdentityPolicy = unseen_identity
         self.protocol = protocol
         self.metrics = list(metrics)
+        self.validation_samples = validation_samples
+        self.score_by = list(score_by)
         self.windows = WindowPlan()
         self.data_source: dict[str, str] = {}
         self._assets: Assets | None = None
@@ -160,7 +167,13 @@ class AnimationModel(LightningModule, Inference, ABC):
         Raises:
             FaceDiffError: if there is no such protocol, metric or option.
         """
-        return Evaluation(self.protocol, self.unseen_identity, self.metrics)
+        return Evaluation(
+            self.protocol,
+            self.unseen_identity,
+            self.metrics,
+            validation_samples=self.validation_samples,
+            score_by=self.score_by,
+        )
 
     options_path = "model"
 

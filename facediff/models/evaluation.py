@@ -18,9 +18,10 @@ from facediff.data.batch import pad
 from facediff.data.corpus import EYELID_PAIRS
 from facediff.data.phonemes import closures, phonemes_file, read_phonemes
 from facediff.data.speakers import MeanFaces, speaker_gallery
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.metrics import (
     Context,
+    EnergyScore,
     EyelidPairs,
     LipPairs,
     ProtocolMetrics,
@@ -91,6 +92,9 @@ METHODS = ("model", "still", "mean_face", "shuffled")
 """Who is scored: the model; a face that never moves from its template, or from the mean of its speaker's training
 clips; the model given another sentence's speech."""
 
+ENERGY_REGIONS = ("lips", "upper_face")
+"""Regions by whose energy scores the best checkpoint is chosen."""
+
 OF_THE_MODEL = {"samples", "conditions", "style", "time"}
 """Needs that only the model meets: metrics that have one are not taken of a still face or of shuffled speech."""
 
@@ -128,12 +132,23 @@ class Evaluation:
         FaceDiffError: if there is no such metric or option.
     """
 
-    def __init__(self, protocol_name: str, unseen_identity: str, metrics: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        protocol_name: str,
+        unseen_identity: str,
+        metrics: Sequence[str] = (),
+        *,
+        validation_samples: int = 2,
+        score_by: Sequence[str] = (),
+    ) -> None:
         try:
             self.protocol = protocol(protocol_name)
         except ValueError as error:
             raise ArgumentError({"model.protocol": protocol_name}, str(error), located=True) from error
         self.unseen_identity = unseen_identity
+        self.validation_samples = validation_samples
+        self.score_by = list(score_by)
+        self.energies: dict[str, EnergyScore] = {}
         try:
             self.requests = parse_all(metrics)
         except FaceDiffError as error:
@@ -146,6 +161,7 @@ class Evaluation:
         self._data: SpeechMotionDataModule | None = None
         self._mean_faces: MeanFaces | None = None
         self._speakers: list[str] = []
+        self._validation_seeds = range(1)
 
     def prepare(
         self, model: Inference, splits: Sequence[str], device: torch.device, data: SpeechMotionDataModule
@@ -161,6 +177,8 @@ class Evaluation:
         self._sequences = []
         self._data = data
         self._mean_faces = None
+        self._check_attributes()
+        self._prepare_energies(model, regions, device)
         self._speakers = sorted(assets.templates)
         methods = METHODS if self.splits != ["val"] else METHODS[:1]
         self.metrics = {
@@ -179,6 +197,40 @@ class Evaluation:
             }
             for split in self.splits
         }
+
+    def _prepare_energies(self, model: Inference, regions: Mapping[str, Region], device: torch.device) -> None:
+        """Make the energy scores of validation, of the model and of a still face, by region."""
+        self.energies = {}
+        if self.splits != ["val"]:
+            return
+        # Without noise, samples would be one and the same, and the score is the distance from the truth.
+        self._validation_seeds = range(self.validation_samples if model.samples else 1)
+        count = max(2, len(self._validation_seeds))
+        self.energies = {
+            f"{who}/{name}": EnergyScore(regions[name], n_samples=count).to(device)
+            for who in ("model", "still")
+            for name in ENERGY_REGIONS
+        }
+
+    def _add_energies(self, samples: Tensor, batch: Batch) -> None:
+        """Add a validation batch's samples (batch, samples, frames, V, 3), and those of a still face."""
+        if batch.repeated:
+            return
+        for name, metric in self.energies.items():
+            drawn = torch.zeros_like(samples) if name.startswith("still") else samples
+            shown = drawn[:, : metric.n_samples].expand(-1, metric.n_samples, -1, -1, -1)
+            metric.to(samples.device).update(shown, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
+
+    def _energy(self) -> float | None:
+        """The energy score over that of a still face, mean of the regions; empties the metrics."""
+        shares = []
+        for name in ENERGY_REGIONS if self.energies else ():
+            with contextlib.suppress(ValueError):  # nothing was validated
+                own, still = (float(self.energies[f"{who}/{name}"].compute()) for who in ("model", "still"))
+                shares += [own / still] if still else []
+        for metric in self.energies.values():
+            metric.reset()
+        return sum(shares) / len(shares) if shares else None
 
     def _context(
         self, model: Inference, regions: Mapping[str, Region], device: torch.device, data: SpeechMotionDataModule
@@ -239,11 +291,15 @@ class Evaluation:
         inputs: dict[str, Any] = {"computing": self._clock(model) - start, "speech": spoken}
         if not batch.repeated:
             chosen = self.chosen[split]["model"].values()
+            count = len(self._validation_seeds) if self.energies else 1
             if "samples" in self.needs:
-                count = max(int(getattr(metric, "n_samples", 1)) for metric in chosen)
-                # A sample is the seed of its noise; the first is the motion that all other metrics score.
+                count = max(count, *(int(getattr(metric, "n_samples", 1)) for metric in chosen))
+            # A sample is the seed of its noise; the first is the motion that all other metrics score.
+            if count > 1 or self.energies:
                 more = [model.generate(batch, seed=seed) for seed in range(1, count)]
                 inputs["samples"] = torch.stack([motion, *more], 1)
+            if self.energies:
+                self._add_energies(inputs["samples"][:, : len(self._validation_seeds)], batch)
             if "conditions" in self.needs:
                 views = [with_identity(batch, place, each) for place, each in self._styles(model).items()]
                 inputs["predictions"] = torch.stack([model.generate(view, seed=0) for view in views], 1)
@@ -309,7 +365,55 @@ class Evaluation:
         for place, (clip, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
             own = {name: each[place] for name, each in values.items()}
             facts = {"split": split, "method": method, "clip": clip, "identity": identity, "frames": frames}
-            self._sequences.append({**facts, **own})
+            self._sequences.append({**facts, **self._attributes(clip), **own})
+
+    def _attributes(self, clip: str) -> dict[str, str | None]:
+        """What scores may be grouped by, such as a clip's emotion."""
+        if self._data is None:
+            return {}
+        names = dict.fromkeys((*self._data.score_attributes, *self.score_by))
+        attributes = self._data.corpus.clips[clip].attributes
+        return {name: attributes.get(name) for name in names}
+
+    def _check_attributes(self) -> None:
+        """Refuse to group scores by what no clip of the splits has."""
+        if self.score_by and self._data is not None:
+            clips = [clip for split in self.splits for clip in self._data.clips(split)]
+            known = sorted({name for clip in clips for name in clip.attributes})
+            for name in self.score_by:
+                if name not in known:
+                    offered = choices(name, known) if known else "its clips have no attributes; list them in clips.csv"
+                    raise ArgumentError({"model.score_by": name}, f"no clip has it: {offered}", located=True)
+
+    def groups(self, split: str) -> list[dict[str, Any]]:
+        """One row per method and group of clips with equal attributes ``score_by``; collective under several processes.
+
+        Scores are pooled as over the whole split; metrics that have no value of single clips are left out.
+        """
+        if not self.score_by:
+            return []
+        rows = [row for row in self.sequences() if row["split"] == split]
+        scores: dict[str, Metric] = {**self.metrics[split]["model"].scores(), **self.chosen[split]["model"]}
+        pooled = {
+            name: metric.pooling
+            for name, metric in scores.items()
+            if isinstance(metric, SequenceMetric) and type(metric).clip_weight is SequenceMetric.clip_weight
+        }
+        found: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+        for row in rows:
+            found.setdefault((row["method"], *(row[name] or "" for name in self.score_by)), []).append(row)
+        table = []
+        for key in sorted(found, key=lambda key: (METHODS.index(key[0]), key[1:])):
+            members, line = found[key], dict(zip(("method", *self.score_by), key, strict=True))
+            means: dict[str, float | None] = {}
+            for name, pooling in pooled.items():
+                valued = [row for row in members if row.get(name) is not None]
+                weights = [row["frames"] if pooling == "frames" else 1 for row in valued]
+                total = sum(row[name] * weight for row, weight in zip(valued, weights, strict=True))
+                means[name] = total / sum(weights) if valued else None
+            counts = {"frames": sum(row["frames"] for row in members), "sequences": len(members)}
+            table.append({"split": split, **line, **means, **counts})
+        return table
 
     def _inputs(self, motion: Tensor, batch: Batch) -> dict[str, Any]:
         """What metrics chosen by name may read of a batch, by the name under which they take it; see `NEEDS`."""
@@ -343,12 +447,18 @@ class Evaluation:
         return [{key: None if row.get(key) != row.get(key) else row.get(key) for key in keys} for row in rows]
 
     def scalars(self, split: str) -> dict[str, float]:
-        """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics."""
+        """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics.
+
+        For validation ``val/energy`` too, by which the best checkpoint is chosen: the energy score of lips and upper
+        face, each over that of a still face. No mean face can win it.
+        """
         found: dict[str, float] = {}
         for row in self.rows(split):
             prefix = split if row["method"] == "model" else f"{split}/{row['method']}"
             names = [*map(str, self.metrics[split]["model"]), *self.chosen[split]["model"]]
             found |= {f"{prefix}/{name}": row[name] for name in names if row[name] is not None}
+        if (energy := self._energy()) is not None:
+            found[f"{split}/energy"] = energy
         for metrics in self.metrics[split].values():
             metrics.reset()
         for chosen in self.chosen[split].values():

@@ -157,6 +157,51 @@ def test_validation_is_the_same_twice(make_model: Make, tiny: Tiny, make_trainer
     assert {"val/loss", "val/mve", "val/lve", "val/fdd", "val/reconstruction"} <= scores[0].keys()
 
 
+def test_the_best_checkpoint_is_chosen_by_energy_over_a_still_faces(
+    make_model: Make, tiny: Tiny, make_trainer: MakeTrainer
+) -> None:
+    model = make_model(validation_samples=3, motion_scale="none")
+    (scores,) = make_trainer().validate(model, datamodule=tiny, verbose=False)
+    sums = dict.fromkeys(("model", "still"), np.zeros(2))
+    for batch in tiny.val_dataloader():
+        with torch.inference_mode():
+            drawn = [model.eval().generate(batch, seed=seed).double().numpy() for seed in range(3)]
+        truth = batch.motion.double().numpy()
+        for clip, frames in enumerate(batch.frame_lengths.tolist()):
+            for place, region in enumerate((slice(0, 12), slice(12, 24))):
+                true, samples = truth[clip, :frames, region], [each[clip, :frames, region] for each in drawn]
+
+                def apart(one: np.ndarray, other: np.ndarray) -> float:
+                    return float(np.sqrt(np.square(one - other).sum((1, 2)) / 12).sum())
+
+                pairs = [apart(samples[i], samples[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+                own = np.mean([apart(each, true) for each in samples]) - np.mean(pairs) / 2
+                for who, value in (("model", own), ("still", apart(0 * true, true))):
+                    sums[who] = sums[who] + value * np.eye(2)[place]
+    assert scores["val/energy"] == pytest.approx((sums["model"] / sums["still"]).mean(), rel=1e-5)
+
+
+def test_test_scores_are_printed_and_written_by_attribute(
+    make_model: Make, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer = make_trainer(callbacks=[ScoreTable()])
+    trainer.test(make_model(motion_scale="none", score_by=["mood"]), datamodule=tiny, verbose=False)
+    assert "\nby mood\n" in capsys.readouterr().out
+    with (tmp_path / "test_scores_by.csv").open() as stream:
+        groups = list(csv.DictReader(stream))
+    with (tmp_path / "test_sequences.csv").open() as stream:
+        clips = list(csv.DictReader(stream))
+    assert {row["mood"] for row in groups} == {"calm", "lively"}
+    for row in groups:
+        own = [clip for clip in clips if all(clip[name] == row[name] for name in ("split", "method", "mood"))]
+        frames = [int(clip["frames"]) for clip in own]
+        assert (int(row["sequences"]), int(row["frames"])) == (len(own), sum(frames))
+        assert float(row["lve"]) == pytest.approx(np.average([float(clip["lve"]) for clip in own], weights=frames))
+        assert float(row["fdd"]) == pytest.approx(np.mean([float(clip["fdd"]) for clip in own]))
+    with pytest.raises(FaceDiffError, match="score_by"):
+        make_trainer().test(make_model(motion_scale="none", score_by=["mod"]), datamodule=tiny, verbose=False)
+
+
 def test_mixed_precision_trains_with_clipped_gradients(make_model: Make, tiny: Tiny, make_trainer: MakeTrainer) -> None:
     model = make_model()
     before = model.network.unembed.weight.detach().clone()
