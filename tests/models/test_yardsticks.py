@@ -1,0 +1,185 @@
+"""The yardsticks against the metrics taken by hand, for a model with noise and for one without."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import facediff.metrics as fm
+from facediff.cli.yardsticks import text
+from facediff.data import Batch, collate
+from facediff.errors import FaceDiffError
+from facediff.models.base import AnimationModel
+from facediff.models.yardsticks import YARDSTICKS, Sampling, Yardsticks, means_of, measure
+from tests.fakes.tiny import RATE, SEEN, VERTICES, Tiny
+
+LIPS, UPPER = range(12), range(12, 24)
+Make = Callable[..., Any]
+
+
+class Scripted(AnimationModel):
+    """Says what a script makes of a clip's true motion, its reference and a seed."""
+
+    samples = True
+    script: Callable[[Batch, int], Tensor]
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        raise NotImplementedError
+
+    def generate_clips(self, batch: Batch, *, seed: int = 0, progress: Any = None) -> Tensor:  # noqa: ANN401
+        return type(self).script(batch, seed)
+
+    def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Any = None) -> Tensor:  # noqa: ANN401
+        return torch.cat([self.generate_clips(clip, seed=seed) for seed in seeds])
+
+
+def scripted(data: Tiny, script: Callable[[Batch, int], Tensor], *, noise: bool = True) -> Scripted:
+    made = type("Made", (Scripted,), {"script": staticmethod(script), "samples": noise})
+    model = made(n_vertices=VERTICES, identities=SEEN, frame_rate=float(RATE), motion_scale="none")
+    model.adopt(data.assets())
+    return model.eval()
+
+
+def noisy(batch: Batch, seed: int) -> Tensor:
+    """The truth with noise of the seed and the clip, three times as much on the upper face."""
+    random = torch.Generator().manual_seed(1000 * seed + sum(map(ord, batch.names[0])))
+    noise = torch.randn(batch.motion.shape[1:], generator=random) * 0.001
+    noise[:, 12:] *= 3
+    return batch.motion + noise
+
+
+def run(data: Tiny, *models: AnimationModel, **options: Any) -> Yardsticks:  # noqa: ANN401
+    return measure({f"{place}.ckpt": lambda model=model: model for place, model in enumerate(models)}, data, **options)
+
+
+def test_every_yardstick_is_the_metric_that_it_names(tiny: Tiny) -> None:
+    model = scripted(tiny, noisy)
+    found = run(tiny, model, splits=["test_a"], sampling=Sampling(samples=4, references=1))
+    drawn, truths, still, faces = [], [], [], []
+    clips = tiny.dataset("test_a")
+    people = {
+        person: torch.cat([tiny.corpus.read_motion(clip) for clip in tiny.clips("train") if clip.identity == person])
+        for person in SEEN
+    }
+    for sample in clips:
+        batch = collate([sample])
+        drawn.append(torch.cat([noisy(batch, seed) for seed in range(4)]))
+        truths.append(sample.motion)
+        still.append(torch.zeros_like(sample.motion))
+        faces.append(people[sample.identity_name].mean(0).expand_as(sample.motion))
+
+    def taken(metric: Any, of: list[Tensor], **more: Any) -> float:  # noqa: ANN401
+        for motion, truth in zip(of, truths, strict=True):
+            for each in motion if motion.ndim == 4 and not isinstance(metric, fm.metric_of_samples) else [motion]:
+                metric.update(each, truth, **more)
+        return float(metric.compute())
+
+    fm.metric_of_samples = (fm.SpreadErrorRatio, fm.EnergyScore, fm.SamplesMetric)  # type: ignore[attr-defined]
+    lve = taken(fm.LipVertexError(LIPS), drawn)
+    of_still, of_faces = (taken(fm.LipVertexError(LIPS), of) for of in (still, faces))
+    mean, best = (taken(each(LIPS, n_samples=4), drawn) for each in (fm.MeanEstimateError, fm.CoverageError))
+    expected = {
+        "liveliness_upper_face": taken(fm.MotionLiveliness(UPPER), drawn),
+        "liveliness_lips": taken(fm.MotionLiveliness(LIPS), drawn),
+        "spread_face": taken(fm.SpreadErrorRatio(n_samples=4), drawn),
+        "spread_upper_face": taken(fm.SpreadErrorRatio(UPPER, n_samples=4), drawn),
+        "spread_lips": taken(fm.SpreadErrorRatio(LIPS, n_samples=4), drawn),
+        "energy_lips": taken(fm.EnergyScore(LIPS, n_samples=4), drawn),
+        "energy_upper_face": taken(fm.EnergyScore(UPPER, n_samples=4), drawn),
+        "fdd_still": taken(fm.FaceDynamicsDeviation(UPPER), drawn) / taken(fm.FaceDynamicsDeviation(UPPER), still),
+        "mve": taken(fm.MeanVertexError(), drawn),
+        "lve": lve,
+        "lve_still": lve / of_still,
+        "lve_mean_still": mean / of_still,
+        "lve_best_still": best / of_still,
+        "lve_mean_face": lve / of_faces,
+        "lve_mean_mean_face": mean / of_faces,
+        "lve_best_mean_face": best / of_faces,
+    }
+    del fm.metric_of_samples  # type: ignore[attr-defined]
+    for name, value in expected.items():
+        assert found.mean("test_a", name) == pytest.approx(value, rel=1e-5), name
+    assert found.mean("test_a", "real_time_factor") > 0  # type: ignore[operator]
+    assert found.clips == {"test_a": 4}
+    assert {"blink_ratio", "closures"} <= found.missing.keys()
+    assert found.mean("test_a", "blink_ratio") is None
+
+
+def test_a_reference_is_followed_with_the_label_and_without(tiny: Tiny) -> None:
+    """The script moves as its reference does, if it is not told who speaks; the truth plus a little if it is."""
+
+    def script(batch: Batch, seed: int) -> Tensor:
+        styled = batch.reference.mean(1, keepdim=True).expand_as(batch.motion)
+        return torch.where(batch.identity[:, None, None, None] >= 0, batch.motion + 0.001, styled)
+
+    found = run(tiny, scripted(tiny, script), sampling=Sampling(samples=2, references=1))
+    assert found.mean("test_a", "nearest_speaker") == 1.0
+    assert found.mean("test_a", "true_nearest_speaker") == 1.0
+    assert "chance 1/3" in found.title("nearest_speaker")
+    assert found.mean("test_a", "mve_hidden_another") > 1.2  # type: ignore[operator]
+    assert found.mean("test_a", "mve_known_another") == pytest.approx(1.0)
+    assert found.mean("test_b", "mve_known_another") is None  # nobody has trained on C, whose label says nothing
+    assert found.mean("test_b", "nearest_speaker") == 1.0
+
+
+def test_a_model_without_noise_has_no_spread_and_is_scored_by_its_distance(tiny: Tiny) -> None:
+    model = scripted(tiny, lambda batch, seed: torch.zeros_like(batch.motion), noise=False)
+    found = run(tiny, model, sampling=Sampling(samples=5))
+    assert found.samples == 1
+    assert "spread 0" in text(found)
+    for split in ("test_a", "test_b"):
+        assert found.mean(split, "spread_face") == 0.0
+        for name in ("lve_still", "lve_mean_still", "lve_best_still", "fdd_still"):
+            assert found.mean(split, name) == pytest.approx(1.0)
+        distances = [sample.motion[:, :12].square().sum((1, 2)).div(12).sqrt() for sample in tiny.dataset(split)]
+        assert found.mean(split, "energy_lips") == pytest.approx(torch.cat(distances).mean().item(), rel=1e-5)
+
+
+def test_several_checkpoints_have_means_and_deviations_and_others_ratios(tiny: Tiny) -> None:
+    models = [
+        scripted(tiny, lambda batch, seed, share=share: share * batch.motion, noise=False) for share in (0.5, 0.8)
+    ]
+    found = run(tiny, *models, splits=["test_b"])
+    assert found.values["test_b"]["liveliness_lips"] == [pytest.approx(0.5), pytest.approx(0.8)]
+    assert found.mean("test_b", "liveliness_lips") == pytest.approx(0.65)
+    assert found.deviation("test_b", "liveliness_lips") == pytest.approx(0.3 / 2**0.5)
+    stored = json.loads(json.dumps(found.as_dict()))
+    assert means_of(stored, "f")["test_b"]["liveliness_lips"] == pytest.approx(0.65)
+    with pytest.raises(FaceDiffError, match="f:"):
+        means_of({"format": "other"}, "f")
+    rows = {row["yardstick"]: row for row in found.rows()}
+    assert rows.keys() == YARDSTICKS.keys()
+    assert rows["liveliness_lips"]["value_2"] == pytest.approx(0.8)
+    assert "0.650 ± 0.212" in text(found)
+    with pytest.raises(FaceDiffError, match="samples"):
+        Sampling(samples=1)
+
+
+def test_the_command_writes_what_it_prints(
+    make_model: Make, tiny: Tiny, make_trainer: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from facediff.cli.app import main
+
+    trainer = make_trainer(limit_train_batches=1, limit_val_batches=0)
+    trainer.fit(make_model(), datamodule=tiny)
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+    words = ["yardsticks", str(tmp_path / "a.ckpt"), "--corpus", "tests.fakes.tiny.Tiny", "--quiet", "--samples", "2"]
+    words += ["--references", "1", "--clips", "1"]
+    assert main([*words, "--json", str(tmp_path / "a.json"), "--csv", str(tmp_path / "a.csv")]) == 0
+    printed = capsys.readouterr().out
+    assert "SYNTHETIC corpus tiny" in printed
+    assert "ddim with 3 steps" in printed
+    content = json.loads((tmp_path / "a.json").read_text())
+    assert content["clips"] == {"test_a": 1, "test_b": 1}
+    assert main([*words, "--sampler", "ddpm", "--steps", "2", "--against", str(tmp_path / "a.json")]) == 0
+    printed = capsys.readouterr().out
+    assert "ddpm with 2 steps" in printed
+    assert "[1.000]" in printed
+    assert main([*words, "--split", "tests"]) == 2
+    assert main([*words, "--against", str(tmp_path / "a.csv.json")]) == 2
