@@ -504,5 +504,4 @@ def sampler_of(model: AnimationModel) -> str:
     if not model.samples:
         return f"{type(model).__name__} without noise"
     sampler = getattr(model, "sampler", None)
-    steps = getattr(sampler, "steps", None)
-    return f"{type(sampler).__name__} with {steps} steps"
+    return type(model).__name__ if sampler is None else f"{type(sampler).__name__} with {sampler.steps} steps"
