@@ -27,6 +27,7 @@ def yardsticks(
     references: Annotated[ranges.Samples, Option(metavar="N")] = 2,
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
     steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
+    expressivity: Annotated[ranges.Expressivity | None, Option(metavar="E")] = None,
     split: Annotated[list[str] | None, Option(metavar="NAME")] = None,
     clips: Annotated[ranges.Samples | None, Option(metavar="N")] = None,
     against: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
@@ -57,6 +58,7 @@ def yardsticks(
         references: samples of each clip with each of up to eight references and labels
         sampler: sampler by name; see `facediff components sampler`
         steps: denoising steps of the sampler
+        expressivity: 0 for the mean of what the model finds possible, 1 for a sample (default: the checkpoint's)
         split: val, test_a or test_b; repeatable (default: all test splits)
         clips: clips of a split at most, evenly spread, for a quick look (default: all)
         against: a checkpoint, or a file of --json, whose values are printed next to these with the ratios
@@ -88,7 +90,7 @@ def yardsticks(
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar
 
-    sampling = Sampling(samples, references, sampler, steps, seed)
+    sampling = Sampling(samples, references, sampler, steps, seed, expressivity)
     known = means_of(stored, f"--against {against}") if against is not None and against.suffix == ".json" else {}
     data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)
     splits = list(dict.fromkeys(split)) if split else data.test_splits

@@ -101,6 +101,7 @@ class Sampling:
         sampler: by name; the checkpoint's if None.
         steps: of the sampler; the sampler's own if None.
         seed: of the first sample; the others follow.
+        expressivity: 0 for the mean prediction, 1 for a sample; the checkpoint's if None.
     """
 
     samples: ranges.Samples = 10
@@ -108,6 +109,7 @@ class Sampling:
     sampler: str | None = None
     steps: ranges.Steps | None = None
     seed: ranges.Seed = 0
+    expressivity: ranges.Expressivity | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -231,7 +233,7 @@ class Measurement:
     @torch.inference_mode()
     def add(self, clip: Clip, sample: Sample) -> None:
         """Generate motion for a clip, and score it."""
-        batch = collate([sample]).to(self.model.device)
+        batch = self.model.with_person_styles(collate([sample]).to(self.model.device))
         motion = self._samples(batch)
         truth, template = batch.motion[0], batch.template[0]
         for metric in self.of_samples.values():
@@ -468,6 +470,8 @@ def measure(
             )
         if sampling.sampler is not None or sampling.steps is not None:
             model.choose_sampler(sampling.sampler, sampling.steps)
+        if sampling.expressivity is not None:
+            model.choose_expressivity(sampling.expressivity)
         described.add(sampler_of(model))
         for split, dataset in datasets.items():
             measurement = Measurement(model, material, sampling)
@@ -504,4 +508,10 @@ def sampler_of(model: AnimationModel) -> str:
     if not model.samples:
         return f"{type(model).__name__} without noise"
     sampler = getattr(model, "sampler", None)
-    return type(model).__name__ if sampler is None else f"{type(sampler).__name__} with {sampler.steps} steps"
+    if sampler is None:
+        return type(model).__name__
+    found = f"{type(sampler).__name__} with {sampler.steps} steps"
+    own = model.expressivity
+    if isinstance(own, Tensor):
+        return f"{found}, expressivity by vertex"
+    return found if own == 1 else f"{found}, expressivity {own:g}"

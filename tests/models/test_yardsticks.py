@@ -181,5 +181,9 @@ def test_the_command_writes_what_it_prints(
     printed = capsys.readouterr().out
     assert "ddpm with 2 steps" in printed
     assert "[1.000]" in printed
+    assert main([*words, "--expressivity", "0", "--split", "test_b"]) == 0
+    printed = capsys.readouterr().out
+    assert "expressivity 0" in printed
+    assert next(line for line in printed.splitlines() if "spread / error, whole face" in line).split()[-1] == "0.000"
     assert main([*words, "--split", "tests"]) == 2
     assert main([*words, "--against", str(tmp_path / "a.csv.json")]) == 2
