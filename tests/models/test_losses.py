@@ -197,6 +197,19 @@ def test_fused_losses_are_their_definitions(
     assert not found[1][0][~mask].any()
 
 
+def test_fused_losses_of_a_clip_without_frames_are_their_definitions() -> None:
+    """It adds nothing, and is no division by zero; a batch of such clips alone has the loss 0."""
+    for lengths in ((5, 0, 3), (0, 0)):
+        *parts, truth, mask = linear_parts(lengths, 2)
+        leaves = [part.clone().requires_grad_() for part in parts]
+        terms = losses_fused.fused_losses(*leaves, truth, mask, torch.tensor(REGION), WEIGHTS)
+        expected = by_definition(*parts, truth, mask, torch.tensor(REGION), 1.0)
+        torch.testing.assert_close(terms, expected, rtol=1e-12, atol=1e-14)
+        terms["loss"].backward()
+        assert all(torch.isfinite(leaf.grad).all() for leaf in leaves if leaf.grad is not None)
+        assert (float(terms["loss"].detach()) == 0) == (sum(lengths) == 0)
+
+
 def test_fused_losses_leave_alone_what_is_frozen_and_what_it_is_given() -> None:
     features, weight, bias, truth, mask = linear_parts((6, 4), 1)
     kept = [part.clone() for part in (features, weight, bias, truth)]

@@ -111,6 +111,19 @@ def test_unit_noise_does_not_depend_on_the_number_of_threads(monkeypatch: pytest
         assert torch.equal(found[0], unit_noise((3, 7, 50), torch.device("cpu"), torch.Generator().manual_seed(5)))
 
 
+def test_unit_noise_is_many_streams_whose_seeds_come_from_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Equal seeds give equal noise in every version, so the parts and their seeds are part of the definition."""
+    monkeypatch.setattr(samplers, "PART", 100)
+    made = unit_noise((3, 7, 50), torch.device("cpu"), torch.Generator().manual_seed(5))
+    seeds = torch.randint(2**63 - 1, (11,), generator=torch.Generator().manual_seed(5)).tolist()
+    sizes = [100] * 10 + [50]
+    parts = [
+        torch.empty(size).normal_(generator=torch.Generator().manual_seed(seed))
+        for size, seed in zip(sizes, seeds, strict=True)
+    ]
+    assert torch.equal(made.flatten(), torch.cat(parts))
+
+
 def test_unit_noise_follows_the_global_seed() -> None:
     torch.manual_seed(1)
     first, second = unit_noise((20,), torch.device("cpu")), unit_noise((20,), torch.device("cpu"))
