@@ -60,6 +60,8 @@ FIRST = 4
 """How many of the best killers are tried first; how many files are imported before all others are."""
 QUICK = 0.1
 """Seconds of a quick test."""
+IMPORTING = 60.0
+"""Seconds that a new process may take to import what it tests."""
 
 # --- Tests -----------------------------------------------------------------------------------------------------------
 
@@ -382,11 +384,17 @@ class Workshop:
             self.tests |= {name: Test(**test) for name, test in stored[file]["tests"].items() if test["passed"]}
 
     def chosen(self, mutant: Mutant) -> list[str]:
-        """The tests for a mutant: those that killed its neighbours first, then file by file, the quick ones first."""
+        """The tests for a mutant: those that killed its neighbours, then one variant of every test, then the others."""
         killers = self.killers[mutant.file]
         touching = {name: test for name, test in self.tests.items() if test.touches(mutant)}
-        found, spent = [], 0.0
+        variants: collections.Counter[str] = collections.Counter()
+        turn: dict[str, int] = {}
         for name in sorted(touching, key=lambda name: touching[name].seconds):
+            function = name.split("[")[0]
+            turn[name] = variants[function]
+            variants[function] += 1
+        found, spent = [], 0.0
+        for name in sorted(touching, key=lambda name: (turn[name], touching[name].seconds)):
             spent += touching[name].seconds
             if found and spent > self.seconds:
                 break
@@ -394,7 +402,8 @@ class Workshop:
         first = [name for name, _ in killers.most_common(FIRST) if name in touching]
         rest = [name for name in found if name not in first]
         # By file, since fixtures are shared within one.
-        return first + sorted(rest, key=lambda name: (touching[name].seconds > QUICK, name.split("::")[0]))
+        rest.sort(key=lambda name: (turn[name] > 0, touching[name].seconds > QUICK, name.split("::")[0]))
+        return first + rest
 
     def try_out(self, mutant: Mutant) -> Outcome:
         """Make the mutant and show it to the tests."""
@@ -442,7 +451,7 @@ class Workshop:
             parts = [[name for name in tests if (name.split("::")[0] in few) == wanted] for wanted in (True, False)]
             status: int | None = 0
             for some in filter(None, parts):
-                status = forked(partial(work, some), limit)
+                status = forked(partial(work, some), limit + IMPORTING)
                 if status != pytest.ExitCode.OK:
                     break
         finally:
@@ -524,9 +533,10 @@ def main(words: Sequence[str] | None = None) -> int:
     if kept.exists():
         for line in kept.read_text().splitlines():
             entry = json.loads(line)
-            tried[entry.pop("key")] = Outcome(**entry)
+            key = entry.pop("key")
+            tried[key] = Outcome(**entry)
     alive = [m for m in mutants if m.key in tried and tried[m.key].result != "killed"]
-    todo = [m for m in mutants if m.key not in tried] + (alive if options.again else [])
+    todo = (alive if options.again else []) + [m for m in mutants if m.key not in tried]
     todo.sort(key=lambda mutant: not mutant.exchangeable)  # what takes longest last
     if todo:
         for name in options.preload:
