@@ -5,12 +5,18 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Mapping
 
+MANY = 40
+"""Names that are no longer listed in full."""
+
 
 def choices(name: str, known: Iterable[str]) -> str:
-    """What follows "there is no …": the nearest of the known names, then all of them."""
+    """What follows "there is no …": the nearest of the known names, then all of them, unless they are very many."""
     names = list(known)
     near = difflib.get_close_matches(name, names, n=1)
     hint = f'did you mean "{near[0]}"? ' if near else ""
+    if near and len(names) > MANY:
+        near = difflib.get_close_matches(name, names, n=5, cutoff=0.3)
+        return f"{hint}the nearest of {len(names)} are {', '.join(near)}"
     return f"{hint}known are {', '.join(names)}"
 
 

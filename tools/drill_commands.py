@@ -157,6 +157,11 @@ DRILLS = [
         "ours corpus --bootstrap 10 --workers 1 --quiet --json a.json --csv a.csv",
         pieces=True,
     ),
+    Drill(
+        "yardsticks",
+        f"model.ckpt --corpus {TINY} --data-root corpus --samples 2 --references 1 --max-clips 1 --quiet --json a.json",
+        f"model.ckpt --corpus {TINY} --data-root corpus --samples 3 --references 1 --max-clips 1 --quiet --json a.json",
+    ),
     Drill("figure frames", f"{PAPER} --dpi 80 --phonemes m -o a.png", f"{PAPER} --dpi 80 --phonemes f -o a.png"),
     Drill("figure heatmap", f"{PAPER} --dpi 80 -o a.png", f"{PAPER} --dpi 100 -o a.png"),
     Drill("figure error", f"{PAPER} --dpi 80 -o a.svg", f"{PAPER} --dpi 100 -o a.svg"),

@@ -90,7 +90,7 @@ def panels_by_section(panels: ModuleType, clips: Sequence[str], terms: Sequence[
 
     return {
         "Losses": [line(term, f"train/{term}", f"val/{term}", log_y=True) for term in ("loss", *terms)],
-        "Metrics": [line(f"validation {metric}", f"val/{metric}") for metric in METRICS],
+        "Metrics": [line(f"validation {metric}", f"val/{metric}") for metric in ("energy", *METRICS)],
         "Optimisation": [
             line("learning rate", "lr-AdamW"),
             line("gradient norm before clipping", "gradient/norm", log_y=True),
@@ -111,7 +111,7 @@ def panels_by_section(panels: ModuleType, clips: Sequence[str], terms: Sequence[
             *(
                 panels.BarPlot(
                     title=f"{metric}, {words}",
-                    metrics=[f"{split}/{metric}", f"{split}/still/{metric}", f"{split}/shuffled/{metric}"],
+                    metrics=[f"{split}/{method}{metric}" for method in ("", "still/", "mean_face/", "shuffled/")],
                 )
                 for split, words in SPLITS.items()
                 for metric in METRICS

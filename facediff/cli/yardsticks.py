@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.lightning import import_corpus, tell_folder
-from facediff.cli.options import Corpus, Folder, Seed
+from facediff.cli.options import Corpus, FileOrList, Folder, Seed
 from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
@@ -27,13 +28,13 @@ def yardsticks(
     references: Annotated[ranges.Samples, Option(metavar="N")] = 2,
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
     steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
-    expressivity: Annotated[ranges.Expressivity | None, Option(metavar="E")] = None,
-    split: Annotated[list[str] | None, Option(metavar="NAME")] = None,
-    clips: Annotated[ranges.Samples | None, Option(metavar="N")] = None,
+    expressivity: Annotated[str | None, Option(metavar="E")] = None,
+    splits: Annotated[Sequence[str] | None, Option(metavar="NAME,…")] = None,
+    max_clips: Annotated[ranges.Samples | None, Option(metavar="N")] = None,
     against: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
     data_root: Folder = None,
     corpus: Corpus = None,
-    eyelid_pairs: Annotated[str | None, Option(metavar="FILE")] = None,
+    eyelid_pairs: FileOrList = None,
     device: str = "cpu",
     seed: Seed = 0,
     json: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
@@ -59,12 +60,12 @@ def yardsticks(
         sampler: sampler by name; see `facediff components sampler`
         steps: denoising steps of the sampler
         expressivity: 0 for the mean of what the model finds possible, 1 for a sample (default: the checkpoint's)
-        split: val, test_a or test_b; repeatable (default: all test splits)
-        clips: clips of a split at most, evenly spread, for a quick look (default: all)
+        splits: val, test_a, test_b (default: all test splits)
+        max_clips: clips of a split at most, evenly spread, for a quick look (default: all)
         against: a checkpoint, or a file of --json, whose values are printed next to these with the ratios
         data_root: where the corpus is, if not where it was in training
         corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class
-        eyelid_pairs: file of the corpus folder with pairs of eyelid vertices (default: regions/eyelid_pairs.txt)
+        eyelid_pairs: file with pairs of eyelid vertices (default: regions/eyelid_pairs.txt in the corpus's folder)
         device: cpu, cuda …
         seed: of the first sample; the others follow
         json: write everything as JSON
@@ -76,9 +77,9 @@ def yardsticks(
             raise FaceDiffError(f"{path}: no such file; expected a checkpoint that `facediff fit` has written")
     if len({*map(str, checkpoints)}) < len(checkpoints):
         raise FaceDiffError("a checkpoint is given twice; give each once")
-    for name in split or ():
+    for name in splits or ():
         if name not in SPLITS:
-            raise FaceDiffError(f"--split {name}: there is no such split; expected one of {', '.join(SPLITS)}")
+            raise FaceDiffError(f"--splits {name}: there is no such split; expected one of {', '.join(SPLITS)}")
     if against is not None and against.suffix == ".json":
         from facediff.utils.plain_files import load_json
 
@@ -87,21 +88,23 @@ def yardsticks(
 
     from facediff.models.checkpoint import load_model
     from facediff.models.yardsticks import Sampling, means_of, measure
+    from facediff.pipelines.animate import usable_device
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar
 
-    sampling = Sampling(samples, references, sampler, steps, seed, expressivity)
+    sampling = Sampling(samples, references, sampler, steps, seed, one_number(expressivity))
+    device = usable_device(device)
     known = means_of(stored, f"--against {against}") if against is not None and against.suffix == ".json" else {}
     data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)
-    splits = list(dict.fromkeys(split)) if split else data.test_splits
+    splits = list(dict.fromkeys(splits)) if splits else data.test_splits
     others = [] if against is None or known else [against]
-    counts = [min(len(data.clips(name)), clips or 10**9) for name in splits]
+    counts = [min(len(data.clips(name)), max_clips or 10**9) for name in splits]
     total = sum(counts) * (len(checkpoints) + len(others))
     with progress_bar("clips", total, shown=not quiet) as step:
 
         def results(paths: list[Path]) -> Yardsticks:
             models = {str(path): partial(load_model, path, device) for path in paths}
-            return measure(models, data, splits=splits, sampling=sampling, most_clips=clips, step=step)
+            return measure(models, data, splits=splits, sampling=sampling, most_clips=max_clips, step=step)
 
         found = results(checkpoints)
         if others:
@@ -114,6 +117,22 @@ def yardsticks(
     if csv is not None:
         write_rows(csv, found.rows())
     tell(*text(found).split("\n"))
+
+
+def one_number(expressivity: str | None) -> float | None:
+    """The factor for all of the face.
+
+    Raises:
+        FaceDiffError: if it is no number.
+    """
+    if expressivity is None:
+        return None
+    try:
+        return float(expressivity)
+    except ValueError as error:
+        raise FaceDiffError(
+            f"--expressivity {expressivity}: expected one number from 0 to 2; regions are for `facediff animate`"
+        ) from error
 
 
 def corpus_of_checkpoint(
@@ -134,7 +153,7 @@ def corpus_of_checkpoint(
     else:
         tell_folder(checkpoint, options)
     if eyelid_pairs is not None:
-        options["eyelid_pairs"] = eyelid_pairs
+        options["eyelid_pairs"] = str(Path(eyelid_pairs).resolve())
     data = module(**options)
     data.prepare_data()
     if not data.root.is_dir():

@@ -267,12 +267,18 @@ class AnimationModel(LightningModule, Inference, ABC):
             total=total,
             warmup_steps=self.warmup_steps,
             schedule=self.lr_schedule,
-            epoch_steps=math.ceil(self.trainer.num_training_batches / self.trainer.accumulate_grad_batches),
+            epoch_steps=self._steps_an_epoch() if self.lr_schedule == "exponential" else 1,
             decay=self.lr_decay,
             decay_epoch=self.lr_decay_epoch,
         )
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def _steps_an_epoch(self) -> int:
+        """Optimiser steps of an epoch."""
+        if not math.isfinite(self.trainer.num_training_batches):
+            self.trainer.fit_loop.setup_data()  # with max_steps, Lightning has not counted the batches yet
+        return math.ceil(self.trainer.num_training_batches / self.trainer.accumulate_grad_batches)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted loss; every term is logged as ``train/<term>``."""

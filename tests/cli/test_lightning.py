@@ -326,6 +326,7 @@ def test_two_processes_train_together(tiny_root: Path, tmp_path: Path) -> None:
     load_model(run / "best.ckpt")
 
 
+@pytest.mark.slow
 def test_three_processes_score_as_one_does(
     checkpoint: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -403,5 +404,5 @@ def test_wandb_gets_the_sequences_and_the_protocol(
     words = ["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false", *logger]
     assert main(words) == 0
     wandb.finish()
-    columns = ["split", "method", "clip", "identity", "frames", "mve", "lve", "fdd", "audio", "error"]
+    columns = ["split", "method", "clip", "identity", "frames", "mood", "mve", "lve", "fdd", "audio", "error"]
     assert logged == {"columns": columns, "rows": 24}

@@ -23,9 +23,10 @@ from facediff.utils.files import atomic, atomic_folder, put_in_place
 LIGHTNING = {"fit", "validate", "test", "predict"}
 
 NO_PATHS = {
-    *("accelerator", "clip", "clips", "corpus", "device", "expressiveness", "expressivity", "font", "guidance"),
+    *("accelerator", "by", "clip", "clips", "corpus", "device", "expressiveness", "expressivity", "font", "guidance"),
     *("identity", "kind", "labels"),
     *("metric", "name", "output_unit", "pattern", "phonemes", "protocol", "region", "sampler", "scalar", "split"),
+    "splits",
     *("subjects", "suffix", "topology", "truth_pattern", "unit"),
 }
 """Texts that are no paths; a new option of type text either joins them or declares that it is read or written."""

@@ -170,7 +170,7 @@ def test_the_command_writes_what_it_prints(
     trainer.fit(make_model(), datamodule=tiny)
     trainer.save_checkpoint(tmp_path / "a.ckpt")
     words = ["yardsticks", str(tmp_path / "a.ckpt"), "--corpus", "tests.fakes.tiny.Tiny", "--quiet", "--samples", "2"]
-    words += ["--references", "1", "--clips", "1"]
+    words += ["--references", "1", "--max-clips", "1"]
     assert main([*words, "--json", str(tmp_path / "a.json"), "--csv", str(tmp_path / "a.csv")]) == 0
     printed = capsys.readouterr().out
     assert "SYNTHETIC corpus tiny" in printed
@@ -181,9 +181,9 @@ def test_the_command_writes_what_it_prints(
     printed = capsys.readouterr().out
     assert "ddpm with 2 steps" in printed
     assert "[1.000]" in printed
-    assert main([*words, "--expressivity", "0", "--split", "test_b"]) == 0
+    assert main([*words, "--expressivity", "0", "--splits", "test_b"]) == 0
     printed = capsys.readouterr().out
     assert "expressivity 0" in printed
     assert next(line for line in printed.splitlines() if "spread / error, whole face" in line).split()[-1] == "0.000"
-    assert main([*words, "--split", "tests"]) == 2
+    assert main([*words, "--splits", "tests"]) == 2
     assert main([*words, "--against", str(tmp_path / "a.csv.json")]) == 2

@@ -63,7 +63,7 @@ BASES: dict[str, str] = {
     "export": "WORLD/clicks.npz -o out.glb --quiet",
     "blendshapes": "WORLD/clicks.npz -o weights.csv --shapes WORLD/shapes",
     "retarget": "WORLD/clicks.npz --target-mesh WORLD/face.obj -o out.npz",
-    "yardsticks": "WORLD/model.ckpt --corpus tests.fakes.tiny.Tiny --samples 2 --references 1 --clips 1 --quiet",
+    "yardsticks": "WORLD/model.ckpt --corpus tests.fakes.tiny.Tiny --samples 2 --references 1 --max-clips 1 --quiet",
     "evaluate": "WORLD/ours WORLD/corpus --bootstrap 10 --workers 1 --quiet",
     "figure frames": f"{DRAWN} --times 0.1",
     "figure heatmap": DRAWN,

@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).parents[2] / "tools" / "benchmarks" / "evaluating.py"
 
 
+@pytest.mark.slow
 def test_a_toy_run_gets_the_same_numbers_both_ways_and_prints_ratios() -> None:
     # Large enough that the memory of a corpus stands out from what the interpreter itself takes and gives back.
     words = ["--clips=4", "--frames=50", "--vertices=3000", "--workers=1"]

@@ -16,6 +16,9 @@ TOY = (
 Output = tuple[str, dict[str, Any]]
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def output(tmp_path_factory: pytest.TempPathFactory) -> Output:
     """What a toy run prints, and its unrounded numbers."""
