@@ -138,6 +138,8 @@ def test_preview_with_two_processes(tiny: Tiny, tiny_root: Path, tmp_path: Path)
     words = ["--config", "configs/experiment/puppet.yaml", "--config", str(tmp_path / "two.yaml")]
     words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--data.batch_size=2"]
     words += ["--model.dim=16", "--model.diffusion_steps=20", "--model.sampler.steps=2"]
+    # So that a few steps move the weights, and the pictures of averaged and latest ones differ.
+    words += ["--model.motion_space=vertices", "--model.warmup_steps=0", "--model.learning_rate=3e-3"]
     done = subprocess.run(
         [sys.executable, "-m", "facediff", "fit", *words],
         capture_output=True,
