@@ -17,6 +17,7 @@ os.environ["FACEDIFF_TRACEBACK"] = "1"  # unexpected errors fail a test as what 
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as pl
 import pytest
@@ -95,13 +96,22 @@ def make_trainer(tmp_path: Path) -> Callable[..., pl.Trainer]:
     return make
 
 
+def saved(network: Any, config: Any, folder: Path) -> Path:  # noqa: ANN401 - of transformers
+    """The folder, with a network of random weights in it, as transformers saves one."""
+    from transformers.utils import logging
+
+    torch.manual_seed(0)
+    logging.disable_progress_bar()
+    network(config).save_pretrained(folder)
+    logging.enable_progress_bar()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def hubert_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A HuBERT of the published shape (seven convolutions, stride 320) in miniature, with random weights."""
     from transformers import HubertConfig, HubertModel
-    from transformers.utils import logging
 
-    folder = tmp_path_factory.mktemp("hubert")
     config = HubertConfig(
         hidden_size=32,
         num_hidden_layers=3,
@@ -111,20 +121,14 @@ def hubert_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
         num_conv_pos_embeddings=8,
         num_conv_pos_embedding_groups=4,
     )
-    torch.manual_seed(0)
-    logging.disable_progress_bar()
-    HubertModel(config).save_pretrained(folder)
-    logging.enable_progress_bar()
-    return folder
+    return saved(HubertModel, config, tmp_path_factory.mktemp("hubert"))
 
 
 @pytest.fixture(scope="session")
 def ctc_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wav2vec 2.0 with a CTC head over 29 letters in miniature, of the published shape, with random weights."""
     from transformers import Wav2Vec2Config, Wav2Vec2ForCTC
-    from transformers.utils import logging
 
-    folder = tmp_path_factory.mktemp("ctc")
     config = Wav2Vec2Config(
         vocab_size=29,
         hidden_size=16,
@@ -135,8 +139,4 @@ def ctc_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
         num_conv_pos_embeddings=8,
         num_conv_pos_embedding_groups=4,
     )
-    torch.manual_seed(0)
-    logging.disable_progress_bar()
-    Wav2Vec2ForCTC(config).save_pretrained(folder)
-    logging.enable_progress_bar()
-    return folder
+    return saved(Wav2Vec2ForCTC, config, tmp_path_factory.mktemp("ctc"))

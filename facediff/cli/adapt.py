@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from facediff.cli.lightning import import_corpus, tell_folder
+from facediff.cli.lightning import corpus_and_folder
 from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed, confirm_cost
 from facediff.cli.parsing import Option
 from facediff.cli.process import tell
@@ -121,14 +121,8 @@ def adaptation_data(
 ) -> tuple[str, SpeechMotionDataModule]:
     """The new speaker's name, and the checkpoint's data module with that speaker put first."""
     from facediff.data.datamodule import person_name
-    from facediff.models.checkpoint import corpus_of
 
-    import_corpus(checkpoint, content, corpus, "--corpus ")
-    module, options = corpus_of(checkpoint, content)
-    if data_root is not None:
-        options["root"] = str(data_root)
-    else:
-        tell_folder(checkpoint, options)
+    module, options = corpus_and_folder(checkpoint, content, corpus, data_root)
     folder = Path(person)
     name = person_name(folder) if folder.is_dir() else person
     if name in content["hyper_parameters"].get("identities", []):

@@ -25,6 +25,7 @@ from facediff.utils.files import config_dir
 
 if TYPE_CHECKING:
     from facediff.cli.lightning_cli import FaceDiffCLI
+    from facediff.data import SpeechMotionDataModule
 
 OPTIONS = (
     *("config", "name", "model", "data", "trainer", "seed_everything", "ckpt_path"),
@@ -181,6 +182,31 @@ def tell_folder(path: Path, options: Mapping[str, Any]) -> None:
     """Say which folder is read because a checkpoint, which may come from anybody, names it."""
     if options.get("root") is not None:
         tell(f"{path}: names the corpus folder {options['root']}, which is read")
+
+
+def corpus_and_folder(
+    path: Path, checkpoint: Mapping[str, Any], corpus: str | None, root: Path | None
+) -> tuple[type[SpeechMotionDataModule], dict[str, Any]]:
+    """The data module's class that a checkpoint was trained with, and its options.
+
+    Args:
+        path: the checkpoint.
+        checkpoint: its content.
+        corpus: the class that the user names by ``--corpus``, if any.
+        root: where the user says that the corpus is; None for where the checkpoint says.
+
+    Raises:
+        FaceDiffError: as :func:`import_corpus`.
+    """
+    from facediff.models.checkpoint import corpus_of
+
+    import_corpus(path, checkpoint, corpus, "--corpus ")
+    module, options = corpus_of(path, checkpoint)
+    if root is not None:
+        options["root"] = str(root)
+    else:
+        tell_folder(path, options)
+    return module, options
 
 
 def change_values(words: Sequence[str], change: Callable[[str, str], str]) -> list[str]:

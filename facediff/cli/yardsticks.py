@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.lightning import import_corpus, tell_folder
+from facediff.cli.lightning import corpus_and_folder
 from facediff.cli.options import Corpus, FileOrList, Folder, Seed
 from facediff.cli.parsing import Option
 from facediff.cli.process import tell
@@ -92,7 +92,8 @@ def yardsticks(
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar
 
-    sampling = Sampling(samples, references, sampler, steps, seed, one_number(expressivity))
+    factor = None if expressivity is None else ranges.EXPRESSIVITY.read("--expressivity", expressivity)
+    sampling = Sampling(samples, references, sampler, steps, seed, factor)
     device = usable_device(device)
     known = means_of(stored, f"--against {against}") if against is not None and against.suffix == ".json" else {}
     data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)
@@ -119,22 +120,6 @@ def yardsticks(
     tell(*text(found).split("\n"))
 
 
-def one_number(expressivity: str | None) -> float | None:
-    """The factor for all of the face.
-
-    Raises:
-        FaceDiffError: if it is no number.
-    """
-    if expressivity is None:
-        return None
-    try:
-        return float(expressivity)
-    except ValueError as error:
-        raise FaceDiffError(
-            f"--expressivity {expressivity}: expected one number from 0 to 2; regions are for `facediff animate`"
-        ) from error
-
-
 def corpus_of_checkpoint(
     checkpoint: Path, data_root: Path | None, corpus: str | None, eyelid_pairs: str | None
 ) -> SpeechMotionDataModule:
@@ -143,15 +128,9 @@ def corpus_of_checkpoint(
     Raises:
         FaceDiffError: if its class is not known, or its folder is not there.
     """
-    from facediff.models.checkpoint import corpus_of, read_checkpoint
+    from facediff.models.checkpoint import read_checkpoint
 
-    content = read_checkpoint(checkpoint)
-    import_corpus(checkpoint, content, corpus, "--corpus ")
-    module, options = corpus_of(checkpoint, content)
-    if data_root is not None:
-        options["root"] = str(data_root)
-    else:
-        tell_folder(checkpoint, options)
+    module, options = corpus_and_folder(checkpoint, read_checkpoint(checkpoint), corpus, data_root)
     if eyelid_pairs is not None:
         options["eyelid_pairs"] = str(Path(eyelid_pairs).resolve())
     data = module(**options)

@@ -483,22 +483,28 @@ class AnimationModel(LightningModule, Inference, ABC):
         for encoder in waiting:
             encoder.attach(mesh_hierarchy(template.numpy(), self.assets.faces.numpy(), **encoder.mesh_options))
 
-    def measure(self, data: SpeechMotionDataModule) -> None:
+    def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """Take from the training split what a model that was never trained needs: principal components of motion.
 
         Args:
             data: set up for training.
+            at_least: components that the caller needs, whatever its modules do.
+
+        Returns:
+            the components of scaled, weighted motion, each as long as its standard deviation; None if nobody needs any.
 
         Raises:
-            FaceDiffError: if some are needed and the training motion never changes.
+            FaceDiffError: if some modules need them and the training motion never changes.
         """
         waiting = [module for module in self.modules() if isinstance(module, PrincipalComponents)]
-        if not waiting:
-            return
+        count = max([at_least, *(module.count for module in waiting)])
+        if not count:
+            return None
         weights = self.motion_weights().flatten()
-        mean, shapes = data.principal_motion(max(module.count for module in waiting), weights)
+        mean, shapes = data.principal_motion(count, weights)
         for module in waiting:
             module.attach(mean * self.scale, shapes * self.scale, weights)
+        return shapes * self.scale
 
     def motion_weights(self) -> Float[Tensor, "vertices 3"]:
         """What motion is multiplied by before its principal components are taken."""

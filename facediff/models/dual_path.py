@@ -218,15 +218,14 @@ class DualPathDiffusion(AnimationModel):
             nn.init.zeros_(self.network.unembed.weight)
             nn.init.zeros_(self.network.unembed.bias)
 
-    def measure(self, data: SpeechMotionDataModule) -> None:
+    def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """Besides principal components, how much noise hides of the training motion."""
-        super().measure(data)
-        space = self.motion_space
-        if self.noise_scale == "auto":
-            _, shapes = data.principal_motion(PRINCIPAL, self.motion_weights().flatten())
-            variances = (shapes * self.scale).square().sum(1)
-            self.rescale_noise(half_hidden(space.noised_variances(variances), variances))
-        space.fit(self.process.signal)
+        shapes = super().measure(data, PRINCIPAL if self.noise_scale == "auto" else at_least)
+        if self.noise_scale == "auto" and shapes is not None:
+            variances = shapes[:PRINCIPAL].square().sum(1)
+            self.rescale_noise(half_hidden(self.motion_space.noised_variances(variances), variances))
+        self.motion_space.fit(self.process.signal)
+        return shapes
 
     def motion_weights(self) -> Float[Tensor, "vertices 3"]:
         """The motion space's weights of regions."""

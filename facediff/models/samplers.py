@@ -150,7 +150,7 @@ def visited(process: NoiseProcess, steps: int, spacing: Spacing, last_noise: flo
             where the spacing itself ends.
 
     Raises:
-        FaceDiffError: if the process has less signal than that in its noisiest step.
+        FaceDiffError: if fewer steps than that have as much noise as the last one is to have.
     """
     if spacing == "steps" and last_noise is None:
         # From the end of the process, since sampling starts from pure noise; the clean end itself is no step.

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from facediff import registry
+from facediff.data import Batch, collate
+from tests.fakes.tiny import Tiny
 
 DIM = 16
 STYLE_DIM = 12
@@ -33,6 +35,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if {"kind", "name"} <= set(metafunc.fixturenames):
         cases = [(kind, name) for kind in SIZES for name in registry.COMPONENTS[kind].names()]
         metafunc.parametrize(("kind", "name"), cases)
+
+
+@pytest.fixture
+def batch(tiny: Tiny) -> Batch:
+    """Two clips, the first padded."""
+    dataset = tiny.dataset("train")
+    return collate([dataset[0], dataset[7]])
 
 
 @pytest.fixture

@@ -47,13 +47,6 @@ def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
     return make
 
 
-@pytest.fixture
-def batch(tiny: Tiny) -> Batch:
-    """Two clips, the first padded."""
-    dataset = tiny.dataset("train")
-    return collate([dataset[0], dataset[7]])
-
-
 def speech(seconds: float) -> Tensor:
     return 0.1 * torch.randn(int(seconds * 16000), generator=torch.Generator().manual_seed(0))
 

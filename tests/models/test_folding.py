@@ -138,13 +138,6 @@ def ready(make_model: Make, tiny: Tiny) -> Make:
     return make
 
 
-@pytest.fixture
-def batch(tiny: Tiny) -> Batch:
-    """Two clips, the first padded."""
-    dataset = tiny.dataset("train")
-    return collate([dataset[0], dataset[7]])
-
-
 def cast(batch: Batch, dtype: torch.dtype) -> Batch:
     tensors = {name: value for name, value in vars(batch).items() if isinstance(value, Tensor)}
     return replace(batch, **{name: v.to(dtype) for name, v in tensors.items() if v.is_floating_point()})

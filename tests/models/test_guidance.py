@@ -38,13 +38,6 @@ def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
     return make
 
 
-@pytest.fixture
-def batch(tiny: Tiny) -> Batch:
-    """Two clips, the first padded."""
-    dataset = tiny.dataset("train")
-    return collate([dataset[0], dataset[7]])
-
-
 def hiding(model: DualPathDiffusion, batch: Batch, *names: str) -> Hidden:
     masks = {name: torch.full((len(batch),), name in names) for name in EVERYTHING}
     return Hidden(**masks)

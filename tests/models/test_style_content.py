@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,8 @@ from facediff.models.style_content.losses import (
     relative_distance,
 )
 from facediff.models.style_content.network import MotionDecoder, WindowedTransformer
-from tests.fakes.tiny import SEEN, VERTICES, Tiny
+from tests.fakes.style_content import make
+from tests.fakes.tiny import VERTICES, Tiny
 
 MakeTrainer = Callable[..., Trainer]
 
@@ -207,25 +207,6 @@ class TestObjectives:
         same = dynamics_distance(motion, other, everything, everything, chosen, vertices)
         assert float(same) == pytest.approx(0, abs=1e-9)
         assert float(dynamics_distance(motion, truth, mask, truth_mask, chosen & False, vertices)) == 0
-
-
-SMALL: dict[str, object] = {
-    "dim": 16,
-    "content_dim": 8,
-    "speech_layers": 1,
-    "decoder_channels": (16, 16, 16),
-    "decoder_hidden": (16, 16),
-    "basis_size": 6,
-    "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0),
-    "mesh_encoder": partial(registry.mesh_encoder.spiral, channels=(4, 4), spiral_length=5),
-    "style_encoder": partial(registry.style_encoder.lstm, style_dim=4),
-}
-
-
-def make(**options: object) -> StyleContentDisentanglement:
-    torch.manual_seed(0)
-    sizes: dict[str, object] = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": 25.0}
-    return StyleContentDisentanglement(**{**sizes, **SMALL, **options})  # type: ignore[arg-type]
 
 
 def pairs(data: Tiny, *names: str) -> Batch:

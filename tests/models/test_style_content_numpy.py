@@ -14,36 +14,17 @@ import numpy as np
 import pytest
 import torch
 
-from facediff import registry
 from facediff.data import Batch, collate
 from facediff.models import StyleContentDisentanglement
 from facediff.models.style_content.losses import align, cepstra, pair_up
 from facediff.models.style_content.network import WindowedTransformer
-from tests.fakes.tiny import SEEN, VERTICES, Tiny
+from tests.fakes.style_content import make
+from tests.fakes.tiny import VERTICES, Tiny
 
 Array = np.ndarray
 SCALE = 100.0
 CLOSE = {"rtol": 2e-3, "atol": 2e-5}
 """The model computes in float32."""
-
-
-def make(**options: object) -> StyleContentDisentanglement:
-    torch.manual_seed(0)
-    usual: dict[str, object] = {
-        "n_vertices": VERTICES,
-        "identities": SEEN,
-        "frame_rate": 25.0,
-        "dim": 16,
-        "content_dim": 8,
-        "speech_layers": 1,
-        "decoder_channels": (16, 16, 16),
-        "decoder_hidden": (16, 16),
-        "basis_size": 6,
-        "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0),
-        "mesh_encoder": partial(registry.mesh_encoder.spiral, channels=(4, 4), spiral_length=5),
-        "style_encoder": partial(registry.style_encoder.lstm, style_dim=4),
-    }
-    return StyleContentDisentanglement(**{**usual, **options})  # type: ignore[arg-type]
 
 
 def ready(tiny: Tiny, **options: object) -> StyleContentDisentanglement:

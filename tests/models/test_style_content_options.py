@@ -20,8 +20,8 @@ from facediff.mesh.flame import read_masks
 from facediff.models import Style, load_model
 from facediff.models.base import STYLES_KEY, lr_factor
 from facediff.models.style_content.losses import squared_distance, style_distance
+from tests.fakes.style_content import make
 from tests.fakes.tiny import Tiny, write_tiny
-from tests.models.test_style_content import make
 
 MakeTrainer = Callable[..., Trainer]
 
