@@ -71,6 +71,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         region_help: where to get such files.
         reference_attributes: what a style reference shares with its target where possible.
         score_attributes: columns of the table of test scores of single clips; ``reference_attributes`` unless stated.
+        compared_speakers: speakers among whom the yardsticks look for the nearest one, and for another's references; all
+            with a template if None.
         licence: the terms under which the corpus is distributed.
         obtain: how to obtain the corpus.
 
@@ -122,6 +124,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     region_help: ClassVar[str] = ""
     reference_attributes: ClassVar[tuple[str, ...]] = ()
     score_attributes: ClassVar[tuple[str, ...]] = ()
+    compared_speakers: ClassVar[tuple[str, ...] | None] = None
     licence: ClassVar[str] = "unknown"
     obtain: ClassVar[str] = ""
 

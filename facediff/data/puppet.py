@@ -16,13 +16,15 @@ from facediff.data.datamodule import Count, SpeechMotionDataModule
 from facediff.mesh import Mesh
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import eyelid_pairs
+from facediff.synthetic.speakers import MOST_DRAWN, drawn_names
 from facediff.utils.files import cache_dir
 from facediff.utils.ranges import Range
 
 
-def cache_root(seed: int) -> Path:
+def cache_root(seed: int, drawn_speakers: int = 0) -> Path:
     """Where the corpus of a seed is kept: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
-    return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}"
+    more = f"-drawn{drawn_speakers}" if drawn_speakers else ""
+    return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}{more}"
 
 
 def built_in_mesh() -> Mesh:
@@ -41,6 +43,8 @@ class Puppet(SpeechMotionDataModule):
     Args:
         root: the corpus folder; the user's cache folder if None.
         seed: seed of the corpus; another seed makes another corpus.
+        drawn_speakers: how many speakers with random voice, face and speaking style also say the training sentences.
+            What is tested does not change.
         batch_size: clips a batch; used where no frame budget is given.
         options: those of every data module.
     """
@@ -53,22 +57,31 @@ class Puppet(SpeechMotionDataModule):
     identities = list(puppet.SEEN_IDENTITIES)
     mesh_files: ClassVar[tuple[str, ...]] = ("PUPPET.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
+    compared_speakers: ClassVar[tuple[str, ...] | None] = (*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES)
 
     def __init__(
         self,
         *,
         root: str | None = None,
         seed: Annotated[int, Range(0, 2**32 - 1)] = 0,
+        drawn_speakers: Annotated[int, Range(0, MOST_DRAWN)] = 0,
         batch_size: Count = 8,
+        extra_identities: list[str] | None = None,
         **options: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(root=str(cache_root(seed)) if root is None else root, batch_size=batch_size, **options)
+        super().__init__(
+            root=str(cache_root(seed, drawn_speakers)) if root is None else root,
+            batch_size=batch_size,
+            extra_identities=[*(extra_identities or []), *drawn_names(drawn_speakers)],
+            **options,
+        )
         self.seed = seed
+        self.drawn_speakers = drawn_speakers
 
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
-        if not puppet.is_complete(self.root, seed=self.seed):
-            puppet.generate(self.root, seed=self.seed)
+        if not puppet.is_complete(self.root, seed=self.seed, drawn=self.drawn_speakers):
+            puppet.generate(self.root, seed=self.seed, drawn=self.drawn_speakers)
 
     def eyelid_pairs(self) -> Tensor | None:
         """Those of the corpus folder, or of the mesh itself where the folder was made before it had such a file."""

@@ -125,7 +125,8 @@ class Material:
         self.data = data
         self.assets = data.assets()
         self.regions = regions_of(self.assets)
-        self.speakers = sorted(self.assets.templates)
+        compared = data.compared_speakers
+        self.speakers = sorted(name for name in self.assets.templates if compared is None or name in compared)
         self.mean_faces = MeanFaces(data)
         self.missing: dict[str, str] = {}
         self.gallery = None
@@ -149,7 +150,7 @@ class Material:
             for name, clips in self.data.reference_policy().candidates.items()
         }
         mine = candidates.get(clip.identity, [])
-        others = [other for name in sorted(candidates) if name != clip.identity for other in candidates[name]]
+        others = [other for name in self.speakers if name != clip.identity for other in candidates.get(name, [])]
 
         def alike(other: Clip) -> bool:
             return all(other.attributes.get(name) == clip.attributes.get(name) for name in attributes)

@@ -17,7 +17,7 @@ from facediff.synthetic.face import build_face
 from facediff.synthetic.geometry import Array
 from facediff.synthetic.motion import FRAME_RATE, analyse, generate_weights, segments_of, visemes_of
 from facediff.synthetic.rig import Rig, build_rig, eyelid_pairs, lip_pairs
-from facediff.synthetic.speakers import SPEAKERS
+from facediff.synthetic.speakers import MOST_DRAWN, SPEAKERS, drawn_names, speaker_of
 from facediff.synthetic.speech import SENTENCES, Phoneme, speak
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic_folder, describe_files, same_sizes
@@ -64,15 +64,19 @@ class Clip:
         return f"{self.identity}_{self.sentence}"
 
 
-def clips() -> tuple[Clip, ...]:
+def clips(drawn: int = 0) -> tuple[Clip, ...]:
     """All clips, speaker by speaker.
 
     Moods take turns, shifted by one from speaker to speaker, so that every speaker has every mood equally
     often in training and every sentence is heard in every mood.
+
+    Args:
+        drawn: How many drawn speakers there are besides the eight. They say the training sentences only.
     """
     everything = (*TRAIN_SENTENCES, *VAL_SENTENCES, *TEST_SENTENCES)
     plan = [(identity, everything) for identity in SEEN_IDENTITIES]
     plan += [(identity, (*REFERENCE_SENTENCES, *TEST_SENTENCES)) for identity in UNSEEN_IDENTITIES]
+    plan += [(identity, TRAIN_SENTENCES) for identity in drawn_names(drawn)]
     return tuple(
         Clip(identity, number, MOODS[(number + turn) % len(MOODS)])
         for turn, (identity, numbers) in enumerate(plan)
@@ -87,6 +91,7 @@ def generate(
     workers: int | None = None,
     progress: bool = True,
     only: Sequence[str] | None = None,
+    drawn: int = 0,
 ) -> None:
     """Write the built-in corpus, unless the folder holds it already.
 
@@ -99,39 +104,41 @@ def generate(
         workers: How many processes share the work; one by default.
         progress: Whether to show a progress bar.
         only: Names of clips to write instead of all, for trials; such a corpus never counts as complete.
+        drawn: How many drawn speakers say the training sentences, besides the eight.
 
     Raises:
         FaceDiffError: If the folder holds something else, cannot be written, or espeak-ng is missing.
     """
     root = Path(root)
-    chosen = _chosen(only)
-    if only is None and is_complete(root, seed=seed):
+    chosen = _chosen(only, drawn)
+    if only is None and is_complete(root, seed=seed, drawn=drawn):
         return
     _refuse_foreign(root)
     with atomic_folder(root, replace=True) as folder:
         _write_common(folder, chosen)
         frames = _write_clips(folder, chosen, seed, workers, progress)
-        counts = {"subjects": len(SPEAKERS), "vertices": len(build_face().vertices), "frames": frames}
+        counts = {"subjects": len(SPEAKERS) + drawn, "vertices": len(build_face().vertices), "frames": frames}
         files = describe_files(folder)
-        write_json(folder / MANIFEST, {**_facts(seed, len(chosen)), **counts, "files": files})
+        write_json(folder / MANIFEST, {**_facts(seed, len(chosen), drawn), **counts, "files": files})
 
 
-def is_complete(root: Path, *, seed: int = 0) -> bool:
+def is_complete(root: Path, *, seed: int = 0, drawn: int = 0) -> bool:
     """Whether a folder holds the whole corpus of this version and seed; compares sizes, not contents.
 
     Args:
         root: The folder.
         seed: The seed that it must have been made with.
+        drawn: How many drawn speakers it must have.
     """
     manifest = read_json(Path(root) / MANIFEST) or {}
-    facts, files = _facts(seed, len(clips())), manifest.get("files")
+    facts, files = _facts(seed, len(clips(drawn)), drawn), manifest.get("files")
     same = all(manifest.get(key) == value for key, value in facts.items())
     return same and isinstance(files, dict) and same_sizes(Path(root), files)
 
 
 def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, tuple[Phoneme, ...]]:
     """One clip's waveform (640 T,) at 16 kHz, rig weights (T, controls), and phonemes in time."""
-    speaker = SPEAKERS[clip.identity]
+    speaker = speaker_of(clip.identity)
     spoken = speak(SENTENCES[clip.number - 1], speaker.voice)
     before = round(_QUIET_BEFORE * SAMPLE_RATE)
     length = before + spoken.samples.size + round(_QUIET_AFTER * SAMPLE_RATE)
@@ -141,7 +148,8 @@ def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, 
     samples = samples[: frames * _SAMPLES_PER_FRAME]
     end = frames / FRAME_RATE
     phonemes = _in_quiet(spoken.phonemes, before / SAMPLE_RATE, end)
-    random = np.random.default_rng([seed, list(SPEAKERS).index(clip.identity), clip.number])
+    everybody = (*SPEAKERS, *drawn_names(MOST_DRAWN))
+    random = np.random.default_rng([seed, everybody.index(clip.identity), clip.number])
     weights = generate_weights(
         segments_of(phonemes), analyse(samples, SAMPLE_RATE), frames, speaker.style, clip.mood, random
     )
@@ -162,7 +170,7 @@ def _in_quiet(phonemes: tuple[Phoneme, ...], before: float, end: float) -> tuple
 @lru_cache(maxsize=8)
 def rig_of(identity: str) -> Rig:
     """Rig of a speaker, by name."""
-    speaker = SPEAKERS[identity]
+    speaker = speaker_of(identity)
     return build_rig(speaker.shape, speaker.style.asymmetry)
 
 
@@ -178,12 +186,13 @@ def regions() -> dict[str, NDArray[np.int64]]:
     return {"lve": mesh.both("mouth_0", "lip_crest", "lip_front", "lip_inner"), "fdd": np.union1d(upper, eyes)}
 
 
-def _facts(seed: int, count: int) -> dict[str, int | str]:
-    return {"corpus": _CORPUS, "format": FORMAT, "generator": GENERATOR, "seed": seed, "clips": count}
+def _facts(seed: int, count: int, drawn: int) -> dict[str, int | str]:
+    facts: dict[str, int | str] = {"corpus": _CORPUS, "format": FORMAT, "generator": GENERATOR, "seed": seed}
+    return {**facts, "clips": count, **({"drawn": drawn} if drawn else {})}
 
 
-def _chosen(only: Sequence[str] | None) -> tuple[Clip, ...]:
-    everything = clips()
+def _chosen(only: Sequence[str] | None, drawn: int) -> tuple[Clip, ...]:
+    everything = clips(drawn)
     if only is None:
         return everything
     known = {clip.name: clip for clip in everything}
@@ -206,7 +215,8 @@ def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
     for name in ("wav", "vertices_npy", "phonemes", "regions"):
         (folder / name).mkdir()
     mesh = build_face()
-    templates = {identity: np.array(rig_of(identity).neutral) for identity in (*SEEN_IDENTITIES, *UNSEEN_IDENTITIES)}
+    everybody = dict.fromkeys((*SEEN_IDENTITIES, *UNSEEN_IDENTITIES, *(clip.identity for clip in chosen)))
+    templates = {identity: np.array(rig_of(identity).neutral) for identity in everybody}
     with (folder / "templates.pkl").open("wb") as stream:
         pickle.dump(templates, stream, protocol=2)
     mean = np.mean([templates[identity] for identity in SEEN_IDENTITIES], axis=0)
@@ -218,7 +228,7 @@ def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
         (folder / "regions" / file).write_text("".join(f"{upper}, {lower}\n" for upper, lower in pairs))
     table = [["clip", "subject", "sentence", "mood", "voice", "text"]]
     for clip in chosen:
-        voice, text = SPEAKERS[clip.identity].voice.name, SENTENCES[clip.number - 1]
+        voice, text = speaker_of(clip.identity).voice.name, SENTENCES[clip.number - 1]
         table.append([clip.name, clip.identity, clip.sentence, clip.mood, voice, text])
     write_table(folder / "clips.csv", table)
 
