@@ -46,9 +46,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tools.mutants import Mutant, sample  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
-MODELS = ["dual_path", "samplers", "losses", "losses_fused", "motion_space", "principal", "folding", "layers"]
-MODELS += ["decoders", "fusions", "speaker_encoders", "mesh_encoders", "audio_encoders", "inference"]
-MODELS += ["style_content/losses", "style_content/model", "style_content/network"]
+MODELS = ["dual_path/model", "dual_path/network", "samplers", "losses", "losses_fused", "motion_space", "principal"]
+MODELS += ["folding", "layers", "decoders", "fusions", "speaker_encoders", "mesh_encoders", "audio_encoders"]
+MODELS += ["inference", "style_content/losses", "style_content/model", "style_content/network"]
 SOURCES = [f"facediff/models/{name}.py" for name in MODELS] + ["facediff/metrics/*.py"]
 TESTS = ["tests/models", "tests/metrics", "facediff/models", "facediff/metrics"]
 # They start processes or try thousands of arguments, and compute little.

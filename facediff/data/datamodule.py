@@ -71,7 +71,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         region_help: where to get such files.
         reference_attributes: what a style reference shares with its target where possible.
         score_attributes: columns of the table of test scores of single clips; ``reference_attributes`` unless stated.
-        compared_speakers: speakers among whom the yardsticks look for the nearest one, and for another's references; all
+        compared_speakers: among whom the yardsticks look for the nearest speaker and for another's references; all
             with a template if None.
         licence: the terms under which the corpus is distributed.
         obtain: how to obtain the corpus.
@@ -441,10 +441,14 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         if weights is not None:
             frames *= weights
         # The eigenvectors of the frames' products with one another give the same components as those of the
-        # covariance, a matrix of (3V, 3V) that would not fit into memory.
-        values, vectors = torch.linalg.eigh(frames @ frames.T)
+        # covariance, which for a large mesh would not fit into memory. The smaller of the two is decomposed.
+        few = len(frames) <= frames.shape[1]
+        values, vectors = torch.linalg.eigh(frames @ frames.T if few else frames.T @ frames)
         kept = [i for i in reversed(range(len(values))) if values[i] > 1e-10 * values[-1]][:count]
-        shapes = vectors[:, kept].T @ frames / len(frames) ** 0.5
+        if few:
+            shapes = vectors[:, kept].T @ frames / len(frames) ** 0.5
+        else:
+            shapes = vectors[:, kept].T * (values[kept, None] / len(frames)).sqrt()
         return mean.float(), shapes.float()
 
     def _spread_frames(self, clips: list[Clip], count: int) -> Iterator[Tensor]:

@@ -198,6 +198,27 @@ def trained(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) 
     return model.eval()
 
 
+@pytest.mark.parametrize("frames", [2, 16])
+def test_principal_motion_is_that_of_the_spread_frames(
+    frames: int, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facediff.data.datamodule.FRAMES", frames)
+    tiny.setup("fit")
+    stack = []
+    for clip in tiny.clips("train"):
+        motion = tiny.corpus.read_motion(clip).double().flatten(1)
+        stack.append(motion[np.linspace(0, len(motion) - 1, min(frames, len(motion))).astype(int)])
+    matrix = torch.cat(stack).numpy()
+    assert (len(matrix) > matrix.shape[1]) == (frames == 16)  # either way of computing them
+    weights = torch.linspace(0.5, 2, matrix.shape[1])
+    mean, shapes = tiny.principal_motion(5, weights)
+    np.testing.assert_allclose(mean, matrix.mean(0), rtol=1e-5, atol=1e-9)
+    _, sizes, directions = np.linalg.svd((matrix - matrix.mean(0)) * weights.numpy(), full_matrices=False)
+    expected = directions[:5] * sizes[:5, None] / len(matrix) ** 0.5
+    signs = np.sign((expected * shapes.numpy()).sum(1, keepdims=True))
+    np.testing.assert_allclose(shapes.numpy(), signs * expected, rtol=1e-3, atol=1e-4 * float(np.abs(expected).max()))
+
+
 def test_training_measures_components_and_noise_scale(trained: DualPathDiffusion, tiny: Tiny) -> None:
     space = trained.motion_space
     assert isinstance(space, ComponentMotion)

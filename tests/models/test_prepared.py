@@ -14,7 +14,7 @@ from facediff import registry
 from facediff.data import collate
 from facediff.models import DualPathDiffusion
 from facediff.models.decoders import Decoder
-from facediff.models.dual_path import Conditions
+from facediff.models.dual_path.network import Conditions
 from facediff.models.folding import Space
 from tests.fakes.tiny import Tiny
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Batch, collate
 from facediff.models import DualPathDiffusion
-from facediff.models.dual_path import StyleTokens
+from facediff.models.dual_path.network import StyleTokens
 from facediff.models.motion_space import ComponentMotion
 from tests.fakes.tiny import VERTICES, Tiny
 

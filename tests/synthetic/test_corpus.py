@@ -6,6 +6,7 @@ import json
 import pickle
 import subprocess
 import sys
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,12 @@ import pytest
 import soundfile
 
 from facediff import synthetic as puppet
+from facediff.data import Puppet
 from facediff.errors import FaceDiffError
 from facediff.synthetic import corpus as corpus_module
 from facediff.synthetic.corpus import clips, generate, is_complete
+from facediff.synthetic.motion import SpeakingStyle
+from facediff.synthetic.speakers import SPEAKERS, drawn_speaker
 
 pytest.importorskip("espeakng_loader")
 
@@ -42,6 +46,64 @@ def test_splits_are_disjoint_and_moods_balanced() -> None:
         references = [c for c in plan if c.identity == identity and c.number in puppet.REFERENCE_SENTENCES]
         assert {c.mood for c in references} == set(puppet.MOODS)
         assert {c.number for c in plan if c.identity == identity} == {*range(1, 25), *range(28, 33)}
+
+
+def test_drawn_speakers_say_the_training_sentences_only() -> None:
+    plan = clips(2)
+    assert plan[: len(clips())] == clips()
+    further = plan[len(clips()) :]
+    assert {clip.identity for clip in further} == {"X01", "X02"}
+    assert [clip.number for clip in further] == 2 * list(puppet.TRAIN_SENTENCES)
+    for identity in ("X01", "X02"):
+        moods = [clip.mood for clip in further if clip.identity == identity]
+        assert {moods.count(mood) for mood in puppet.MOODS} == {8}
+
+
+def test_drawn_speakers_leave_the_eight_as_they_are(corpus: Path, tmp_path: Path) -> None:
+    generate(tmp_path / "more", only=["F1_e01", "X02_e01"], progress=False, drawn=2)
+    there = digests(tmp_path / "more")
+    assert there["vertices_npy/F1_e01.npy"] == digests(corpus)["vertices_npy/F1_e01.npy"]
+    rows = list(csv.DictReader((tmp_path / "more" / "clips.csv").read_text(encoding="utf-8").splitlines()))
+    assert [row["subject"] for row in rows] == ["F1", "X02"]
+    templates = pickle.loads((tmp_path / "more" / "templates.pkl").read_bytes())  # noqa: S301 - written by ourselves
+    assert list(templates) == [*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES, "X02"]
+    assert (tmp_path / "more" / "PUPPET.ply").read_bytes() == (corpus / "PUPPET.ply").read_bytes()
+    motion = np.load(tmp_path / "more" / "vertices_npy" / "X02_e01.npy").reshape(-1, puppet.N_VERTICES, 3)
+    assert 0.001 < np.abs(motion - templates["X02"]).max() < 0.04
+
+
+def test_drawn_speakers_know_nothing_of_those_who_are_only_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = [drawn_speaker.__wrapped__(number) for number in range(1, 40)]
+    for field in fields(SpeakingStyle):
+        values = [getattr(SPEAKERS[name].style, field.name) for name in puppet.SEEN_IDENTITIES]
+        wider = 0.1 * (max(values) - min(values)) + 1e-9
+        assert all(min(values) - wider <= getattr(s.style, field.name) <= max(values) + wider for s in drawn)
+        spread = np.ptp([getattr(speaker.style, field.name) for speaker in drawn])
+        assert spread > 0.7 * (max(values) - min(values))
+    for name in puppet.UNSEEN_IDENTITIES:
+        monkeypatch.setitem(SPEAKERS, name, replace(SPEAKERS[name], style=SpeakingStyle(jaw=9.0, blinks=9.0)))
+    assert drawn_speaker.__wrapped__(1) == drawn[0]
+    assert len({speaker.voice for speaker in drawn}) > 30
+
+
+def test_corpus_with_drawn_speakers_is_another_corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(corpus_module, "clips", lambda drawn=0: clips(drawn)[:1] + clips(drawn)[-drawn:][:drawn])
+    root = tmp_path / "corpus"
+    generate(root, progress=False, drawn=1)
+    assert is_complete(root, drawn=1)
+    assert not is_complete(root)
+    assert not is_complete(root, drawn=2)
+
+
+def test_data_module_trains_on_drawn_speakers_and_compares_the_eight(tmp_path: Path) -> None:
+    root = tmp_path / "corpus"
+    generate(root, only=["F1_e01", "F1_e04", "F4_e01", "X01_e01", "X01_e04"], progress=False, drawn=2)
+    data = Puppet(root=str(root), drawn_speakers=2)
+    data.setup("fit")
+    assert data.identities == ["X01", "X02", *puppet.SEEN_IDENTITIES]
+    assert len(data.train_dataloader().dataset) == 4  # all but the unseen speaker's clip
+    assert data.compared_speakers == (*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES)
+    assert Puppet(drawn_speakers=2).root != Puppet().root
 
 
 def test_layout(corpus: Path) -> None:
@@ -112,7 +174,7 @@ def test_only_a_whole_corpus_is_complete(tmp_path: Path, monkeypatch: pytest.Mon
     assert not is_complete(root)
     generate(root, only=["F1_e01"], progress=False)
     assert not is_complete(root)
-    monkeypatch.setattr(corpus_module, "clips", lambda: clips()[:2])
+    monkeypatch.setattr(corpus_module, "clips", lambda drawn=0: clips(drawn)[:2])
     generate(root, progress=False)
     assert is_complete(root)
     assert not is_complete(root, seed=1)

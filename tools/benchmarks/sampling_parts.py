@@ -17,7 +17,7 @@ from facediff.data.audio import samples_for
 from facediff.models import DualPathDiffusion
 from facediff.models.audio_encoders import HubertEncoder
 from facediff.models.decoders import StyleTransformer
-from facediff.models.dual_path import Conditions
+from facediff.models.dual_path.network import Conditions
 from facediff.models.folding import SamplingSpace, Space, fold
 from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.inference import ClipNoise

@@ -1,0 +1,5 @@
+"""Dual-path style diffusion."""
+
+from facediff.models.dual_path.model import DualPathDiffusion
+
+__all__ = ["DualPathDiffusion"]

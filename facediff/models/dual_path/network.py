@@ -1,0 +1,315 @@
+"""The network of dual-path style diffusion: conditions, the denoising network and its own layers.
+
+The components that are chosen by name have files of their own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff.data import Batch
+from facediff.models.audio_encoders import AudioEncoder
+from facediff.models.decoders import Decoder
+from facediff.models.folding import (
+    Blend,
+    Fold,
+    FoldedSpace,
+    PreconditionedSpace,
+    Space,
+    VertexSpace,
+    WeightCache,
+    fold,
+    unchanged,
+)
+from facediff.models.fusions import Fusion
+from facediff.models.layers import frame_mask
+from facediff.models.mesh_encoders import MeshEncoder
+from facediff.models.motion_space import Preconditioning
+from facediff.models.speaker_encoders import (
+    IdentityEncoder,
+    StyleEncoder,
+)
+
+TokenForm = Literal["levels", "single"]
+
+
+class Hidden(NamedTuple):
+    """Which clips lack which condition, by True; None if no clip does."""
+
+    speech: Bool[Tensor, " batch"] | None = None
+    identity: Bool[Tensor, " batch"] | None = None
+    style: Bool[Tensor, " batch"] | None = None
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What does not change over the denoising steps of a clip.
+
+    Attributes:
+        audio: speech features F_a.
+        style: style tokens, the condition F_s.
+        mask: True on valid frames.
+        fusion: what the fusion prepared for inference.
+        decoder: what the decoder prepared for inference.
+        step_table: the embedding of each step; None if steps are embedded as they come.
+        shares: under guidance the rows are all clips, then all clips with some conditions hidden, and so on; this is
+            what the prediction of each of these parts contributes.
+        dynamic: F_dyn of the clips, as it was encoded; None where conditions were changed.
+    """
+
+    audio: Float[Tensor, "batch frames dim"]
+    style: Float[Tensor, "batch tokens dim"]
+    mask: Bool[Tensor, "batch frames"]
+    fusion: object = None
+    decoder: object = None
+    step_table: Float[Tensor, "steps dim"] | None = None
+    shares: tuple[float, ...] = (1.0,)
+    dynamic: Float[Tensor, "batch dynamic_dim"] | None = None
+
+    def frames(self, start: int, end: int) -> Conditions:
+        """The conditions of some of the frames, with nothing prepared."""
+        return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end], shares=self.shares)
+
+    def drawn(self, times: int) -> Conditions:
+        """The conditions of several noisy versions of every clip, those of a clip one after the other."""
+        audio, style, mask = (value.repeat_interleave(times, 0) for value in (self.audio, self.style, self.mask))
+        return Conditions(audio, style, mask, shares=self.shares)
+
+    def repeated(self, times: int) -> Conditions:
+        """One clip's conditions for several samples of it, with nothing prepared; nothing is copied without need."""
+        if times == 1:
+            return self
+        if len(self.shares) > 1:
+            return self.drawn(times)
+        audio, style = (value.expand(times, -1, -1) for value in (self.audio, self.style))
+        return Conditions(audio, style, self.mask.expand(times, -1))
+
+
+class DualPathNetwork(nn.Module):
+    """Predicts clean motion from noisy motion under speech, identity and style.
+
+    In the denoising loop motion appears in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V), or fewer
+    coordinates than 3V in another motion space. Outside it
+    ``mesh_encoder`` stands in front of the style encoder (X = Linear(M_ref) in the paper).
+
+    Args:
+        coordinates: numbers in a frame of noisy motion.
+        dim: channels C.
+        audio_encoder: speech to F_a.
+        identity_encoder: identity to F_id.
+        mesh_encoder: reference motion to one feature per frame; None without a dynamic style.
+        style_encoder: these features to F_dyn.
+        fusion: F_a and F_m to F_am.
+        decoder: F_fused and style tokens to F_dec.
+        token_form: how F_s is presented to the decoder.
+        speech_may_hide: learn what stands for speech that is not given.
+        style_may_hide: the same for the dynamic style.
+    """
+
+    def __init__(
+        self,
+        *,
+        coordinates: int,
+        dim: int,
+        audio_encoder: AudioEncoder,
+        identity_encoder: IdentityEncoder,
+        mesh_encoder: MeshEncoder | None,
+        style_encoder: StyleEncoder,
+        fusion: Fusion,
+        decoder: Decoder,
+        token_form: TokenForm,
+        speech_may_hide: bool = False,
+        style_may_hide: bool = False,
+    ) -> None:
+        super().__init__()
+        self.coordinates = coordinates
+        self.audio_encoder = audio_encoder
+        self.identity_encoder = identity_encoder
+        self.style_encoder = style_encoder
+        self.style_tokens = StyleTokens(identity_encoder.token_dims + style_encoder.token_dims, dim, token_form)
+        self.embed = nn.Linear(coordinates, dim)
+        self.mesh_encoder = mesh_encoder
+        self.step_embedding = StepEmbedding(dim)
+        self.fusion = fusion
+        self.fused_norm = nn.LayerNorm(dim)
+        self.decoder = decoder
+        self.unembed = nn.Linear(dim, coordinates)
+        # Only where they are trained, so that other checkpoints have no weights for them.
+        self.no_speech = nn.Parameter(torch.zeros(dim)) if speech_may_hide else None
+        self.no_style = nn.Parameter(torch.zeros(sum(style_encoder.token_dims))) if style_may_hide else None
+        self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
+
+    def conditions(
+        self,
+        batch: Batch,
+        identity: Int[Tensor, " batch"],
+        dynamic_style: Float[Tensor, "batch dynamic_dim"],
+        hidden: Hidden = Hidden(),  # noqa: B008 - it cannot be changed
+    ) -> Conditions:
+        """Everything that is computed once per clip.
+
+        Args:
+            batch: its speech, or cached features of it, and its lengths.
+            identity: identity indices, −1 for unknown.
+            dynamic_style: F_dyn, as :meth:`dynamic_style` gives it.
+            hidden: conditions that are not given; for a multiple of the clips, which are then repeated as a whole.
+        """
+        cached = batch.cached_features or ()
+        audio = self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached)
+        mask, encoded = frame_mask(batch.frame_lengths, audio.shape[1]), dynamic_style
+        times = max((len(each) for each in hidden if each is not None), default=len(batch)) // len(batch)
+        if times > 1:
+            audio, mask = audio.repeat(times, 1, 1), mask.repeat(times, 1)
+            identity, dynamic_style = identity.repeat(times), dynamic_style.repeat(times, 1)
+        if hidden.identity is not None:
+            identity = identity.masked_fill(hidden.identity, -1)  # an unseen speaker
+        # Chosen among given and learnt features, and not only where one is hidden: under several processes every weight
+        # needs a gradient in every step.
+        if hidden.speech is not None and self.no_speech is not None:
+            audio = torch.where(hidden.speech[:, None, None], self.no_speech.to(audio), audio)
+        if hidden.style is not None and self.no_style is not None:
+            dynamic_style = torch.where(hidden.style[:, None], self.no_style.to(dynamic_style), dynamic_style)
+        style = torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1)  # eq. 14
+        return Conditions(audio, self.style_tokens(style), mask, dynamic=encoded)
+
+    def dynamic_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch dynamic_dim"]:
+        """F_dyn of scaled reference motion (eq. 2 to 9); of width 0 without a dynamic style."""
+        if self.mesh_encoder is None:
+            return reference.new_zeros((len(reference), 0))
+        return self.style_encoder(self.mesh_encoder(reference), mask)
+
+    def forward(
+        self,
+        noisy: Float[Tensor, "batch frames coordinates"],
+        step: Int[Tensor, " batch"],
+        conditions: Conditions,
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Predict the clean scaled motion M̂⁰ from Mⁿ."""
+        return self.clean_motion(self.core(self.embed(noisy), step, conditions))
+
+    def core(
+        self, motion: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions
+    ) -> Float[Tensor, "batch frames dim"]:
+        """F_m to F_dec: everything between the two vertex-space maps.
+
+        Args:
+            motion: F_m.
+            step: step numbers counted from 0.
+            conditions: as they are, or prepared for inference.
+        """
+        # A component that prepares nothing need not know that others do.
+        fusion, decoder = ([] if made is None else [made] for made in (conditions.fusion, conditions.decoder))
+        fused = self.fusion(conditions.audio, motion, conditions.mask, *fusion)  # eq. 12
+        table = conditions.step_table
+        embedded = self.step_embedding(step) if table is None else table[step]
+        fused = self.fused_norm(fused + embedded[:, None])  # eq. 13
+        return self.decoder(fused, conditions.style, conditions.mask, *decoder)
+
+    def clean_motion(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames coordinates"]:
+        """The last map, from F_dec to clean scaled motion."""
+        # In mixed precision this map stays in the weights' own type: differences over time of half-precision motion
+        # are noise.
+        with torch.autocast(features.device.type, enabled=False):
+            return self.unembed(features.to(next(self.unembed.parameters()).dtype))
+
+    def prepare_for_inference(
+        self,
+        conditions: Conditions,
+        steps: int,
+        *,
+        folded: bool,
+        blend: Blend = unchanged,
+        preconditioning: Preconditioning | None = None,
+    ) -> Space:
+        """Everything that is constant over the denoising steps of a clip or window, as the space a sampler runs in.
+
+        It holds for the weights and the precision in which it was made, so it is made again for every run; what follows
+        from the weights alone is kept until they change.
+
+        Args:
+            conditions: as :meth:`conditions` gives them, or those of some frames.
+            steps: the process's steps N.
+            folded: run in the width of the model where both ends are linear, else on the vertices.
+            blend: changes the features that the network gives in every step.
+            preconditioning: the scales around the network in a space of its own; None on vertices.
+        """
+        first, last = self.embed, self.unembed
+        folded = folded and preconditioning is None and isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
+        ends = [weight for weight in (first.weight, last.weight, last.bias) if weight is not None] if folded else []
+
+        def of_weights() -> tuple[Tensor, Fold | None]:
+            table = self.step_embedding(torch.arange(steps, device=conditions.audio.device))
+            return table, fold(first.weight, last.weight, last.bias) if folded else None
+
+        # The table and the fold depend on weights only. They are kept between runs, and made again as soon as any of
+        # these weights has changed, as it has after training or moving to another device.
+        weights = [self.step_embedding.frequencies, *self.step_embedding.parameters(), *ends]
+        table, product = self._of_weights.get(weights, (steps, folded), of_weights)
+        audio, style, mask = conditions.audio, conditions.style, conditions.mask
+        fusion, decoder = self.fusion.prepare(audio, mask), self.decoder.prepare(style, mask)
+        ready = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
+        if preconditioning is not None:
+            return PreconditionedSpace(self, ready, preconditioning, blend, ready.shares)
+        if product is None:
+            return VertexSpace(self, ready, blend, ready.shares)
+        return FoldedSpace(self, ready, product, blend, ready.shares)
+
+
+class StyleTokens(nn.Module):
+    """F_s = Concat(F_id, F_dyn) (eq. 14), presented to the decoder as tokens.
+
+    Attention over a single key is constant, so by default each part of F_s (coarse, mid, fine, dynamic) becomes a
+    token with a projection of its own.
+
+    Args:
+        token_dims: widths of the parts; may be empty, then one learnt token stands for "no condition".
+        dim: channels of a token.
+        form: a token per part (``levels``) or one token for all (``single``).
+    """
+
+    def __init__(self, token_dims: tuple[int, ...], dim: int, form: TokenForm) -> None:
+        super().__init__()
+        # The paper's form, whose attention has nothing to choose between; kept for comparison.
+        if form == "single" and token_dims:
+            token_dims = (sum(token_dims),)
+        self.token_dims = token_dims
+        self.projections = nn.ModuleList(nn.Linear(width, dim) for width in token_dims)
+        self.null = None if token_dims else nn.Parameter(torch.zeros(1, 1, dim))
+
+    def forward(self, style: Float[Tensor, "batch style_dim"]) -> Float[Tensor, "batch tokens dim"]:
+        """Split F_s and project each part."""
+        if self.null is not None:
+            return self.null.expand(len(style), -1, -1)
+        parts = torch.split(style, list(self.token_dims), dim=-1)
+        return torch.stack([p(part) for p, part in zip(self.projections, parts, strict=True)], dim=1)
+
+
+class StepEmbedding(nn.Module):
+    """t_emb: sinusoids of the diffusion step, then an MLP.
+
+    Args:
+        dim: channels C.
+    """
+
+    frequencies: Tensor
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        half = dim // 2
+        frequencies = torch.exp(-math.log(10_000.0) * torch.arange(half) / half)
+        self.register_buffer("frequencies", frequencies, persistent=False)
+        self.mlp = nn.Sequential(nn.Linear(2 * half, dim), nn.SiLU(), nn.Linear(dim, dim))
+
+    def forward(self, step: Int[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
+        """Embed step numbers counted from 0."""
+        # Wavelengths from 2π to 2π · 10 000 steps, so that near and far steps differ in some channel.
+        angle = step[:, None].float() * self.frequencies
+        return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))
