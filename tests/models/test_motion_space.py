@@ -198,7 +198,7 @@ def trained(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) 
     return model.eval()
 
 
-@pytest.mark.parametrize("frames", [2, 16])
+@pytest.mark.parametrize("frames", [4, 16])
 def test_principal_motion_is_that_of_the_spread_frames(
     frames: int, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -214,7 +214,9 @@ def test_principal_motion_is_that_of_the_spread_frames(
     mean, shapes = tiny.principal_motion(5, weights)
     np.testing.assert_allclose(mean, matrix.mean(0), rtol=1e-5, atol=1e-9)
     _, sizes, directions = np.linalg.svd((matrix - matrix.mean(0)) * weights.numpy(), full_matrices=False)
-    expected = directions[:5] * sizes[:5, None] / len(matrix) ** 0.5
+    kept = min(5, int((sizes**2 > 1e-10 * sizes[0] ** 2).sum()))
+    assert len(shapes) == kept
+    expected = directions[:kept] * sizes[:kept, None] / len(matrix) ** 0.5
     signs = np.sign((expected * shapes.numpy()).sum(1, keepdims=True))
     np.testing.assert_allclose(shapes.numpy(), signs * expected, rtol=1e-3, atol=1e-4 * float(np.abs(expected).max()))
 
