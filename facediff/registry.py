@@ -183,7 +183,11 @@ class Kind:
         return iter(self.entries())
 
 
-audio_encoder = Kind("audio_encoder", "facediff.models.audio_encoders", "speech to one feature per frame")
+audio_encoder = Kind(
+    "audio_encoder",
+    "facediff.models.audio_encoders facediff.models.speech_networks",
+    "speech to one feature per frame",
+)
 identity_encoder = Kind("identity_encoder", "facediff.models.speaker_encoders", "a speaker's label to a vector")
 motion_space = Kind("motion_space", "facediff.models.motion_space", "the numbers of a frame that are noised")
 mesh_encoder = Kind("mesh_encoder", "facediff.models.mesh_encoders", "a mesh's motion to one feature per frame")
@@ -193,7 +197,7 @@ decoder = Kind("decoder", "facediff.models.decoders", "fused features and style 
 sampler = Kind("sampler", "facediff.models.samplers", "runs the reverse diffusion process")
 model = Kind(
     "model",
-    "facediff.models.dual_path facediff.models.style_content",
+    "facediff.models.dual_path facediff.models.style_content facediff.models.published.faceformer",
     "a method, as a LightningModule",
     aliases=False,  # Lightning refuses to reload a module that is named by a nested alias
 )

@@ -63,6 +63,7 @@ def animate(
     checkpoint: Checkpoint,
     output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file or folder", dash=True)],
     identity: Identity = None,
+    condition: Identity = None,
     style: Annotated[str | None, Option(metavar="STYLE", reads=True)] = None,
     style_template: Annotated[str | None, Option(metavar="FACE", reads=True)] = None,
     samples: Annotated[ranges.Samples, Option(metavar="N")] = 1,
@@ -95,6 +96,7 @@ def animate(
         checkpoint: trained model (.ckpt)
         output: file to write; its suffix chooses the format (see `facediff export --help`); a folder for a batch
         identity: whose face and identity; by default the first one trained on
+        condition: the training identity that the model is conditioned on, where it is not that of the face
         style: the speaking style: a motion (.npy of absolute vertices, .npz animation), a vector of `facediff style
             extract`, a clip's name (F1_e03), or a mixture of them (a.npy:0.3,b.npy:0.7); by default the identity's
             stored reference
@@ -149,6 +151,7 @@ def animate(
     options = AnimationOptions(
         checkpoint=checkpoint,
         identity=identity,
+        condition=condition,
         style=style,
         style_template=style_template,
         samples=samples,

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from facediff.models.checkpoint import load_model as load_model
     from facediff.models.dual_path import DualPathDiffusion as DualPathDiffusion
     from facediff.models.inference import Style as Style
+    from facediff.models.published.faceformer import FaceFormer as FaceFormer
     from facediff.models.style_content import StyleContentDisentanglement as StyleContentDisentanglement
 
 __getattr__, __dir__, __all__ = lazy_names(
@@ -18,6 +19,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "checkpoint": "load_model",
         "dual_path": "DualPathDiffusion",
         "inference": "Style",
+        "published.faceformer": "FaceFormer",
         "style_content": "StyleContentDisentanglement",
     },
 )

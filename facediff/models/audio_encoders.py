@@ -7,10 +7,10 @@ import json
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -34,6 +34,13 @@ Features = Float[Tensor, "batch steps channels"]
 
 Lengths = Int[Tensor, " batch"]
 """Valid samples, steps or frames of each clip."""
+
+StepRule = Literal["features", "features_cut", "hidden", "hidden_cut"]
+"""Where the published methods leave a pretrained network's 50 steps a second: its ``features``, what the convolutions
+give, or its last ``hidden`` states are interpolated to the steps wanted, or (``…_cut``) cut after them."""
+
+CONVOLUTIONS = ((10, 5), (3, 2), (3, 2), (3, 2), (3, 2), (2, 2), (2, 2))
+"""Kernels and strides of the convolutions of wav2vec 2.0 and HuBERT."""
 
 
 class AudioEncoder(nn.Module, ABC):
@@ -60,10 +67,10 @@ class AudioEncoder(nn.Module, ABC):
         finally:
             self._level = before
 
-    def standardise(self, audio: Waves, lengths: Lengths) -> Waves:
+    def standardise(self, audio: Waves, lengths: Lengths, epsilon: float = 1e-7) -> Waves:
         """Speech of zero mean and unit variance, as :func:`standardise` makes it or by the level that is set."""
         if self._level is None:
-            return standardise(audio, lengths)
+            return standardise(audio, lengths, epsilon)
         mean, deviation = self._level
         return (audio - mean) / deviation * frame_mask(lengths, audio.shape[1])
 
@@ -78,6 +85,33 @@ class AudioEncoder(nn.Module, ABC):
             NotImplementedError: if the encoder has no frozen part.
         """
         raise NotImplementedError(f"{type(self).__name__} has no frozen part")
+
+    def steps_of(self, samples: int) -> int:
+        """Steps that the convolutions of a pretrained network make of so many samples, 50 a second but for the ends.
+
+        The published methods count their frames by them, whatever encoder takes the network's place.
+        """
+        return convolved(samples, CONVOLUTIONS)
+
+    def at_steps(
+        self, audio: Waves, audio_lengths: Lengths, steps: Lengths, rule: StepRule, *cached: Tensor
+    ) -> Float[Tensor, "batch most_steps width"]:
+        """Encode as the published methods do: a number of steps for each clip, which need not be its frames.
+
+        Here for encoders that follow no such rule: as many frames, spread over the clip evenly.
+
+        Args:
+            audio: as :meth:`forward` takes it.
+            audio_lengths: likewise.
+            steps: how many are wanted of each clip.
+            rule: where they come from.
+            cached: features of the frozen part with their lengths, if they are at hand.
+
+        Returns:
+            features, ``most_steps = steps.max()``; zero beyond a clip's own steps.
+        """
+        encoded: Tensor = self(audio, audio_lengths, steps, *cached)
+        return encoded
 
     @abstractmethod
     def forward(self, audio: Waves, audio_lengths: Lengths, frame_lengths: Lengths) -> Frames:
@@ -101,14 +135,25 @@ class AudioEncoderFactory(Protocol):
         ...
 
 
-def standardise(audio: Waves, lengths: Lengths) -> Waves:
+def convolved(samples: int, layers: Iterable[tuple[int, int]]) -> int:
+    """Steps that convolutions without padding, each of a kernel and a stride, make of so many samples; at least 0.
+
+    >>> convolved(16_000, CONVOLUTIONS)
+    49
+    """
+    for kernel, stride in layers:
+        samples = max(0, (samples - kernel) // stride + 1)
+    return samples
+
+
+def standardise(audio: Waves, lengths: Lengths, epsilon: float = 1e-7) -> Waves:
     """Zero mean and unit variance over each clip's valid samples, zero on padding, as HuBERT's processor does."""
     mask = frame_mask(lengths, audio.shape[1])
     count = lengths[:, None].to(audio.dtype)
     # Over the valid samples alone: zeros of padding would make a short clip louder in a batch than by itself.
     mean = (audio * mask).sum(1, keepdim=True) / count
     variance = ((audio - mean).square() * mask).sum(1, keepdim=True) / count
-    return (audio - mean) / (variance + 1e-7).sqrt() * mask
+    return (audio - mean) / (variance + epsilon).sqrt() * mask
 
 
 @audio_encoder.register("mel")

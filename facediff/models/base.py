@@ -217,6 +217,10 @@ class AnimationModel(LightningModule, Inference, ABC):
         """
         return self.person_styles.get(identity) or super().default_style(identity)
 
+    def styled_identities(self) -> list[str]:
+        """The identities that have a style of their own to be conditioned on."""
+        return [*{**self.assets.references, **self.person_styles}]
+
     def with_person_styles(self, batch: Batch) -> Batch:
         """The batch with the style of all motion of each clip's speaker, where the model uses it and knows it."""
         known = [self.person_styles.get(name) for name in batch.identity_names]
@@ -366,7 +370,7 @@ class AnimationModel(LightningModule, Inference, ABC):
         """Score generated motion, faces that do not move, and the model's motion for another sentence's speech."""
         split = self.evaluation.splits[dataloader_idx]
         batch = self.with_person_styles(batch)
-        styles: dict[str, Reference | Style] = {**self.assets.references, **self.person_styles}
+        styles = {name: self.default_style(name) for name in self.styled_identities()}
         for name, view in conditioned(batch, self.unseen_identity, self.identities, styles):
             self.evaluation.score(self, split, view, name)
             if view.decoy_audio is not None:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, collate
 from facediff.data.audio import samples_for
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.utils import SAMPLE_RATE
 
@@ -77,6 +77,8 @@ class Inference(ABC):
 
     Class attributes:
         samples: whether motion depends on random noise, by a sampler that :meth:`choose_sampler` changes.
+        hears_all: whether the model counts its frames by itself (:meth:`frames_of`) and hears all samples of a
+            recording; else speech is cut or filled up to whole frames.
 
     Attributes:
         frame_rate: motion frames a second.
@@ -85,6 +87,7 @@ class Inference(ABC):
     """
 
     samples: ClassVar[bool] = False
+    hears_all: ClassVar[bool] = False
     frame_rate: float
     windows: WindowPlan
     expressivity: Expressivity = 1.0
@@ -94,6 +97,7 @@ class Inference(ABC):
         audio: Float[Tensor, " samples"],
         *,
         identity: str,
+        condition: str | None = None,
         style: Reference | Style | None = None,
         seed: int = 0,
         expressivity: Expressivity | None = None,
@@ -104,14 +108,15 @@ class Inference(ABC):
         Args:
             audio: speech at 16 kHz.
             identity: whose face and identity; any speaker of the training corpus, also one not trained on.
+            condition: the training identity that the model is conditioned on, where it is not that of the face.
             style: reference motion, or a style vector made by this model; the speaker's default one if None.
             seed: seed of the noise; equal seeds give equal motion on one machine.
             expressivity: as :meth:`choose_expressivity` takes it, for this call alone; the model's own if None.
             progress: wraps the iteration over sampling steps, or over the seconds of long speech.
 
         Raises:
-            FaceDiffError: if the identity is unknown, the reference does not fit the topology, the speech is shorter
-                than a frame, or the model has no such expressivity.
+            FaceDiffError: if the identity or the condition is unknown, the reference does not fit the topology, the
+                speech is shorter than a frame, or the model has no such expressivity.
 
         Example:
             >>> model = facediff.models.load_model(Path("demo/puppet.ckpt"))  # doctest: +SKIP
@@ -120,7 +125,13 @@ class Inference(ABC):
             torch.Size([150, 1008, 3])
         """
         return self.animate_samples(
-            audio, identity=identity, style=style, seeds=[seed], expressivity=expressivity, progress=progress
+            audio,
+            identity=identity,
+            condition=condition,
+            style=style,
+            seeds=[seed],
+            expressivity=expressivity,
+            progress=progress,
         )[0]
 
     @torch.inference_mode()
@@ -129,6 +140,7 @@ class Inference(ABC):
         audio: Float[Tensor, " samples"],
         *,
         identity: str,
+        condition: str | None = None,
         style: Reference | Style | None = None,
         seeds: Sequence[int],
         expressivity: Expressivity | None = None,
@@ -139,6 +151,7 @@ class Inference(ABC):
         Args:
             audio: speech at 16 kHz.
             identity: as :meth:`animate` takes it.
+            condition: as :meth:`animate` takes it.
             style: as :meth:`animate` takes it.
             seeds: one for each sample.
             expressivity: as :meth:`animate` takes it.
@@ -147,10 +160,10 @@ class Inference(ABC):
         Raises:
             FaceDiffError: as :meth:`animate`.
         """
-        clip = self.clip_of(audio, identity, style)
+        clip = self.clip_of(audio, identity, style, condition)
         with self.expressed(expressivity):
             motions = self.sample_clip(clip, seeds, progress=progress)
-        trained = identity if int(clip.identity[0]) >= 0 else "unknown"
+        trained = self.assets.identities[int(clip.identity[0])] if int(clip.identity[0]) >= 0 else "unknown"
         return [
             Prediction(clip.names[0], trained, clip.reference_names[0], (motion + clip.template).cpu())
             for motion in motions
@@ -176,6 +189,7 @@ class Inference(ABC):
         self,
         *,
         identity: str,
+        condition: str | None = None,
         style: Reference | Style | None = None,
         seeds: Sequence[int] = (0,),
         plan: WindowPlan | None = None,
@@ -185,6 +199,7 @@ class Inference(ABC):
 
         Args:
             identity: as :meth:`animate` takes it.
+            condition: as :meth:`animate` takes it.
             style: as :meth:`animate` takes it.
             seeds: one for each sample.
             plan: how speech is cut; shorter windows give frames sooner. :attr:`windows` if None.
@@ -196,7 +211,8 @@ class Inference(ABC):
         # The speech is not known yet; a clip of one silent frame carries the face and the style.
         frame = torch.zeros(samples_for(1, self.frame_rate), device=self.device)
         with self.expressed(expressivity):
-            return SpeechStream(self, self.clip_of(frame, identity, style), seeds=seeds, plan=plan)
+            clip = self.clip_of(frame, identity, style, condition, frames=1)
+            return SpeechStream(self, clip, seeds=seeds, plan=plan)
 
     def generate(
         self,
@@ -242,13 +258,43 @@ class Inference(ABC):
                     start += part.shape[1]
         return motion
 
-    def clip_of(self, audio: Float[Tensor, " samples"], identity: str, style: Reference | Style | None) -> Batch:
+    def frames_of(self, samples: int) -> int:
+        """Frames that the model gives for speech of so many samples at 16 kHz; 0 if it is too short for one."""
+        return round(samples * self.frame_rate / SAMPLE_RATE)
+
+    def check_condition(self, condition: str | None) -> None:
+        """Refuse to be conditioned on a speaker that the model was not trained on.
+
+        Raises:
+            FaceDiffError: naming the known identities.
+        """
+        if condition is not None and condition not in self.assets.identities:
+            raise FaceDiffError(
+                f'condition: the model was not trained on "{condition}": {choices(condition, self.assets.identities)}'
+            )
+
+    def clip_of(
+        self,
+        audio: Float[Tensor, " samples"],
+        identity: str,
+        style: Reference | Style | None,
+        condition: str | None = None,
+        frames: int | None = None,
+    ) -> Batch:
         """Speech, a face and a style as a batch of one clip on the model's device; its motion is zero.
+
+        Args:
+            audio: speech at 16 kHz.
+            identity: as :meth:`animate` takes it.
+            style: as :meth:`animate` takes it.
+            condition: as :meth:`animate` takes it.
+            frames: how many the speech lasts; as :meth:`frames_of` counts them if None.
 
         Raises:
             FaceDiffError: as :meth:`animate`.
         """
         template = self.assets.template(identity)
+        self.check_condition(condition)
         style = style or self.default_style(identity)
         # A style vector bypasses the style encoder, whose reference is then a single frame that is not looked at.
         nothing = template.new_zeros(1, *template.shape)
@@ -258,15 +304,15 @@ class Inference(ABC):
                 f"style: the reference {reference.clip} has {reference.motion.shape[1]} vertices, the checkpoint's "
                 f"faces have {len(template)}; give a motion of the same topology"
             )
-        frames = round(len(audio) * self.frame_rate / SAMPLE_RATE)
+        frames = self.frames_of(len(audio)) if frames is None else frames
         if frames < 1:
             raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s); give more of it")
-        length = samples_for(frames, self.frame_rate)
+        length = len(audio) if self.hears_all else samples_for(frames, self.frame_rate)
         sample = Sample(
             audio=torch.nn.functional.pad(audio[:length], (0, max(0, length - len(audio)))),
             motion=torch.zeros(frames, *template.shape),
             template=template,
-            identity=self.assets.identity_index(identity),
+            identity=self.assets.identity_index(identity if condition is None else condition),
             reference=reference.motion.float(),
             name="speech",
             identity_name=identity,

@@ -80,6 +80,15 @@ def interpolate_frames(
     return mixed * frame_mask(frame_lengths, frames)[..., None]
 
 
+def interpolate_ends(features: Float[Tensor, "batch steps dim"], frames: int) -> Frames:
+    """Resample clips of one length linearly in time, so that the first and last frame are the first and last step.
+
+    Frame i lies at step i·(steps − 1)/(frames − 1), as the published methods of the field have it; see
+    :func:`interpolate_frames` for the way in which frames keep their place in time.
+    """
+    return F.interpolate(features.transpose(1, 2), size=frames, mode="linear", align_corners=True).transpose(1, 2)
+
+
 class RotaryEmbedding(nn.Module):
     """Rotary position embedding: rotates channel pairs by an angle proportional to the frame number.
 

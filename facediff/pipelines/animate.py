@@ -40,6 +40,7 @@ class AnimationOptions:
 
     checkpoint: Path
     identity: str | None = None
+    condition: str | None = None
     style: str | None = None
     style_template: str | None = None
     samples: ranges.Samples = 1
@@ -104,6 +105,7 @@ class AnimationPipeline:
 
     def __init__(self, options: AnimationOptions, *, seed: int = 0) -> None:
         from facediff.models import load_model
+        from facediff.models.inference import WindowPlan
         from facediff.models.styles import read_styles
 
         self.options = options
@@ -125,9 +127,12 @@ class AnimationPipeline:
         usual = self.model.windows
         seconds = usual.seconds if options.window is None else options.window
         overlap = min(usual.overlap, seconds / 2) if options.overlap is None else options.overlap
-        self.model.windows = replace(usual, seconds=seconds, overlap=overlap)
+        # Who asks for windows gets them, also of a model that else takes speech of any length in one pass.
+        above = usual.above if options.window is None else min(usual.above, WindowPlan.above)
+        self.model.windows = replace(usual, seconds=seconds, overlap=overlap, above=above)
         self.model.windows.in_frames(self.model.frame_rate)
         self.identity = options.identity or self.model.identities[0]
+        self.model.check_condition(options.condition)
         facts = facts_of(self.model.assets, self.identity)
         name = f"the checkpoint's corpus {self.model.assets.corpus}"
         controls.check(facts["template"], facts["faces"], facts["regions"], name)
@@ -204,13 +209,10 @@ class AnimationPipeline:
         """
         import torch
 
-        from facediff.data.audio import SAMPLE_RATE
-
         seeds, name = [seed + i for i in range(self.options.samples)], valid_text(name)
         # Counted in whole frames, as the model counts them: otherwise speech of just about the limit would be animated
         # by windows here and in one pass there.
-        rate = self.model.frame_rate
-        short = self.model.windows.in_one_pass(round(len(speech) * rate / SAMPLE_RATE), rate)
+        short = self.model.windows.in_one_pass(self.model.frames_of(len(speech)), self.model.frame_rate)
         spool: AbstractContextManager[Path | None] = nullcontext() if short else scratch_folder(output)
         with spool as folder:
             with self.precision():
@@ -218,6 +220,7 @@ class AnimationPipeline:
                     made = self.model.animate_samples(
                         torch.from_numpy(speech).to(self.model.device),
                         identity=self.identity,
+                        condition=self.options.condition,
                         style=self.style,
                         seeds=seeds,
                         progress=None if self.options.quiet else partial(track, description="sampling"),
@@ -260,7 +263,9 @@ class AnimationPipeline:
         from facediff.animation.files import MotionWriter
         from facediff.utils.arrays import open_array
 
-        stream = self.model.stream(identity=self.identity, style=self.style, seeds=seeds)
+        stream = self.model.stream(
+            identity=self.identity, condition=self.options.condition, style=self.style, seeds=seeds
+        )
         progress = None if self.options.quiet else partial(track, description="seconds of speech")
         template = self.model.assets.template(self.identity)
         writers = [MotionWriter(folder / f"{seed}.npy", tuple(template.shape)) for seed in seeds]
@@ -289,6 +294,8 @@ class AnimationPipeline:
             "seed": str(seed),
             "precision": "bfloat16 and float32" if self.options.precision == "bf16" else "float32",
         }
+        if self.options.condition is not None:
+            metadata["condition"] = self.options.condition
         if sampler is not None:
             metadata["sampler"] = f"{type(sampler).__name__}, {sampler.steps} steps"
         for option in ("expressivity", "guidance"):

@@ -52,7 +52,9 @@ def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_00
     busy, heard = 0.0, 0
     with sink(output, tuple(template.shape)) as write, pipeline.precision(), ended_by_interrupt() as read:
         # The style is encoded within the precision as well, as it is for a file.
-        stream = model.stream(identity=pipeline.identity, style=pipeline.style, seeds=[seed])
+        stream = model.stream(
+            identity=pipeline.identity, condition=options.condition, style=pipeline.style, seeds=[seed]
+        )
         for samples in pcm(sys.stdin.buffer, rate, read):
             started = time.perf_counter()
             part = stream.feed(torch.from_numpy(samples))

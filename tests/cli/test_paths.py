@@ -23,7 +23,19 @@ from facediff.utils.files import atomic, atomic_folder, put_in_place
 LIGHTNING = {"fit", "validate", "test", "predict"}
 
 NO_PATHS = {
-    *("accelerator", "by", "clip", "clips", "corpus", "device", "expressiveness", "expressivity", "font", "guidance"),
+    *(
+        "accelerator",
+        "by",
+        "clip",
+        "clips",
+        "condition",
+        "corpus",
+        "device",
+        "expressiveness",
+        "expressivity",
+        "font",
+        "guidance",
+    ),
     *("identity", "kind", "labels"),
     *("metric", "name", "output_unit", "pattern", "phonemes", "protocol", "region", "sampler", "scalar", "split"),
     "splits",

@@ -1,0 +1,386 @@
+"""What FaceFormer, CodeTalker and TalkingStyle share: a Transformer decoder that makes motion frame by frame.
+
+Each frame's token is the motion of the frame before it, plus the speaker's style and a periodic position; it attends to
+all frames before it, the more the nearer they are, and to its own moment of the speech. Both masks are rows of their
+own for each frame, so the keys and values of earlier frames never change, and may be kept.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff.data import Batch
+from facediff.errors import ArgumentError, FaceDiffError
+from facediff.models.audio_encoders import StepRule
+from facediff.models.layers import Heads, Layers, Share, Width
+from facediff.models.published.base import PublishedModel
+from facediff.utils.ranges import Range
+
+Loop = Literal["cached", "literal"]
+"""How frames are made: with the keys and values of earlier frames kept, or from all earlier frames again each time."""
+
+LongSpeech = Literal["refuse", "windows", "extend"]
+"""What is done with speech beyond the tables of the published code."""
+
+TABLE_FRAMES = 600
+"""Frames of the published tables of the attention's bias."""
+
+Period = Annotated[int, Range(1, 100_000)]
+
+
+class AutoregressiveModel(PublishedModel):
+    """Base of the methods that make motion frame by frame with the decoder of FaceFormer.
+
+    Args:
+        dim: channels of the decoder.
+        num_layers: its layers.
+        num_heads: its attention heads.
+        feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
+        dropout: in the decoder and on its positions.
+        period: frames after which positions and the attention's bias repeat; those of a second if None.
+        loop: ``cached`` keeps the keys and values of earlier frames, which changes nothing but rounding (and which
+            random numbers dropout draws in training); ``literal`` computes all earlier frames again for each frame,
+            as the published code does.
+        long_speech: what is done with more than 600 frames, for which the published tables have no rows: ``refuse``
+            them, as published; animate ``windows`` of them; or ``extend`` the tables by their formula.
+        options: those of :class:`PublishedModel`.
+    """
+
+    def __init__(
+        self,
+        *,
+        dim: Width | None = None,
+        num_layers: Layers = 1,
+        num_heads: Heads = 4,
+        feed_forward_dim: Width | None = None,
+        dropout: Share = 0.1,
+        period: Period | None = None,
+        loop: Loop = "cached",
+        long_speech: LongSpeech = "refuse",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(**options)
+        # The projects' own widths on their two data sets.
+        self.dim = dim or (128 if self.pairs else 64)
+        if self.dim % num_heads or self.dim % 2:
+            raise ArgumentError({"dim": self.dim, "num_heads": num_heads}, "dim must be even, and a multiple of heads")
+        self.decoder_options: dict[str, Any] = {
+            "dim": self.dim,
+            "num_layers": num_layers,
+            "num_heads": num_heads,
+            "hidden_dim": feed_forward_dim or 2 * self.dim,
+            "dropout": dropout,
+            "period": period or max(1, round(self.frame_rate)),
+            "steps": 2 if self.pairs else 1,
+        }
+        self.loop: Loop = loop
+        self.long_speech: LongSpeech = long_speech
+        if long_speech != "windows":
+            self.windows = type(self.windows)(above=math.inf)
+        else:
+            self.windows = type(self.windows)(above=TABLE_FRAMES / self.frame_rate)
+
+    def check_length(self, frames: Int[Tensor, " batch"], source: str) -> None:
+        """Refuse more frames than the published tables have.
+
+        Raises:
+            FaceDiffError: with what to do instead.
+        """
+        most = int(frames.max())
+        if most > TABLE_FRAMES and self.long_speech != "extend":
+            raise FaceDiffError(
+                f"{source}: {most / self.frame_rate:.1f} s are {most} frames, and {type(self).__name__}'s published "
+                f"tables have {TABLE_FRAMES} ({TABLE_FRAMES / self.frame_rate:g} s); animate it in windows "
+                f"(--window 4), or make the model with long_speech=extend or long_speech=windows"
+            )
+
+    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch steps width"]:
+        """Speech features: as many as frames, or two for each where speech comes in pairs."""
+        steps = 2 * frames if self.pairs else frames
+        rule: StepRule = "features_cut" if self.pairs else "features"
+        cached = batch.cached_features or ()
+        return self.audio_encoder.at_steps(batch.audio, batch.audio_lengths, steps, rule, *cached)
+
+
+class KeysValues(NamedTuple):
+    """What attention has made of some positions, both (batch, heads, positions, head_dim)."""
+
+    key: Tensor
+    value: Tensor
+
+
+class ProjectedAttention(nn.Module):
+    """Multi-head attention whose queries, keys and values come from one stacked map, as in PyTorch's own layer.
+
+    Args:
+        dim: channels.
+        num_heads: heads.
+        dropout: on the attention's weights in training.
+    """
+
+    def __init__(self, dim: int, num_heads: int, dropout: float) -> None:
+        super().__init__()
+        self.num_heads, self.dropout = num_heads, dropout
+        self.project = nn.Linear(dim, 3 * dim)
+        self.out = nn.Linear(dim, dim)
+        nn.init.xavier_uniform_(self.project.weight)
+        nn.init.zeros_(self.project.bias)
+        nn.init.zeros_(self.out.bias)
+
+    def queries(self, x: Float[Tensor, "batch positions dim"]) -> Float[Tensor, "batch heads positions head_dim"]:
+        """The first third of the map."""
+        dim = x.shape[-1]
+        return self._split(F.linear(x, self.project.weight[:dim], self.project.bias[:dim]))
+
+    def keys_values(self, x: Float[Tensor, "batch positions dim"]) -> KeysValues:
+        """The second and the last third."""
+        dim = x.shape[-1]
+        key, value = F.linear(x, self.project.weight[dim:], self.project.bias[dim:]).chunk(2, -1)
+        return KeysValues(self._split(key), self._split(value))
+
+    def attend(self, query: Tensor, context: KeysValues, bias: Tensor | None = None) -> Tensor:
+        """The attention itself, whose scores get ``bias``, and the map of its result."""
+        dropout = self.dropout if self.training else 0.0
+        bias = None if bias is None else bias.to(query.dtype)
+        mixed = F.scaled_dot_product_attention(query, context.key, context.value, attn_mask=bias, dropout_p=dropout)
+        return self.out(mixed.transpose(1, 2).flatten(2))
+
+    def attend_own(self, query: Tensor, context: KeysValues) -> Tensor:
+        """Each position attends to its own moment alone: the context's positions divided among the queries."""
+        batch, heads, frames, width = query.shape
+        # The same as a mask that leaves only these positions, without the table of all others.
+        queries = query.transpose(1, 2).reshape(batch * frames, heads, 1, width)
+        own = KeysValues(
+            *(part.view(batch, heads, frames, -1, width).transpose(1, 2).flatten(0, 1) for part in context)
+        )
+        return self.attend(queries, own).view(batch, frames, -1)
+
+    def _split(self, x: Tensor) -> Tensor:
+        return x.view(*x.shape[:-1], self.num_heads, -1).transpose(1, 2)
+
+
+class DecoderLayer(nn.Module):
+    """Self-attention, attention to the speech, feed-forward; each is added, and normalised afterwards.
+
+    Args:
+        dim: channels.
+        num_heads: attention heads.
+        hidden_dim: channels of the feed-forward layer.
+        dropout: everywhere.
+    """
+
+    def __init__(self, dim: int, num_heads: int, hidden_dim: int, dropout: float) -> None:
+        super().__init__()
+        self.self_attention = ProjectedAttention(dim, num_heads, dropout)
+        self.cross_attention = ProjectedAttention(dim, num_heads, dropout)
+        self.first, self.second = nn.Linear(dim, hidden_dim), nn.Linear(hidden_dim, dim)
+        self.norms = nn.ModuleList(nn.LayerNorm(dim) for _ in range(3))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, speech: KeysValues, past: KeysValues, bias: Tensor | None) -> Tensor:
+        """Frames ``x`` (B, T, dim) that see the positions of ``past`` as the ``bias`` (heads, T, P) lets them.
+
+        Args:
+            x: the frames' tokens.
+            speech: keys and values of these frames' own moments of the speech.
+            past: keys and values of all frames that they may see, themselves included.
+            bias: added to the attention's scores.
+        """
+        heard = self.self_attention.attend(self.self_attention.queries(x), past, bias)
+        x = self.norms[0](x + self.dropout(heard))
+        heard = self.cross_attention.attend_own(self.cross_attention.queries(x), speech)
+        x = self.norms[1](x + self.dropout(heard))
+        hidden = self.second(self.dropout(torch.relu(self.first(x))))
+        return self.norms[2](x + self.dropout(hidden))
+
+
+class MotionDecoder(nn.Module):
+    """The decoder: tokens of frames, and the speech that they go with, to one vector for each frame.
+
+    Args:
+        dim: channels; even.
+        num_layers: layers.
+        num_heads: attention heads.
+        hidden_dim: channels of the feed-forward layers.
+        dropout: everywhere, and on the positions.
+        period: frames after which positions and bias repeat.
+        steps: steps of speech that belong to a frame.
+    """
+
+    def __init__(
+        self, *, dim: int, num_layers: int, num_heads: int, hidden_dim: int, dropout: float, period: int, steps: int
+    ) -> None:
+        super().__init__()
+        self.dim, self.num_heads, self.period, self.steps = dim, num_heads, period, steps
+        self.layers = nn.ModuleList(DecoderLayer(dim, num_heads, hidden_dim, dropout) for _ in range(num_layers))
+        self.dropout = nn.Dropout(dropout)
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return next(self.parameters()).device
+
+    def positions(self, frames: int, start: int = 0) -> Float[Tensor, "frames dim"]:
+        """Sinusoids of the frame number within its period; even channels are sines, odd ones cosines."""
+        return periodic_positions(frames, self.dim, self.period, start=start, device=self.device)
+
+    def bias(self, frames: int, start: int = 0) -> Float[Tensor, "heads frames positions"]:
+        """What the scores of frames ``start`` to ``start + frames`` get: less the older a frame, −∞ for later ones."""
+        return periodic_bias(frames, self.num_heads, self.period, start=start, device=self.device)
+
+    def forward(
+        self, tokens: Float[Tensor, "batch frames dim"], memory: Float[Tensor, "batch steps dim"]
+    ) -> Float[Tensor, "batch frames dim"]:
+        """All frames together; positions are added to the tokens here."""
+        frames = tokens.shape[1]
+        x, bias = self.dropout(tokens + self.positions(frames)), self.bias(frames)
+        for layer in self.layers:
+            speech = layer.cross_attention.keys_values(memory[:, : frames * self.steps])  # type: ignore[union-attr, operator]
+            x = layer(x, speech, layer.self_attention.keys_values(x), bias)  # type: ignore[union-attr, operator]
+        return x
+
+    def start(self, memory: Float[Tensor, "batch steps dim"]) -> Continuation:
+        """The state before the first frame, for :meth:`step`."""
+        speech = [layer.cross_attention.keys_values(memory) for layer in self.layers]  # type: ignore[union-attr, operator]
+        return Continuation(self, speech, memory.shape[1] // self.steps)
+
+
+class Continuation:
+    """A decoder that goes on frame by frame, with the keys and values of all earlier frames.
+
+    Args:
+        decoder: the decoder.
+        speech: keys and values of all speech, for each layer.
+        frames: how many will be made.
+    """
+
+    def __init__(self, decoder: MotionDecoder, speech: list[KeysValues], frames: int) -> None:
+        self.decoder, self.speech, self.frame = decoder, speech, 0
+        self._keys: list[list[Tensor]] = [[] for _ in decoder.layers]
+        self._values: list[list[Tensor]] = [[] for _ in decoder.layers]
+        self._positions, self._room = decoder.positions(frames), frames
+        self._kept: list[KeysValues] | None = None
+
+    def step(self, token: Float[Tensor, "batch 1 dim"]) -> Float[Tensor, "batch 1 dim"]:
+        """The next frame; its position is added to the token here."""
+        decoder, at, steps = self.decoder, self.frame, self.decoder.steps
+        x, bias = decoder.dropout(token + self._positions[at]), decoder.bias(1, at)
+        for number, layer in enumerate(decoder.layers):
+            past = self._with(number, layer.self_attention.keys_values(x))  # type: ignore[union-attr, operator]
+            speech = KeysValues(*(part[:, :, at * steps : (at + 1) * steps] for part in self.speech[number]))
+            x = layer(x, speech, past, bias)
+        self.frame += 1
+        return x
+
+    def _with(self, number: int, new: KeysValues) -> KeysValues:
+        """Keys and values of a layer up to the present frame."""
+        if torch.is_grad_enabled():  # what a gradient goes through must not be written over
+            keys, values = self._keys[number], self._values[number]
+            keys.append(new.key)
+            values.append(new.value)
+            return KeysValues(torch.cat(keys, 2), torch.cat(values, 2))
+        if self._kept is None:
+            batch, heads, _, width = new.key.shape
+            self._kept = [
+                KeysValues(*(new.key.new_empty(batch, heads, self._room, width) for _ in range(2)))
+                for _ in self.decoder.layers
+            ]
+        kept = self._kept[number]
+        for store, part in zip(kept, new, strict=True):
+            store[:, :, self.frame : self.frame + 1] = part
+        return KeysValues(*(store[:, :, : self.frame + 1] for store in kept))
+
+
+def periodic_positions(
+    frames: int, dim: int, period: int, *, start: int = 0, device: torch.device | None = None
+) -> Float[Tensor, "frames dim"]:
+    """Row p: sin((p mod period)·w_m) in the even channels 2m, the cosines in the odd ones, w_m = 10000^(−2m/dim)."""
+    places = torch.arange(start, start + frames, device=device) % period
+    rates = torch.exp(torch.arange(0, dim, 2, device=device).float() * (-math.log(10_000.0) / dim))
+    angle = places[:, None].float() * rates
+    return torch.stack([angle.sin(), angle.cos()], -1).flatten(1)
+
+
+def periodic_bias(
+    frames: int, heads: int, period: int, *, start: int = 0, device: torch.device | None = None
+) -> Float[Tensor, "heads frames positions"]:
+    """−2^(−8(h+1)/heads)·⌊(i − j)/period⌋ for head h, frame i and position j ≤ i; −∞ for j > i."""
+    rows = torch.arange(start, start + frames, device=device)[:, None]
+    distance = rows - torch.arange(start + frames, device=device)
+    slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
+    bias = -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")
+    return bias.masked_fill(distance < 0, -torch.inf)
+
+
+class AutoregressiveNetwork(nn.Module):
+    """Features of speech and a speaker's style to offsets of the vertices, frame by frame.
+
+    Args:
+        audio_width: channels of the features.
+        n_vertices: vertices V.
+        style: weights of the training identities to a vector of the decoder's width.
+        decoder: the decoder's options.
+    """
+
+    def __init__(
+        self,
+        *,
+        audio_width: int,
+        n_vertices: int,
+        style: nn.Module,
+        decoder: dict[str, Any],
+    ) -> None:
+        super().__init__()
+        dim = int(decoder["dim"])
+        self.audio_map = nn.Linear(audio_width, dim)
+        self.motion_in = nn.Linear(3 * n_vertices, dim)
+        self.decoder = MotionDecoder(**decoder)
+        self.motion_out = nn.Linear(dim, 3 * n_vertices)
+        self.style = style
+        nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
+        nn.init.zeros_(self.motion_out.bias)
+
+    def teacher_forced(
+        self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], motion: Tensor
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Every frame from the true motion (B, T, 3V) of the frame before it, all in one pass.
+
+        The first frame follows one that does not move, so that it gets the bias of ``motion_in``; a frame that is
+        generated does not, as published.
+        """
+        before = F.pad(motion, (0, 0, 1, 0))[:, :-1]
+        return self.motion_out(self.decoder(self.motion_in(before) + style[:, None], memory))
+
+    def generate(
+        self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], loop: Loop
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Every frame from the frame that was generated before it."""
+        frames = memory.shape[1] // self.decoder.steps
+        return self._literal(style, memory, frames) if loop == "literal" else self._cached(style, memory, frames)
+
+    def _literal(self, style: Tensor, memory: Tensor, frames: int) -> Tensor:
+        tokens = style[:, None]
+        while True:
+            motion = self.motion_out(self.decoder(tokens, memory))
+            if tokens.shape[1] == frames:
+                return motion
+            tokens = torch.cat([tokens, self.motion_in(motion[:, -1:]) + style[:, None]], 1)
+
+    def _cached(self, style: Tensor, memory: Tensor, frames: int) -> Tensor:
+        # From one frame to the next, motion passes through two maps without anything between them: their product has
+        # the width of the decoder, and the vertices are needed only once, at the end.
+        first, last = self.motion_in, self.motion_out
+        with torch.autocast(memory.device.type, enabled=False):
+            turn = first.weight @ last.weight
+            shift = first.weight @ last.bias + first.bias
+        state, token, made = self.decoder.start(memory), style[:, None], []
+        for _ in range(frames):
+            made.append(state.step(token))
+            token = F.linear(made[-1], turn, shift) + style[:, None]
+        return self.motion_out(torch.cat(made, 1))

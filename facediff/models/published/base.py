@@ -1,0 +1,198 @@
+"""What the field's published methods have in common: each of them adds its network, its loss and its inference.
+
+They hear speech through a pretrained network at 50 steps a second, count their frames by it, know a speaker as one
+column of a table, and train on motion as it is, without a scale, one clip at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff.data import Batch
+from facediff.errors import ArgumentError
+from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
+from facediff.models.base import AnimationModel, Decay, MotionScale
+from facediff.models.evaluation import IdentityPolicy
+from facediff.models.inference import BatchMotion, Progress, Style
+from facediff.models.layers import Width, frame_mask
+from facediff.registry import component_class
+from facediff.utils.plain_options import fits, parameters
+
+Alignment = Literal["auto", "pairs", "interpolated"]
+"""How speech at 50 steps a second meets motion: as ``pairs`` of steps for each frame, as the projects do on BIWI at 25
+frames a second, or ``interpolated`` to the frames, as they do on VOCASET at 30; ``auto`` chooses by the frame rate."""
+
+NO_STYLE = Style("none", torch.zeros(0))
+"""The style of a model that takes none."""
+
+
+class PublishedModel(AnimationModel):
+    """Base of the published methods.
+
+    A method adds ``losses`` and :meth:`generate_frames`; it hears speech through :attr:`audio_encoder`, and finds what
+    it knows of a clip's speaker in :meth:`identity_weights`.
+
+    Args:
+        audio_encoder: speech to features; the method's own pretrained network, or another encoder of the registry.
+        audio_dim: channels of an encoder that does not state them by itself, as a pretrained network does.
+        alignment: how speech at 50 steps a second meets motion: ``pairs`` of steps for each frame, or ``interpolated``;
+            ``auto`` takes pairs at 25 frames a second, as the projects do.
+        motion_scale: as in :class:`facediff.models.AnimationModel`; the published methods scale nothing.
+        weight_decay: likewise; the published methods train with Adam, which is AdamW with a decay of 0.
+        unseen_identity: likewise; the published methods condition an unseen speaker on each training identity in turn.
+        options: those of every model, see :class:`facediff.models.AnimationModel`.
+    """
+
+    hears_all: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        *,
+        audio_encoder: AudioEncoderFactory,
+        audio_dim: Width | None = None,
+        alignment: Alignment = "auto",
+        motion_scale: MotionScale = "none",
+        weight_decay: Decay = 0.0,
+        unseen_identity: IdentityPolicy = "each_seen",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(
+            motion_scale=motion_scale, weight_decay=weight_decay, unseen_identity=unseen_identity, **options
+        )
+        self.pairs = self.frame_rate == 25.0 if alignment == "auto" else alignment == "pairs"
+        self.audio_encoder, self.audio_width = make_encoder(audio_encoder, audio_dim)
+
+    # What a method adds.
+
+    @abstractmethod
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """Offsets from the template, in the corpus's unit.
+
+        Args:
+            batch: clips; what is wanted of them is their speech and identity.
+            frames: how many each clip gets, at least 1, as :meth:`frames_of` counts them.
+            seeds: of the noise, one for each clip.
+            progress: wraps the iteration over steps.
+
+        Returns:
+            motion of ``frames.max()`` frames; what it is beyond a clip's own frames has no meaning.
+        """
+
+    # The audio encoder and the clock of speech.
+
+    def steps_of(self, samples: int) -> int:
+        """Steps at 50 a second that a pretrained network gives for so many samples."""
+        return self.audio_encoder.steps_of(samples)
+
+    def frames_of(self, samples: int) -> int:
+        """Frames that the method gives for speech of so many samples."""
+        steps = self.steps_of(samples)
+        # In this very order and in floating point, as the projects compute it: 205 steps give 122 frames, not 123.
+        return steps // 2 if self.pairs else int((steps / 50.0) * self.frame_rate)
+
+    def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
+        """Frames of each clip that training compares: motion that lasts longer than pairs of steps is cut."""
+        lengths = batch.frame_lengths
+        if not self.pairs:
+            return lengths
+        steps = torch.tensor([self.steps_of(int(n)) // 2 for n in batch.audio_lengths], device=lengths.device)
+        return torch.minimum(lengths, steps.clamp_min(1))
+
+    # The speaker.
+
+    def identity_weights(self, batch: Batch) -> Float[Tensor, "batch identities"]:
+        """One-hot rows of the clips' identities; of an unknown speaker, equal weights of all training identities."""
+        count = len(self.identities)
+        known = nn.functional.one_hot(batch.identity.clamp_min(0), count).to(batch.template)
+        return torch.where(batch.identity[:, None] >= 0, known, known.new_full((count,), 1.0 / count))
+
+    def styled_identities(self) -> list[str]:
+        """Every training identity: the table is the style."""
+        return list(self.identities)
+
+    def default_style(self, identity: str) -> Style:
+        """A style vector of no numbers, since the method takes no reference motion."""
+        return NO_STYLE
+
+    # Inference.
+
+    def generate_clips(self, batch: Batch, *, seed: int = 0, progress: Progress | None = None) -> BatchMotion:
+        """The method's own number of frames for each clip, whose last one is held as long as the clip lasts.
+
+        The published methods give a frame less than the motion has, or two; scores count all frames of the truth.
+        """
+        own = [max(1, self.frames_of(int(samples))) for samples in batch.audio_lengths]
+        frames = torch.tensor(own, device=batch.audio.device)
+        made = self.generate_frames(batch, frames, seeds=[seed] * len(batch), progress=progress)
+        return held(made, frames, batch.frame_lengths)
+
+    def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> BatchMotion:
+        """Several samples of one clip; a method without noise makes one."""
+        count = len(seeds) if self.samples else 1
+        frames = torch.tensor([max(1, self.frames_of(int(clip.audio_lengths[0])))] * count, device=clip.audio.device)
+        clips = clip if count == 1 else clip.select([0] * count)
+        made = self.generate_frames(clips, frames, seeds=list(seeds)[:count], progress=progress)
+        motion = held(made, frames, clip.frame_lengths.expand(count))
+        return motion if self.samples else motion.expand(len(seeds), -1, -1, -1)
+
+
+class SpeakerTable(nn.Module):
+    """One row for each training identity, so that a speaker more is a row more.
+
+    Args:
+        count: identities.
+        dim: channels of a row.
+        like: how it starts: as PyTorch's ``linear`` map of one-hot rows, or as its ``embedding``.
+    """
+
+    def __init__(self, count: int, dim: int, like: Literal["linear", "embedding"] = "linear") -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(count, dim))
+        if like == "linear":
+            nn.init.uniform_(self.weight, -1 / math.sqrt(count), 1 / math.sqrt(count))
+        else:
+            nn.init.normal_(self.weight)
+
+    def forward(self, weights: Float[Tensor, "batch identities"]) -> Float[Tensor, "batch dim"]:
+        """The rows, mixed by the weights that :meth:`PublishedModel.identity_weights` gives."""
+        return weights @ self.weight
+
+
+def make_encoder(factory: AudioEncoderFactory, dim: int | None) -> tuple[AudioEncoder, int]:
+    """An audio encoder and its channels.
+
+    Raises:
+        ArgumentError: if its channels are not stated, and it does not know them by itself.
+    """
+    made = component_class(factory)
+    if dim is None and not fits(None, parameters(made)["dim"]):
+        raise ArgumentError(
+            {"audio_dim": dim}, f"{made.__name__} does not state its channels by itself; give them, e.g. 64"
+        )
+    encoder = factory(dim=dim)  # type: ignore[arg-type]
+    width: int = getattr(encoder, "width", dim or 0)
+    return encoder, width
+
+
+def held(motion: BatchMotion, frames: Int[Tensor, " batch"], wanted: Int[Tensor, " batch"]) -> BatchMotion:
+    """Motion of ``wanted`` frames of each clip: cut, or with its last frame held; zero on padding."""
+    longest = int(wanted.max())
+    places = torch.arange(longest, device=motion.device)[None].minimum(frames[:, None] - 1)
+    rows = torch.arange(len(motion), device=motion.device)[:, None]
+    return motion[rows, places] * frame_mask(wanted, longest)[..., None, None]
+
+
+def masked_mean(values: Float[Tensor, "batch frames ..."], frames: Int[Tensor, " batch"]) -> Float[Tensor, ""]:
+    """The mean over all numbers of the valid frames: of one clip, what PyTorch's own losses give."""
+    flat = values.flatten(2)
+    mask = frame_mask(frames, flat.shape[1])[..., None]
+    return (flat * mask).sum() / (frames.sum() * flat.shape[2]).clamp_min(1)

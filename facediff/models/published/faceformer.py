@@ -1,0 +1,94 @@
+"""FaceFormer (Fan, Lin, Saito, Wang, Komura: "FaceFormer: Speech-Driven 3D Facial Animation with Transformers", 2022).
+
+An autoregressive Transformer decoder over wav2vec 2.0; the network is that of ``autoregressive.py`` with one column of
+a table for each speaker. docs/methods/faceformer.md says what of the published code is an option here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch
+from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.inference import BatchMotion, Progress
+from facediff.models.published.autoregressive import AutoregressiveModel, AutoregressiveNetwork
+from facediff.models.published.base import SpeakerTable, masked_mean
+from facediff.models.speech_networks import Wav2Vec2Encoder
+
+PUBLISHED_ENCODER = partial(
+    Wav2Vec2Encoder,
+    source="facebook/wav2vec2-base-960h",
+    spec_augment=True,
+    layer_drop=0.1,
+    epsilon=1e-5,
+    edges=False,
+)
+"""wav2vec 2.0 base with the settings of 2021: all but the convolutions is trained, with masks and layer drop."""
+
+
+@registry.model.register("FaceFormer")
+class FaceFormer(AutoregressiveModel):
+    """FaceFormer: an autoregressive Transformer with periodic positions and biased attention.
+
+    Args:
+        audio_encoder: speech to features; wav2vec 2.0 base as published.
+        teacher_forcing: train on the true motion of the frame before, in one pass, and not on the generated one; the
+            published training generates.
+        options: those of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
+    """
+
+    def __init__(
+        self,
+        *,
+        audio_encoder: AudioEncoderFactory = PUBLISHED_ENCODER,
+        teacher_forcing: bool = False,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(audio_encoder=audio_encoder, **options)
+        self.teacher_forcing = teacher_forcing
+        self.network = AutoregressiveNetwork(
+            audio_width=self.audio_width,
+            n_vertices=self.n_vertices,
+            style=SpeakerTable(len(self.identities), self.dim),
+            decoder=self.decoder_options,
+        )
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The table of speakers."""
+        return [self.network.style]
+
+    def conditions(
+        self, batch: Batch, frames: Int[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, "batch dim"], Float[Tensor, "batch steps dim"]]:
+        """The speaker's style and the speech of so many frames."""
+        memory = self.network.audio_map(self.hear(batch, frames))
+        return self.network.style(self.identity_weights(batch)), memory
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """The mean squared error of all coordinates."""
+        frames = self.trained_frames(batch)
+        self.check_length(frames, batch.names[0])
+        style, memory = self.conditions(batch, frames)
+        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
+        if self.teacher_forcing:
+            made = self.network.teacher_forced(style, memory, truth)
+        else:
+            made = self.network.generate(style, memory, self.loop)
+        error = masked_mean((made - truth).square(), frames)
+        return {"reconstruction": error, "loss": error}
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """Frame by frame; nothing is random."""
+        self.check_length(frames, batch.names[0])
+        style, memory = self.conditions(batch, frames)
+        made = self.network.generate(style, memory, self.loop)
+        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale

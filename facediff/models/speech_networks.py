@@ -1,0 +1,228 @@
+"""Pretrained wav2vec 2.0 and HuBERT, base and large, as the published methods of the field use them.
+
+The methods differ in where they leave the network's 50 steps a second for the motion's frames
+(:data:`~facediff.models.audio_encoders.StepRule`), in the constant by which speech is standardised, and in what is
+frozen; the network is the same. Its convolutions are frozen in all of them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
+from facediff.models.audio_encoders import (
+    AudioEncoder,
+    Features,
+    Lengths,
+    StepRule,
+    Waves,
+    by_length,
+    check_source,
+    convolved,
+    fingerprint,
+    known_options,
+    load_pretrained,
+    unreadable,
+    with_edges,
+)
+from facediff.models.layers import Frames, Share, Width, interpolate_ends, interpolate_frames
+from facediff.registry import audio_encoder
+from facediff.utils.ranges import Range
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel
+
+NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert"}
+"""Types of networks that are built alike, and how their classes' names begin."""
+
+
+@audio_encoder.register("wav2vec2")
+class Wav2Vec2Encoder(AudioEncoder):
+    """Pretrained wav2vec 2.0 or HuBERT, base or large; all but its convolutions is fine-tuned.
+
+    The published methods that facediff has (FaceFormer and others) hear speech through it; a model of facediff's own
+    may as well. ``hubert`` is the encoder that keeps more of the network frozen, whose frozen layers run once a clip.
+
+    Args:
+        dim: channels of the result, by a linear map of the hidden states; the hidden states as they are if None. Given
+            by the model.
+        source: a name on the Hugging Face hub or a directory that ``from_pretrained`` reads.
+        frozen_layers: Transformer layers kept frozen, together with the feature projection; 0 freezes the convolutions
+            alone, −1 the whole network.
+        spec_augment: mask stretches of the features in training, as the pretrained model's configuration says.
+        layer_drop: probability of skipping a Transformer layer in training.
+        epsilon: added to the variance by which speech is standardised: 1e-7 as transformers has it today, 1e-5 as it
+            had in 2021.
+        edges: add 40 zeros at either end of speech, so that every step is centred in its own stretch of it; the
+            published methods do not.
+        config: the network's configuration as plain data; if given, the weights are not read from ``source`` but left
+            for a checkpoint to fill in. Checkpoints use it, so that they need no access to ``source``.
+
+    Raises:
+        FaceDiffError: if ``source`` cannot be read, or is no such network.
+        MissingExtraError: if transformers is not installed.
+    """
+
+    checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere
+
+    def __init__(
+        self,
+        *,
+        dim: Width | None,
+        source: str = "facebook/wav2vec2-base-960h",
+        frozen_layers: Annotated[int, Range(-1, 256)] = 0,
+        spec_augment: bool = False,
+        layer_drop: Share = 0.0,
+        epsilon: Annotated[float, Range(0, 1, above=True)] = 1e-7,
+        edges: bool = True,
+        config: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.network: Any = load_network(source, config)
+        settings = self.network.config
+        settings.apply_spec_augment, settings.layerdrop = spec_augment, layer_drop
+        self.epsilon, self.edges = epsilon, edges
+        depth = len(self.network.encoder.layers)
+        if frozen_layers > depth:
+            raise ArgumentError({"frozen_layers": frozen_layers}, f"this network has {depth} layers; −1 freezes all")
+        self._freeze(depth if frozen_layers < 0 else frozen_layers, everything=frozen_layers < 0)
+        self.out = None if dim is None else nn.Linear(settings.hidden_size, dim)
+        self.width: int = settings.hidden_size if dim is None else dim
+
+    def checkpoint_init_args(self) -> dict[str, Any]:
+        """What a checkpoint stores in place of ``source``: the configuration as plain data."""
+        return {"config": self.network.config.to_dict()}
+
+    def _freeze(self, layers: int, *, everything: bool) -> None:
+        """Freeze the convolutions, so many layers with the feature projection, or everything."""
+        network = self.network
+        # Otherwise transformers marks the convolutions' input as differentiable and computes gradients for them.
+        network.feature_extractor._freeze_parameters()
+        if layers:
+            network.feature_projection.requires_grad_(False)
+        network.encoder.layers[:layers].requires_grad_(False)
+        if everything:
+            network.requires_grad_(False)
+        # The embedding that SpecAugment writes over masked steps is of no use without SpecAugment.
+        mask = getattr(network, "masked_spec_embed", None)
+        if mask is not None and not network.config.apply_spec_augment:
+            mask.requires_grad_(False)
+
+    def steps_of(self, samples: int) -> int:
+        """Steps that the network's own convolutions make of so many samples."""
+        settings = self.network.config
+        return convolved(samples, zip(settings.conv_kernel, settings.conv_stride, strict=True))
+
+    def frozen_key(self) -> str | None:
+        """A hash of the convolutions' weights, the configuration, and how speech is standardised."""
+        parts = {"feature_extractor": self.network.feature_extractor}
+        facts = {**self.network.config.to_dict(), "epsilon": self.epsilon, "edges": self.edges}
+        return fingerprint(0, facts, parts)
+
+    @torch.no_grad()
+    def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
+        """What the convolutions give, at 50 steps a second."""
+        wave = self.standardise(audio, audio_lengths, self.epsilon)
+        return by_length(wave, audio_lengths, self._convolve)
+
+    def _convolve(self, wave: Tensor) -> Tensor:
+        # At least one step, however short the speech is.
+        heard = with_edges(wave) if self.edges else nn.functional.pad(wave, (0, max(0, 400 - wave.shape[1])))
+        features: Tensor = self.network.feature_extractor(heard).transpose(1, 2)
+        return features
+
+    def forward(
+        self,
+        audio: Waves,
+        audio_lengths: Lengths,
+        frame_lengths: Lengths,
+        features: Features | None = None,
+        feature_lengths: Lengths | None = None,
+    ) -> Frames:
+        """Encode; see :class:`AudioEncoder`."""
+        if features is None or feature_lengths is None:
+            features, feature_lengths = self.frozen_features(audio, audio_lengths)
+        hidden, steps = by_length(features, feature_lengths, self._hidden)
+        return interpolate_frames(hidden if self.out is None else self.out(hidden), steps, frame_lengths)
+
+    def at_steps(
+        self, audio: Waves, audio_lengths: Lengths, steps: Lengths, rule: StepRule, *cached: Tensor
+    ) -> Float[Tensor, "batch most_steps width"]:
+        """Encode as the published methods do; see :meth:`AudioEncoder.at_steps`."""
+        features, lengths = cached or self.frozen_features(audio, audio_lengths)
+        early = rule.startswith("features")
+
+        def resampled(x: Tensor, count: int) -> Tensor:
+            return x[:, :count] if rule.endswith("cut") else interpolate_ends(x, count)
+
+        def encode(x: Tensor, count: int) -> Tensor:
+            return self._hidden(resampled(x, count)) if early else resampled(self._hidden(x), count)
+
+        hidden = by_lengths(features, lengths, steps, encode)
+        return hidden if self.out is None else self.out(hidden)
+
+    def _hidden(self, features: Tensor) -> Tensor:
+        """Hidden states of the last layer, of clips of one length."""
+        network, settings = self.network, self.network.config
+        encoder, large = network.encoder, bool(getattr(settings, "do_stable_layer_norm", False))
+        hidden = network.feature_projection(features)
+        hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # wav2vec 2.0 gives its normalised input as well
+        processes = self.training and torch.distributed.is_available() and torch.distributed.is_initialized()
+        if self.training and settings.apply_spec_augment:
+            if hidden.shape[1] > settings.mask_time_length:  # shorter speech has no room for a mask
+                hidden = network._mask_hidden_states(hidden)
+            elif processes:
+                hidden = hidden + 0.0 * network.masked_spec_embed
+        hidden = hidden + encoder.pos_conv_embed(hidden)
+        hidden = encoder.dropout(hidden if large else encoder.layer_norm(hidden))
+        for layer in encoder.layers:
+            if self.training and settings.layerdrop > 0 and float(torch.rand(())) < settings.layerdrop:
+                if processes:  # where every process must give every weight a gradient in every step
+                    hidden = hidden + 0.0 * torch.stack([p.sum() for p in layer.parameters()]).sum()
+                continue
+            hidden = layer(hidden)
+            hidden = hidden[0] if isinstance(hidden, tuple) else hidden
+        return encoder.layer_norm(hidden) if large else hidden
+
+
+def by_lengths(padded: Tensor, lengths: Tensor, steps: Tensor, encode: Callable[[Tensor, int], Tensor]) -> Tensor:
+    """Encode clips that agree in length and wanted steps together, without their padding; the padded results."""
+    # The networks attend to all of a clip without a mask, so padding would change every step.
+    parts: dict[int, Tensor] = {}
+    pairs = list(zip(lengths.tolist(), steps.tolist(), strict=True))
+    for length, count in sorted(set(pairs)):
+        rows = [row for row, pair in enumerate(pairs) if pair == (length, count)]
+        parts.update(zip(rows, encode(padded[rows, :length], count), strict=True))
+    return nn.utils.rnn.pad_sequence([parts[row] for row in range(len(padded))], batch_first=True)
+
+
+def load_network(source: str, config: dict[str, Any] | None) -> PreTrainedModel:
+    """A wav2vec 2.0 or HuBERT from a directory, from the hub, or from a plain configuration without weights."""
+    try:
+        import transformers
+    except ImportError as error:
+        raise MissingExtraError("transformers", "train", "the wav2vec2 audio encoder") from error
+    if config is None:
+        check_source(source)
+        try:
+            kind = transformers.PretrainedConfig.get_config_dict(os.path.expanduser(source))[0].get("model_type")
+        except Exception as error:  # the hub's errors are of many classes
+            raise unreadable(source, "a network", error) from error
+    else:
+        kind = config.get("model_type")
+    if kind not in NETWORKS:
+        raise FaceDiffError(
+            f'audio_encoder.source: "{source}" is of the type {kind}; expected a network of the type '
+            f"{' or '.join(NETWORKS)}, such as facebook/wav2vec2-base-960h"
+        )
+    network: type[PreTrainedModel] = getattr(transformers, f"{NETWORKS[kind]}Model")
+    if config is not None:
+        return network(known_options(getattr(transformers, f"{NETWORKS[kind]}Config"), config))
+    made: PreTrainedModel = load_pretrained(network, source, f"{NETWORKS[kind]} network")
+    return made

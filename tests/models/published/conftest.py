@@ -1,0 +1,45 @@
+"""A tiny model of each published method; a method more is one entry more, and is tested by it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+
+from facediff import registry
+from facediff.models import AnimationModel
+from tests.fakes.tiny import RATE, SEEN, VERTICES
+
+MEL = partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0)
+SIZES = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": float(RATE)}
+
+METHODS: dict[str, dict[str, Any]] = {
+    "FaceFormer": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16},
+}
+"""Options by which each published method is small."""
+
+MakeMethod = Callable[..., AnimationModel]
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Every method, so that a new one is tested by existing."""
+    if "method" in metafunc.fixturenames:
+        metafunc.parametrize("method", METHODS)
+
+
+@pytest.fixture
+def make_method() -> MakeMethod:
+    """A small model by name, with reproducible weights; what starts at zero is random too."""
+
+    def make(name: str, seed: int = 0, **options: Any) -> AnimationModel:  # noqa: ANN401
+        torch.manual_seed(seed)
+        model: AnimationModel = registry.model.get(name)(**{**SIZES, **METHODS[name], **options})
+        for parameter in model.parameters():
+            if parameter.requires_grad and not parameter.any():
+                torch.nn.init.normal_(parameter, std=0.1)
+        return model
+
+    return make
