@@ -10,7 +10,7 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 
-from facediff.data import Assets, Batch, Sample, collate
+from facediff.data import Assets, Sample, collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, load_model
 from facediff.models.adaptation import with_extra_identities
