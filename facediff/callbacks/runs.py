@@ -16,6 +16,7 @@ from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
 from facediff.errors import FaceDiffError
 from facediff.utils.files import atomic
+from facediff.utils.hub import check_model_source, model_path
 
 STATE_KEY = "facediff_training_state"
 """Where a checkpoint holds what Lightning does not keep."""
@@ -106,10 +107,13 @@ def find_scored(trainer: Trainer, asked: str | None) -> Path | None:
     Raises:
         FaceDiffError: if it is not there.
     """
-    path = newest_run(trainer) / LAST if asked == "last" else None if asked is None else Path(asked)
-    if path is not None and not path.is_file():
-        raise FaceDiffError(f"--ckpt_path {asked}: there is no {path}; expected a .ckpt file of `facediff fit`")
-    return path
+    if asked is None or asked == "last":
+        path = None if asked is None else newest_run(trainer) / LAST
+        if path is not None and not path.is_file():
+            raise FaceDiffError(f"--ckpt_path {asked}: there is no {path}; expected a .ckpt file of `facediff fit`")
+        return path
+    check_model_source(asked, "--ckpt_path")
+    return model_path(asked)
 
 
 def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
@@ -123,7 +127,15 @@ def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
         FaceDiffError: if a checkpoint is asked for, and there is none.
     """
     if asked is not None:
-        return newest_run(trainer) / LAST if asked == "last" else find_scored(trainer, asked)
+        if asked == "last":
+            return newest_run(trainer) / LAST
+        found = find_scored(trainer, asked)
+        if found is not None and found.is_dir():
+            raise FaceDiffError(
+                f"--ckpt_path {asked}: a model that was published holds no state of a training that could go on; "
+                f"expected a .ckpt file of `facediff fit`, or the word last"
+            )
+        return found
     if int(os.environ.get("SLURM_RESTART_COUNT") or 0):
         job = os.environ.get("SLURM_JOB_ID", "")
         for run in runs_folder(trainer).glob("*"):

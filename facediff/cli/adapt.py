@@ -13,6 +13,7 @@ from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.hub import check_model_source
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
@@ -60,8 +61,7 @@ def adapt(
     """
     if output.suffix != ".ckpt":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
-    if not checkpoint.is_file():
-        raise FaceDiffError(f"--checkpoint {checkpoint}: no such file")
+    check_model_source(checkpoint, "--checkpoint")
     from lightning.pytorch import Trainer, seed_everything
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO

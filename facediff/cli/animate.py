@@ -21,6 +21,7 @@ from facediff.cli.parsing import Option, changed, refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.hub import check_model_source
 
 
 @dataclass(frozen=True)
@@ -139,11 +140,7 @@ def animate(
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
     if not streamed and len(speech) == 1 and not speech[0].exists():
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
-    if not checkpoint.is_file():
-        raise FaceDiffError(
-            f"{checkpoint}: no such checkpoint; expected a .ckpt file that `facediff fit` has written, or "
-            f"demo/puppet.ckpt of `facediff demo`"
-        )
+    check_model_source(checkpoint)
     from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, read_recording
 
     several = len(speech) > 1 or speech[0].is_dir()

@@ -22,6 +22,7 @@ from facediff.cli.process import StoppedBySignal, tell
 from facediff.errors import FaceDiffError, choices
 from facediff.registry import defaults, plain
 from facediff.utils.files import config_dir
+from facediff.utils.hub import check_model_source, model_path
 
 if TYPE_CHECKING:
     from facediff.cli.lightning_cli import FaceDiffCLI
@@ -62,11 +63,10 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     words = change_values(words, fresh_component)
     checkpoint = value_of(words, "--ckpt_path")
     if checkpoint is not None and checkpoint != "last":  # that depends on the config
-        if not Path(checkpoint).is_file():
-            raise FaceDiffError(
-                f"--ckpt_path {checkpoint}: no such file; expected a .ckpt file of `facediff fit`, or the word last"
-            )
-        words = [*words_of_checkpoint(name, Path(checkpoint), words), *words]
+        check_model_source(checkpoint, "--ckpt_path")
+        found = model_path(checkpoint)
+        words = change_values(words, lambda flag, value: str(found) if flag == "--ckpt_path" else value)
+        words = [*words_of_checkpoint(name, found, words), *words]
     if name == "test":
         words = ["--verbose=false", *words]  # ScoreTable prints the scores; Lightning's table repeats them per loader
     if name == "predict":

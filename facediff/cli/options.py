@@ -12,6 +12,7 @@ from facediff.cli.parsing import Option, changed, refuse_idle
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.files import valid_text
+from facediff.utils.hub import check_model_source
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -62,7 +63,9 @@ class SourceOptions:
         for path in animations:
             if not path.is_file():
                 raise FaceDiffError(f"{path}: no such file; expected an animation, .npz or .npy")
-        for option, file in (("--mesh", self.mesh), ("--checkpoint", self.checkpoint), ("--speech", self.speech)):
+        if self.checkpoint is not None:
+            check_model_source(self.checkpoint, "--checkpoint")
+        for option, file in (("--mesh", self.mesh), ("--speech", self.speech)):
             if file is not None and not file.is_file():
                 raise FaceDiffError(f"{option} {file}: no such file")
         if self.identity is not None and self.checkpoint is None:

@@ -8,6 +8,7 @@ from facediff.cli.options import Checkpoint, Identity, Output
 from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
+from facediff.utils.hub import check_model_source
 
 
 def extract(
@@ -27,8 +28,7 @@ def extract(
     """
     if output.suffix != ".npy":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .npy")
-    if not checkpoint.is_file():
-        raise FaceDiffError(f"--checkpoint {checkpoint}: no such file")
+    check_model_source(checkpoint, "--checkpoint")
 
     from facediff.models import load_model
     from facediff.models.styles import extract_style

@@ -13,6 +13,7 @@ from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.hub import check_model_source
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
@@ -73,8 +74,7 @@ def yardsticks(
         quiet: no progress bar
     """
     for path in [*checkpoints, *([] if against is None else [against])]:
-        if not path.is_file():
-            raise FaceDiffError(f"{path}: no such file; expected a checkpoint that `facediff fit` has written")
+        check_model_source(path)
     if len({*map(str, checkpoints)}) < len(checkpoints):
         raise FaceDiffError("a checkpoint is given twice; give each once")
     for name in splits or ():

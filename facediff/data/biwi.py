@@ -8,6 +8,7 @@ from typing import ClassVar
 from facediff import registry
 from facediff.data.corpus import Clip
 from facediff.data.datamodule import SpeechMotionDataModule
+from facediff.utils.licences import Commercial
 
 SEEN = ("F2", "F3", "F4", "M3", "M4", "M5")
 UNSEEN = ("F1", "F5", "F6", "F7", "F8", "M1", "M2", "M6")
@@ -38,6 +39,8 @@ class Biwi(SpeechMotionDataModule):
         "BIWI/regions; put them into regions/ of your corpus folder."
     )
     licence: ClassVar[str] = "B3D(AC)^2 end-user licence of ETH Zurich: non-commercial research"
+    commercial_use: ClassVar[Commercial] = "forbidden"
+    licence_source: ClassVar[str] = "licence agreement of data.vision.ee.ethz.ch/cvl/datasets/b3dac2.en.html"
     obtain: ClassVar[str] = (
         "ETH Zurich distributed BIWI (B3D(AC)^2) on request; since 2024 its page is reported gone and no request is "
         "known to have succeeded, so only those who have a copy can use it. `facediff data prepare biwi RAW OUT` makes "

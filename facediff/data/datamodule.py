@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Annotated, Any, ClassVar, Literal, Self
@@ -31,6 +32,7 @@ from facediff.data.dataset import (
 )
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.registry import defaults, keeps_arguments, plain
+from facediff.utils.licences import Commercial, Licence, merged, read_licences
 from facediff.utils.plain_options import read_options
 from facediff.utils.ranges import Range
 from facediff.utils.torch_files import load_tensors, open_checkpoint
@@ -74,6 +76,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         compared_speakers: among whom the yardsticks look for the nearest speaker and for another's references; all
             with a template if None.
         licence: the terms under which the corpus is distributed.
+        commercial_use: whether these terms allow it: ``allowed``, ``forbidden`` or ``unknown``.
+        licence_source: where the terms stand, without ``https://``.
         obtain: how to obtain the corpus.
 
     Attributes:
@@ -126,6 +130,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     score_attributes: ClassVar[tuple[str, ...]] = ()
     compared_speakers: ClassVar[tuple[str, ...] | None] = None
     licence: ClassVar[str] = "unknown"
+    commercial_use: ClassVar[Commercial] = "unknown"
+    licence_source: ClassVar[str] = ""
     obtain: ClassVar[str] = ""
 
     @keeps_arguments
@@ -224,6 +230,15 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             stream.seek(0)
             made: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
         return made
+
+    @classmethod
+    def corpus_licence(cls) -> Licence:
+        """The label of the corpus's own terms."""
+        return Licence(f"corpus {cls.corpus_name}", cls.licence, cls.commercial_use, cls.licence_source)
+
+    def licences(self) -> tuple[Licence, ...]:
+        """The labels of everything that is trained on: the corpus, and every imported speaker."""
+        return merged([self.corpus_licence()], map(person_licence, self.people))
 
     # What a corpus adds.
 
@@ -545,3 +560,15 @@ def person_name(folder: Path) -> str:
             f"`facediff data import-person`"
         )
     return name
+
+
+def person_licence(folder: Path) -> Licence:
+    """The terms of an imported speaker's recordings, as ``manifest.json`` of their folder states them.
+
+    Raises:
+        FaceDiffError: if the manifest states them in another form than :meth:`Licence.state`.
+    """
+    manifest = read_manifest(folder)
+    stated = manifest.get("licence")
+    (label,) = read_licences(folder / "manifest.json", [Licence("speaker").state() if stated is None else stated])
+    return replace(label, of=f"speaker {manifest.get('person')}")

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 from facediff import registry
 from facediff.data.corpus import FLAME_SOURCES, Clip
 from facediff.data.datamodule import SpeechMotionDataModule
+from facediff.utils.licences import Commercial
 
 EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry", "contempt")
 TRAIN = (
@@ -48,6 +49,8 @@ class Mead3D(SpeechMotionDataModule):
     reference_attributes: ClassVar[tuple[str, ...]] = ("emotion",)
     score_attributes: ClassVar[tuple[str, ...]] = ("emotion", "intensity")
     licence: ClassVar[str] = "MEAD and FLAME licences: non-commercial research"
+    commercial_use: ClassVar[Commercial] = "forbidden"
+    licence_source: ClassVar[str] = "wywu.github.io/projects/MEAD/MEAD.html and flame.is.tue.mpg.de/modellicense.html"
     obtain: ClassVar[str] = (
         "3DMEAD is MEAD (wywu.github.io/projects/MEAD) with the reconstructions that EMOTE's authors distribute (see "
         "the inferno repository, github.com/radekd91/inferno); `facediff data prepare mead3d RAW OUT --flame MODEL` "

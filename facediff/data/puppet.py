@@ -18,6 +18,7 @@ from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import eyelid_pairs
 from facediff.synthetic.speakers import MOST_DRAWN, drawn_names
 from facediff.utils.files import cache_dir
+from facediff.utils.licences import Commercial
 from facediff.utils.ranges import Range
 
 
@@ -58,6 +59,11 @@ class Puppet(SpeechMotionDataModule):
     mesh_files: ClassVar[tuple[str, ...]] = ("PUPPET.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
     compared_speakers: ClassVar[tuple[str, ...] | None] = (*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES)
+    # Face and motion come from this package's code. The program espeak-ng, which speaks, is under the GPL 3, whose
+    # terms cover the program and not its output (gnu.org/licenses/gpl-faq.html#GPLOutput).
+    licence: ClassVar[str] = "Apache-2.0"
+    commercial_use: ClassVar[Commercial] = "allowed"
+    licence_source: ClassVar[str] = "LICENSE of facediff, which makes it; gnu.org/licenses/gpl-faq.html#GPLOutput"
 
     def __init__(
         self,

@@ -8,6 +8,7 @@ from typing import ClassVar
 from facediff import registry
 from facediff.data.corpus import FLAME_SOURCES, Clip
 from facediff.data.datamodule import SpeechMotionDataModule
+from facediff.utils.licences import Commercial
 
 TRAIN = (
     "FaceTalk_170728_03272_TA",
@@ -48,6 +49,8 @@ class Vocaset(SpeechMotionDataModule):
         "(github.com/uuembodiedsocialai/FaceDiffuser) into regions/."
     )
     licence: ClassVar[str] = "VOCASET licence of the Max Planck Society: non-commercial research"
+    commercial_use: ClassVar[Commercial] = "forbidden"
+    licence_source: ClassVar[str] = "voca.is.tue.mpg.de/license.html"
     obtain: ClassVar[str] = (
         "VOCASET is distributed after registration at voca.is.tue.mpg.de; `facediff data prepare vocaset RAW OUT` "
         "makes the corpus folder from its files."

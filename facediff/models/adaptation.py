@@ -40,6 +40,7 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
     before = model.state_dict()
     grown.load_state_dict({name: grow(before[name], value) for name, value in grown.state_dict().items()})
     grown.adopt(replace(model.assets, identities=identities))
+    grown.licences, grown.provenance = model.licences, model.provenance
     return grown
 
 

@@ -29,7 +29,8 @@ from facediff.models.inference import Inference, Prediction, Style, WindowPlan
 from facediff.models.layers import frame_mask
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.principal import PrincipalComponents
-from facediff.registry import COMPONENTS, component_class, defaults, describe, keeps_arguments, plain
+from facediff.registry import COMPONENTS, component_class, corpus, defaults, describe, keeps_arguments, plain
+from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
 from facediff.utils.limits import LIMITS, quoted
 from facediff.utils.plain_options import is_name, is_plain_text
 from facediff.utils.ranges import Range, Vertices
@@ -39,6 +40,9 @@ StyleSource = Literal["reference", "person"]
 MotionScale = Literal["unit", "none"]
 Decay = Annotated[float, Range(0, 1000)]
 
+
+PROVENANCE_KEY = "facediff_provenance"
+"""Where a checkpoint keeps what it was made from, as texts by name: ``parent``, ``epochs``, ``steps``, ``version``."""
 
 STYLES_KEY = "facediff_styles"
 """Where a checkpoint keeps the speakers' style vectors, if they are of all their motion."""
@@ -155,6 +159,9 @@ class AnimationModel(LightningModule, Inference, ABC):
         self.score_by = list(score_by)
         self.windows = WindowPlan()
         self.data_source: dict[str, str] = {}
+        self.licences: tuple[Licence, ...] = ()
+        self.provenance: dict[str, str] = {}
+        self.data_options: dict[str, Any] = {}
         self._assets: Assets | None = None
         self.style_source: StyleSource = style_source
         self.person_styles: dict[str, Style] = {}
@@ -447,6 +454,9 @@ class AnimationModel(LightningModule, Inference, ABC):
             raise FaceDiffError("facediff's models train and test on a SpeechMotionDataModule; pass datamodule=…")
         if stage != "predict":
             _ = self.evaluation  # an unknown protocol or metric is reported before the corpus is read
+        if stage == "fit":
+            # Those of a checkpoint that is adapted or resumed stay: a model inherits from all that it has learnt from.
+            self.licences = merged(self.licences, data.licences(), network_licences(dict(self.hparams)))
         self.data_source = {
             "class_path": f"{type(data).__module__}.{type(data).__qualname__}",
             "root": str(data.root.resolve()),
@@ -535,18 +545,67 @@ class AnimationModel(LightningModule, Inference, ABC):
         checkpoint[FORMAT_KEY] = FORMAT
         checkpoint[ASSETS_KEY] = self.assets.state()
         checkpoint[DATA_SOURCE_KEY] = self.data_source
+        checkpoint[LICENCES_KEY] = [licence.state() for licence in self.licences]
+        if self.provenance:
+            checkpoint[PROVENANCE_KEY] = dict(self.provenance)
         if self.style_source == "person":
             # Of the weights that are saved: weight averaging has replaced the present ones in the checkpoint by now.
             if self._trainer is not None and isinstance(self.trainer.datamodule, SpeechMotionDataModule):  # type: ignore[attr-defined]
                 self.encode_people(checkpoint["state_dict"])
             checkpoint[STYLES_KEY] = {name: (style.name, style.vector) for name, style in self.person_styles.items()}
 
+    def save_pretrained(
+        self,
+        folder: str | Path,
+        *,
+        half: bool = False,
+        license: str | None = None,
+        **card: Any,  # noqa: A002, ANN401
+    ) -> Path:
+        """Write the model as a folder that can be handed to others, or sent to the Hugging Face hub.
+
+        ``facediff.load`` and every command that takes a checkpoint read it again. It holds the weights, what animation
+        needs of the corpus, and a model card, but nothing that only training needs.
+
+        Args:
+            folder: a folder that does not exist, or is empty.
+            half: store the parameters in 16 bits: half as large; the motion differs a little.
+            license: licence of the weights, such as ``apache-2.0``; that of the data if None.
+            card: further facts for the model card, as :func:`facediff.models.model_card.write_card` takes them.
+
+        Returns:
+            the folder.
+
+        Raises:
+            FaceDiffError: if the folder is not empty or cannot be written.
+
+        Example:
+            >>> model.save_pretrained("talking-face", license="apache-2.0")  # doctest: +SKIP
+        """
+        from facediff.models.pretrained import publish
+
+        return publish(self, Path(folder), half=half, licence=license, **card)
+
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the assets from the checkpoint."""
         if ASSETS_KEY in checkpoint:
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
             self.data_source = checkpoint.get(DATA_SOURCE_KEY, {})
+            self.licences = merged(self.licences, self._stated_licences(checkpoint))
+            self.provenance = read_provenance(checkpoint)
+            self.data_options = dict(checkpoint.get("datamodule_hyper_parameters") or {})
             self.person_styles = read_person_styles(checkpoint.get(STYLES_KEY, {}))
+
+    def _stated_licences(self, checkpoint: dict[str, Any]) -> tuple[Licence, ...]:
+        """A checkpoint's labels; of one without, written before there were labels, those of its corpus by name."""
+        if LICENCES_KEY in checkpoint:
+            return read_licences("its labels", checkpoint[LICENCES_KEY])
+        known: list[type[Any]] = [entry.implementation for entry in corpus]
+        named = next((each for each in known if getattr(each, "corpus_name", None) == self.assets.corpus), None)
+        own = Licence(f"corpus {self.assets.corpus}") if named is None else named.corpus_licence()
+        options = checkpoint.get("datamodule_hyper_parameters") or {}
+        people = [Licence(f"speaker {Path(str(folder)).name}") for folder in options.get("people") or []]
+        return merged([own], people, network_licences(dict(self.hparams)))
 
     @classmethod
     def load_from_checkpoint(
@@ -581,6 +640,21 @@ class StyleEncoding(nn.Module):
     def forward(self, reference: Tensor, mask: Tensor) -> Tensor:
         """Style vectors, as :meth:`AnimationModel.encode_style` gives them."""
         return self.model.encode_style(reference, mask)
+
+
+def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
+    """What a checkpoint was made from; the epochs and steps of one that says nothing else.
+
+    Raises:
+        FaceDiffError: if it is anything but short texts by name.
+    """
+    found = checkpoint.get(PROVENANCE_KEY, {})
+    if not isinstance(found, dict) or not all(
+        isinstance(text, str) and is_plain_text(text) for item in found.items() for text in item
+    ):
+        raise FaceDiffError(f"its provenance is {quoted(found)}; expected texts by name. The file is damaged")
+    counted = {"epochs": checkpoint.get("epoch"), "steps": checkpoint.get("global_step")}
+    return {**found, **{name: str(count) for name, count in counted.items() if isinstance(count, int)}}
 
 
 def read_person_styles(state: object) -> dict[str, Style]:

@@ -1,5 +1,8 @@
 """The one door into a checkpoint: an untrusted file becomes a model that is ready for inference.
 
+A model folder (:mod:`facediff.models.pretrained`), also of the Hugging Face hub, is read into the same content as a
+checkpoint, and goes the same way from there on.
+
 Every command and every method that loads a checkpoint comes through here, before Lightning or jsonargparse see any of
 it. In this order, and before anything is imported or allocated because the file asks for it:
 
@@ -18,6 +21,7 @@ corpus or adapted; see SECURITY.md.
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import types
@@ -33,7 +37,10 @@ import torch
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, Assets
 from facediff.errors import FaceDiffError
 from facediff.models.allocation import allocation_budget
+from facediff.models.pretrained import read_model
 from facediff.registry import COMPONENTS, Kind, corpus, model
+from facediff.utils.hub import model_path
+from facediff.utils.licences import require_cleared
 from facediff.utils.limits import LIMITS, quoted
 from facediff.utils.plain_options import Components, is_name, is_path, is_plain_text, read_options, unknown_class
 from facediff.utils.torch_files import EXPECTED, load_tensors, open_checkpoint
@@ -46,22 +53,27 @@ INSTANTIATOR = "lightning.pytorch.cli.instantiate_module"
 """What Lightning imports and calls to rebuild a module; no checkpoint of facediff's names anything else."""
 
 
-def load_model(path: Path | str, device: str = "cpu") -> AnimationModel:
+def load_model(path: Path | str, device: str = "cpu", *, commercial_only: bool = False) -> AnimationModel:
     """A trained model, ready for inference.
 
     Args:
-        path: a checkpoint of any model, also of an installed package's.
+        path: a checkpoint of any model, also of an installed package's; a model folder; or ``user/name[@revision]`` of
+            the Hugging Face hub, where no such path exists.
         device: where it computes.
+        commercial_only: refuse a model whose licence labels do not allow commercial use.
 
     Raises:
-        FaceDiffError: as :func:`read_checkpoint`, or if the model cannot be rebuilt.
+        FaceDiffError: as :func:`read_checkpoint`, or if the model cannot be rebuilt, or its licence is refused.
 
     Example:
         >>> model = load_model("demo/puppet.ckpt")  # doctest: +SKIP
         >>> model.animate(speech, identity="F1").vertices.shape  # doctest: +SKIP
         torch.Size([75, 1008, 3])
     """
-    return build_model(path, read_checkpoint(path)).to(device)
+    found = build_model(path, read_checkpoint(path))
+    if commercial_only:
+        require_cleared(path, found.licences)
+    return found.to(device)
 
 
 def read_assets(path: Path | str) -> Assets:
@@ -70,8 +82,30 @@ def read_assets(path: Path | str) -> Assets:
     Raises:
         FaceDiffError: if the file is missing, or no checkpoint of this version of facediff.
     """
+    with open_content(path, weights=False) as (content, name):
+        return assets_of(name, content)
+
+
+@contextmanager
+def open_content(
+    path: str | os.PathLike[str] | IO[bytes], *, weights: bool = True
+) -> Iterator[tuple[dict[str, Any], str]]:
+    """The content of a checkpoint or of a model folder, of which only the outer form is checked, and its name.
+
+    Args:
+        path: a checkpoint, which may be open; a model folder; or a name of the Hugging Face hub.
+        weights: whether the weights of a model folder are wanted too.
+
+    Raises:
+        FaceDiffError: if there is none, or it is damaged.
+    """
+    if isinstance(path, str | os.PathLike) and (found := model_path(path)).is_dir():
+        content = read_model(found, weights=weights)
+        check_content(content, path)
+        yield content, str(path)
+        return
     with open_checkpoint(path) as (stream, name):
-        return assets_of(name, read_file(stream, name))
+        yield read_file(stream, name), name
 
 
 def assets_of(path: Path | str, checkpoint: Mapping[str, Any]) -> Assets:
@@ -90,14 +124,14 @@ def read_checkpoint(path: str | os.PathLike[str] | IO[bytes]) -> dict[str, Any]:
     """Read a checkpoint without running any code from it, and check all that it names.
 
     Args:
-        path: the file, which may be open.
+        path: the file, which may be open; a model folder; or a name of the Hugging Face hub.
 
     Raises:
         FaceDiffError: if the file is missing, or no checkpoint of this version of facediff, or names a model, a
             component or a value that is not known.
     """
-    with open_checkpoint(path) as (stream, name):
-        checkpoint = read_file(stream, name)
+    with open_content(path) as (checkpoint, name):
+        pass
     model_of(name, checkpoint["hyper_parameters"])
     assets = assets_of(name, checkpoint)
     if checkpoint["hyper_parameters"].get("identities") != assets.identities:
@@ -112,6 +146,14 @@ def checked_file(path: str | os.PathLike[str] | IO[bytes]) -> Iterator[IO[bytes]
     Raises:
         FaceDiffError: as :func:`read_checkpoint` and :func:`build_model`.
     """
+    if isinstance(path, str | os.PathLike) and model_path(path).is_dir():
+        content = read_checkpoint(path)
+        build_model(str(path), content)
+        made = io.BytesIO()
+        torch.save(content, made)
+        made.seek(0)
+        yield made
+        return
     with open_checkpoint(path) as (stream, name):
         build_model(name, read_checkpoint(stream))
         stream.seek(0)
@@ -121,6 +163,16 @@ def checked_file(path: str | os.PathLike[str] | IO[bytes]) -> Iterator[IO[bytes]
 def read_file(stream: IO[bytes], path: Path | str) -> dict[str, Any]:
     """The plain data and tensors of a checkpoint of facediff's; only its outer form is checked."""
     checkpoint = load_tensors(stream, path)
+    check_content(checkpoint, path)
+    return checkpoint
+
+
+def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - whatever a file holds
+    """Refuse a content that has not the outer form of a checkpoint of facediff's.
+
+    Raises:
+        FaceDiffError: naming the file and the part.
+    """
     if not isinstance(checkpoint, dict) or not {ASSETS_KEY, "hyper_parameters", "state_dict"} <= checkpoint.keys():
         raise FaceDiffError(
             f"{path}: a checkpoint, but not of facediff: it lacks the templates and sizes that animation needs; "
@@ -146,7 +198,6 @@ def read_file(stream: IO[bytes], path: Path | str) -> dict[str, Any]:
     for name, value in checkpoint["state_dict"].items():
         if not isinstance(value, torch.Tensor):
             raise FaceDiffError(f"{path}: its weight {quoted(name)} is {quoted(value)}; expected a tensor")
-    return checkpoint
 
 
 def model_of(path: Path | str, hparams: Mapping[str, Any]) -> tuple[type[AnimationModel], dict[str, Any]]:
@@ -200,7 +251,10 @@ def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
             made = found(**arguments)
         made.on_load_checkpoint(checkpoint)
         check_weights(path, weights, made.state_dict())
-        made.load_state_dict(weights)
+        try:
+            made.load_state_dict(weights)
+        except RuntimeError as error:
+            raise FaceDiffError(f"{path}: {misfit(weights, made.state_dict())}") from error
     except FaceDiffError as error:
         raise FaceDiffError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
     except Exception as error:
@@ -233,6 +287,19 @@ def check_weights(path: Path | str, weights: Mapping[str, torch.Tensor], own: Ma
                 f"{path}: its weights {quoted(name)} are of the type {value.dtype}, and {mine.dtype} in the model; the "
                 f"file is damaged"
             )
+
+
+def misfit(weights: Mapping[str, torch.Tensor], own: Mapping[str, Any]) -> str:
+    """What is wrong with weights that do not fit a model, in a sentence."""
+    missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
+    other = sorted(name for name in own.keys() & weights.keys() if own[name].shape != weights[name].shape)
+    found = "they do not fit"
+    for names, what in ((missing, "are missing"), (extra, "are too many"), (other, "are of another shape")):
+        if names:
+            shapes = f" {tuple(weights[names[0]].shape)} in place of {tuple(own[names[0]].shape)}" * (names is other)
+            found = f"{len(names)} {what}, the first is {quoted(names[0])}{shapes}"
+            break
+    return f"its weights are not those of its model ({found}); the file is damaged, or its options were changed"
 
 
 def corpus_class(path: Path | str, source: Mapping[str, Any]) -> type[SpeechMotionDataModule]:

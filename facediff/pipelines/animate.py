@@ -14,6 +14,7 @@ from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, check_export
 from facediff.utils import ranges
 from facediff.utils.files import scratch_folder, valid_text
+from facediff.utils.hub import model_name
 from facediff.utils.progress import track
 
 if TYPE_CHECKING:
@@ -287,7 +288,7 @@ class AnimationPipeline:
         metadata = {
             "generator": f"facediff {__version__}",
             "model": type(self.model).__name__,
-            "checkpoint": valid_text(self.options.checkpoint.name),
+            "checkpoint": valid_text(model_name(self.options.checkpoint)),
             "corpus": f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus,
             "identity": self.identity if trained_on else f"{self.identity} (not trained on)",
             "style": style,

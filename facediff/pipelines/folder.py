@@ -20,6 +20,7 @@ from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, fact
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
+from facediff.utils.hub import model_files
 from facediff.utils.jobs import PerWorker
 from facediff.utils.tables import print_table
 
@@ -99,7 +100,7 @@ def animate_folder(
 
 def _deciding_files(options: AnimationOptions) -> list[Path]:
     """The files whose content decides the animations."""
-    files = [options.checkpoint, *style_paths(options.style)]
+    files = [*model_files(options.checkpoint), *style_paths(options.style)]
     template = None if options.style_template is None else Path(options.style_template)
     optional = (options.target_mesh, options.controls.eyes, options.correspondence, template)
     files += [path for path in optional if path is not None and path.is_file()]

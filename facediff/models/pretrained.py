@@ -1,0 +1,296 @@
+"""Model folders: a trained model as files that can be handed to others, without anything that only training needs.
+
+A folder holds
+
+- ``model.safetensors``: the weights that checkpoints animate with, which are the averaged ones where training averaged;
+  tensors that are equal, such as principal components that two modules know, are stored once;
+- ``config.json``: the model's class and options, plain values of its assets, the licence labels and what it was made
+  from, all as :meth:`AnimationModel.on_save_checkpoint` gives them, under a version number;
+- ``assets.npz``: templates, triangles, regions, and a reference motion for every speaker; motion is stored as
+  differences between frames, without loss, which compresses to less than half;
+- ``README.md``: a model card (:mod:`facediff.models.model_card`), for people only.
+
+Read again, these are the very content of a checkpoint, and pass every check of :mod:`facediff.models.checkpoint`:
+nothing in a folder can name anything to import, to open or to run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facediff.data.batch import DATA_SOURCE_KEY
+from facediff.errors import FaceDiffError
+from facediff.utils.arrays import read_arrays
+from facediff.utils.files import atomic_folder
+from facediff.utils.hub import ASSETS, CONFIG, WEIGHTS
+from facediff.utils.licences import Licence, commercial_use, known_licence, merged
+from facediff.utils.limits import LIMITS, check_format, quoted
+from facediff.utils.plain_files import json_text, load_json
+from facediff.utils.safetensors import TYPES, read_safetensors, write_safetensors
+
+if TYPE_CHECKING:
+    from facediff.models.base import AnimationModel
+
+FORMAT = "facediff model 1"
+"""Mark of the format of model folders; those of another mark are refused."""
+
+DATA_OPTIONS_KEY = "datamodule_hyper_parameters"
+"""Where a checkpoint keeps the options of the data module."""
+
+LIGHTNING = "2.6.0"
+"""Which Lightning is said to have written the content, so that it converts nothing."""
+
+PARTS = {"format", "version", "model", "state", "shared"}
+REMEDY = "expected a folder that `facediff publish` has written; copy or download it again"
+MARK = "$tensor"
+MOTION_FRAMES = 8
+"""From so many frames on, a (T, V, 3) tensor is stored as differences between frames."""
+
+NUMBERS = {name: size for name, size in TYPES.values()}
+
+
+def publish(model: AnimationModel, folder: Path, *, half: bool = False, licence: str | None = None) -> Path:
+    """Write a model folder, whole or not at all; see :meth:`AnimationModel.save_pretrained`."""
+    _ = model.assets
+    before = model.licences
+    model.licences = merged([weights_licence(before, licence)], [each for each in before if each.of != "weights"])
+    try:
+        with atomic_folder(folder) as made:
+            write_model(model, made, half=half)
+    finally:
+        model.licences = before
+    return folder
+
+
+def weights_licence(inherited: Iterable[Licence], name: str | None) -> Licence:
+    """The label of a model's weights, from the licence that its author chose; by default the strictest of its data's.
+
+    Where several of the data's are equally strict, the first is named.
+    """
+    found = list(inherited)
+    if name is not None:
+        return Licence("weights", name, known_licence(name), "chosen when the model was published")
+    strictest = commercial_use(found)
+    origin = next((each for each in found if each.commercial == strictest), Licence("weights"))
+    return Licence("weights", origin.name, strictest, f"as {origin.of}" if found else "")
+
+
+def write_model(model: AnimationModel, folder: Path, *, half: bool = False) -> dict[str, Any]:
+    """Write a model's files into a folder that exists; not atomic.
+
+    Args:
+        model: trained, or read from a checkpoint.
+        folder: an empty folder.
+        half: store parameters in 16 bits; buffers, which are constants of formulas, stay as they are.
+
+    Returns:
+        what ``config.json`` holds.
+
+    Raises:
+        FaceDiffError: if the model holds anything but tensors and plain values.
+    """
+    content = content_of(model)
+    weights, shared = stored_once(content.pop("state_dict"))
+    if half:
+        parameters = {name for name, _ in model.named_parameters()}
+        weights = {name: halved(value) if name in parameters else value for name, value in weights.items()}
+    tensors: dict[str, Tensor] = {}
+    config = {
+        "format": FORMAT,
+        "version": facediff_version(),
+        "model": as_plain(content.pop("hyper_parameters"), tensors, "model"),
+        "state": as_plain(content, tensors, ""),
+        "shared": shared,
+    }
+    write_safetensors(folder / WEIGHTS, weights)
+    arrays = {name: coded(value) if is_motion(value) else as_array(value) for name, value in tensors.items()}
+    with (folder / ASSETS).open("wb") as stream:
+        np.savez_compressed(stream, **cast(Any, arrays))
+    (folder / CONFIG).write_text(json_text(folder / CONFIG, config) + "\n", encoding="utf-8")
+    return config
+
+
+def facediff_version() -> str:
+    """The version that writes."""
+    with suppress(PackageNotFoundError):  # run from a folder that was never installed
+        return version("facediff")
+    return "unknown"
+
+
+def content_of(model: AnimationModel) -> dict[str, Any]:
+    """What a checkpoint of the model holds for inference; no folder of this machine is named in it."""
+    content: dict[str, Any] = {"hyper_parameters": dict(model.hparams), "state_dict": model.state_dict()}
+    model.on_save_checkpoint(content)
+    content[DATA_SOURCE_KEY] = {name: text for name, text in model.data_source.items() if name == "class_path"}
+    if model.data_options:
+        content[DATA_OPTIONS_KEY] = {
+            name: value for name, value in model.data_options.items() if name not in ("root", "people")
+        }
+    for key in ("hyper_parameters", DATA_OPTIONS_KEY):
+        content[key] = without_paths(content.get(key, {}))
+    return content
+
+
+def without_paths(value: Any) -> Any:  # noqa: ANN401 - plain data
+    """Plain data with an empty text in place of every absolute path."""
+    if isinstance(value, Mapping):
+        return {name: without_paths(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_paths(part) for part in value]
+    return (
+        "" if isinstance(value, str) and (value.startswith(("/", "~", ".")) or value[1:3] in (":\\", ":/")) else value
+    )
+
+
+def stored_once(weights: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The weights without those that equal an earlier one, and for each of these the earlier one's name."""
+    kept: dict[str, Tensor] = {}
+    shared: dict[str, str] = {}
+    seen: dict[tuple[Any, ...], list[str]] = {}
+    for name, value in weights.items():
+        alike = seen.setdefault((value.dtype, tuple(value.shape)), [])
+        twin = next((other for other in alike if value.numel() > 1 and torch.equal(kept[other], value)), None)
+        if twin is None:
+            kept[name] = value
+            alike.append(name)
+        else:
+            shared[name] = twin
+    return kept, shared
+
+
+def halved(value: Tensor) -> Tensor:
+    """A weight in 16 bits; as it is, where a number is too large for them."""
+    small = value.half() if value.dtype in (torch.float32, torch.float64) else value
+    return small if bool(small.isfinite().all()) else value
+
+
+def read_model(folder: Path, *, weights: bool = True) -> dict[str, Any]:
+    """A model folder as the content of a checkpoint; only its form is checked.
+
+    Args:
+        folder: the folder.
+        weights: whether the weights are read too.
+
+    Raises:
+        FaceDiffError: if a file is missing, damaged, or of a later format.
+    """
+    path = folder / CONFIG
+    config = load_json(path, remedy=REMEDY)
+    if not isinstance(config, dict) or "format" not in config:
+        raise FaceDiffError(f"{path}: is no config of a model of facediff's; {REMEDY}")
+    check_format(path, config["format"], FORMAT)
+    if config.keys() != PARTS or not all(isinstance(config[part], dict) for part in ("model", "state", "shared")):
+        raise FaceDiffError(f"{path}: holds {quoted(sorted(config))}; expected {', '.join(sorted(PARTS))}. {REMEDY}")
+    arrays = read_arrays(folder / ASSETS, remedy=REMEDY)
+    content = {
+        "pytorch-lightning_version": LIGHTNING,
+        "hyper_parameters": with_tensors(config["model"], arrays, path),
+        **with_tensors(config["state"], arrays, path),
+        "state_dict": {},
+    }
+    if weights:
+        tensors = read_safetensors(folder / WEIGHTS)
+        for name, twin in config["shared"].items():
+            if name in tensors or not isinstance(twin, str) or twin not in tensors:
+                raise FaceDiffError(f"{path}: the weights {quoted(name)} are said to equal {quoted(twin)}; {REMEDY}")
+        tensors.update({name: tensors[twin] for name, twin in config["shared"].items()})
+        LIMITS.check("bytes", sum(value.numel() * value.element_size() for value in tensors.values()), folder)
+        content["state_dict"] = tensors
+    return content
+
+
+# Plain data with tensors in it, as JSON and arrays.
+
+
+def as_plain(value: Any, tensors: dict[str, Tensor], name: str) -> Any:  # noqa: ANN401 - plain data of any form
+    """Plain data for JSON; a tensor goes to ``tensors``, and its place holds a mark with its name and its type.
+
+    Raises:
+        FaceDiffError: if it holds anything else.
+    """
+    if isinstance(value, Tensor):
+        key, number = name, 2
+        while key in tensors or "/" in key or "\\" in key:
+            key, number = f"{name.replace('/', '_')}_{number}".replace("\\", "_"), number + 1
+        tensors[key] = value.detach().cpu()
+        return {MARK: key, "type": str(value.dtype).removeprefix("torch."), "shape": list(value.shape)}
+    if isinstance(value, Mapping):
+        if not all(isinstance(each, str) for each in value) or MARK in value:
+            raise FaceDiffError(f"the model keeps {quoted(value)} in {name}; expected values by name")
+        return {each: as_plain(part, tensors, f"{name}.{each}".lstrip(".")) for each, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_plain(part, tensors, f"{name}.{place}") for place, part in enumerate(value)]
+    if value is not None and not isinstance(value, bool | int | float | str):
+        raise FaceDiffError(f"the model keeps {quoted(value)} in {name}; expected tensors and plain values")
+    return value
+
+
+def with_tensors(value: Any, arrays: Mapping[str, np.ndarray[Any, Any]], path: Path) -> Any:  # noqa: ANN401
+    """Undo :func:`as_plain`.
+
+    Raises:
+        FaceDiffError: naming the tensor that is missing or of another size than stated.
+    """
+    if isinstance(value, list):
+        return [with_tensors(part, arrays, path) for part in value]
+    if not isinstance(value, dict):
+        return value
+    if MARK not in value:
+        return {name: with_tensors(part, arrays, path) for name, part in value.items()}
+    name, kind, shape = value[MARK], value.get("type"), value.get("shape")
+    array = arrays.get(name) if isinstance(name, str) else None
+    sized = isinstance(shape, list) and len(shape) <= 64
+    sized = sized and all(isinstance(size, int) and 0 <= size < 1 << 32 for size in cast(list[Any], shape))
+    if array is None or kind not in NUMBERS or not sized:
+        raise FaceDiffError(f"{path}: its tensor {quoted(name)} is not in {ASSETS}, or of an unknown type; {REMEDY}")
+    shape = cast(list[int], shape)
+    count = int(np.prod(shape, dtype=object)) if shape else 1
+    if array.size * array.itemsize != count * NUMBERS[kind]:
+        raise FaceDiffError(f"{path}: its tensor {quoted(name)} has another size than the one in {ASSETS}; {REMEDY}")
+    if array.dtype == np.uint8 and array.ndim == 3 and kind != "uint8":
+        array = decoded(array)
+    numbers = torch.from_numpy(np.frombuffer(bytearray(np.ascontiguousarray(array).tobytes()), np.uint8))
+    made = numbers.view(getattr(torch, kind)) if kind != "bool" else numbers != 0
+    return made.reshape(shape)
+
+
+def is_motion(value: Tensor) -> bool:
+    """Whether a tensor is stored as differences between frames."""
+    return value.ndim == 3 and len(value) >= MOTION_FRAMES and value.dtype in (torch.float16, torch.float32)
+
+
+def as_array(value: Tensor) -> np.ndarray[Any, Any]:
+    """A tensor as an array; of a type that NumPy lacks, as whole numbers of as many bytes."""
+    if value.dtype in (torch.bfloat16,):
+        return value.contiguous().view(torch.int16).numpy()
+    return value.contiguous().numpy()
+
+
+def coded(value: Tensor) -> np.ndarray[Any, Any]:
+    """Motion (T, V, 3) as bytes (B, T, 3V): differences of the bit patterns between frames, byte by byte apart.
+
+    Neighbouring frames are alike, so that the upper bytes of most differences are 0 or 255, which zip shortens well;
+    whole numbers wrap around, so that nothing is lost.
+    """
+    array = value.contiguous().numpy()
+    bits = array.view(f"<u{array.itemsize}").reshape(len(array), -1)
+    steps = bits.copy()
+    steps[1:] -= bits[:-1]
+    return np.ascontiguousarray(np.moveaxis(steps.view(np.uint8).reshape(*bits.shape, array.itemsize), -1, 0))
+
+
+def decoded(planes: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Undo :func:`coded`, up to the type and the shape."""
+    item = len(planes)
+    if item not in (2, 4):
+        return planes
+    steps = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view(f"<u{item}")[..., 0]
+    return np.cumsum(steps, axis=0, dtype=steps.dtype)

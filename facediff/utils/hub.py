@@ -1,0 +1,206 @@
+"""Where a model comes from: a checkpoint, a model folder, or the Hugging Face hub, from which it is fetched.
+
+Importing this costs nothing, so that commands can refuse a name at once. Fetched folders are kept in the hub's own
+cache (``HF_HOME``), where they are found again without network; ``HF_HUB_OFFLINE`` and ``HF_ENDPOINT`` mean what they
+mean to ``huggingface_hub``, through which everything goes.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.limits import LIMITS, brief
+
+CONFIG, WEIGHTS, ASSETS, CARD = "config.json", "model.safetensors", "assets.npz", "README.md"
+FILES = (CONFIG, WEIGHTS, ASSETS, CARD)
+"""The files of a model folder; no other is fetched."""
+
+EXPECTED = (
+    "expected a .ckpt file that `facediff fit` has written, a folder of `facediff publish`, or user/name[@revision] of "
+    "the Hugging Face hub"
+)
+
+_ID = re.compile(r"(?P<name>[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})(?:@(?P<revision>[\w.-][\w./-]{0,199}))?")
+
+
+def hub_id(source: str | os.PathLike[str]) -> tuple[str, str | None] | None:
+    """Name and revision of a model on the hub; None for what can be no such name, or is a path of this machine.
+
+    Example:
+        >>> hub_id("ada/talking-face@v1"), hub_id("demo/puppet.ckpt"), hub_id("./ada/face")
+        (('ada/talking-face', 'v1'), None, None)
+    """
+    text = os.fspath(source)
+    found = _ID.fullmatch(text)
+    if found is None or os.path.lexists(text) or found["name"].endswith((".ckpt", ".pt", ".pth", ".safetensors")):
+        return None
+    return found["name"], found["revision"]
+
+
+def check_model_source(source: str | os.PathLike[str], option: str = "") -> None:
+    """Refuse, before anything heavy is imported, what can be no trained model.
+
+    Args:
+        source: what the user gave.
+        option: the option that names it, for messages.
+
+    Raises:
+        FaceDiffError: if there is no such file, the folder holds no model, or it is no name of the hub either.
+    """
+    shown = f"{option} {source}".strip()
+    if os.path.isdir(source):  # noqa: PTH112 - also of a name with a NUL, which pathlib raises for
+        for name in (CONFIG, WEIGHTS, ASSETS):
+            if not (Path(source) / name).is_file():
+                raise FaceDiffError(f"{shown}: this folder has no {name}, so it holds no model; {EXPECTED}")
+    elif not os.path.isfile(source) and hub_id(source) is None:  # noqa: PTH113
+        raise FaceDiffError(f"{shown}: no such checkpoint; {EXPECTED}")
+
+
+def model_path(source: str | os.PathLike[str]) -> Path:
+    """The checkpoint or the model folder that a name stands for; a model of the hub is fetched.
+
+    Raises:
+        FaceDiffError: if there is none, or it cannot be fetched.
+    """
+    check_model_source(source)
+    named = hub_id(source)
+    return Path(source) if named is None else fetch(*named)
+
+
+def model_files(source: str | os.PathLike[str]) -> list[Path]:
+    """The files that decide what a model makes: the checkpoint, or those of the folder that hold numbers.
+
+    Raises:
+        FaceDiffError: as :func:`model_path`.
+    """
+    path = model_path(source)
+    return [path / name for name in (CONFIG, WEIGHTS, ASSETS)] if path.is_dir() else [path]
+
+
+def model_name(source: str | os.PathLike[str]) -> str:
+    """What metadata call a model: the name of its file or folder, or its whole name on the hub."""
+    return os.fspath(source) if hub_id(source) is not None else Path(source).resolve().name
+
+
+def fetch(name: str, revision: str | None = None) -> Path:
+    """The folder of a model of the hub, in the hub's cache on this machine.
+
+    Raises:
+        FaceDiffError: if there is no such model, no network, or it is larger than the budget.
+        MissingExtraError: if huggingface_hub is not installed.
+    """
+    try:
+        from huggingface_hub import snapshot_download
+        from huggingface_hub.errors import LocalEntryNotFoundError
+    except ImportError as error:
+        raise MissingExtraError("huggingface_hub", "hub", f"fetching the model {name}") from error
+    shown = name if revision is None else f"{name}@{revision}"
+    with _hub_errors(shown, "fetched"), _progress():
+        words: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
+        try:
+            planned = snapshot_download(name, dry_run=True, **words)
+        except LocalEntryNotFoundError:
+            planned = []  # no network, or told to stay offline: the cache may have it
+        LIMITS.check("bytes", sum(file.file_size or 0 for file in planned), shown)
+        folder = Path(snapshot_download(name, **words))
+    for part in (CONFIG, WEIGHTS, ASSETS):
+        if not (folder / part).is_file():
+            raise FaceDiffError(
+                f"{shown}: this model of the hub has no {part}, so facediff did not write it; expected a model that "
+                f"`facediff publish --push` has sent there"
+            )
+    return folder
+
+
+def push(folder: Path, name: str, *, private: bool = False) -> str:
+    """Send a model folder to the hub; the model's address.
+
+    Raises:
+        FaceDiffError: if it cannot be sent.
+        MissingExtraError: if huggingface_hub is not installed.
+    """
+    try:
+        from huggingface_hub import HfApi
+    except ImportError as error:
+        raise MissingExtraError("huggingface_hub", "hub", "sending a model to the hub") from error
+    with _hub_errors(name, "sent"), _progress():
+        api = HfApi(library_name="facediff")
+        address = api.create_repo(name, private=private, exist_ok=True)
+        api.upload_folder(
+            repo_id=name, folder_path=folder, commit_message="Publish with facediff", allow_patterns=list(FILES)
+        )
+    return str(address)
+
+
+@contextmanager
+def _progress() -> Iterator[None]:
+    """Without the hub's progress bars where nobody sees them."""
+    from huggingface_hub.utils.tqdm import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
+
+    quiet = sys.stderr is None or not sys.stderr.isatty()
+    if not quiet or are_progress_bars_disabled():
+        yield
+        return
+    disable_progress_bars()
+    try:
+        yield
+    finally:
+        enable_progress_bars()
+
+
+@contextmanager
+def _hub_errors(name: str, done: str) -> Iterator[None]:
+    """Whatever the hub's library raises, as one sentence."""
+    from huggingface_hub import errors
+
+    try:
+        yield
+    except FaceDiffError:
+        raise
+    except errors.GatedRepoError as error:
+        raise FaceDiffError(
+            f"{name}: its owner gives access on request only; accept the terms on its page, then log in with `hf auth "
+            f"login`"
+        ) from error
+    except errors.RevisionNotFoundError as error:
+        raise FaceDiffError(f"{name}: the model has no such revision; expected a branch, a tag or a commit") from error
+    except errors.RepositoryNotFoundError as error:
+        raise FaceDiffError(
+            f"{name}: neither a file or folder here nor a model on the hub that you may see; check the name, and log "
+            f"in with `hf auth login` if it is private"
+        ) from error
+    except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
+        raise FaceDiffError(_unreachable(name, done)) from error
+    except errors.HFValidationError as error:
+        raise FaceDiffError(f"{name}: is no name of a model on the hub ({brief(error)}); expected user/name") from error
+    except Exception as error:  # errors of the network are of whatever class its library has
+        status = getattr(getattr(error, "response", None), "status_code", None)
+        if status in (401, 403):
+            raise FaceDiffError(
+                f"{name}: the hub refuses it ({status}); log in with `hf auth login` as somebody who may write there"
+            ) from error
+        if status is None and _is_network(error):
+            raise FaceDiffError(_unreachable(name, done)) from error
+        raise FaceDiffError(
+            f"{name}: cannot be {done} ({brief(error)}); try again later, or give a folder in its place"
+        ) from error
+
+
+def _unreachable(name: str, done: str) -> str:
+    offline = os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "ON", "YES", "TRUE")
+    reason = "HF_HUB_OFFLINE is set" if offline else "the hub cannot be reached"
+    here = "neither a file or folder here nor in the hub's cache, and cannot be fetched" if done == "fetched" else ""
+    return f"{name}: {here or f'cannot be {done}'}: {reason}. Go online once, or give a checkpoint or a model folder"
+
+
+def _is_network(error: BaseException) -> bool:
+    """Whether an error is that of a connection, under any library."""
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    return bool(kinds & {"ConnectionError", "TransportError", "TimeoutException", "ConnectError", "OSError"})

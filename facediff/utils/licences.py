@@ -1,0 +1,169 @@
+"""Licence labels: the terms of the data and networks that a model was made from, and whether they allow commercial use.
+
+A label repeats what the owner of a data set states in public, with the place where it stands; it is no legal advice.
+A model made from several things may be used only as far as all of them allow, so the strictest label decides
+(:func:`commercial_use`). Nobody is asked when nothing is known: unknown counts as not cleared.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
+
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import quoted
+from facediff.utils.plain_options import is_plain_text
+
+Commercial = Literal["allowed", "unknown", "forbidden"]
+"""Whether terms allow commercial use, from the mildest to the strictest."""
+
+LICENCES_KEY = "facediff_licences"
+"""Where checkpoints and model folders keep their labels, as a list of :meth:`Licence.state`."""
+
+MOST = 1000
+"""Labels that a file may hold."""
+
+KNOWN: dict[str, Commercial] = {
+    **dict.fromkeys(("apache-2.0", "mit", "bsd-2-clause", "bsd-3-clause", "cc0-1.0", "unlicense", "isc"), "allowed"),
+    **dict.fromkeys(("cc-by-4.0", "cc-by-3.0", "cc-by-sa-4.0", "cc-by-sa-3.0", "cdla-permissive-2.0"), "allowed"),
+    **dict.fromkeys(("cc-by-nc-4.0", "cc-by-nc-3.0", "cc-by-nc-sa-4.0", "cc-by-nc-nd-4.0"), "forbidden"),
+}
+"""Licences by the identifier that the Hugging Face hub and SPDX give them, in small letters."""
+
+SPEECH_NETWORKS = {
+    **dict.fromkeys(
+        ("facebook/hubert-base-ls960", "facebook/hubert-large-ls960-ft", "facebook/hubert-xlarge-ls960-ft"),
+        "Apache-2.0",
+    ),
+    **dict.fromkeys(("facebook/wav2vec2-base-960h", "facebook/wav2vec2-base"), "Apache-2.0"),
+}
+"""Licences of pretrained audio encoders, as their model cards on the hub state them."""
+
+
+@dataclass(frozen=True)
+class Licence:
+    """The terms of one thing that a model was made from.
+
+    Attributes:
+        of: what it is, such as ``corpus biwi`` or ``weights``.
+        name: the licence, such as ``Apache-2.0``, or the terms in a few words.
+        commercial: whether it allows commercial use.
+        source: where that stands.
+    """
+
+    of: str
+    name: str = "unknown"
+    commercial: Commercial = "unknown"
+    source: str = ""
+
+    def state(self) -> dict[str, str]:
+        """Plain data for a checkpoint or a JSON file."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return f"{self.of}: {self.name} (commercial use {self.commercial})"
+
+
+def commercial_use(licences: Iterable[Licence]) -> Commercial:
+    """What the strictest of several licences says of commercial use; unknown if there are none.
+
+    Example:
+        >>> commercial_use([Licence("corpus puppet", "Apache-2.0", "allowed"), Licence("speaker Eva")])
+        'unknown'
+    """
+    order = get_args(Commercial)
+    return max((licence.commercial for licence in licences), key=order.index, default="unknown")
+
+
+def merged(*groups: Iterable[Licence]) -> tuple[Licence, ...]:
+    """The labels of what a model inherits from, each once."""
+    return tuple(dict.fromkeys(licence for group in groups for licence in group))
+
+
+def in_words(licences: Iterable[Licence]) -> str:
+    """All licences in one line, for messages and the metadata of files.
+
+    Example:
+        >>> in_words([Licence("corpus puppet", "Apache-2.0", "allowed")])
+        'corpus puppet: Apache-2.0; commercial use allowed'
+    """
+    found = list(licences)
+    names = "; ".join(f"{each.of}: {each.name}" for each in found) or "unknown"
+    return f"{names}; commercial use {commercial_use(found)}"
+
+
+def known_licence(name: str) -> Commercial:
+    """What a licence says of commercial use, by its usual identifier; unknown for any other.
+
+    Example:
+        >>> known_licence("Apache-2.0"), known_licence("cc-by-nc-4.0"), known_licence("ours")
+        ('allowed', 'forbidden', 'unknown')
+    """
+    return KNOWN.get(name.lower(), "unknown")
+
+
+def require_cleared(source: object, licences: Iterable[Licence]) -> None:
+    """Refuse a model whose data or weights are not cleared for commercial use.
+
+    Raises:
+        FaceDiffError: naming the model and what is in the way.
+    """
+    found = list(licences)
+    if commercial_use(found) == "allowed":
+        return
+    reasons = "; ".join(str(each) for each in found if each.commercial != "allowed") or "it states no licence"
+    raise FaceDiffError(
+        f"{source}: not cleared for commercial use ({reasons}), and only cleared models were asked for. Choose a model "
+        f"whose data allow it, or omit --commercial-only (commercial_only=True) where its terms fit your use"
+    )
+
+
+def read_licences(source: object, state: object) -> tuple[Licence, ...]:
+    """The labels that a file holds.
+
+    Raises:
+        FaceDiffError: naming the file, if they are anything but short texts by field.
+    """
+    fields = set(Licence.__dataclass_fields__)
+    if not isinstance(state, list | tuple) or len(state) > MOST:
+        raise FaceDiffError(f"{source}: its licences are {quoted(state)}; expected a list. The file is damaged")
+    found = []
+    for entry in state:
+        good = isinstance(entry, Mapping) and entry.keys() == fields
+        if not good or not all(isinstance(text, str) and is_plain_text(text) for text in entry.values()):
+            raise FaceDiffError(
+                f"{source}: one of its licences is {quoted(entry)}; expected the texts {', '.join(sorted(fields))}"
+            )
+        if entry["commercial"] not in get_args(Commercial):
+            raise FaceDiffError(
+                f"{source}: the licence of {quoted(entry['of'])} says of commercial use {quoted(entry['commercial'])}; "
+                f"expected {', '.join(get_args(Commercial))}"
+            )
+        found.append(Licence(**entry))
+    return tuple(found)
+
+
+def network_licences(options: Any) -> tuple[Licence, ...]:  # noqa: ANN401 - plain data of any form
+    """Labels of the pretrained networks that a model's options name, wherever they do.
+
+    A network that was read from a folder is not known by its path; its licence is unknown.
+    """
+    if isinstance(options, Mapping):
+        own = options.get("_name_or_path")
+        inner = merged(*(network_licences(value) for value in options.values()))
+        if not isinstance(own, str) or not own:  # no network, or one that was trained here from nothing
+            return inner
+        name = SPEECH_NETWORKS.get(own)
+        shown = own if name is not None or re.fullmatch(r"[\w.-]+/[\w.-]+", own) else "from a folder"
+        label = Licence(
+            f"audio encoder {shown}",
+            name or "unknown",
+            known_licence(name or ""),
+            f"model card huggingface.co/{own}" if name else "",
+        )
+        return merged([label], inner)
+    if isinstance(options, list | tuple):
+        return merged(*map(network_licences, options))
+    return ()
