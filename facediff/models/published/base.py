@@ -39,8 +39,11 @@ class PublishedModel(AnimationModel):
     A method adds ``losses`` and :meth:`generate_frames`; it hears speech through :attr:`audio_encoder`, and finds what
     it knows of a clip's speaker in :meth:`identity_weights`.
 
+    Class attributes:
+        published_encoder: the audio encoder as the method's authors use it.
+
     Args:
-        audio_encoder: speech to features; the method's own pretrained network, or another encoder of the registry.
+        audio_encoder: speech to features; the method's own pretrained network with its settings if None.
         audio_dim: channels of an encoder that does not state them by itself, as a pretrained network does.
         alignment: how speech at 50 steps a second meets motion: ``pairs`` of steps for each frame, or ``interpolated``;
             ``auto`` takes pairs at 25 frames a second, as the projects do.
@@ -51,11 +54,12 @@ class PublishedModel(AnimationModel):
     """
 
     hears_all: ClassVar[bool] = True
+    published_encoder: ClassVar[AudioEncoderFactory]
 
     def __init__(
         self,
         *,
-        audio_encoder: AudioEncoderFactory,
+        audio_encoder: AudioEncoderFactory | None = None,
         audio_dim: Width | None = None,
         alignment: Alignment = "auto",
         motion_scale: MotionScale = "none",
@@ -67,7 +71,12 @@ class PublishedModel(AnimationModel):
             motion_scale=motion_scale, weight_decay=weight_decay, unseen_identity=unseen_identity, **options
         )
         self.pairs = self.frame_rate == 25.0 if alignment == "auto" else alignment == "pairs"
-        self.audio_encoder, self.audio_width = make_encoder(audio_encoder, audio_dim)
+        self.audio_encoder, self.audio_width = make_encoder(audio_encoder or self.published_encoder, audio_dim)
+
+    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
+        """Save the arguments as every model does, with the published audio encoder where none was given."""
+        chosen = given.get("audio_encoder")
+        super().keep_hyperparameters({**given, "audio_encoder": chosen or self.published_encoder})
 
     # What a method adds.
 

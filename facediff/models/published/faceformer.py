@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -22,36 +22,29 @@ from facediff.models.published.autoregressive import AutoregressiveModel, Autore
 from facediff.models.published.base import SpeakerTable, masked_mean
 from facediff.models.speech_networks import Wav2Vec2Encoder
 
-PUBLISHED_ENCODER = partial(
-    Wav2Vec2Encoder,
-    source="facebook/wav2vec2-base-960h",
-    spec_augment=True,
-    layer_drop=0.1,
-    epsilon=1e-5,
-    edges=False,
-)
-"""wav2vec 2.0 base with the settings of 2021: all but the convolutions is trained, with masks and layer drop."""
-
 
 @registry.model.register("FaceFormer")
 class FaceFormer(AutoregressiveModel):
     """FaceFormer: an autoregressive Transformer with periodic positions and biased attention.
 
     Args:
-        audio_encoder: speech to features; wav2vec 2.0 base as published.
         teacher_forcing: train on the true motion of the frame before, in one pass, and not on the generated one; the
             published training generates.
         options: those of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
     """
 
-    def __init__(
-        self,
-        *,
-        audio_encoder: AudioEncoderFactory = PUBLISHED_ENCODER,
-        teacher_forcing: bool = False,
-        **options: Any,  # noqa: ANN401
-    ) -> None:
-        super().__init__(audio_encoder=audio_encoder, **options)
+    # wav2vec 2.0 base as transformers had it in 2021; all but the convolutions is trained, with masks and layer drop.
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder,
+        source="facebook/wav2vec2-base-960h",
+        spec_augment=True,
+        layer_drop=0.1,
+        epsilon=1e-5,
+        edges=False,
+    )
+
+    def __init__(self, *, teacher_forcing: bool = False, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(**options)
         self.teacher_forcing = teacher_forcing
         self.network = AutoregressiveNetwork(
             audio_width=self.audio_width,
