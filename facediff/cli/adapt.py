@@ -13,7 +13,7 @@ from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
-from facediff.utils.hub import check_model_source
+from facediff.utils.hub import check_model_source, model_name
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
@@ -35,6 +35,7 @@ def adapt(
     corpus: Corpus = None,
     seed: Seed = 0,
     accelerator: str = "auto",
+    commercial_only: bool = False,
     quiet: bool = False,
     yes: bool = False,
 ) -> None:
@@ -56,6 +57,7 @@ def adapt(
             may be a file of the working folder
         seed: seed of all random numbers
         accelerator: Lightning's: auto, cpu, gpu …
+        commercial_only: refuse a checkpoint that is not cleared for commercial use
         quiet: no progress bar
         yes: start without a question, however long it takes
     """
@@ -69,11 +71,14 @@ def adapt(
     from facediff.cli.trainer_options import explained
     from facediff.models.adaptation import train_only, with_extra_identities
     from facediff.models.checkpoint import build_model, read_checkpoint
+    from facediff.utils.licences import require_cleared
 
     started = time.monotonic()
     content = read_checkpoint(checkpoint)
     name, data = adaptation_data(checkpoint, content, person, mode, data_root, corpus)
     model = build_model(checkpoint, content)
+    if commercial_only:
+        require_cleared(checkpoint, model.licences)
     data.prepare_data()
     if not data.root.is_dir():
         raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
@@ -86,6 +91,7 @@ def adapt(
     confirm_cost(yes, "--epochs", seconds=CLIP_SECONDS * epochs * len(clips))
     seed_everything(seed, verbose=False)
     model = with_extra_identities(model, list(data.identities))
+    model.provenance = {"parent": model_name(checkpoint)}
     model.learning_rate, model.lr_schedule, model.warmup_steps = learning_rate, "cosine", 0
     train_only(model.train(), train)
     with explained({"max_epochs": epochs, "accelerator": accelerator}, prefix="--"):

@@ -74,6 +74,7 @@ def animate(
     guidance: Annotated[str | None, Option(metavar="SCALES")] = None,
     seed: Seed = 0,
     device: str = "cpu",
+    commercial_only: bool = False,
     precision: Literal["32", "bf16"] = "32",
     target_mesh: File = None,
     correspondence: Map = None,
@@ -112,6 +113,7 @@ def animate(
             trained for that (default: the checkpoint's, usually 1)
         seed: seed of the noise
         device: cpu, cuda …
+        commercial_only: refuse a model that is not cleared for commercial use
         precision: bf16 multiplies in 16 bits, where the processor is faster at it; the motion differs a little
         target_mesh: transfer the motion to this mesh
         correspondence: with --target-mesh: .npz to use if it exists, else to write
@@ -157,6 +159,7 @@ def animate(
         expressivity=expressivity,
         guidance=guidance,
         device=device,
+        commercial_only=commercial_only,
         precision=precision,
         window=windows.window,
         overlap=windows.overlap,
@@ -192,6 +195,7 @@ def animate(
     written, animation = pipeline.write(samples_of_speech, speech[0].stem, output, seed=seed)
     metadata = animation.metadata
     notes = "".join(f", {name}: {metadata[name]}" for name in ("edited", "procedural") if name in metadata)
+    notes += f", licence: {metadata['licence']}"
     line = f"{len(animation.vertices)} frames, identity {metadata['identity']}, style of {metadata['style']}{notes}"
     for path in written:
         tell(f"{path}: {line}")

@@ -17,6 +17,7 @@ def extract(
     checkpoint: Checkpoint,
     output: Output,
     identity: Identity = None,
+    commercial_only: bool = False,
 ) -> None:
     """Write the style vector of clips, their mean if there are several.
 
@@ -25,6 +26,7 @@ def extract(
         checkpoint: trained model (.ckpt)
         output: vector to write (.npy)
         identity: whose motion it is, where the files' names do not say it; by default the first one trained on
+        commercial_only: refuse a model that is not cleared for commercial use
     """
     if output.suffix != ".npy":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .npy")
@@ -34,7 +36,7 @@ def extract(
     from facediff.models.styles import extract_style
     from facediff.utils.files import atomic
 
-    model = load_model(checkpoint)
+    model = load_model(checkpoint, commercial_only=commercial_only)
     vector = extract_style(clips, identity or model.identities[0], model)
     if not len(vector):
         raise FaceDiffError(f"{checkpoint}: was trained without a dynamic style, so it has no style vectors")

@@ -37,6 +37,7 @@ def yardsticks(
     corpus: Corpus = None,
     eyelid_pairs: FileOrList = None,
     device: str = "cpu",
+    commercial_only: bool = False,
     seed: Seed = 0,
     json: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
     csv: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
@@ -68,6 +69,7 @@ def yardsticks(
         corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class
         eyelid_pairs: file with pairs of eyelid vertices (default: regions/eyelid_pairs.txt in the corpus's folder)
         device: cpu, cuda …
+        commercial_only: refuse models that are not cleared for commercial use
         seed: of the first sample; the others follow
         json: write everything as JSON
         csv: write one row for each split and yardstick
@@ -104,7 +106,7 @@ def yardsticks(
     with progress_bar("clips", total, shown=not quiet) as step:
 
         def results(paths: list[Path]) -> Yardsticks:
-            models = {str(path): partial(load_model, path, device) for path in paths}
+            models = {str(path): partial(load_model, path, device, commercial_only=commercial_only) for path in paths}
             return measure(models, data, splits=splits, sampling=sampling, most_clips=max_clips, step=step)
 
         found = results(checkpoints)

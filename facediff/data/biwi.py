@@ -39,6 +39,7 @@ class Biwi(SpeechMotionDataModule):
         "BIWI/regions; put them into regions/ of your corpus folder."
     )
     licence: ClassVar[str] = "B3D(AC)^2 end-user licence of ETH Zurich: non-commercial research"
+    languages: ClassVar[tuple[str, ...]] = ("en",)
     commercial_use: ClassVar[Commercial] = "forbidden"
     licence_source: ClassVar[str] = "licence agreement of data.vision.ee.ethz.ch/cvl/datasets/b3dac2.en.html"
     obtain: ClassVar[str] = (

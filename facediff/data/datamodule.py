@@ -79,6 +79,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         commercial_use: whether these terms allow it: ``allowed``, ``forbidden`` or ``unknown``.
         licence_source: where the terms stand, without ``https://``.
         obtain: how to obtain the corpus.
+        languages: codes of the languages that are spoken in it.
 
     Attributes:
         pair_sentences: whether neighbours in training batches speak the same sentence; a model that learns from such
@@ -133,6 +134,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     commercial_use: ClassVar[Commercial] = "unknown"
     licence_source: ClassVar[str] = ""
     obtain: ClassVar[str] = ""
+    languages: ClassVar[tuple[str, ...]] = ()
 
     @keeps_arguments
     def __init__(

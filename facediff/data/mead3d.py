@@ -49,6 +49,7 @@ class Mead3D(SpeechMotionDataModule):
     reference_attributes: ClassVar[tuple[str, ...]] = ("emotion",)
     score_attributes: ClassVar[tuple[str, ...]] = ("emotion", "intensity")
     licence: ClassVar[str] = "MEAD and FLAME licences: non-commercial research"
+    languages: ClassVar[tuple[str, ...]] = ("en",)
     commercial_use: ClassVar[Commercial] = "forbidden"
     licence_source: ClassVar[str] = "wywu.github.io/projects/MEAD/MEAD.html and flame.is.tue.mpg.de/modellicense.html"
     obtain: ClassVar[str] = (

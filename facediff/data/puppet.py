@@ -62,6 +62,7 @@ class Puppet(SpeechMotionDataModule):
     # Face and motion come from this package's code. The program espeak-ng, which speaks, is under the GPL 3, whose
     # terms cover the program and not its output (gnu.org/licenses/gpl-faq.html#GPLOutput).
     licence: ClassVar[str] = "Apache-2.0"
+    languages: ClassVar[tuple[str, ...]] = ("en",)
     commercial_use: ClassVar[Commercial] = "allowed"
     licence_source: ClassVar[str] = "LICENSE of facediff, which makes it; gnu.org/licenses/gpl-faq.html#GPLOutput"
 

@@ -49,6 +49,7 @@ class Vocaset(SpeechMotionDataModule):
         "(github.com/uuembodiedsocialai/FaceDiffuser) into regions/."
     )
     licence: ClassVar[str] = "VOCASET licence of the Max Planck Society: non-commercial research"
+    languages: ClassVar[tuple[str, ...]] = ("en",)
     commercial_use: ClassVar[Commercial] = "forbidden"
     licence_source: ClassVar[str] = "voca.is.tue.mpg.de/license.html"
     obtain: ClassVar[str] = (

@@ -237,7 +237,7 @@ def make_document(
         extras={"targetNames": [f"{prefix}_{index:04d}" for index in range(len(targets))]},
     )
     return gltf.GLTF2(
-        asset=gltf.Asset(generator="facediff"),
+        asset=gltf.Asset(generator="facediff", copyright=animation.metadata.get("licence")),
         scene=0,
         scenes=[gltf.Scene(nodes=[0])],
         nodes=[gltf.Node(name=animation.name, mesh=0, extras=extras)],

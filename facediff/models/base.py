@@ -559,8 +559,10 @@ class AnimationModel(LightningModule, Inference, ABC):
         folder: str | Path,
         *,
         half: bool = False,
-        license: str | None = None,
-        **card: Any,  # noqa: A002, ANN401
+        license: str | None = None,  # noqa: A002 - the hub's word
+        name: str | None = None,
+        scores: str | Path | None = None,
+        languages: Sequence[str] | None = None,
     ) -> Path:
         """Write the model as a folder that can be handed to others, or sent to the Hugging Face hub.
 
@@ -571,7 +573,9 @@ class AnimationModel(LightningModule, Inference, ABC):
             folder: a folder that does not exist, or is empty.
             half: store the parameters in 16 bits: half as large; the motion differs a little.
             license: licence of the weights, such as ``apache-2.0``; that of the data if None.
-            card: further facts for the model card, as :func:`facediff.models.model_card.write_card` takes them.
+            name: what the card calls the model; the folder's name if None.
+            scores: ``test_scores.csv`` that ``facediff test`` wrote for this model, for the card.
+            languages: codes of the languages that it was trained on; those of its corpus if None.
 
         Returns:
             the folder.
@@ -584,7 +588,8 @@ class AnimationModel(LightningModule, Inference, ABC):
         """
         from facediff.models.pretrained import publish
 
-        return publish(self, Path(folder), half=half, licence=license, **card)
+        table = None if scores is None else Path(scores)
+        return publish(self, Path(folder), half=half, licence=license, name=name, scores=table, languages=languages)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the assets from the checkpoint."""

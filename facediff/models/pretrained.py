@@ -16,8 +16,9 @@ nothing in a folder can name anything to import, to open or to run.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -28,12 +29,14 @@ from torch import Tensor
 
 from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
+from facediff.models.model_card import Facts, card, check_languages, read_scores
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
-from facediff.utils.hub import ASSETS, CONFIG, WEIGHTS
+from facediff.utils.hub import ASSETS, CARD, CONFIG, WEIGHTS
 from facediff.utils.licences import Licence, commercial_use, known_licence, merged
 from facediff.utils.limits import LIMITS, check_format, quoted
 from facediff.utils.plain_files import json_text, load_json
+from facediff.utils.plain_options import is_plain_text
 from facediff.utils.safetensors import TYPES, read_safetensors, write_safetensors
 
 if TYPE_CHECKING:
@@ -44,6 +47,9 @@ FORMAT = "facediff model 1"
 
 DATA_OPTIONS_KEY = "datamodule_hyper_parameters"
 """Where a checkpoint keeps the options of the data module."""
+
+LONGEST_LICENCE = 200
+"""Characters of the name of a licence."""
 
 LIGHTNING = "2.6.0"
 """Which Lightning is said to have written the content, so that it converts nothing."""
@@ -57,17 +63,47 @@ MOTION_FRAMES = 8
 NUMBERS = {name: size for name, size in TYPES.values()}
 
 
-def publish(model: AnimationModel, folder: Path, *, half: bool = False, licence: str | None = None) -> Path:
-    """Write a model folder, whole or not at all; see :meth:`AnimationModel.save_pretrained`."""
-    _ = model.assets
+def publish(
+    model: AnimationModel,
+    folder: Path,
+    *,
+    half: bool = False,
+    licence: str | None = None,
+    name: str | None = None,
+    scores: Path | None = None,
+    languages: Sequence[str] | None = None,
+) -> Path:
+    """Write a model folder with its card, whole or not at all; see :meth:`AnimationModel.save_pretrained`."""
+    _ = model.assets  # an untrained model is refused before anything is written
+    if licence is not None and not (licence.strip() and is_plain_text(licence) and len(licence) <= LONGEST_LICENCE):
+        raise FaceDiffError(f"--license {quoted(licence)}: expected a short name, such as apache-2.0 or cc-by-nc-4.0")
+    check_languages(languages or ())
+    rows = [] if scores is None else read_scores(scores)
     before = model.licences
-    model.licences = merged([weights_licence(before, licence)], [each for each in before if each.of != "weights"])
+    model.licences = published_licences(before, licence)
     try:
         with atomic_folder(folder) as made:
             write_model(model, made, half=half)
+            sizes = {path.name: path.stat().st_size for path in made.iterdir()}
+            facts = Facts(name or folder.resolve().name, rows, languages, half, sizes)
+            (made / CARD).write_text(card(model, model.licences, facts), encoding="utf-8")
     finally:
         model.licences = before
     return folder
+
+
+def published_licences(inherited: Iterable[Licence], name: str | None) -> tuple[Licence, ...]:
+    """A model's labels once it is published: that of its weights, and those that it inherits.
+
+    Args:
+        inherited: the model's labels.
+        name: the licence that its author chose for the weights; that of the data if None.
+    """
+    found = list(inherited)
+    kept = [each for each in found if each.of != "weights"]
+    # Whoever publishes somebody's published weights inherits their terms, as those of the parent.
+    parents = [replace(each, of="parent's weights") for each in found if each.of == "weights"] if name else []
+    return merged([weights_licence(found, name)], parents, kept)
 
 
 def weights_licence(inherited: Iterable[Licence], name: str | None) -> Licence:

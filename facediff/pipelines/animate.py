@@ -15,6 +15,7 @@ from facediff.export import ExportOptions, check_export
 from facediff.utils import ranges
 from facediff.utils.files import scratch_folder, valid_text
 from facediff.utils.hub import model_name
+from facediff.utils.licences import licence_metadata
 from facediff.utils.progress import track
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ class AnimationOptions:
     expressivity: str | None = None
     guidance: str | None = None
     device: str = "cpu"
+    commercial_only: bool = False
     precision: Literal["32", "bf16"] = "32"
     window: ranges.Window | None = None
     overlap: ranges.Window | None = None
@@ -110,7 +112,9 @@ class AnimationPipeline:
         from facediff.models.styles import read_styles
 
         self.options = options
-        self.model = load_model(options.checkpoint, device=usable_device(options.device))
+        self.model = load_model(
+            options.checkpoint, usable_device(options.device), commercial_only=options.commercial_only
+        )
         if options.samples > 1 and not self.model.samples:
             raise FaceDiffError(
                 f"--samples {options.samples}: {type(self.model).__name__} makes one animation, whatever the "
@@ -290,6 +294,7 @@ class AnimationPipeline:
             "model": type(self.model).__name__,
             "checkpoint": valid_text(model_name(self.options.checkpoint)),
             "corpus": f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus,
+            **licence_metadata(self.model.licences),
             "identity": self.identity if trained_on else f"{self.identity} (not trained on)",
             "style": style,
             "seed": str(seed),

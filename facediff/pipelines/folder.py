@@ -86,6 +86,7 @@ def animate_folder(
         retarget(neutral, options.target_mesh, options.correspondence)
     quiet = replace(options, quiet=True, export=replace(options.export, quiet=True))
     decides = {**asdict(quiet), "seed": seed, "max_seconds": max_seconds}
+    del decides["commercial_only"]  # refuses a model, and changes no animation
     return run_folder(
         found,
         output,

@@ -44,6 +44,12 @@ def hub_id(source: str | os.PathLike[str]) -> tuple[str, str | None] | None:
     return found["name"], found["revision"]
 
 
+def is_hub_name(text: str) -> bool:
+    """Whether a text can name a model on the hub, without a revision."""
+    found = _ID.fullmatch(text)
+    return found is not None and found["revision"] is None
+
+
 def check_model_source(source: str | os.PathLike[str], option: str = "") -> None:
     """Refuse, before anything heavy is imported, what can be no trained model.
 

@@ -94,6 +94,17 @@ def in_words(licences: Iterable[Licence]) -> str:
     return f"{names}; commercial use {commercial_use(found)}"
 
 
+def licence_metadata(licences: Iterable[Licence]) -> dict[str, str]:
+    """The entries of an animation's metadata.
+
+    Example:
+        >>> licence_metadata([Licence("corpus puppet", "Apache-2.0", "allowed")])
+        {'licence': 'corpus puppet: Apache-2.0; commercial use allowed', 'commercial_use': 'allowed'}
+    """
+    found = list(licences)
+    return {"licence": in_words(found), "commercial_use": commercial_use(found)}
+
+
 def known_licence(name: str) -> Commercial:
     """What a licence says of commercial use, by its usual identifier; unknown for any other.
 

@@ -36,7 +36,7 @@ NO_PATHS = {
         "font",
         "guidance",
     ),
-    *("identity", "kind", "labels"),
+    *("identity", "kind", "labels", "languages", "license", "push"),
     *("metric", "name", "output_unit", "pattern", "phonemes", "protocol", "region", "sampler", "scalar", "split"),
     "splits",
     *("subjects", "suffix", "topology", "truth_pattern", "unit"),

@@ -1,0 +1,95 @@
+"""``facediff publish``: a trained model as a folder for others, and on the Hugging Face hub."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from facediff.cli.parsing import Option, refuse_idle
+from facediff.cli.process import tell
+from facediff.errors import FaceDiffError
+from facediff.utils import hub
+
+SCORES = "test_scores.csv"
+
+
+def publish(
+    checkpoint: Annotated[Path, Option(metavar="CHECKPOINT", reads=True)],
+    folder: Annotated[Path, Option(metavar="FOLDER", writes="folder")],
+    *,
+    license: Annotated[str | None, Option(metavar="NAME")] = None,
+    half: bool = False,
+    name: Annotated[str | None, Option(metavar="NAME")] = None,
+    scores: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
+    languages: Annotated[Sequence[str] | None, Option(metavar="CODE,…")] = None,
+    push: Annotated[str | None, Option(metavar="USER/NAME")] = None,
+    private: bool = False,
+    commercial_only: bool = False,
+) -> None:
+    """Write a trained model as a folder that others can use, and send it to the Hugging Face hub.
+
+    The folder holds the weights, what animation needs of the corpus, licence labels and a model card (README.md), and
+    nothing that only training needs: it cannot be trained on with `facediff fit`. Wherever a command takes a
+    checkpoint, it takes such a folder too, and user/name[@revision] of the hub.
+
+    For example:
+      facediff publish demo/puppet.ckpt puppet --license apache-2.0
+      facediff publish demo/puppet.ckpt puppet --half --push ada/puppet
+      facediff animate speech.wav --checkpoint ada/puppet -o speech.mp4
+
+    Args:
+        checkpoint: trained model (.ckpt), a model folder, or user/name[@revision] of the hub
+        folder: new folder to write
+        license: licence of the weights, such as apache-2.0 or cc-by-nc-4.0 (default: that of the data)
+        half: store the weights in 16 bits: half as large; the motion differs a little
+        name: what the card calls the model (default: that of --push, else the folder's)
+        scores: test_scores.csv of `facediff test` for this model, for the card (default: the one next to the
+            checkpoint, if it is not older)
+        languages: codes of the languages that it was trained on, en,zh-CN (default: those of its corpus)
+        push: send the folder to this name on the hub; log in with `hf auth login` before
+        private: with --push: a new model is visible to its owner alone
+        commercial_only: refuse a model that is not cleared for commercial use
+    """
+    hub.check_model_source(checkpoint)
+    if push is None:
+        refuse_idle("is for --push", private=private)
+    elif not hub.is_hub_name(push):
+        raise FaceDiffError(f"--push {push}: is no name of a model on the hub; expected user/name")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise FaceDiffError(f"{folder}: is not empty; choose a new folder, or remove this one")
+
+    from facediff.models import load_model
+    from facediff.models.pretrained import published_licences
+    from facediff.utils.licences import in_words
+
+    found = scores or scores_next_to(checkpoint)
+    model = load_model(checkpoint, commercial_only=commercial_only)
+    model.provenance = {"published_from": hub.model_name(checkpoint), **model.provenance}
+    model.save_pretrained(
+        folder, half=half, license=license, name=name or push, scores=found, languages=languages or None
+    )
+    labels = in_words(published_licences(model.licences, license))
+    size = sum(path.stat().st_size for path in folder.iterdir())
+    weights = (folder / hub.WEIGHTS).stat().st_size
+    tell(f"{folder}: {size / 1e6:.1f} MB, {weights / 1e6:.1f} of them weights; licence: {labels}")
+    tell(f"{folder / hub.CARD}: model card, {'without scores' if found is None else f'scores from {found}'}")
+    source = str(folder)
+    if push is not None:
+        tell(f"sent to {hub.push(folder, push, private=private)}")
+        source = push
+    tell(f"next: {shlex.join(['facediff', 'animate', 'speech.wav', '--checkpoint', source, '-o', 'speech.mp4'])}")
+
+
+def scores_next_to(checkpoint: Path) -> Path | None:
+    """The table of test scores next to a checkpoint; None if there is none, or it was written before the checkpoint."""
+    if not checkpoint.is_file():
+        return None
+    table = checkpoint.parent / SCORES
+    if not table.is_file():
+        return None
+    if table.stat().st_mtime + 1 < checkpoint.stat().st_mtime:
+        tell(f"{table}: is older than the checkpoint and was left out; give it with --scores if it is of this model")
+        return None
+    return table

@@ -1,0 +1,359 @@
+"""Model cards: the ``README.md`` of a model folder, with the metadata that the Hugging Face hub reads.
+
+A card states what is known of a model and says so where something is not. Scores come with their protocol, the hashes
+of the regions that they were taken over, and the frames and sequences that went into them, as the test wrote them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from facediff.errors import FaceDiffError
+from facediff.registry import COMPONENTS, corpus
+from facediff.utils.hub import ASSETS, CONFIG, WEIGHTS
+from facediff.utils.licences import KNOWN, Licence, commercial_use
+from facediff.utils.limits import quoted
+from facediff.utils.plain_files import read_rows
+
+if TYPE_CHECKING:
+    from facediff.models.base import AnimationModel
+
+SCORES = "test_scores.csv"
+"""What ``facediff test`` calls its table of scores."""
+
+SPLITS = {"test_a": "test A, seen speakers", "test_b": "test B, unseen speakers", "val": "validation"}
+METHODS = {
+    "model": "this model",
+    "still": "still face",
+    "mean_face": "speaker's mean face",
+    "shuffled": "this model, shuffled speech",
+}
+ABOUT = {"split", "method", "unseen_identity", "protocol", "frames", "sequences", "cut_prediction", "cut_truth"}
+"""Columns of a table of scores that are no scores; those of regions end in ``_vertices`` and ``_hash``."""
+
+LONGEST_NAME = 96
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a card says in addition to what the model knows.
+
+    Attributes:
+        name: the model's name.
+        scores: rows of a table that ``facediff test`` wrote for this very model; none if it was not tested.
+        languages: codes of the languages that it was trained on, such as ``en``; those of the corpus if None.
+        half: whether its parameters are stored in 16 bits.
+        sizes: bytes of the folder's files by name.
+    """
+
+    name: str
+    scores: Sequence[Mapping[str, str]] = ()
+    languages: Sequence[str] | None = None
+    half: bool = False
+    sizes: Mapping[str, int] = field(default_factory=dict)
+
+
+def read_scores(path: Path) -> list[dict[str, str]]:
+    """The rows of a table of scores.
+
+    Raises:
+        FaceDiffError: if the file is none that ``facediff test`` has written.
+    """
+    remedy = f"expected {SCORES} as `facediff test` writes it"
+    rows = list(read_rows(path, remedy=remedy))
+    if not rows or not {"split", "method", "protocol", "frames"} <= rows[0].keys():
+        raise FaceDiffError(f"{path}: is no table of test scores; {remedy}")
+    for row in rows:
+        for column in scored(rows):
+            if not re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?|nan|", row[column].strip(), re.IGNORECASE):
+                raise FaceDiffError(f"{path}: its {column} is {quoted(row[column])}; expected a number. {remedy}")
+    return rows
+
+
+def scored(rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """The columns that are scores."""
+    return list(filter(is_score, rows[0])) if rows else []
+
+
+def is_score(column: str) -> bool:
+    """Whether a column holds scores."""
+    return column not in ABOUT and not column.endswith(("_vertices", "_hash"))
+
+
+def check_languages(languages: Iterable[str]) -> None:
+    """Refuse what is no code of a language.
+
+    Raises:
+        FaceDiffError: naming it.
+    """
+    for code in languages:
+        if not re.fullmatch(r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})*", code):
+            raise FaceDiffError(f"--languages {quoted(code)}: expected codes such as en or zh-CN, separated by commas")
+
+
+def card(model: AnimationModel, licences: Sequence[Licence], facts: Facts) -> str:
+    """The text of a model card: metadata in YAML, then Markdown."""
+    import yaml
+
+    head = yaml.safe_dump(metadata(model, licences, facts), sort_keys=False, allow_unicode=True, width=100)
+    parts = [
+        introduction(model, facts),
+        how_to_use(model, facts),
+        licence_section(licences),
+        data_section(model, facts),
+        training_section(model),
+        score_section(model, facts),
+        limits_section(model),
+        files_section(facts),
+    ]
+    return f"---\n{head}---\n\n" + "\n\n".join(parts) + "\n"
+
+
+def metadata(model: AnimationModel, licences: Sequence[Licence], facts: Facts) -> dict[str, Any]:
+    """The metadata of the card, by the hub's names; ``commercial_use`` and ``corpus`` are ours."""
+    weights = next((each for each in licences if each.of == "weights"), Licence("weights"))
+    identifier = weights.name.lower()
+    known = identifier in KNOWN
+    parent = model.provenance.get("parent", "")
+    found: dict[str, Any] = {"license": identifier if known else "unknown" if identifier == "unknown" else "other"}
+    if found["license"] == "other":
+        found["license_name"] = re.sub(r"[^a-z0-9.]+", "-", identifier).strip("-")[:LONGEST_NAME]
+    found["library_name"] = "facediff"
+    if languages := languages_of(model, facts):
+        found["language"] = list(languages)
+    found["tags"] = [
+        *("speech-driven-3d-facial-animation", "3d-face", "talking-head", "audio-to-motion"),
+        type(model).__name__.lower(),
+        f"corpus-{model.assets.corpus}",
+        *(["synthetic-data"] if model.assets.synthetic else []),
+    ]
+    if re.fullmatch(r"[\w.-]+/[\w.-]+(@.*)?", parent):
+        found["base_model"] = parent.partition("@")[0]
+    found["corpus"] = {"name": model.assets.corpus, "synthetic": model.assets.synthetic}
+    found["commercial_use"] = commercial_use(licences)
+    if results := model_index(model, facts):
+        found["model-index"] = [{"name": facts.name, "results": results}]
+    return found
+
+
+def model_index(model: AnimationModel, facts: Facts) -> list[dict[str, Any]]:
+    """The model's own scores in the form in which the hub shows them."""
+    results = []
+    for row in facts.scores:
+        if row["method"] != "model":
+            continue
+        values = {name: float(row[name]) for name in scored(facts.scores) if row[name] and row[name].lower() != "nan"}
+        label = f"{model.assets.corpus} ({SPLITS.get(row['split'], row['split'])})"
+        results.append(
+            {
+                "task": {"type": "speech-driven-3d-facial-animation", "name": "Speech-driven 3D facial animation"},
+                "dataset": {"type": model.assets.corpus, "name": label, "split": row["split"], "args": conditions(row)},
+                "metrics": [
+                    {"type": name, "value": value, "name": f"{name.upper()}, protocol {row['protocol']}"}
+                    for name, value in values.items()
+                ],
+            }
+        )
+    return results
+
+
+def conditions(row: Mapping[str, str]) -> dict[str, str]:
+    """What decides a row's scores: protocol, regions, frames and sequences."""
+    return {name: value for name, value in row.items() if name not in ("split", "method") and not is_score(name)}
+
+
+# The sections.
+
+
+def introduction(model: AnimationModel, facts: Facts) -> str:
+    """What the model is, in a few lines."""
+    assets = model.assets
+    count = sum(parameter.numel() for parameter in model.parameters())
+    lines = [
+        f"# {text(facts.name)}",
+        "",
+        f"Speech in, a talking 3D face out: a model of the method `{type(model).__name__}` of "
+        f"facediff, trained on {'the synthetic' if assets.synthetic else 'the'} corpus **{text(assets.corpus)}**.",
+    ]
+    if assets.synthetic:
+        lines += [
+            "",
+            "> **Synthetic data.** A program made the faces and their motion. The scores below compare models on this "
+            "corpus; they say nothing about real people.",
+        ]
+    rows = [
+        ("vertices", f"{model.n_vertices}, in {text(assets.unit)}"),
+        ("frames a second", f"{model.frame_rate:g}"),
+        ("identities", ", ".join(text(name) for name in model.identities)),
+        ("weights", f"{count / 1e6:.2f} million, stored in {'16' if facts.half else '32'} bits"),
+        *((kind.replace("_", " "), f"`{name}`") for kind, name in components(model).items()),
+    ]
+    return "\n".join([*lines, "", table(("", ""), rows)])
+
+
+def components(model: AnimationModel) -> dict[str, str]:
+    """The names of the model's components by kind."""
+    options = {kind: model.hparams.get(kind) for kind in COMPONENTS}
+    return {
+        kind: str(option["class_path"]).rpartition(".")[2]
+        for kind, option in options.items()
+        if isinstance(option, Mapping) and "class_path" in option
+    }
+
+
+def how_to_use(model: AnimationModel, facts: Facts) -> str:
+    """The two ways to use it."""
+    identity = model.identities[0]
+    return f"""## How to use it
+
+```bash
+pip install "facediff[all]"
+facediff animate speech.wav --checkpoint {facts.name} --identity {identity} -o speech.mp4
+```
+
+```python
+import facediff
+
+model = facediff.load("{facts.name}")
+model.animate("speech.wav", identity="{identity}").save("speech.glb")
+```
+
+In place of the name, give this folder's path, or `user/name` (or `user/name@revision`) of the hub. The folder holds
+numbers and plain text only; nothing in it is run."""
+
+
+def licence_section(licences: Sequence[Licence]) -> str:
+    """The labels, and what the strictest of them says."""
+    rows = [(text(each.of), text(each.name), each.commercial, text(each.source) or "not stated") for each in licences]
+    verdict = {
+        "allowed": "Commercial use is **allowed** by every licence that this model inherits.",
+        "forbidden": "Commercial use is **forbidden** by at least one licence that this model inherits.",
+        "unknown": "Whether commercial use is allowed is **unknown**; treat it as not allowed until you know.",
+    }[commercial_use(licences)]
+    shown = table(("of", "licence", "commercial use", "where it stands"), rows) if rows else ""
+    advice = "The strictest decides; read the terms themselves, this is no legal advice."
+    return f"## Licences\n\n{verdict} {advice}\n\n{shown}"
+
+
+def data_section(model: AnimationModel, facts: Facts) -> str:
+    """What it was trained on."""
+    assets = model.assets
+    languages = ", ".join(languages_of(model, facts)) or "not stated"
+    rows = [
+        ("corpus", text(assets.corpus)),
+        ("kind", "synthetic, made by a program" if assets.synthetic else "captured from real people"),
+        ("speakers trained on", str(len(model.identities))),
+        ("faces known", str(len(assets.templates))),
+        ("languages", languages),
+    ]
+    return f"## Data\n\n{table(('', ''), rows)}"
+
+
+def training_section(model: AnimationModel) -> str:
+    """How it was trained."""
+    known = model.provenance
+    options = dict(model.hparams)
+    data = model.data_options
+    rows = [
+        ("adapted from", text(known.get("parent") or "nothing; trained from its first step")),
+        ("epochs", known.get("epochs", "not known")),
+        ("optimiser steps", known.get("steps", "not known")),
+        ("learning rate", f"{options.get('learning_rate', 'not known')}, {options.get('lr_schedule', '')}"),
+        ("weight decay", str(options.get("weight_decay", "not known"))),
+        ("clips a batch", str(data.get("batch_size", "not known"))),
+        ("training window", "whole clips" if data.get("window") is None else f"{data['window']} frames"),
+        ("weights stored", "the averaged ones, where training averaged them"),
+    ]
+    return f"## Training\n\n{table(('', ''), rows)}\n\nEvery option is in `{CONFIG}`."
+
+
+def score_section(model: AnimationModel, facts: Facts) -> str:
+    """The scores with everything that decides them."""
+    if not facts.scores:
+        return (
+            "## Scores\n\nNone are known. `facediff test --ckpt_path FOLDER` measures them where the corpus is, and "
+            "`facediff publish --scores test_scores.csv` puts them here."
+        )
+    first, names = facts.scores[0], scored(facts.scores)
+    header = ["split", "method", *(name.upper() for name in names), "frames", "sequences"]
+    rows = [
+        [
+            SPLITS.get(row["split"], text(row["split"])),
+            METHODS.get(row["method"], text(row["method"])),
+            *(f"{float(row[name]):.4g}" if row[name] else "" for name in names),
+            text(row["frames"]),
+            text(row.get("sequences", "")),
+        ]
+        for row in facts.scores
+    ]
+    regions = [column.removesuffix("_hash") for column in first if column.endswith("_hash")]
+    taken = [
+        f"{text(region)}: {text(first.get(f'{region}_vertices', ''))} vertices, hash `{text(first[f'{region}_hash'])}`"
+        for region in regions
+    ]
+    policy = text(first.get("unseen_identity", ""))
+    notes = [
+        f"Protocol `{text(first['protocol'])}`; lower is better; unit of length {text(model.assets.unit)}.",
+        f"Regions: {'; '.join(taken)}." if taken else "",
+        f"Unseen speakers were tested with the identity policy `{policy}`." if policy else "",
+        "The other rows are yardsticks: a face that never moves, the speaker's mean face, and this model with the "
+        "speech of another clip. docs/metrics.md of facediff defines every score.",
+    ]
+    return "## Scores\n\n" + table(header, rows) + "\n\n" + "\n".join(note for note in notes if note)
+
+
+def limits_section(model: AnimationModel) -> str:
+    """What it is for, and what it cannot do."""
+    synthetic = (
+        "- It has learnt from a program's motion: it shows how such a model works, not how people move.\n"
+        if model.assets.synthetic
+        else "- Its identities are real people: do not make them say what they have not agreed to say.\n"
+    )
+    return f"""## Intended use
+
+Research and production of facial animation from recorded or synthesised speech: games, avatars, studies of methods.
+Do not use it to imitate a person without their consent, or to deceive.
+
+## Limits
+
+{synthetic}- It animates faces of its own topology ({model.n_vertices} vertices); other meshes need `--target-mesh`.
+- It moves the face alone: blinks, gaze and head motion are as far learnt as the corpus has them.
+- Speech in other languages, singing, noise and children's voices were not tested.
+- Unseen speakers get the style of a reference clip; their likeness is below that of trained identities."""
+
+
+def files_section(facts: Facts) -> str:
+    """The files and their sizes."""
+    about = {
+        WEIGHTS: "weights, without anything that only training needs",
+        CONFIG: "the model's class and options, licence labels; plain values",
+        ASSETS: "templates, triangles, regions and reference motions that animation needs",
+    }
+    rows = [(f"`{name}`", f"{facts.sizes.get(name, 0) / 1e6:.2f} MB", what) for name, what in about.items()]
+    return f"## Files\n\n{table(('file', 'size', 'content'), rows)}"
+
+
+# Helpers.
+
+
+def languages_of(model: AnimationModel, facts: Facts) -> Sequence[str]:
+    """The languages that were stated, else those of the corpus."""
+    if facts.languages is not None:
+        return facts.languages
+    known: list[type[Any]] = [entry.implementation for entry in corpus]
+    return next((each.languages for each in known if getattr(each, "corpus_name", None) == model.assets.corpus), ())
+
+
+def text(value: str) -> str:
+    """A text that Markdown shows as it is, in a table too."""
+    return re.sub(r"([\\`*_{}\[\]<>|])", r"\\\1", " ".join(str(value).split()))
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown; its cells are Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
