@@ -9,7 +9,6 @@ import collections
 import contextlib
 import difflib
 import hashlib
-import random
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +63,15 @@ OMITTED = frozenset(
     + ["nan_to_num", "expm1", "log1p", "cumsum", "cumprod", "diff", "norm", "transpose"]
 )
 """Functions and methods whose argument may stand for their value."""
+SYMMETRIC = frozenset(
+    ["min", "max", "minimum", "maximum", "logical_and", "logical_or", "equal", "isclose", "allclose"]
+    + ["transpose", "swapaxes", "mse_loss", "l1_loss", "huber_loss"]
+)
+"""Functions and methods whose first two arguments may change places without any difference."""
+EVEN = frozenset(["abs", "square", "square_", "norm", "vector_norm"])
+"""Functions and methods that do not see the sign of their argument."""
+BESIDES = frozenset(["device", "strict", "preserve_rng_state", "non_blocking"])
+"""Keywords that change where or how fast something is computed, or what is refused, and not what."""
 MODULES = ("torch", "math", "functional", "nn.functional", "torch.nn.functional", "F", "np")
 
 
@@ -117,6 +125,7 @@ class Finder(ast.NodeVisitor):
         self.inside = False
         self.body = False
         self.found: list[tuple[ast.AST, str, str, str, bool]] = []
+        self.signless: set[ast.AST] = set()
 
     # Where a node stands; ast counts columns in bytes.
     def span(self, node: ast.AST) -> tuple[int, int]:
@@ -200,6 +209,8 @@ class Finder(ast.NodeVisitor):
 
     # What is changed.
     def visit_BinOp(self, node: ast.BinOp) -> None:
+        if isinstance(node.op, ast.Pow) and isinstance(node.right, ast.Constant) and node.right.value == 2:
+            self.ignores_sign(node.left)
         new = ARITHMETIC.get(type(node.op))
         text = isinstance(node.left, (ast.JoinedStr, ast.Constant)) and not isinstance(
             getattr(node.left, "value", None), (int, float)
@@ -209,11 +220,18 @@ class Finder(ast.NodeVisitor):
             self.add(node, "left term only", node.left)
             if not isinstance(node.op, (ast.Pow, ast.FloorDiv, ast.Mod)):
                 self.add(node, "right term only", node.right)
-            if isinstance(node.op, (ast.Sub, ast.Div)):
+            if isinstance(node.op, (ast.Sub, ast.Div)) and node not in self.signless:
                 self.add(node, "operands swapped", ast.BinOp(node.right, node.op, node.left))
         elif isinstance(node.op, ast.MatMult):
             self.add(node, "operands swapped", ast.BinOp(node.right, node.op, node.left))
         self.generic_visit(node)
+
+    def ignores_sign(self, value: ast.AST | None) -> None:
+        # A difference over time of a difference has the same two signs.
+        while isinstance(value, ast.Call) and isinstance(value.func, ast.Attribute) and value.func.attr == "diff":
+            value = value.func.value
+        if isinstance(value, ast.BinOp) and isinstance(value.op, ast.Sub):
+            self.signless.add(value)
 
     def is_type(self, node: ast.BinOp) -> bool:
         # `int | None` at the level of a module.
@@ -275,19 +293,22 @@ class Finder(ast.NodeVisitor):
                 self.add(node, f"{name} omitted", inner)
         elif owner == "self" and self.inside and len(node.args) == 1 and not node.keywords:
             self.add(node, f"{name} omitted", node.args[0])
+        if name in EVEN:
+            of_value = isinstance(node.func, ast.Attribute) and owner not in {*MODULES, "torch.linalg", "self"}
+            self.ignores_sign(node.func.value if of_value else node.args[0] if node.args else None)  # type: ignore[attr-defined]
         plain = [a for a in node.args if not isinstance(a, ast.Starred)]
-        symmetric = name in {"min", "max", "minimum", "maximum"} or len(plain) < len(node.args)
+        symmetric = name in SYMMETRIC or len(plain) < len(node.args)
         if len(plain) >= 2 and not symmetric and ast.dump(plain[0]) != ast.dump(plain[1]):
             args = [plain[1], plain[0], *plain[2:]]
             self.add(node, "arguments swapped", ast.Call(node.func, args, node.keywords))
         for i, keyword in enumerate(node.keywords):
-            if keyword.arg not in {None, "device", "strict"}:
+            if keyword.arg is not None and keyword.arg not in BESIDES:
                 rest = [*node.keywords[:i], *node.keywords[i + 1 :]]
                 self.add(node, f"{keyword.arg}= dropped", ast.Call(node.func, node.args, rest))
         self.generic_visit(node)
 
     def visit_keyword(self, node: ast.keyword) -> None:
-        if node.arg != "strict":
+        if node.arg not in BESIDES - {"device"}:
             self.visit(node.value)
 
     def visit_Slice(self, node: ast.Slice) -> None:
@@ -322,11 +343,15 @@ def mutants_of(file: str, source: bytes) -> list[Mutant]:
 
 
 def sample(root: Path, patterns: Iterable[str], count: int, seed: int) -> list[Mutant]:
-    """Mutants of the files, in random order; ``count`` of them, or all if 0."""
+    """Mutants of the files, in random order; ``count`` of them, or all if 0.
+
+    The place of a mutant in this order depends on the seed and on itself alone: a sample stays what it is, but for the
+    lines that were changed.
+    """
     files = sorted({path for pattern in patterns for path in root.glob(pattern) if path.suffix == ".py"})
     sources = {str(path.relative_to(root)): path.read_bytes() for path in files}
     every = [mutant for file, source in sources.items() for mutant in mutants_of(file, source)]
-    random.Random(seed).shuffle(every)  # noqa: S311 - a sample, no secret
+    every.sort(key=lambda mutant: hashlib.sha256(f"{seed} {mutant.key}".encode()).digest())
     meant = {file: ast.dump(ast.parse(source)) for file, source in sources.items()}
     found: list[Mutant] = []
     for mutant in every:

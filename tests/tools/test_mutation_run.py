@@ -88,6 +88,24 @@ def test_terms_are_changed(before: str, after: str) -> None:
     assert ast.unparse(ast.parse(text.format(after))) in changes(text.format(before))
 
 
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("x.transpose(1, 2)", "x.transpose(2, 1)"),
+        ("F.huber_loss(x, y)", "F.huber_loss(y, x)"),
+        ("(a - b).square()", "(b - a).square()"),
+        ("(a - b).diff(dim=1).abs()", "(b - a).diff(dim=1).abs()"),
+        ("torch.linalg.vector_norm(a - b)", "torch.linalg.vector_norm(b - a)"),
+        ("(a - b) ** 2", "(b - a) ** 2"),
+        ("checkpoint(f, preserve_rng_state=False)", "checkpoint(f, preserve_rng_state=True)"),
+        ("checkpoint(f, preserve_rng_state=False)", "checkpoint(f)"),
+    ],
+)
+def test_changes_without_effect_are_not_made(before: str, after: str) -> None:
+    text = "def g():\n    return {}\n"
+    assert ast.unparse(ast.parse(text.format(after))) not in changes(text.format(before))
+
+
 @pytest.mark.parametrize("statement", ["x += y", "self.x = y", "x[0] = y", "f(x)", "continue"])
 def test_statements_are_removed(statement: str) -> None:
     text = "def g():\n    for x in y:\n        {}\n"
@@ -126,6 +144,15 @@ def test_the_sample_follows_its_seed() -> None:
     first, again, other = ([mutant.key for mutant in mutants.sample(ROOT, files, 20, seed)] for seed in (0, 0, 1))
     assert first == again != other
     assert len(set(first)) == 20
+
+
+def test_a_sample_stays_when_other_lines_change(tmp_path: Path) -> None:
+    """So that killing a survivor, or adding a file, does not make another sample of it."""
+    (tmp_path / "a.py").write_text("".join(f"def f{i}(x):\n    return x + {i}\n\n" for i in range(30)))
+    before = mutants.sample(tmp_path, ["*.py"], 40, 0)
+    (tmp_path / "b.py").write_text("def g(x):\n    return 2 * x\n")
+    after = mutants.sample(tmp_path, ["*.py"], 50, 0)
+    assert [m.key for m in after if m.file == "a.py"][:40] == [m.key for m in before]
 
 
 def test_what_hangs_is_ended() -> None:
