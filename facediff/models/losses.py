@@ -147,15 +147,15 @@ def style_contrast(styles: Float[Tensor, "clips dim"], identities: Sequence[str]
     own = torch.eye(len(identities), dtype=torch.bool, device=styles.device)
     same &= ~own
     directions = torch.nn.functional.normalize(styles.float(), dim=1)
-    # A style is not compared with itself. Its logit of −∞ takes it out of the softmax; what the logarithm then makes of
-    # it is set to 0, since −∞ times the mask's 0 would be NaN.
+    # A style is not compared with itself. Its logit of −∞ takes it out of the softmax; what the logarithm makes of it is
+    # not chosen below, since −∞ times a mask's 0 would be NaN.
     logits = (directions @ directions.T / temperature).masked_fill(own, -torch.inf)
-    chances = logits.log_softmax(1).masked_fill(own, 0.0)
+    chances = logits.log_softmax(1)
     counts = same.sum(1)
     # Nobody has two styles, or all styles are of one identity: there is nothing to choose between.
     if not counts.any() or bool(same.logical_or(own).all()):
         return styles.new_zeros(())
-    each = -(chances * same).sum(1) / counts.clamp_min(1)
+    each = -chances.where(same, 0.0).sum(1) / counts.clamp_min(1)
     return each[counts > 0].mean()
 
 

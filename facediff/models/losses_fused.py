@@ -82,7 +82,7 @@ class _FusedLosses(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         frames = features.flatten(0, 1)
         frames_low, terms = frames.to(low), features.new_zeros(4, dtype=_sum_dtype(features.device))
-        needed = [blocks.wanted and each for each in ctx.needs_input_grad]
+        needed = ctx.needs_input_grad if blocks.wanted else (False, False, False)
         of_frames = torch.zeros_like(frames) if needed[0] else None
         of_weight = torch.empty_like(weight) if needed[1] else None
         of_bias = torch.empty_like(bias) if bias is not None and needed[2] else None

@@ -140,6 +140,35 @@ def test_the_nearest_speaker_is_that_of_the_documented_distance() -> None:
         assert metric.compute().item() == 1.0
 
 
+def test_the_nearest_speaker_follows_from_offsets_alone() -> None:
+    """Where the gallery's faces all lie to one side, this side says nothing of a speaker."""
+    known, own, mood = gallery()
+    rng = np.random.default_rng(3)
+    motion = torch.from_numpy(own[:, None] + rng.normal(size=(4, 1, 1, 1)) * mood + np.zeros((4, 3, 6, 3)))
+    aside = torch.from_numpy(100 * rng.normal(size=(6, 3)))
+    moved = fm.SpeakerGallery(known.means + aside, known.speakers)
+    for gallery_of, shift in ((known, 0 * aside), (moved, aside)):
+        found = fm.NearestSpeakerAccuracy(gallery_of, components=8)
+        found.update(motion + shift, [0, 1, 2, 3])
+        assert found.compute().item() == 1.0
+
+
+def test_one_recording_of_each_speaker_is_compared_in_euclidean_distance() -> None:
+    rng = np.random.default_rng(4)
+    means = torch.from_numpy(rng.normal(size=(3, 5, 3)))
+    clips = torch.from_numpy(rng.normal(size=(50, 2, 5, 3)))
+    gaps = clips.mean(1).flatten(1)[:, None] - means.flatten(1)
+    metric = fm.NearestSpeakerAccuracy(fm.SpeakerGallery(means, (4, 9, 6)))
+    metric.update(clips, [(4, 9, 6)[place] for place in gaps.square().sum(2).argmin(1)])
+    assert metric.compute().item() == 1.0
+
+
+@pytest.mark.parametrize("options", [{"components": 0}, {"components": -1}, {"shrinkage": 0.0}, {"shrinkage": -0.1}])
+def test_a_space_without_components_and_a_covariance_that_may_vanish_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        fm.NearestSpeakerAccuracy(gallery()[0], **options)  # type: ignore[arg-type]
+
+
 def test_a_speaker_without_recordings_is_left_out() -> None:
     known, _, _ = gallery()
     metric = fm.NearestSpeakerAccuracy(known)

@@ -68,6 +68,21 @@ def test_liveliness_without_any_motion_of_the_truth_is_refused() -> None:
         fm.motion_liveliness(torch.rand(5, 3, 3), torch.zeros(5, 3, 3))
 
 
+def test_sums_of_ratios_are_kept_in_float64() -> None:
+    """A corpus adds up a few thousand sequences: a small one after many must not be lost."""
+    truth = torch.zeros(2, 1, 3)
+    truth[0, 0, 0], truth[1, 0, 0] = 1.0, -1.0
+    metric = fm.MotionLiveliness()
+    metric.update(1e5 * truth, 1e5 * truth)
+    for _ in range(20):
+        metric.update(5 * truth, truth)
+    assert metric.parts.dtype == torch.float64
+    expected = ((1e10 + 20 * 25) / (1e10 + 20)) ** 0.5
+    assert metric.compute().item() == pytest.approx(expected, rel=1e-12)
+    metric.reset()
+    assert metric.parts.dtype == torch.float64
+
+
 @pytest.mark.parametrize("metric", [fm.SpreadErrorRatio, fm.EnergyScore])
 def test_another_number_of_samples_is_refused(metric: type) -> None:
     with pytest.raises(ValueError, match="n_samples"):

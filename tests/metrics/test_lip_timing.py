@@ -129,6 +129,18 @@ def test_lags_are_taken_where_both_turn_alike_and_not_beyond_a_neighbour() -> No
     assert matched_lags([(0, 0)], [0.0], [0.0]) == []
 
 
+def test_lags_reach_the_neighbouring_extrema_and_the_ends_themselves() -> None:
+    truth = [0.0, 0, 1, 0, 1, 0, 0]  # up at 2, down at 3, up at 4; the ends are 0 and 6
+
+    def turning(place: int, way: float) -> list[float]:
+        return [way if frame == place else 0.0 for frame in range(9)]
+
+    for row, way, reached in ((2, 1.0, {1, 2, 3}), (3, -1.0, {2, 3, 4}), (4, 1.0, {3, 4, 5, 6})):
+        for column in range(1, 8):
+            found = matched_lags([(row, column)], truth, turning(column, way))
+            assert found == ([abs(row - column)] if column in reached else []), (row, column)
+
+
 def test_options_out_of_range_are_refused() -> None:
     with pytest.raises(ValueError, match='unknown at .paths..*did you mean "path"'):
         TemporalMisalignment([(0, 1)], at="paths")  # type: ignore[arg-type]

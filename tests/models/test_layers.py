@@ -91,6 +91,14 @@ def test_attention_refuses_impossible_heads() -> None:
         Attention(6, 6, 2, rotary=True)
 
 
+def test_rotary_frequencies_are_no_weights() -> None:
+    """They follow from the sizes, so checkpoints do not have them; a model moves them along all the same."""
+    rotary = RotaryEmbedding(8, base=100.0)
+    assert not rotary.state_dict()
+    assert [name for name, _ in rotary.named_buffers()] == ["frequencies"]
+    np.testing.assert_allclose(rotary.frequencies.numpy(), 100.0 ** -(np.arange(4) / 4), rtol=1e-6)
+
+
 def test_frame_mask() -> None:
     assert frame_mask(torch.tensor([0, 2, 3]), 3).int().tolist() == [[0, 0, 0], [1, 1, 0], [1, 1, 1]]
 

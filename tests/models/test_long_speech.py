@@ -16,7 +16,7 @@ from facediff.data import collate
 from facediff.data.audio import samples_for
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion, StyleContentDisentanglement
-from facediff.models.inference import Level, SpeechStream, WindowOverlap, WindowPlan, crossfaded
+from facediff.models.inference import FramePlan, Level, SpeechStream, WindowOverlap, WindowPlan, crossfaded
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames
@@ -277,13 +277,29 @@ def test_audio_encoder_hears_a_piece_as_loud_as_in_the_whole(ready: Ready) -> No
         ({"overlap": float("nan")}, "overlap: nan s is impossible"),
         ({"before": float("inf")}, "window: the speech before and after"),
         ({"above": float("nan")}, "window: the speech before and after"),
-        ({"after": -1.0}, "window: the speech before and after"),
+        ({"before": -0.01}, "window: the speech before and after"),
+        ({"before": float("nan")}, "window: the speech before and after"),
+        ({"after": -0.01}, "window: the speech before and after"),
+        ({"after": float("inf")}, "window: the speech before and after"),
+        ({"after": float("nan")}, "window: the speech before and after"),
+        ({"above": -0.01}, "window: the speech before and after"),
+        ({"seconds": -1.0}, "window: -1 s is impossible"),
+        ({"seconds": 600.1}, r"window: 600\.1 s is impossible"),
+        ({"overlap": -0.1}, r"overlap: -0\.1 s is impossible"),
+        ({"seconds": 1.0, "overlap": 0.51}, r"overlap: 0\.51 s is impossible"),
         ({"seconds": float("nan")}, "window: nan s is impossible"),
     ],
 )
 def test_window_plan_refuses_impossible_lengths(change: dict[str, float], sentence: str) -> None:
-    with pytest.raises(FaceDiffError, match=sentence.replace(".", r"\.")):
+    with pytest.raises(FaceDiffError, match=sentence):
         WindowPlan(**change)
+
+
+def test_window_plan_takes_lengths_up_to_its_limits() -> None:
+    plan = WindowPlan(seconds=600.0, overlap=300.0, before=0.0, after=0.0, above=0.0)
+    assert plan.look_ahead == 600.0
+    assert plan.in_frames(25.0) == FramePlan(15_000, 7500, 0, 0)
+    assert WindowPlan(seconds=0.2, overlap=0.01).in_frames(20.0) == FramePlan(4, 1, 40, 10)
 
 
 @pytest.mark.parametrize("rate", [24.0, 25.0, 30.0, 60.0])

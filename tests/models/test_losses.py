@@ -197,6 +197,37 @@ def test_fused_losses_are_their_definitions(
     assert not found[1][0][~mask].any()
 
 
+@pytest.mark.parametrize("factor", [0.0, 0.5, 1.0, 2.0])
+def test_fused_losses_pass_on_what_comes_after_them(factor: float) -> None:
+    """Gradients are ready with the loss, and are multiplied by whatever its own gradient turns out to be."""
+    *parts, truth, mask = linear_parts((6, 4), 1)
+    found = []
+    for compute in (losses_fused.fused_losses, None):
+        leaves = [part.clone().requires_grad_() for part in parts]
+        if compute is None:
+            terms = by_definition(*leaves, truth, mask, torch.tensor(REGION), 1.0)
+        else:
+            terms = compute(*leaves, truth, mask, torch.tensor(REGION), WEIGHTS)
+        (factor * terms["loss"]).backward()
+        found.append([leaf.grad for leaf in leaves])
+    torch.testing.assert_close(found[0], found[1], rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("wanted", [0, 1, 2])
+def test_fused_losses_have_the_gradient_of_one_part_alone(wanted: int) -> None:
+    """Features without a gradient are those of a frozen network, a map without one that of an adapted one."""
+    *parts, truth, mask = linear_parts((6, 4), 1)
+    found = []
+    for fused in (True, False):
+        leaves = [part.clone().requires_grad_(place == wanted) for place, part in enumerate(parts)]
+        given = (*leaves, truth, mask, torch.tensor(REGION))
+        terms = losses_fused.fused_losses(*given, WEIGHTS) if fused else by_definition(*given, 1.0)
+        terms["loss"].backward()
+        assert [leaf.grad is not None for leaf in leaves] == [place == wanted for place in range(3)]
+        found.append(leaves[wanted].grad)
+    torch.testing.assert_close(found[0], found[1], rtol=1e-11, atol=1e-13)
+
+
 def test_fused_losses_of_a_clip_without_frames_are_their_definitions() -> None:
     """It adds nothing, and is no division by zero; a batch of such clips alone has the loss 0."""
     for lengths in ((5, 0, 3), (0, 0)):

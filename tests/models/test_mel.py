@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -90,6 +91,24 @@ def test_mel_feature_of_silence_and_short_speech_is_finite(encoder: MelEncoder) 
         out = encoder(torch.zeros(1, samples), torch.tensor([samples]), torch.tensor([3]))
         assert out.shape == (1, 3, 8)
         assert torch.isfinite(out).all()
+
+
+@pytest.mark.parametrize("samples", [1, 159, 160, 161, 319, 320, 321, 479, 480, 2000])
+def test_mel_spectra_are_their_formula_also_of_short_speech(encoder: MelEncoder, samples: int) -> None:
+    """Spectrum k is centred on sample 160 k, there are two at least, and padding beyond a clip's own is zero."""
+    wave = torch.randn(samples, generator=torch.Generator().manual_seed(samples))
+    steps = max(2, samples // 160)
+    zeros = np.zeros(256 + 160 * steps + 512)
+    zeros[256 : 256 + samples] = wave.double().numpy()
+    window = np.pad(0.5 - 0.5 * np.cos(2 * np.pi * np.arange(400) / 400), 56)
+    power = np.stack([np.abs(np.fft.rfft(zeros[160 * k : 160 * k + 512] * window)) ** 2 for k in range(steps)])
+    expected = (np.log(power @ encoder.filters.double().numpy().T + 1e-5) + 2) / 4
+    alone, counted = encoder._log_mel(wave[None], torch.tensor([samples]))
+    padded, _ = encoder._log_mel(torch.nn.functional.pad(wave, (0, 999))[None], torch.tensor([samples]))
+    assert counted.tolist() == [steps]
+    for found in (alone, padded):
+        np.testing.assert_allclose(found[0, :steps].numpy(), expected, rtol=1e-4, atol=1e-4)
+        assert not found[0, steps:].any()
 
 
 def test_standardise_against_transformers() -> None:

@@ -124,6 +124,14 @@ def test_unit_noise_is_many_streams_whose_seeds_come_from_one(monkeypatch: pytes
     assert torch.equal(made.flatten(), torch.cat(parts))
 
 
+def test_unit_noise_begins_another_stream_after_two_million_numbers() -> None:
+    part = 2**21
+    made = unit_noise((part + 3,), torch.device("cpu"), torch.Generator().manual_seed(5))
+    seeds = torch.randint(2**63 - 1, (2,), generator=torch.Generator().manual_seed(5)).tolist()
+    for seed, numbers in zip(seeds, (made[:part], made[part:]), strict=True):
+        assert torch.equal(numbers, torch.empty(len(numbers)).normal_(generator=torch.Generator().manual_seed(seed)))
+
+
 def test_unit_noise_follows_the_global_seed() -> None:
     torch.manual_seed(1)
     first, second = unit_noise((20,), torch.device("cpu")), unit_noise((20,), torch.device("cpu"))

@@ -13,7 +13,16 @@ from torch import Tensor
 
 from facediff.data import Batch, Sample, collate
 from facediff.models.audio_encoders import AudioEncoder
-from facediff.models.inference import ClipNoise, FramePlan, Inference, SpeechStream, Window, WindowNoise, WindowPlan
+from facediff.models.inference import (
+    ClipNoise,
+    FramePlan,
+    Inference,
+    SpeechStream,
+    Window,
+    WindowNoise,
+    WindowPlan,
+    with_speech,
+)
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames
 HOP, FRAMES, SHARED, BEFORE, AFTER = 20, 30, 10, 12, 5
@@ -104,6 +113,34 @@ def test_long_speech_may_be_told_how_many_frames_it_lasts(wanted: int) -> None:
     speech = 0.2 * np.random.default_rng(0).standard_normal(60 * 640)
     made = torch.cat(list(SpeechStream(Echo(), clip()).parts(torch.from_numpy(speech).float(), frames=wanted)), 1)
     np.testing.assert_allclose(made[0, :, 0, 0].numpy(), expected(speech, wanted), rtol=1e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize(("samples", "seconds"), [(30 * 640, 2), (32_000, 2), (32_001, 3), (640, 1)])
+def test_long_speech_is_heard_by_the_second(samples: int, seconds: int) -> None:
+    """A recording is fed as from a microphone, second by second, which is what progress counts."""
+    speech, counted, heard = torch.randn(samples), [], []
+    stream = SpeechStream(Echo(), clip())
+    feed = stream.feed
+    stream.feed = lambda some: (heard.append(len(some)), feed(some))[1]  # type: ignore[method-assign, func-returns-value]
+
+    def progress(places: Any) -> Any:  # noqa: ANN401
+        counted.extend(places)
+        return places
+
+    made = torch.cat(list(stream.parts(speech, progress=progress)), 1)
+    assert made.shape[1] == round(samples / 640)
+    assert counted == list(range(seconds))
+    assert heard == [min(16_000, samples - 16_000 * second) for second in range(seconds)]
+
+
+def test_a_window_of_speech_keeps_the_face_and_has_motion_of_zeros() -> None:
+    known = clip()
+    heard = with_speech(known, torch.ones(3200), 5)
+    assert heard.motion.shape == (1, 5, 2, 3)
+    assert not heard.motion.any()
+    assert (heard.audio.shape, heard.audio_lengths.tolist(), heard.frame_lengths.tolist()) == ((1, 3200), [3200], [5])
+    assert heard.mask.tolist() == [[True] * 5]
+    assert heard.template is known.template
 
 
 def test_a_microphones_noise_is_not_amplified() -> None:
