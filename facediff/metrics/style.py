@@ -260,12 +260,13 @@ class NearestSpeakerAccuracy(SequenceMetric):
         super().__init__(definition=words, **options)
         means = gallery.means.flatten(1).double().cpu()
         centre = means.mean(0)
+        apart = means - centre
         # The products of recordings with one another have the same components as a covariance of (3V, 3V).
-        values, vectors = torch.linalg.eigh((means - centre) @ (means - centre).T)
+        values, vectors = torch.linalg.eigh(apart @ apart.T)
         kept = [place for place in reversed(range(len(values))) if values[place] > 1e-10 * values[-1]][:components]
-        basis = vectors[:, kept].T @ (means - centre)
+        basis = vectors[:, kept].T @ apart
         basis = basis / basis.norm(dim=1, keepdim=True)
-        places = (means - centre) @ basis.T
+        places = apart @ basis.T
         own = torch.stack([places[speaker == number].mean(0) for number in range(len(numbers))])
         within = places - own[speaker]
         covariance = within.T @ within / max(1, len(speaker) - len(numbers))

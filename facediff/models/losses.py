@@ -147,8 +147,8 @@ def style_contrast(styles: Float[Tensor, "clips dim"], identities: Sequence[str]
     own = torch.eye(len(identities), dtype=torch.bool, device=styles.device)
     same &= ~own
     directions = torch.nn.functional.normalize(styles.float(), dim=1)
-    # A style is not compared with itself. Its logit of −∞ takes it out of the softmax; what the logarithm makes of it is
-    # not chosen below, since −∞ times a mask's 0 would be NaN.
+    # A style is not compared with itself: its logit of −∞ takes it out of the softmax. The sum below leaves it out
+    # by choice, since −∞ times a mask's 0 would be NaN.
     logits = (directions @ directions.T / temperature).masked_fill(own, -torch.inf)
     chances = logits.log_softmax(1)
     counts = same.sum(1)

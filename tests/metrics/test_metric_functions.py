@@ -84,3 +84,46 @@ def test_a_class_of_ones_own_becomes_a_function() -> None:
 def test_a_metric_that_defines_nothing_says_so() -> None:
     with pytest.raises(NotImplementedError):
         SequenceMetric(definition="nothing").update(torch.zeros(1, 2, 3), torch.zeros(1, 2, 3))
+
+
+# A score is only comparable with another of the same definition, so the definition that comes without options stays.
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "bilabial_closure_rate": {"threshold": 0.2, "count": "frames", "of": "prediction", "pooling": "frames"},
+    "blink_rate": {"frames_per_second": None, "of": "prediction", "closed": 0.5, "reopened": 0.3},
+    "blink_rate_ratio": {"closed": 0.5, "reopened": 0.3},
+    "clip_speech_lip_correlation": {"n_identities": 1, "of": "prediction"},
+    "coverage_error": {"n_samples": 10, "squared": True, "pooling": "frames"},
+    "energy_score": {"n_samples": 4, "of": "frames", "pooling": "frames"},
+    "face_dynamics_deviation": {"sign": "absolute"},
+    "frame_speech_lip_correlation": {"of": "prediction"},
+    "identity_diversity": {"pooling": "sequences"},
+    "lip_vertex_error": {"squared": True, "pooling": "frames"},
+    "mean_estimate_error": {"n_samples": 10, "squared": True, "pooling": "frames"},
+    "mean_vertex_error": {"reduction": "mean", "squared": False, "pooling": "frames"},
+    "mouth_opening_difference": {"pooling": "frames"},
+    "nearest_speaker_accuracy": {"components": 16, "shrinkage": 0.1},
+    "sample_diversity": {"pairing": "shuffled", "n_samples": 10, "seed": 1234, "pooling": "sequences"},
+    "spread_error_ratio": {"n_samples": 4},
+    "style_retrieval_accuracy": {"closeness": "cosine"},
+    "temporal_misalignment": {"at": "extrema", "smoothing": 2.0, "frames_per_second": None},
+    "upper_face_vertex_error": {"reduction": "mean", "squared": False, "pooling": "frames"},
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_definition_without_options_stays(name: str) -> None:
+    found = registry.defaults(registry.metric.get(name))
+    promised = DEFAULTS.get(name, {}) | {"sync_on_compute": True, "process_group": None}
+    promised |= {
+        option: value for option, value in {"length_rule": "min", "check_finite": True}.items() if option in found
+    }
+    assert {option: found.get(option) for option in promised} == promised
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_function_tells_its_arguments_what_comes_back_and_what_is_refused(name: str) -> None:
+    function = getattr(fm, name)
+    sections = (function.__doc__ or "").split("\n\n")
+    assert [section.partition("\n")[0] for section in sections[2:]] == ["Args:", "Returns:", "Raises:"]
+    assert f"`{registry.metric.get(name).__name__}`" in sections[1]
+    assert inspect.signature(function).return_annotation is Tensor

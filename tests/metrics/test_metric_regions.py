@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from facediff.metrics import LipVertexError, Region, lip_vertex_error
+from facediff.metrics import TOPOLOGIES, LipVertexError, Region, lip_vertex_error
 
 Indices = Any  # right and wrong ones
 
@@ -141,3 +141,35 @@ def test_repeated_lip_indices_change_nothing() -> None:
     region = LipVertexError([1, 3, 3, 1]).region
     assert region is not None
     assert (region.count, region.duplicates) == (2, 2)
+
+
+# Of the meshes themselves, and of the index files and masks that circulate with them.
+PUBLISHED = {
+    "biwi": (23370, {4996}, {7784}),
+    "vocaset": (5023, {250, 428, 648}, {827, 1501}),
+    "mead3d": (5023, {250, 428, 648}, {827, 1501}),
+    "multiface": (6172, {1035, 1438}, {656, 1529}),
+}
+
+
+def test_usual_meshes_and_regions_have_their_published_sizes() -> None:
+    found = {name: (each.n_vertices, {*each.lips}, {*each.upper}) for name, each in TOPOLOGIES.items()}
+    assert found == PUBLISHED
+    assert [each.name for each in TOPOLOGIES.values()] == [*PUBLISHED]
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_region_is_known_by_its_size_and_bound_to_its_mesh(name: str) -> None:
+    mesh, (vertices, lips, upper) = TOPOLOGIES[name], PUBLISHED[name]
+    for part, sizes in (("lips", lips), ("upper", upper)):
+        for size in sizes:
+            region = Region.from_indices("some", range(size))
+            assert " usual on " in mesh.remark(part, region)
+            assert " not usual on " not in mesh.remark(part, region)
+            assert " not usual on " in mesh.remark(part, Region.from_indices("some", range(size + 1)))
+            assert mesh.bind(region).n_vertices == vertices
+    assert mesh.bind(Region.from_indices("last", [vertices - 1])).indices == (vertices - 1,)
+    with pytest.raises(ValueError, match=str(vertices)):
+        mesh.bind(Region.from_indices("beyond", [vertices]))
+    with pytest.raises(ValueError, match="belongs to a mesh"):
+        mesh.bind(Region.from_indices("other", [0], n_vertices=vertices + 1))

@@ -159,3 +159,15 @@ def test_files_of_pairs_are_named_in_errors(tmp_path: Path) -> None:
         assert str(path) in str(caught.value)
     with pytest.raises(ValueError, match="not sorted and distinct"):
         LipPairs("lips", ((2, 9), (1, 3)))
+
+
+def test_a_closure_rate_says_over_what_it_is_taken() -> None:
+    """Frames that are counted alike, and sequences that are, give different numbers and different words."""
+    said = {}
+    for pooling, count in (("frames", "frames"), ("sequences", "frames"), ("frames", "closures")):
+        said[pooling, count] = BilabialClosureRate([(0, 1)], pooling=pooling, count=count, threshold=0.3).describe()  # type: ignore[arg-type]
+    assert "over all sequences [1]" in said["frames", "frames"]
+    assert "over each sequence, then mean over sequences [1]" in said["sequences", "frames"]
+    assert "the frames of known closures" in said["frames", "frames"]
+    assert "the known closures in which" in said["frames", "closures"]
+    assert all("plus 0.3 of its range" in words for words in said.values())

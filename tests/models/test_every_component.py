@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 from jaxtyping import TypeCheckError
 from torch import Tensor, nn
+
+from facediff import registry
 
 Make = Callable[..., nn.Module]
 Call = Callable[..., tuple[Tensor, ...]]
@@ -94,3 +97,66 @@ def test_declared_shapes_are_enforced(kind: str, name: str, make: Make, call: Ca
         pytest.skip("the hook covers facediff's own components only")
     with pytest.raises(TypeCheckError):
         module(*(tensor[..., None] for tensor in inputs))
+
+
+# An option that a config or a script does not name keeps its meaning: what is trained by it stays comparable.
+DEFAULTS: dict[str, dict[str, dict[str, Any]]] = {
+    "audio_encoder": {
+        "ctc": {"source": "facebook/wav2vec2-base-960h"},
+        "hubert": {
+            "source": "facebook/hubert-base-ls960",
+            "frozen_layers": 2,
+            "spec_augment": False,
+            "layer_drop": 0.0,
+        },
+        "mel": {"n_mels": 64, "hidden_dim": 128, "num_layers": 4, "dropout": 0.1},
+    },
+    "identity_encoder": {"hierarchical": {"level_dim": None, "unseen": "mean"}},
+    "motion_space": {"components": {"count": 64, "whitening": 0.5, "upper_face_weight": 1.0, "lips_weight": 1.0}},
+    "mesh_encoder": {
+        "components": {"count": 64},
+        "spiral": {
+            "channels": (16, 32, 32),
+            "factor": 4,
+            "spiral_length": 12,
+            "dilation": 1,
+            "pooling": "select",
+            "negative_slope": 0.2,
+            "max_frames": None,
+        },
+    },
+    "style_encoder": {
+        "lstm": {"style_dim": 32, "num_layers": 1, "pooling": "last"},
+        "tcn_gru_transformer": {
+            "dilations": (1, 2, 4, 8, 16),
+            "kernel_size": 3,
+            "causal": True,
+            "num_layers": 2,
+            "num_heads": 4,
+            "n_positions": 64,
+            "dropout": 0.1,
+        },
+    },
+    "fusion": {"cross_attention": {"num_heads": 4, "rotary": True, "dropout": 0.1}},
+    "decoder": {
+        "gru": {"num_layers": 2, "bidirectional": True, "dropout": 0.1},
+        "style_transformer": {
+            "num_layers": 4,
+            "num_heads": 4,
+            "feed_forward_factor": 4,
+            "dropout": 0.1,
+            "final_norm": True,
+        },
+    },
+    "sampler": {
+        "ddim": {"steps": 25, "eta": 0.0, "spacing": "steps", "last_noise": None},
+        "ddpm": {"steps": None, "spacing": "steps", "last_noise": None},
+        "dpm_solver": {"steps": 5, "order": 2, "spacing": "steps", "last_noise": None},
+    },
+}
+
+
+@pytest.mark.parametrize(("of", "component"), [(of, one) for of, several in DEFAULTS.items() for one in several])
+def test_options_that_are_not_named_keep_their_meaning(of: str, component: str) -> None:
+    found, promised = registry.defaults(registry.COMPONENTS[of].get(component)), DEFAULTS[of][component]
+    assert {option: found.get(option) for option in promised} == promised

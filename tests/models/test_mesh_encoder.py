@@ -196,6 +196,16 @@ def test_max_frames_changes_nothing(frames: int, make: Callable[..., MeshEncoder
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
+def test_max_frames_trains_on_motion_that_needs_no_gradient(make: Callable[..., MeshEncoder]) -> None:
+    """Recorded motion has none; the weights learn from it all the same."""
+    found = []
+    for frames in (None, 2):
+        encoder = make("spiral", max_frames=frames)
+        encoder(motion()).square().sum().backward()
+        found.append([p.grad for p in encoder.parameters()])
+    torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("pooling", ["select", "mean"])
 def test_spiral_without_a_mesh_is_an_error(hierarchy: Hierarchy, pooling: Literal["select", "mean"]) -> None:
     encoder = SpiralMeshEncoder(dim=DIM, n_vertices=VERTICES, pooling=pooling)

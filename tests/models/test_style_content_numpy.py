@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 import torch
 
+from facediff import registry
 from facediff.data import Batch, collate
 from facediff.models import StyleContentDisentanglement
+from facediff.models.audio_encoders import mel_filters
 from facediff.models.style_content.losses import align, cepstra, pair_up
 from facediff.models.style_content.network import WindowedTransformer
 from tests.fakes.style_content import make
@@ -131,6 +133,88 @@ def test_the_speech_branch_asks_with_the_middle_step(window: int, ratio: float, 
         answer = layer(x[window // 2 : window // 2 + 1], x, w, "query", 2)
         expected = linear(norm(answer, w, "out.0"), w, "out.1")[0]
         np.testing.assert_allclose(made[frame], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_cepstra_are_their_formula() -> None:
+    """One windowed stretch a frame, its log-mel energies' cosine transform and slopes, standardised over the clip."""
+    audio, frames, rate = torch.randn(9_000, generator=torch.Generator().manual_seed(0)), 16, 30.0
+    hop, made = 16_000 / rate, cepstra(audio, 16, rate)
+    padded = np.pad(double(audio), (256, 256 + 600))
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(512) / 512)
+    starts = [round(hop * (frame + 0.5)) for frame in range(frames)]
+    power = np.stack([np.abs(np.fft.rfft(padded[start : start + 512] * window)) ** 2 for start in starts])
+    energy = np.log(power @ double(mel_filters(40, 512, 60.0, 7600.0)).T + 1e-6)
+    basis = np.cos(np.pi / 40 * (np.arange(40)[:, None] + 0.5) * np.arange(13))
+    features = energy @ basis
+    features = np.concatenate([features, np.gradient(features, axis=0)], 1)
+    np.testing.assert_allclose(made, (features - features.mean(0)) / features.std(0), rtol=1e-9, atol=1e-9)
+    still = cepstra(audio[:600], 1, rate)
+    assert still.shape == (1, 26)
+    assert not still.any()
+
+
+@pytest.mark.parametrize("rate", [None, 25.0, 50.0, 60.0, 12.5])
+def test_speech_is_encoded_at_its_own_rate(tiny: Tiny, rate: float | None) -> None:
+    """The audio encoder is asked for ``speech_rate`` steps a second, the windows lie as many apart as fit a frame."""
+    model, batch = ready(tiny, speech_rate=rate), clips(tiny, "A_e01", "B_e03")
+    network, ratio = model.network, (rate or 25.0) / 25.0
+    steps = [round(frames * ratio) for frames in batch.frame_lengths.tolist()]
+    assert model.network.speech_content.window == round(0.64 * (rate or 25.0))
+    with torch.no_grad():
+        features = network.audio_encoder(batch.audio, batch.audio_lengths, torch.tensor(steps))
+        expected = network.speech_content(features, batch.motion.shape[1], ratio)
+        made = network.content_of_speech(batch)
+    assert made.shape == (2, batch.motion.shape[1], 8)
+    assert torch.equal(made, expected)
+    before, after = model.context_frames()
+    window, half = network.speech_content.window, network.speech_content.window // 2
+    assert (before, after) == (max(8, math.ceil(half / ratio)), math.ceil((window - 1 - half) / ratio))
+
+
+def test_kept_features_of_speech_stand_for_the_speech(tiny: Tiny, ctc_source: Path) -> None:
+    """Where the batch brings features, no speech is heard."""
+    model = ready(tiny, audio_encoder=partial(registry.audio_encoder.ctc, source=str(ctc_source)))
+    batch, network = clips(tiny, "A_e01", "B_e03"), model.network
+    features, lengths = network.audio_encoder.frozen_features(batch.audio, batch.audio_lengths)
+    kept = replace(batch, features=features, feature_lengths=lengths)
+    with torch.no_grad():
+        heard = network.content_of_speech(batch)
+        network.audio_encoder.frozen_features = None  # type: ignore[method-assign, assignment]
+        assert torch.equal(network.content_of_speech(kept), heard)
+        changed = network.content_of_speech(replace(kept, features=features.roll(1, 1)))
+    assert not torch.allclose(changed, heard, atol=1e-3)
+
+
+def test_the_style_of_windows_is_of_the_frames_that_count(tiny: Tiny) -> None:
+    """Windows may begin anywhere in what was read, and be of unequal length where a clip is shorter than one."""
+    model, batch = ready(tiny), clips(tiny, "A_e01", "B_e02", "A_e04")
+    lengths = batch.frame_lengths.tolist()
+    windows = [(3, 11), (0, 5), (lengths[2] - 6, lengths[2])]
+    motion = batch.motion * SCALE
+    with torch.no_grad():
+        made = model.style_of_window(replace(batch, window=torch.tensor(windows)), motion)
+        for row, (first, end) in enumerate(windows):
+            part = motion[row : row + 1, first:end]
+            alone = model.network.style(part, torch.ones(part.shape[:2], dtype=torch.bool))
+            torch.testing.assert_close(made[row], alone[0], rtol=1e-4, atol=1e-5)
+        whole = model.style_of_window(batch, motion)
+        torch.testing.assert_close(whole, model.network.style(motion, batch.mask))
+
+
+def test_windows_are_aligned_where_the_data_set_says_so(tiny: Tiny) -> None:
+    """−1 is a frame without a partner; a clip that is its own partner, and frames around a window, do not count."""
+    batch = clips(tiny, "A_e01", "B_e01", "A_e02", "A_e03", "B_e04")
+    frames = batch.motion.shape[1]
+    places = torch.full((5, frames), -1)
+    places[0, 2:6], places[1, 1:5], places[2, 0:3], places[4, 0:3] = 3, 4, 1, 2
+    windows = torch.tensor([(3, 9), (0, 4), (0, 8), (0, 8), (0, 8)])
+    batch = replace(batch, partner_frames=places, window=windows)
+    pairing = pair_up(batch, ready(tiny).alignments)
+    assert pairing.partner.tolist() == [1, 0, 2, 3, 4], "two sentences of one person have nothing to swap"
+    found = [row.nonzero().flatten().tolist() for row in pairing.aligned]
+    assert found == [[3, 4, 5], [1, 2, 3], [], [], []]
+    assert pairing.frames.tolist() == places.clamp_min(0).tolist()
+    assert not pair_up(batch, None).aligned.any()
 
 
 # The objective, written out from its formulas: the networks are called, everything between them is NumPy.

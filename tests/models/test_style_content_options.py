@@ -42,6 +42,50 @@ def test_training_follows_the_rate(tiny_root: Path, make_trainer: MakeTrainer) -
     assert rates == pytest.approx([1e-3] * 2 + [5e-4] * 2 + [2.5e-4] * 2)
 
 
+@pytest.mark.parametrize("context", [False, True])
+@pytest.mark.parametrize("windows", [False, True])
+@pytest.mark.parametrize("pairs", [False, True])
+def test_training_asks_the_data_for_what_the_options_say(
+    tiny_root: Path, make_trainer: MakeTrainer, context: bool, windows: bool, pairs: bool
+) -> None:
+    model = make(window_context=context, aligned_windows=windows, aligned_pairs=pairs)
+    data, trainer = Tiny(root=str(tiny_root), window=8), make_trainer()
+    model.trainer, trainer.datamodule = trainer, data  # type: ignore[attr-defined]
+    model.setup("fit")
+    assert data.pair_sentences
+    assert data.aligner is (model.alignments if windows and pairs else None)
+    assert data.window_context == ((8, 7) if context else (0, 0))
+    model.train()
+    assert model.alignment_allowed() == (windows and pairs)
+    model.eval()
+    assert not model.alignment_allowed()
+
+
+@pytest.mark.parametrize("start", ["pca", "random"])
+def test_a_new_basis_starts_where_it_is_told_to_and_a_trained_one_stays(
+    tiny_root: Path, make_trainer: MakeTrainer, start: str
+) -> None:
+    model, data, trainer = make(basis_start=start), Tiny(root=str(tiny_root)), make_trainer()
+    model.trainer, trainer.datamodule = trainer, data  # type: ignore[attr-defined]
+    basis = model.network.decoder.basis
+    before = basis.weight.detach().clone(), basis.bias.detach().clone()
+    model.setup("fit")
+    if start == "random":
+        assert torch.equal(basis.weight, before[0])
+        assert torch.equal(basis.bias, before[1])
+        return
+    mean, shapes = data.principal_motion(6)
+    torch.testing.assert_close(basis.bias.detach(), mean * model.scale)
+    torch.testing.assert_close(basis.weight.detach()[:, : len(shapes)], (shapes * model.scale).T)
+    torch.nn.init.zeros_(basis.weight)
+    model.setup("fit")  # resumed: its assets are known
+    assert not basis.weight.any()
+    fresh = make(basis_start=start)
+    fresh.trainer = trainer
+    fresh.setup("test")
+    assert torch.equal(fresh.network.decoder.basis.weight, before[0])
+
+
 def test_an_epoch_takes_as_many_windows_as_it_should() -> None:
     """Pairs of one group, no clip with itself, every clip as often as asked, each time with another seed."""
     copies, groups = [1, 3, 2, 3, 1, 1], ["a", "b", "b", "b", "a", "c"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -259,6 +260,22 @@ def test_conditions_are_of_eq_14_and_keep_to_their_clips(model: DualPathDiffusio
     assert torch.equal(part.audio, conditions.audio[:, 2:5])
     assert torch.equal(part.mask, conditions.mask[:, 2:5])
     assert torch.equal(part.style, conditions.style)
+
+
+def test_kept_features_of_speech_stand_for_the_speech(make_model: Make, tiny: Tiny, hubert_source: Path) -> None:
+    """The frozen part of the audio encoder is not asked again where its features came with the batch."""
+    encoder = partial(registry.audio_encoder.hubert, source=str(hubert_source))
+    model = known(make_model(audio_encoder=encoder), tiny)
+    batch = collate([tiny.dataset("train")[place] for place in (0, 7)])
+    hears = model.network.audio_encoder
+    with torch.no_grad():
+        features, steps = hears.frozen_features(batch.audio, batch.audio_lengths)
+        kept = replace(batch, features=features, feature_lengths=steps)
+        heard = model.conditions(batch).audio
+        hears.frozen_features = None  # type: ignore[method-assign, assignment]
+        assert torch.equal(model.conditions(kept).audio, heard)
+        other = model.conditions(replace(kept, features=features.roll(1, 1))).audio
+    assert not torch.allclose(other, heard, atol=1e-3)
 
 
 def test_personal_modules_are_identity_and_style(model: DualPathDiffusion, make_model: Make) -> None:
