@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from facediff.callbacks.outputs import METHOD_NAMES
+from facediff.cli.app import main
 
 
 def run_demo(folder: Path, *words: str) -> dict[tuple[str, str], float]:
@@ -39,3 +40,15 @@ def test_the_demo_learns_to_speak(tmp_path: Path) -> None:
     assert lve["test_a", "model"] <= 0.5 * lve["test_a", "still"]
     assert lve["test_a", "model"] <= 0.6 * lve["test_a", "shuffled"]
     assert lve["test_b", "model"] < lve["test_b", "still"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_fast_demo_writes_the_same_files(tmp_path: Path) -> None:
+    lve = run_demo(tmp_path, "--fast")
+    assert lve["test_a", "model"] < lve["test_a", "still"]
+
+
+def test_fast_and_epochs_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--fast", "--epochs", "3"]) == 2
+    assert "--fast" in capsys.readouterr().err
