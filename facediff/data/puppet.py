@@ -18,6 +18,7 @@ from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import eyelid_pairs
 from facediff.synthetic.speakers import MOST_DRAWN, drawn_names
 from facediff.utils.files import cache_dir
+from facediff.utils.jobs import processors
 from facediff.utils.licences import Commercial
 from facediff.utils.ranges import Range
 
@@ -26,6 +27,13 @@ def cache_root(seed: int, drawn_speakers: int = 0) -> Path:
     """Where the corpus of a seed is kept: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
     more = f"-drawn{drawn_speakers}" if drawn_speakers else ""
     return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}{more}"
+
+
+def made_root(seed: int) -> Path | None:
+    """A folder of :func:`cache_root` that is there, with or without drawn speakers; None if there is none."""
+    usual = cache_root(seed)
+    found = [usual, *sorted(usual.parent.glob(f"{usual.name}-drawn*"))]
+    return next((folder for folder in found if folder.is_dir()), None)
 
 
 def built_in_mesh() -> Mesh:
@@ -88,7 +96,8 @@ class Puppet(SpeechMotionDataModule):
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
         if not puppet.is_complete(self.root, seed=self.seed, drawn=self.drawn_speakers):
-            puppet.generate(self.root, seed=self.seed, drawn=self.drawn_speakers)
+            workers = min(4, processors()) if self.drawn_speakers else 1
+            puppet.generate(self.root, seed=self.seed, drawn=self.drawn_speakers, workers=workers)
 
     def eyelid_pairs(self) -> Tensor | None:
         """Those of the corpus folder, or of the mesh itself where the folder was made before it had such a file."""

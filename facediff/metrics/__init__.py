@@ -23,7 +23,7 @@ class's docstring has the formula, its source, its unit, and what about it is a 
   `LipSpeedCorrelation` (lip PCC)
 - loudness: `ClipSpeechLipCorrelation` and `FrameSpeechLipCorrelation` (SLCC)
 - several samples: `MeanEstimateError`, `CoverageError`, `SampleDiversity`
-- does it generate: `MotionLiveliness`, `SpreadErrorRatio`, `EnergyScore`
+- does it generate: `MotionLiveliness`, `SpectrumDistance`, `SpreadErrorRatio`, `EnergyScore`
 - the eyes: `BlinkRate`, `BlinkRateRatio`
 - several identities: `IdentityDiversity`, `StyleRetrievalAccuracy`, `NearestSpeakerAccuracy`
 - speed: `RealTimeFactor`
@@ -54,9 +54,11 @@ from facediff.metrics.eyes import blink_rate_ratio as blink_rate_ratio
 from facediff.metrics.generation import EnergyScore as EnergyScore
 from facediff.metrics.generation import MotionLiveliness as MotionLiveliness
 from facediff.metrics.generation import RatioMetric as RatioMetric
+from facediff.metrics.generation import SpectrumDistance as SpectrumDistance
 from facediff.metrics.generation import SpreadErrorRatio as SpreadErrorRatio
 from facediff.metrics.generation import energy_score as energy_score
 from facediff.metrics.generation import motion_liveliness as motion_liveliness
+from facediff.metrics.generation import spectrum_distance as spectrum_distance
 from facediff.metrics.generation import spread_error_ratio as spread_error_ratio
 from facediff.metrics.mouth import BilabialClosureRate as BilabialClosureRate
 from facediff.metrics.mouth import Closures as Closures

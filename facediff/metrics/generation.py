@@ -1,8 +1,8 @@
 """Does a model generate? How lively motion is, whether samples scatter as much as they err, and a proper score of both.
 
 A model that predicts the mean of all that speech leaves open scores well in every distance from the truth, and moves
-the upper face hardly at all. These metrics see that. All but :class:`MotionLiveliness` compare several samples of each
-sequence with the one recorded truth.
+the upper face hardly at all. These metrics see that. All but :class:`MotionLiveliness` and :class:`SpectrumDistance`
+compare several samples of each sequence with the one recorded truth.
 """
 
 from __future__ import annotations
@@ -112,6 +112,92 @@ class MotionLiveliness(RatioMetric):
         return ratio.sqrt()
 
 
+@metric.register("spectrum_distance")
+class SpectrumDistance(SequenceMetric):
+    r"""Spectrum distance: by how many decibels the power of a region's motion is off, mean over octaves.
+
+    Of every sequence, offsets are taken from their mean over time, multiplied by the window w[t] = sin(π(t + ½)/T) and
+    transformed over time. Their power |X(f)|² / Σ_t w[t]², summed over coordinates, is added up over octaves below the
+    Nyquist frequency (with 25 frames per second: 6.25–12.5 Hz, 3.1–6.25 Hz …; the last holds all that is slower) and
+    over sequences. The score is the mean over octaves of |10 log₁₀(P(prediction) / P(truth))|, in dB: 0 for motion that
+    is as quick and as slow as the truth, whenever it happens. Powers below a millionth of the truth's total count as
+    that much, so that a still face has a finite score.
+
+    Args:
+        octaves: How many there are.
+
+    >>> import torch
+    >>> truth = torch.randn(50, 4, 3, generator=torch.Generator().manual_seed(0))
+    >>> round(spectrum_distance(0.1 * truth, truth).item(), 6)
+    20.0
+    """
+
+    unit: ClassVar[str] = "dB"
+    powers: Tensor
+
+    def __init__(
+        self, region: RegionLike | None = None, *, octaves: int = 5, **options: Unpack[SequenceOptions]
+    ) -> None:
+        if octaves < 1:
+            raise ValueError(f"octaves={octaves}: expected 1 or more")
+        words = f"mean over {octaves} octaves of the decibels by which the power over time is off, over {{region}} [dB]"
+        super().__init__(definition=words, region=region, **options)
+        self.octaves = octaves
+        self.add_state("powers", torch.zeros(2, octaves, dtype=torch.float64), dist_reduce_fx="sum")
+        self._latest_powers: list[Tensor] = []
+
+    def clip_powers(self, clip: Clip) -> Tensor:
+        """Power of prediction and truth in each octave, the quickest first, of one sequence (2, octaves), float64."""
+        found = []
+        for side in (clip.prediction, clip.truth):
+            motion = _of(side, self.indices).flatten(1)
+            frames = len(motion)
+            place = torch.arange(frames, dtype=torch.float64, device=motion.device)
+            window = torch.sin(torch.pi * (place + 0.5) / frames)
+            transformed = torch.fft.fft((motion - motion.mean(0)) * window[:, None], dim=0)
+            power = transformed.abs().square().sum(1) / window.square().sum()
+            # Frequencies as shares of Nyquist's; the octave k holds those in (2^-(k+1), 2^-k].
+            share = 2 * torch.fft.fftfreq(frames, dtype=torch.float64, device=motion.device).abs()
+            octave = (-share.clamp_min(1e-9).log2()).floor().clamp(0, self.octaves - 1).long()
+            power[0] = 0.0  # what windowing leaves of the mean
+            found.append(power.new_zeros(self.octaves).index_add(0, octave, power))
+        return torch.stack(found)
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The score of one sequence."""
+        powers = self.clip_powers(clip)
+        self._latest_powers.append(powers)
+        return _decibels(powers)
+
+    def add(self, clips: Clips) -> None:
+        """Check aligned sequences and add their powers to the sums; nothing is added where one is refused."""
+        self._latest_powers = []
+        super().add(clips)
+        if self._latest_powers:
+            self.powers = self.powers + torch.stack(self._latest_powers).sum(0)
+        # The score is no mean of the sequences' values; whoever combines sequences must add up states instead.
+        self.latest = None
+
+    def compute(self) -> Tensor:
+        """The score over all sequences so far, a float64 scalar.
+
+        Raises:
+            ValueError: If no process had any sequence, or the truth does not move in any.
+        """
+        if int(self.counts[1]) == 0:
+            self.refuse_to_compute(0)
+        if float(self.powers[1].sum()) == 0:
+            self.leave_synchronised_state()
+            raise ValueError("SpectrumDistance would divide by zero: the truth does not move in any sequence")
+        return _decibels(self.powers)
+
+
+def _decibels(powers: Tensor) -> Tensor:
+    """Mean over octaves of the distance in dB of two rows of powers."""
+    prediction, truth = powers.clamp_min(1e-6 * float(powers[1].sum()))
+    return (10 * (prediction / truth).log10()).abs().mean()
+
+
 @metric.register("spread_error_ratio")
 class SpreadErrorRatio(OfSamples, RatioMetric):
     """Spread over error: how far two samples are apart, as a share of how far a sample is from the truth.
@@ -216,3 +302,4 @@ def _of(motion: Tensor, indices: Tensor | None) -> Tensor:
 motion_liveliness = functional(MotionLiveliness)
 spread_error_ratio = functional(SpreadErrorRatio)
 energy_score = functional(EnergyScore)
+spectrum_distance = functional(SpectrumDistance)

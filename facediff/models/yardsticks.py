@@ -38,6 +38,7 @@ from facediff.metrics import (
     NearestSpeakerAccuracy,
     RealTimeFactor,
     Region,
+    SpectrumDistance,
     SpreadErrorRatio,
     device_name,
 )
@@ -56,6 +57,7 @@ REFERENCES = {
 YARDSTICKS: dict[str, str] = {
     "liveliness_upper_face": "liveliness of the upper face (1)",
     "liveliness_lips": "liveliness of the lips (1)",
+    "spectrum_upper_face": "spectrum of the upper face: decibels off (0)",
     "spread_face": "spread / error, whole face (1)",
     "spread_upper_face": "spread / error, upper face (1)",
     "spread_lips": "spread / error, lips (1)",
@@ -197,6 +199,7 @@ class Measurement:
         self.of_each: dict[str, Metric] = {
             "liveliness_upper_face": MotionLiveliness(upper),
             "liveliness_lips": MotionLiveliness(lips),
+            "spectrum_upper_face": SpectrumDistance(upper),
             "lve": LipVertexError(lips),
             "mve": MeanVertexError(),
             "fdd": FaceDynamicsDeviation(upper),

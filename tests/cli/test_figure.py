@@ -226,8 +226,9 @@ def test_missing_pieces_of_a_corpus(corpus: Path, capsys: pytest.CaptureFixture[
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("drawn", [0, 42])
 def test_the_built_in_corpus_by_name(
-    corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    drawn: int, corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from facediff.data.puppet import cache_root
 
@@ -237,7 +238,7 @@ def test_the_built_in_corpus_by_name(
     assert main(given) == 2
     assert "`facediff demo` makes it" in capsys.readouterr().err
     cache_root(0).parent.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(corpus, cache_root(0))
+    shutil.copytree(corpus, cache_root(0, drawn))
     assert main(given) == 0
 
 

@@ -32,7 +32,13 @@ OF_A_MODEL = {
     "real_time_factor",
     "nearest_speaker_accuracy",
 }
-NO_CLIP_VALUES = {"clip_speech_lip_correlation", "motion_liveliness", "blink_rate", "blink_rate_ratio"}
+NO_CLIP_VALUES = {
+    "clip_speech_lip_correlation",
+    "motion_liveliness",
+    "spectrum_distance",
+    "blink_rate",
+    "blink_rate_ratio",
+}
 PHONEMES = "start,end,ipa,viseme\n0.00,0.08,m,PP\n0.08,0.2,a,aa\n0.2,0.28,ˈb,PP\n"
 
 

@@ -343,6 +343,24 @@ def liveliness(corpus: Corpus, *, region: Sequence[int]) -> float:
     return float(np.sqrt(sum(moved(p) for p, _ in both) / sum(moved(g) for _, g in both)))
 
 
+def decibels_off(corpus: Corpus, *, octaves: int, region: Sequence[int]) -> float:
+    """By the formula, with a sum over frames for every frequency."""
+    powers = np.zeros((2, octaves))
+    for place in range(len(corpus.truths)):
+        for row, x in enumerate(sides(corpus, place)):
+            x = x[:, list(region)].astype(np.float64).reshape(len(x), -1)
+            t = np.arange(len(x))
+            window = np.sin(np.pi * (t + 0.5) / len(x))
+            windowed = (x - x.mean(0)) * window[:, None]
+            for k in range(1, len(x)):
+                share = min(k, len(x) - k) / (len(x) / 2)
+                wave = np.exp(-2j * np.pi * k * t / len(x))
+                octave = next((o for o in range(octaves - 1) if share > 2.0 ** -(o + 1)), octaves - 1)
+                powers[row, octave] += (np.abs(wave @ windowed) ** 2).sum() / (window**2).sum()
+    prediction, truth = np.maximum(powers, 1e-6 * powers[1].sum())
+    return float(np.abs(10 * np.log10(prediction / truth)).mean())
+
+
 def spread_over_error(corpus: Corpus, *, region: Sequence[int]) -> float:
     spread = error = 0.0
     for place in range(len(corpus.truths)):
@@ -463,6 +481,10 @@ def _cases() -> list[Case]:
         expected = partial(liveliness, region=region or range(40))
         word, only = "region" if region else "", {"n_samples": SAMPLES}
         add(fm.MotionLiveliness, twin, (region,), {}, pair_batch, expected, word)
+        for octaves in (1, 4):
+            twin = partial(fm.spectrum_distance, region=region, octaves=octaves)
+            expected = partial(decibels_off, octaves=octaves, region=region or range(40))
+            add(fm.SpectrumDistance, twin, (region,), {"octaves": octaves}, pair_batch, expected, word)
         twin = partial(fm.spread_error_ratio, region=region)
         expected = partial(spread_over_error, region=region or range(40))
         add(fm.SpreadErrorRatio, twin, (region,), {}, samples_batch, expected, word, only)

@@ -89,7 +89,7 @@ def test_an_empty_metric_refuses_to_compute(case: Case, corpus: Corpus) -> None:
 def test_a_metric_says_what_it_is(case: Case) -> None:
     metric = case.make()
     words = metric.describe()
-    assert words.endswith(("[unit]", "[unit²]", "[1]", "[frames]", "[ms]"))
+    assert words.endswith(("[unit]", "[unit²]", "[1]", "[frames]", "[ms]", "[dB]"))
     assert "{" not in words
     regions = [str(getattr(metric, name)) for name in ("region", "pairs") if hasattr(metric, name)]
     assert any(name in words for name in regions if name != "None") or "all vertices" in words

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -89,3 +90,21 @@ def test_another_number_of_samples_is_refused(metric: type) -> None:
         metric(n_samples=1)
     with pytest.raises(ValueError, match="3 samples"):
         metric(n_samples=4).update(torch.rand(3, 5, 2, 3), torch.rand(5, 2, 3))
+
+
+def test_spectrum_distance_is_deaf_to_time_and_hears_speed() -> None:
+    place = torch.arange(200, dtype=torch.float64)
+
+    def wave(cycles: float, phase: float) -> torch.Tensor:
+        return torch.sin(2 * torch.pi * (cycles * place + phase))[:, None, None].expand(-1, 2, 3)
+
+    truth = wave(0.1, 0.0)
+    assert fm.spectrum_distance(wave(0.1, 0.3), truth).item() < 3
+    assert fm.spectrum_distance(wave(0.3, 0.0), truth).item() > 15
+    still = fm.spectrum_distance(torch.zeros_like(truth), truth).item()
+    assert np.isfinite(still)
+    assert still > 15
+    with pytest.raises(ValueError, match="truth does not move"):
+        fm.spectrum_distance(truth, torch.zeros_like(truth))
+    with pytest.raises(ValueError, match="octaves"):
+        fm.SpectrumDistance(octaves=0)

@@ -87,6 +87,7 @@ def test_every_yardstick_is_the_metric_that_it_names(tiny: Tiny) -> None:
     expected = {
         "liveliness_upper_face": taken(fm.MotionLiveliness(UPPER), drawn),
         "liveliness_lips": taken(fm.MotionLiveliness(LIPS), drawn),
+        "spectrum_upper_face": taken(fm.SpectrumDistance(UPPER), drawn),
         "spread_face": taken(fm.SpreadErrorRatio(n_samples=4), drawn),
         "spread_upper_face": taken(fm.SpreadErrorRatio(UPPER, n_samples=4), drawn),
         "spread_lips": taken(fm.SpreadErrorRatio(LIPS, n_samples=4), drawn),

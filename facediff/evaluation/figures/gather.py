@@ -16,7 +16,7 @@ from facediff.data.audio import read_speech
 from facediff.data.check.layouts import by_name, list_folder, recognise
 from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
 from facediff.data.phonemes import Phoneme, phonemes_file, read_phonemes
-from facediff.data.puppet import built_in_mesh, cache_root
+from facediff.data.puppet import built_in_mesh, cache_root, made_root
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import Material, find_clips
 from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
@@ -61,9 +61,10 @@ def gather(
         FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others.
     """
     if truth == Path("puppet") and not truth.is_dir():
-        truth = cache_root(0)
-        if not truth.is_dir():
-            raise FaceDiffError(f"{truth}: the built-in corpus does not exist yet; `facediff demo` makes it")
+        made = made_root(0)
+        if made is None:
+            raise FaceDiffError(f"{cache_root(0)}: the built-in corpus does not exist yet; `facediff demo` makes it")
+        truth = made
     folder, corpus = find_truths(truth)
     manifest = read_manifest(corpus) if corpus else {}
     module = _recognise(topology, corpus or folder, manifest)
