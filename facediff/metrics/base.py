@@ -575,7 +575,8 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
     """The functional form of a metric: its class, used once on one sequence or one padded batch.
 
     Both give the same number by construction. The function takes the motion that `update` takes, then what the class
-    is made of (regions, pairs), then the options of both by keyword. Processes are not brought together.
+    is made of (regions, pairs), then the options of both by keyword. NumPy arrays do where tensors do. Processes are
+    not brought together.
 
     Args:
         metric: The class; the function has its name in snake case.
@@ -600,7 +601,7 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
         given = signature.bind(*args, **kwargs).arguments
         options = {name: given[name] for name in given if name in made}
         options |= {name: infer(given) for name, infer in metric.inferred.items()}
-        batch = {name: given[name] for name in given if name in updated}
+        batch = {name: as_tensor(given[name]) for name in given if name in updated}
         device = next((value.device for value in batch.values() if isinstance(value, Tensor)), None)
         one = metric(**options, sync_on_compute=False).to(device)
         one.update(**batch)
@@ -622,6 +623,12 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
     )
     function.__signature__ = signature  # type: ignore[attr-defined]  # what help() and IDEs show
     return function
+
+
+def as_tensor(value: Any) -> Any:  # noqa: ANN401 - whatever a metric takes
+    """A NumPy array as a tensor of its own; everything else as it is."""
+    # A copy, since torch warns of arrays that may not be written to, such as motion files that are memory-mapped.
+    return torch.tensor(value) if hasattr(value, "__array__") and not isinstance(value, Tensor) else value
 
 
 def _arguments(documented: object) -> dict[str, str]:
