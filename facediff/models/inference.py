@@ -79,6 +79,7 @@ class Inference(ABC):
         samples: whether motion depends on random noise, by a sampler that :meth:`choose_sampler` changes.
         hears_all: whether the model counts its frames by itself (:meth:`frames_of`) and hears all samples of a
             recording; else speech is cut or filled up to whole frames.
+        chosen: attributes that the methods ``choose_…`` change, and :meth:`choosing` restores.
 
     Attributes:
         frame_rate: motion frames a second.
@@ -88,6 +89,7 @@ class Inference(ABC):
 
     samples: ClassVar[bool] = False
     hears_all: ClassVar[bool] = False
+    chosen: ClassVar[tuple[str, ...]] = ("windows", "expressivity")
     frame_rate: float
     windows: WindowPlan
     expressivity: Expressivity = 1.0
@@ -388,6 +390,31 @@ class Inference(ABC):
             FaceDiffError: if the model knows no motion without such a condition, or a scale is out of range.
         """
         raise FaceDiffError(f"guidance: {type(self).__name__} cannot be guided; omit the option")
+
+    def choices(self) -> dict[str, object]:
+        """What has been chosen for inference: windows, expressivity, and whatever else the model offers."""
+        return {name: vars(self)[name] for name in self.chosen if name in vars(self)}
+
+    @contextmanager
+    def choosing(self, choices: Mapping[str, object] | None = None) -> Iterator[None]:
+        """Within it, earlier :meth:`choices` hold; whatever is chosen in it is forgotten at its end.
+
+        Args:
+            choices: those to begin with; the present ones if None.
+        """
+        before = self.choices()
+        self._restore(before if choices is None else choices)
+        try:
+            yield
+        finally:
+            self._restore(before)
+
+    def _restore(self, choices: Mapping[str, object]) -> None:
+        for name in self.chosen:
+            if name in choices:
+                setattr(self, name, choices[name])
+            elif name in vars(self):
+                delattr(self, name)
 
     # How a model generates motion. Only the first method has to be written for every model.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,8 +21,12 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     from torch import Tensor
 
+    from facediff.animation import Animation
     from facediff.data import Assets, Reference
     from facediff.models import AnimationModel, Style
+
+    StyleLike = str | Path | Mapping[str, float] | Animation | npt.NDArray[np.floating] | Tensor | Reference | Style
+    """What a style may be given as in Python, see :func:`style_from`."""
 
 FILES = (".npy", ".npz")
 """Suffixes of files that hold a style; anything else is the name of a clip."""
@@ -72,6 +76,50 @@ def read_styles(
     vector = torch.stack([share * vector_of(s, model) for share, s in zip(shares, styles, strict=True)]).sum(0)
     names = [style.name if isinstance(style, Style) else style.clip for style in styles]
     return Style(" + ".join(f"{share:.3g} {name}" for share, name in zip(shares, names, strict=True)), vector)
+
+
+def style_from(
+    given: StyleLike, identity: str, model: AnimationModel, *, template: str | Path | None = None
+) -> Reference | Style:
+    """The style that was given in Python.
+
+    Args:
+        given: the words of ``--style``; a path; names or paths with their weights, ``{"F1_e03": 0.4, "M2_e05": 0.6}``;
+            a motion as an animation or as an array (T, V, 3) of absolute vertices; a style vector (S,) of
+            :func:`extract_style`; or what this function has returned.
+        identity: whose face is animated; also whose motion an array holds, unless a template is given.
+        model: gives the style vectors.
+        template: as :func:`read_styles` takes it.
+
+    Raises:
+        FaceDiffError: as :func:`read_styles`, or if it is nothing of that kind.
+    """
+    import numpy as np
+
+    from facediff.animation import Animation
+    from facediff.data import Reference
+    from facediff.models import Style
+
+    if isinstance(given, Reference | Style):
+        return given
+    if isinstance(given, Mapping):
+        given = ",".join(f"{name}:{float(weight)!r}" for name, weight in given.items())
+    if isinstance(given, str | Path):
+        return read_styles(str(given), identity, model, template=template)
+    if not style_width(model):
+        raise FaceDiffError(
+            "--style: this checkpoint was trained without a dynamic style, so a style would change nothing; omit it"
+        )
+    if isinstance(given, Animation):
+        motion = StyleFile(Path(given.name), given.vertices, given.template, given.frame_rate, given.unit)
+        return style_of(motion, identity, model)
+    array = np.asarray(given)
+    if array.dtype.kind != "f" or array.ndim not in (1, 2, 3):
+        raise FaceDiffError(
+            f"--style: is {array.dtype} of shape {array.shape}; expected words, a file, an animation, a motion "
+            f"(frames, vertices, 3) or a style vector"
+        )
+    return style_of(StyleFile(Path("style"), array), identity, model, template=template)
 
 
 @dataclass(frozen=True)
@@ -162,11 +210,11 @@ def style_width(model: AnimationModel) -> int:
     return len(vector_of(Reference("still", torch.zeros(1, model.n_vertices, 3)), model))
 
 
-def extract_style(clips: Sequence[str], identity: str, model: AnimationModel) -> Tensor:
+def extract_style(clips: Sequence[StyleLike], identity: str, model: AnimationModel) -> Tensor:
     """The style vector (S,) of clips; their mean if there are several.
 
     Args:
-        clips: motions, as :func:`read_style` takes them.
+        clips: motions, as :func:`read_style` takes them, or :func:`style_from` other things than words.
         identity: whose motion it is, where a file's name does not say it.
         model: gives the style vectors; S is 0 if it was trained without styles.
 
@@ -177,10 +225,14 @@ def extract_style(clips: Sequence[str], identity: str, model: AnimationModel) ->
 
     from facediff.models import Style
 
-    styles = [read_style(clip, identity, model) for clip in clips]
+    styles = [
+        read_style(str(clip), identity, model) if isinstance(clip, str | Path) else style_from(clip, identity, model)
+        for clip in clips
+    ]
     for clip, style in zip(clips, styles, strict=True):
         if isinstance(style, Style):
-            raise FaceDiffError(f"{clip}: is a style vector already; give a motion (frames, vertices, 3)")
+            name = clip if isinstance(clip, str | Path) else style.name
+            raise FaceDiffError(f"{name}: is a style vector already; give a motion (frames, vertices, 3)")
     return torch.stack([vector_of(style, model) for style in styles]).mean(0)
 
 
@@ -203,23 +255,34 @@ def read_style(
     Raises:
         FaceDiffError: if there is no such file or clip, or it is no style for this checkpoint.
     """
+    is_file = style.endswith(FILES)
+    if not is_file:
+        for reference in model.assets.references.values():
+            if reference.clip == style:
+                return reference
+    opened = open_style(Path(style) if is_file else corpus_clip(style, model))
+    return style_of(opened, identity, model, template=template if is_file else None)
+
+
+def style_of(
+    opened: StyleFile, identity: str, model: AnimationModel, *, template: str | Path | None = None
+) -> Reference | Style:
+    """The style in a motion or a vector, however it was obtained; the arguments are those of :func:`read_style`.
+
+    Raises:
+        FaceDiffError: if it is no style for this checkpoint.
+    """
     import torch
 
     from facediff.animation import metres_per_unit
     from facediff.data import Reference
     from facediff.models import Style
 
-    assets = model.assets
-    if not style.endswith(FILES):
-        for reference in assets.references.values():
-            if reference.clip == style:
-                return reference
-    opened = open_style(Path(style) if style.endswith(FILES) else corpus_clip(style, model))
-    path, scale = opened.path, 1.0
+    assets, path, scale = model.assets, opened.path, 1.0
     if opened.array.ndim == 1:
         return Style(path.stem, read_vector(opened, model))
     if opened.template is None:
-        face, whose, rate = face_of_array(opened, identity, model, template if style.endswith(FILES) else None)
+        face, whose, rate = face_of_array(opened, identity, model, template)
     else:
         face, whose, rate = torch.from_numpy(opened.template), None, opened.frame_rate or assets.frame_rate
         if opened.unit not in (None, assets.unit):

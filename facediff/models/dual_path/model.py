@@ -118,6 +118,7 @@ class DualPathDiffusion(AnimationModel):
     """
 
     samples: ClassVar[bool] = True
+    chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "_sampler_options", "guidance")
 
     def __init__(
         self,
@@ -308,7 +309,7 @@ class DualPathDiffusion(AnimationModel):
                     f"guidance: {name}={scale:g} needs a model that knows motion without it; train one with "
                     f"model.{name}_dropout=0.1"
                 )
-        self.guidance |= scales
+        self.guidance = {**self.guidance, **scales}
 
     def views(self) -> dict[tuple[str, ...], float]:
         """Which conditions are hidden in the predictions that guidance combines, and the share of each.
