@@ -1,6 +1,35 @@
 """facediff: personalised speech-driven 3D facial animation with PyTorch Lightning.
 
-Importing this package loads nothing else; import the package that you need, such as ``facediff.metrics``.
+Example:
+    >>> import facediff
+    >>> model = facediff.load("demo/puppet.ckpt")  # doctest: +SKIP
+    >>> animation = model.animate("speech.wav", identity="F1")  # doctest: +SKIP
+    >>> animation.save("speech.mp4")  # doctest: +SKIP
+    [PosixPath('speech.mp4')]
+
+Importing this package loads nothing else: every name is imported when it is first used. docs/python.md shows them all.
 """
 
-__version__ = "0.1.0"
+from typing import TYPE_CHECKING
+
+from facediff.utils.lazy import lazy_names
+from facediff.version import __version__ as __version__
+
+if TYPE_CHECKING:
+    from facediff import metrics as metrics
+    from facediff.errors import FaceDiffError as FaceDiffError
+    from facediff.pipelines.animator import Animator as Animator
+    from facediff.pipelines.animator import load as load
+    from facediff.pipelines.motion import Animation as Animation
+    from facediff.pipelines.motion import read as read
+    from facediff.pipelines.motion import view as view
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "errors": "FaceDiffError",
+        "pipelines.animator": "Animator load",
+        "pipelines.motion": "Animation read view",
+    },
+    packages="metrics",
+)

@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
 
-import facediff
 from facediff import registry
 from facediff.data import SpeechMotionDataModule, collate
 from facediff.errors import FaceDiffError
@@ -26,6 +25,7 @@ from facediff.models import AnimationModel
 from facediff.registry import checks_arguments
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import sha256
+from facediff.version import __version__
 
 PICTURE_SIZE = 320  # Pixels of a picture's sides
 
@@ -75,7 +75,7 @@ def describe_run(model: AnimationModel, data: SpeechMotionDataModule) -> dict[st
         "data/people": ", ".join(f"{folder.name} {manifest_hash(folder)}" for folder in data.people) or "none",
         "protocol": protocol.name,
         "protocol_definition": protocol.describe(),
-        "version/facediff": facediff.__version__,
+        "version/facediff": __version__,
         "version/torch": str(torch.__version__),
         "version/lightning": lightning.__version__,
     }

@@ -75,14 +75,11 @@ def blendshapes(
     source.check([animation])
     if output.suffix.lower() != ".csv":
         raise FaceDiffError(f'--output {output}: unknown suffix "{output.suffix}"; expected a table .csv')
-    if not shapes.exists():
-        raise FaceDiffError(f"--shapes {shapes}: no such folder or file")
     check_picture_path(show)
 
-    from facediff.editing.blendshapes import SolveOptions, solve, write_live_link, write_weights
-    from facediff.editing.retargeting import retarget_shapes
-    from facediff.editing.shapes import ARKIT, read_shapes
+    from facediff.editing.blendshapes import SolveOptions
     from facediff.export.writing import check_free
+    from facediff.pipelines.motion import solve_weights
     from facediff.utils.files import check_writable
 
     check_writable(output.with_suffix(".json"))
@@ -92,11 +89,8 @@ def blendshapes(
     own = source.read(animation)
     if show is not None:
         _ = own.triangles  # refuses an animation without triangles before anything is written
-    found = retarget_shapes(shapes, own) if carry else read_shapes(shapes, own.template, own.unit)
-    if only_arkit:
-        found = found.only(ARKIT)
-    weights = solve(own, found, options)
-    (write_weights if plain else write_live_link)(output, weights)
+    found, weights = solve_weights(own, shapes, options, carry=carry, only_arkit=only_arkit)
+    weights.save(output, plain=plain)
     if show is not None:
         from facediff.export.pictures import draw_worst_frame
 

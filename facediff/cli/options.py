@@ -6,9 +6,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from facediff.cli.parsing import Option, changed, refuse_idle
+from facediff.cli.parsing import Option, changed
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.files import valid_text
@@ -16,9 +16,9 @@ from facediff.utils.hub import check_model_source
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
-    from facediff.animation.files import AnimationFacts
     from facediff.editing.controls import AnimationControls
     from facediff.export import ExportOptions
+    from facediff.pipelines.motion import Source
 
 Output = Annotated[Path, Option(also="-o", metavar="OUT", writes="file")]
 OutputFolder = Annotated[Path, Option(also="-o", metavar="OUT", writes="folder")]
@@ -71,42 +71,16 @@ class SourceOptions:
         if self.identity is not None and self.checkpoint is None:
             raise FaceDiffError("--identity: names a face of a checkpoint; give --checkpoint as well")
 
-    def facts(self) -> tuple[AnimationFacts, AnimationFacts | None]:
-        """What the options say, which overrides a file; and what the checkpoint adds where nothing else says it."""
-        import numpy as np
+    def source(self) -> Source:
+        """The same for reading."""
+        from facediff.pipelines.motion import Source
 
-        from facediff.mesh import read_mesh
-
-        overrides: dict[str, Any] = {}
-        defaults = None
-        if self.checkpoint is not None:
-            from facediff.models.checkpoint import read_assets
-            from facediff.pipelines.animate import facts_of
-
-            defaults = facts_of(read_assets(self.checkpoint), self.identity)
-            if self.identity is not None:
-                overrides["template"] = defaults["template"]
-        if self.mesh is not None:
-            mesh = read_mesh(self.mesh)
-            overrides |= {"template": mesh.vertices.astype(np.float32), "faces": mesh.faces}
-            overrides |= {} if mesh.colours is None else {"colours": mesh.colours}
-        if self.speech is not None:
-            from facediff.data.audio import read_speech
-            from facediff.utils import SAMPLE_RATE
-
-            overrides |= {"speech": read_speech(self.speech), "sample_rate": SAMPLE_RATE}
-        overrides |= {} if self.frame_rate is None else {"frame_rate": self.frame_rate}
-        overrides |= {} if self.unit is None else {"unit": self.unit}
-        return cast("AnimationFacts", overrides), cast("AnimationFacts | None", defaults)
+        return Source(**vars(self))
 
     def read(self, path: Path) -> Animation:
         """The animation in a file, completed by the options; all of its frames are finite."""
-        from facediff.animation import read_animation
-
         self.check([path])
-        animation = read_animation(path, *self.facts())
-        animation.refuse_not_finite()
-        return animation
+        return self.source().read(path)
 
 
 @dataclass(frozen=True)
@@ -127,9 +101,9 @@ class ControlOptions:
     """
 
     expressiveness: Annotated[str | None, Option(metavar="FACTORS")] = None
-    blinks: Annotated[ranges.BlinkRate | None, Option(metavar="RATE", bare=17.0)] = None
-    gaze: Annotated[ranges.GazeAngle | None, Option(metavar="DEGREES", bare=4.0)] = None
-    sway: Annotated[ranges.SwayAngle | None, Option(metavar="DEGREES", bare=2.0)] = None
+    blinks: Annotated[ranges.BlinkRate | None, Option(metavar="RATE", bare=ranges.USUAL_BLINKS)] = None
+    gaze: Annotated[ranges.GazeAngle | None, Option(metavar="DEGREES", bare=ranges.USUAL_GAZE)] = None
+    sway: Annotated[ranges.SwayAngle | None, Option(metavar="DEGREES", bare=ranges.USUAL_SWAY)] = None
     eyes: File = None
     controls_seed: Annotated[ranges.Seed | None, Option(metavar="N")] = None
 
@@ -166,17 +140,9 @@ class OutputOptions:
 
     def check(self, suffix: str) -> None:
         """Refuse options that a format does not use."""
-        from facediff.export import FORMATS
+        from facediff.export import check_used
 
-        if suffix not in FORMATS:  # which is refused with the file's name
-            return
-        given, form = changed(self), FORMATS[suffix]
-        for name, field in (("view", "view"), ("size", "size"), ("tolerance", "tolerance_mm")):
-            users = [other for other, each in FORMATS.items() if field in each.uses]
-            if field not in form.uses:
-                refuse_idle(f"has no effect on {suffix}, but on {', '.join(users)}", **{name: given[name]})
-        if not form.needs_shapes:
-            refuse_idle(f"is for weights, and {suffix} holds none; write .csv", shapes=given["shapes"])
+        check_used(suffix, [name for name, is_changed in changed(self).items() if is_changed])
 
     def export(self, *, footer: str = "", quiet: bool = True) -> ExportOptions:
         """The same for :func:`facediff.export.write_animations`."""

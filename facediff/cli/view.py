@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -53,15 +52,13 @@ def view(
             f"--labels: {len(labels)} names for {len(paths)} panels; give one for each, the truth's first"
         )
 
-    from facediff.export.viewer import write_page
+    from facediff.pipelines.motion import view as page_of
 
-    shown = with_different_names(read_animations(paths, source), paths)
-    if labels is not None:
-        shown = [replace(animation, name=label) for animation, label in zip(shown, labels, strict=True)]
-    if shortest:
-        frames = min(len(animation.vertices) for animation in shown)
-        shown = [replace(animation, vertices=animation.vertices[:frames]) for animation in shown]
-    write_page(output, shown, max_mb=max_mb, truth=None if truth is None else 0)
+    given = with_different_names(read_animations(paths, source), paths)
+    first = None if truth is None else given.pop(0)
+    page = page_of(given, truth=first, labels=labels, shortest=shortest)
+    page.save(output, max_mb=max_mb)
+    shown = page.animations
     size = output.stat().st_size / 1e6
     counted = "1 animation" if len(shown) == 1 else f"{len(shown)} animations"
     tell(f"{output}: {len(shown[0].vertices)} frames of {counted}, {size:.1f} MB; open it in a browser")
@@ -73,17 +70,13 @@ def view(
 
 def read_animations(paths: Sequence[Path], source: SourceOptions) -> list[Animation]:
     """The animations of all files; the first archive completes arrays of as many vertices."""
-    from facediff.animation import read_animation
-    from facediff.animation.files import complete, facts_of
     from facediff.utils.arrays import open_vertices
 
-    overrides, defaults = source.facts()
-    whole = {path: read_animation(path, overrides, defaults) for path in paths if path.suffix == ".npz"}
+    completing = source.source()
+    whole = {path: completing.read(path) for path in paths if path.suffix == ".npz"}
     lender = next(iter(whole.values()), None)
-    found = []
+    found: list[Animation] = []
     for path in paths:
-        completing = defaults
-        if lender is not None and path.suffix == ".npy" and open_vertices(path).shape[1] == len(lender.template):
-            completing = complete(defaults or {}, facts_of(lender))  # the checkpoint takes precedence
-        found.append(whole[path] if path in whole else read_animation(path, overrides, completing))
+        alike = lender is not None and path.suffix == ".npy" and open_vertices(path).shape[1] == len(lender.template)
+        found.append(whole[path] if path in whole else completing.read(path, lender if alike else None))
     return found

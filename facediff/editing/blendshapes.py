@@ -61,7 +61,7 @@ class SolveOptions:
             raise FaceDiffError(f"bounds {self.lower:g} to {self.upper:g}: expected the lower one first, as in 0 1")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Weights:
     """Weights of blendshapes, frame by frame, as :func:`solve` finds them.
 
@@ -101,6 +101,29 @@ class Weights:
         if self.amplitude_mm <= 0:
             return np.zeros_like(self.residual_rms_mm)
         return self.residual_rms_mm / self.amplitude_mm
+
+    def save(self, path: str | Path, *, plain: bool = False) -> Path:
+        """Write the table, and what it cannot say in a .json next to it.
+
+        Args:
+            path: the .csv file.
+            plain: columns time, the set's own names and residuals in mm, instead of those of Live Link Face.
+
+        Raises:
+            FaceDiffError: if a file cannot be written.
+        """
+        path = Path(path)
+        if path.suffix.lower() != ".csv":
+            raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a table .csv')
+        (write_weights if plain else write_live_link)(path, self)
+        return path
+
+    def __repr__(self) -> str:
+        shares = self.residual_share
+        return (
+            f"Weights({len(self.values)} frames, {len(self.names)} shapes; residual: median "
+            f"{np.median(self.residual_rms_mm):.3g} mm, {np.median(shares):.1%} of the motion)"
+        )
 
 
 def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None = None) -> Weights:

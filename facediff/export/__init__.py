@@ -7,6 +7,6 @@ Example:
 """
 
 from facediff.export.format import ExportOptions, Format
-from facediff.export.writing import FORMATS, check_export, write_animations
+from facediff.export.writing import FORMATS, check_export, check_used, write_animations
 
-__all__ = ["FORMATS", "ExportOptions", "Format", "check_export", "write_animations"]
+__all__ = ["FORMATS", "ExportOptions", "Format", "check_export", "check_used", "write_animations"]

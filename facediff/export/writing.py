@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -133,6 +133,27 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
         check_writable(target)
         if form.is_folder:
             check_free(folder_of(target))
+
+
+def check_used(suffix: str, given: Collection[str]) -> None:
+    """Refuse options that the format of a suffix does not use; an unknown suffix is refused elsewhere.
+
+    Args:
+        suffix: of the file.
+        given: names of the options that were given, as ``facediff export`` calls them.
+
+    Raises:
+        FaceDiffError: naming the first option that changes nothing.
+    """
+    if suffix not in FORMATS:
+        return
+    form = FORMATS[suffix]
+    for name, field in (("view", "view"), ("size", "size"), ("tolerance", "tolerance_mm")):
+        if name in given and field not in form.uses:
+            users = [other for other, each in FORMATS.items() if field in each.uses]
+            raise FaceDiffError(f"--{name}: has no effect on {suffix}, but on {', '.join(users)}; omit it")
+    if "shapes" in given and not form.needs_shapes:
+        raise FaceDiffError(f"--shapes: is for weights, and {suffix} holds none; write .csv; omit it")
 
 
 def _targets(path: Path, form: Format, count: int) -> list[Path]:

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from facediff.animation import Animation
     from facediff.data import Assets, Reference
     from facediff.editing.correspondence import Correspondence
-    from facediff.models import Style
+    from facediff.models import AnimationModel, Style
+    from facediff.models.styles import StyleLike
 
 MIN_SECONDS = 0.2
 STEP_SECONDS = 0.01  # What a denoising step of a second of speech takes on two cores (tools/benchmarks/RESULTS.md)
@@ -81,13 +82,21 @@ class AnimationOptions:
 
     def check(self, output: Path) -> None:
         """Refuse what can be refused before a model is loaded."""
+        self.check_inputs()
+        check_export(output, self.export, self.samples)
+
+    def check_inputs(self, *, styled: bool = False) -> None:
+        """Refuse options that belong to others that are not given, and meshes that are not there.
+
+        Args:
+            styled: whether there is a style that is no words.
+        """
         if self.correspondence is not None and self.target_mesh is None:
             raise FaceDiffError("--correspondence: belongs to a mesh; give --target-mesh as well")
-        if self.style_template is not None and self.style is None:
+        if self.style_template is not None and self.style is None and not styled:
             raise FaceDiffError("--style-template: belongs to a motion; give --style as well")
         if self.target_mesh is not None and not self.target_mesh.is_file():
             raise FaceDiffError(f"--target-mesh {self.target_mesh}: no such file")
-        check_export(output, self.export, self.samples)
 
 
 class AnimationPipeline:
@@ -96,6 +105,9 @@ class AnimationPipeline:
     Args:
         options: the choices.
         seed: the one that recordings will be animated with; refused if it decides nothing.
+        model: a model that is loaded already, on its device; it keeps what the options choose. None to load the
+            checkpoint.
+        style: a style that is no words; that of the options if None.
 
     Raises:
         FaceDiffError: if the checkpoint, the style or another option cannot be used.
@@ -106,15 +118,24 @@ class AnimationPipeline:
         pipeline.write(read_recording(Path("speech.wav")), "speech", Path("speech.mp4"), seed=0)
     """
 
-    def __init__(self, options: AnimationOptions, *, seed: int = 0) -> None:
+    def __init__(
+        self,
+        options: AnimationOptions,
+        *,
+        seed: int = 0,
+        model: AnimationModel | None = None,
+        style: StyleLike | None = None,
+    ) -> None:
         from facediff.models import load_model
         from facediff.models.inference import WindowPlan
-        from facediff.models.styles import read_styles
+        from facediff.models.styles import style_from
 
         self.options = options
-        self.model = load_model(
-            options.checkpoint, usable_device(options.device), commercial_only=options.commercial_only
-        )
+        if model is None:
+            model = load_model(
+                options.checkpoint, usable_device(options.device), commercial_only=options.commercial_only
+            )
+        self.model = model
         if options.samples > 1 and not self.model.samples:
             raise FaceDiffError(
                 f"--samples {options.samples}: {type(self.model).__name__} makes one animation, whatever the "
@@ -145,8 +166,9 @@ class AnimationPipeline:
             self._choose_expressivity(facts["template"], facts["regions"], name)
         self._correspondence: Correspondence | None = None
         self.style: Reference | Style | None = None
-        if options.style:
-            self.style = read_styles(options.style, self.identity, self.model, template=options.style_template)
+        wanted = style if style is not None else options.style or None
+        if wanted is not None:
+            self.style = style_from(wanted, self.identity, self.model, template=options.style_template)
 
     def _choose_expressivity(
         self, template: npt.NDArray[np.floating], regions: Mapping[str, npt.NDArray[np.integer]], name: str
@@ -206,11 +228,12 @@ class AnimationPipeline:
 
     @contextmanager
     def samples(
-        self, speech: npt.NDArray[np.float32], name: str, output: Path, *, seed: int
+        self, speech: npt.NDArray[np.float32], name: str, output: Path | None, *, seed: int
     ) -> Iterator[list[Animation]]:
         """Samples of some speech as they come from the model; long ones are on disk as long as the context lasts.
 
-        The arguments are those of :meth:`write`; the folder of ``output`` must have room for long samples.
+        The arguments are those of :meth:`write`; the folder of ``output`` must have room for long samples, which are
+        kept in memory if it is None.
         """
         import torch
 
@@ -218,7 +241,9 @@ class AnimationPipeline:
         # Counted in whole frames, as the model counts them: otherwise speech of just about the limit would be animated
         # by windows here and in one pass there.
         short = self.model.windows.in_one_pass(self.model.frames_of(len(speech)), self.model.frame_rate)
-        spool: AbstractContextManager[Path | None] = nullcontext() if short else scratch_folder(output)
+        spool: AbstractContextManager[Path | None] = (
+            nullcontext() if short or output is None else scratch_folder(output)
+        )
         with spool as folder:
             with self.precision():
                 if folder is None:
@@ -228,7 +253,9 @@ class AnimationPipeline:
                         condition=self.options.condition,
                         style=self.style,
                         seeds=seeds,
-                        progress=None if self.options.quiet else partial(track, description="sampling"),
+                        progress=None
+                        if self.options.quiet
+                        else partial(track, description="sampling" if short else "seconds of speech"),
                     )
                     motions, style = [sample.vertices.numpy() for sample in made], made[0].reference_name
                 else:
@@ -284,8 +311,8 @@ class AnimationPipeline:
     def _animation(
         self, motion: npt.NDArray[np.float32], speech: npt.NDArray[np.float32], name: str, seed: int, style: str
     ) -> Animation:
-        from facediff import __version__
         from facediff.animation import Animation
+        from facediff.version import __version__
 
         assets, sampler = self.model.assets, getattr(self.model, "sampler", None)
         trained_on = assets.identity_index(self.identity) >= 0
@@ -343,17 +370,28 @@ def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[
     Raises:
         FaceDiffError: if the file cannot be read, holds only silence, or lasts too short or too long.
     """
-    import numpy as np
-
-    from facediff.data.audio import SAMPLE_RATE, read_speech
+    from facediff.data.audio import read_speech
 
     speech = read_speech(path, max_seconds=max_seconds)
+    check_speech(speech, str(path))
+    return speech
+
+
+def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
+    """Refuse speech (S,) at 16 kHz that animates nothing.
+
+    Raises:
+        FaceDiffError: naming ``name``, if it holds only silence or lasts too short.
+    """
+    import numpy as np
+
+    from facediff.data.audio import SAMPLE_RATE
+
     seconds = len(speech) / SAMPLE_RATE
     if seconds < MIN_SECONDS:
-        raise FaceDiffError(f"{path}: lasts {seconds:.2f} s; expected speech of at least {MIN_SECONDS} s")
+        raise FaceDiffError(f"{name}: lasts {seconds:.2f} s; expected speech of at least {MIN_SECONDS} s")
     if float(np.abs(speech).max()) < SILENCE:
-        raise FaceDiffError(f"{path}: holds only silence; expected a recording of speech")
-    return speech
+        raise FaceDiffError(f"{name}: holds only silence; expected a recording of speech")
 
 
 def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
@@ -378,9 +416,11 @@ def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
 
 
 def usable_device(name: str) -> str:
-    """The device's name."""
+    """The device's name; ``auto`` is a CUDA device where there is one, and the processor elsewhere."""
     import torch
 
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         # Memory is allocated and read back, which devices that exist in name only cannot do (meta).
         float(torch.ones(1, device=torch.device(name)).sum())

@@ -1,4 +1,4 @@
-"""Samples of speech from standard input to frames of animation, as soon as these are certain."""
+"""Speech that arrives in pieces, such as samples from standard input, to frames of animation once these are certain."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from typing import IO, TYPE_CHECKING
 
 from facediff.errors import FaceDiffError
 from facediff.pipelines.animate import AnimationOptions, AnimationPipeline
+from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic, check_writable
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
+    from torch import Tensor
 
 
 CHUNK = 0.02
@@ -39,8 +41,6 @@ def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_00
     """
     check_stream(options, output)
 
-    import torch
-
     pipeline = AnimationPipeline(options, seed=seed)
     model = pipeline.model
     plan = model.windows
@@ -50,24 +50,78 @@ def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_00
         f"frames at a time, {model.frame_rate:g} a second, {len(template)} vertices; reading {rate} Hz, 16 bit"
     )
     busy, heard = 0.0, 0
-    with sink(output, tuple(template.shape)) as write, pipeline.precision(), ended_by_interrupt() as read:
-        # The style is encoded within the precision as well, as it is for a file.
-        stream = model.stream(
-            identity=pipeline.identity, condition=options.condition, style=pipeline.style, seeds=[seed]
-        )
+    with sink(output, tuple(template.shape)) as write, ended_by_interrupt() as read:
+        live = LiveAnimation(pipeline, rate=rate, seed=seed)
         for samples in pcm(sys.stdin.buffer, rate, read):
             started = time.perf_counter()
-            part = stream.feed(torch.from_numpy(samples))
+            part = live.feed(samples)
             busy += time.perf_counter() - started
             heard += len(samples)
-            write((part[0].cpu() + template).numpy())
+            write(part)
         if not heard:
             raise FaceDiffError("standard input: ended before any sample came; send 16-bit mono PCM to it")
         started = time.perf_counter()
-        part = stream.finish()
+        part = live.finish()
         busy += time.perf_counter() - started
-        write((part[0].cpu() + template).numpy())
-    report(f"{heard / 16_000:.2f} s of speech; real-time factor {busy / max(heard / 16_000, 1e-9):.2f}")
+        write(part)
+    report(f"{heard / rate:.2f} s of speech; real-time factor {busy / max(heard / rate, 1e-9):.2f}")
+
+
+class LiveAnimation:
+    """Animates speech of any length and any sample rate while it arrives; memory does not grow with its length.
+
+    The frames are those of the recording as a whole, however the speech is cut into pieces.
+
+    Args:
+        pipeline: the model with its options, of which this keeps what is chosen now.
+        rate: sample rate of the speech.
+        seed: seed of the noise.
+
+    Raises:
+        FaceDiffError: if the style or the windows do not fit the model.
+    """
+
+    def __init__(self, pipeline: AnimationPipeline, *, rate: int = SAMPLE_RATE, seed: int = 0) -> None:
+        from facediff.data.audio import resampler
+
+        self._pipeline, model = pipeline, pipeline.model
+        self._chosen = model.choices()
+        self._template = model.assets.template(pipeline.identity)
+        self._convert = None if rate == SAMPLE_RATE else resampler(rate)
+        with pipeline.precision():  # the style is encoded within it as well, as it is for a file
+            self._stream = model.stream(
+                identity=pipeline.identity, condition=pipeline.options.condition, style=pipeline.style, seeds=[seed]
+            )
+
+    def feed(self, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Hear samples (n,), and give the frames (m, V, 3) that are certain now; m may be 0."""
+        import torch
+
+        speech = samples if self._convert is None else self._convert(samples, False)
+        with self._pipeline.model.choosing(self._chosen), self._pipeline.precision():
+            return self._absolute(self._stream.feed(torch.from_numpy(speech)))
+
+    def finish(self) -> npt.NDArray[np.float32]:
+        """The frames (m, V, 3) that are left.
+
+        Raises:
+            FaceDiffError: if the speech was shorter than a frame.
+        """
+        import numpy as np
+        import torch
+
+        with self._pipeline.model.choosing(self._chosen), self._pipeline.precision():
+            last = []
+            if self._convert is not None:
+                rest = self._convert(np.zeros(0, np.float32), True)
+                last.append(self._absolute(self._stream.feed(torch.from_numpy(rest))))
+            last.append(self._absolute(self._stream.finish()))
+        return np.concatenate(last)
+
+    def _absolute(self, motion: Tensor) -> npt.NDArray[np.float32]:
+        """Vertices of the first sample's offsets."""
+        vertices: npt.NDArray[np.float32] = (motion[0].cpu() + self._template).numpy()
+        return vertices
 
 
 def check_stream(options: AnimationOptions, output: Path) -> None:
@@ -144,15 +198,10 @@ def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
 
 
 def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.read) -> Iterator[npt.NDArray[np.float32]]:
-    """Pieces (n,) of speech at 16 kHz, as 16-bit mono samples (little endian) of ``rate`` come in.
+    """Pieces (n,) of speech, full scale 1, as 16-bit mono samples (little endian) of ``rate`` come in.
 
     ``read`` works as ``os.read``; half a sample at the end is dropped.
     """
-    import numpy as np
-
-    from facediff.data.audio import SAMPLE_RATE, resampler
-
-    convert = resampler(rate) if rate != SAMPLE_RATE else None
     rest, first = b"", True
     # A read of a pipe gives what is there, at least one byte, and nothing at its end.
     while data := read(source.fileno(), max(2, round(CHUNK * rate) * 2)):
@@ -164,10 +213,14 @@ def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.rea
         data, first = rest + data, False
         whole = len(data) // 2 * 2
         rest = data[whole:]
-        samples = (np.frombuffer(data[:whole], "<i2") / 32768).astype(np.float32)
-        yield samples if convert is None else convert(samples, False)
-    if convert is not None:
-        yield convert(np.zeros(0, np.float32), True)
+        yield samples_of(data[:whole])
+
+
+def samples_of(data: bytes) -> npt.NDArray[np.float32]:
+    """16-bit samples (little endian) as (n,) with full scale 1."""
+    import numpy as np
+
+    return (np.frombuffer(data, "<i2") / 32768).astype(np.float32)
 
 
 @contextmanager

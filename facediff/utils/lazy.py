@@ -12,13 +12,14 @@ from collections.abc import Callable, Mapping
 
 
 def lazy_names(
-    package: str, modules: Mapping[str, str]
+    package: str, modules: Mapping[str, str], packages: str = ""
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names are loaded on first use (PEP 562).
 
     Args:
         package: the package's ``__name__``.
         modules: for each module of the package, its public names, separated by spaces.
+        packages: packages inside the package that are names of it themselves, separated by spaces.
 
     Example:
         >>> __getattr__, __dir__, __all__ = lazy_names("facediff.mesh", {"mesh": "Mesh read_mesh"})
@@ -26,12 +27,16 @@ def lazy_names(
         ['Mesh', 'read_mesh']
     """
     owner = {name: f"{package}.{module}" for module, names in modules.items() for name in names.split()}
+    inside = packages.split()
 
     def get(name: str) -> object:
+        if name in inside:
+            return importlib.import_module(f"{package}.{name}")  # which also makes it an attribute of the package
         if name not in owner:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         value = getattr(importlib.import_module(owner[name]), name)
         setattr(sys.modules[package], name, value)  # found directly from now on
         return value
 
-    return get, lambda: sorted({*owner, *vars(sys.modules[package])}), sorted(owner)
+    names = {*owner, *inside}
+    return get, lambda: sorted({*names, *vars(sys.modules[package])}), sorted(names)

@@ -220,6 +220,8 @@ def _hints(owner: Any) -> dict[str, Any]:  # noqa: ANN401
 # nothing overflows and no machine is filled by a slip of the finger.
 
 BlinkRate = Annotated[float, Range(1, 40)]
+USUAL_BLINKS = 17.0
+"""Blinks a minute where no number is given: those of somebody at rest."""
 Bound = Annotated[float, Range(-1000, 1000)]
 ClipLength = Annotated[float, Range(1, 600)]
 Duration = Annotated[float, Range(0.001, 604_800)]
@@ -234,6 +236,8 @@ FrameRate = Annotated[float, Range(*FRAME_RATES)]
 GUIDANCE_SCALE = Range(0, 10)
 GuidanceScale = Annotated[float, GUIDANCE_SCALE]
 GazeAngle = Annotated[float, Range(0, 20, above=True)]
+USUAL_GAZE = 4.0
+"""Degrees where no number is given."""
 LearningRate = Annotated[float, Range(0, 1, above=True)]
 Level = Annotated[float, Range(0.01, 0.9999)]
 Megabytes = Annotated[float, Range(0.001, 100_000)]
@@ -252,6 +256,8 @@ Steps = Annotated[int, Range(1, 10_000)]
 Strength = Annotated[float, Range(0, 1e6)]
 Stride = Annotated[int, Range(1, 1000)]
 SwayAngle = Annotated[float, Range(0, 15, above=True)]
+USUAL_SWAY = 2.0
+"""Degrees where no number is given."""
 Tolerance = Annotated[float, Range(1e-15, 1)]
 Vertices = Annotated[int, Range(1, 2_000_000)]
 Window = Annotated[float, Range(0.01, 600)]

@@ -8,6 +8,6 @@ Example:
     >>> write_page(path, [read_animation(true), read_animation(predicted)], truth=0)  # doctest: +SKIP
 """
 
-from facediff.export.viewer.page import write_page
+from facediff.export.viewer.page import page_parts, write_page
 
-__all__ = ["write_page"]
+__all__ = ["page_parts", "write_page"]

@@ -73,9 +73,7 @@ def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 3
         MissingExtraError: for a heat map without OpenCV.
     """
     check_writable(path)
-    _check(animations, truth)
-    blobs = Blobs()
-    parts = _page_parts(_page_facts(animations, truth, blobs), blobs)
+    parts = page_parts(animations, truth=truth)
     size = sum(len(part.encode()) for part in parts) / 1_000_000
     if size > max_mb:
         raise FaceDiffError(
@@ -86,8 +84,24 @@ def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 3
         stream.writelines(parts)
 
 
-def _check(animations: Sequence[Animation], truth: int | None) -> None:
-    """Refuse animations that do not make a page."""
+def page_parts(animations: Sequence[Animation], *, truth: int | None = None) -> list[str]:
+    """The text of the page in pieces, in order, as :func:`write_page` writes it.
+
+    Args:
+        animations: as :func:`write_page` takes them.
+        truth: as :func:`write_page` takes it.
+
+    Raises:
+        FaceDiffError: if the animations do not make a page.
+        MissingExtraError: for a heat map without OpenCV.
+    """
+    check_page(animations, truth)
+    blobs = Blobs()
+    return _page_parts(_page_facts(animations, truth, blobs), blobs)
+
+
+def check_page(animations: Sequence[Animation], truth: int | None) -> None:
+    """Refuse animations that do not make a page; the arguments are those of :func:`write_page`."""
     if not 1 <= len(animations) <= MOST_ANIMATIONS:
         raise FaceDiffError(
             f"a page shows 1 to {MOST_ANIMATIONS} animations side by side, not {len(animations)}; choose among them"
