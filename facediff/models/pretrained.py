@@ -285,7 +285,7 @@ def with_tensors(value: Any, arrays: Mapping[str, np.ndarray[Any, Any]], path: P
     array = arrays.get(name) if isinstance(name, str) else None
     sized = isinstance(shape, list) and len(shape) <= 64
     sized = sized and all(isinstance(size, int) and 0 <= size < 1 << 32 for size in cast(list[Any], shape))
-    if array is None or kind not in NUMBERS or not sized:
+    if array is None or not isinstance(kind, str) or kind not in NUMBERS or not sized:
         raise FaceDiffError(f"{path}: its tensor {quoted(name)} is not in {ASSETS}, or of an unknown type; {REMEDY}")
     shape = cast(list[int], shape)
     count = int(np.prod(shape, dtype=object)) if shape else 1

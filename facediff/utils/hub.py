@@ -104,7 +104,7 @@ def fetch(name: str, revision: str | None = None) -> Path:
     """
     try:
         from huggingface_hub import snapshot_download
-        from huggingface_hub.errors import LocalEntryNotFoundError
+        from huggingface_hub.errors import DryRunError
     except ImportError as error:
         raise MissingExtraError("huggingface_hub", "hub", f"fetching the model {name}") from error
     shown = name if revision is None else f"{name}@{revision}"
@@ -112,8 +112,8 @@ def fetch(name: str, revision: str | None = None) -> Path:
         words: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
         try:
             planned = snapshot_download(name, dry_run=True, **words)
-        except LocalEntryNotFoundError:
-            planned = []  # no network, or told to stay offline: the cache may have it
+        except DryRunError:
+            planned = []  # the hub does not answer, or refuses: the cache may have it, or the reason follows
         LIMITS.check("bytes", sum(file.file_size or 0 for file in planned), shown)
         folder = Path(snapshot_download(name, **words))
     for part in (CONFIG, WEIGHTS, ASSETS):
@@ -178,35 +178,47 @@ def _hub_errors(name: str, done: str) -> Iterator[None]:
     except errors.RevisionNotFoundError as error:
         raise FaceDiffError(f"{name}: the model has no such revision; expected a branch, a tag or a commit") from error
     except errors.RepositoryNotFoundError as error:
-        raise FaceDiffError(
-            f"{name}: neither a file or folder here nor a model on the hub that you may see; check the name, and log "
-            f"in with `hf auth login` if it is private"
-        ) from error
+        raise FaceDiffError(_unknown(name)) from error
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
-        raise FaceDiffError(_unreachable(name, done)) from error
+        status = _status(error.__cause__)
+        raise FaceDiffError(_unknown(name) if status == 404 else _unreachable(name, done, status)) from error
     except errors.HFValidationError as error:
         raise FaceDiffError(f"{name}: is no name of a model on the hub ({brief(error)}); expected user/name") from error
     except Exception as error:  # errors of the network are of whatever class its library has
-        status = getattr(getattr(error, "response", None), "status_code", None)
+        status = _status(error)
         if status in (401, 403):
             raise FaceDiffError(
                 f"{name}: the hub refuses it ({status}); log in with `hf auth login` as somebody who may write there"
             ) from error
         if status is None and _is_network(error):
-            raise FaceDiffError(_unreachable(name, done)) from error
+            raise FaceDiffError(_unreachable(name, done, status)) from error
         raise FaceDiffError(
             f"{name}: cannot be {done} ({brief(error)}); try again later, or give a folder in its place"
         ) from error
 
 
-def _unreachable(name: str, done: str) -> str:
+def _unknown(name: str) -> str:
+    return (
+        f"{name}: neither a file or folder here nor a model on the hub that you may see; check the name, and log in "
+        f"with `hf auth login` if it is private"
+    )
+
+
+def _unreachable(name: str, done: str, status: int | None) -> str:
     offline = os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "ON", "YES", "TRUE")
-    reason = "HF_HUB_OFFLINE is set" if offline else "the hub cannot be reached"
+    answered = "the hub cannot be reached" if status is None else f"the hub answers with the status {status}"
+    reason = "HF_HUB_OFFLINE is set" if offline else answered
     here = "neither a file or folder here nor in the hub's cache, and cannot be fetched" if done == "fetched" else ""
     return f"{name}: {here or f'cannot be {done}'}: {reason}. Go online once, or give a checkpoint or a model folder"
+
+
+def _status(error: BaseException | None) -> int | None:
+    """The status of the answer that made an error; None if there was no answer."""
+    status = getattr(getattr(error, "response", None), "status_code", None)
+    return status if isinstance(status, int) else None
 
 
 def _is_network(error: BaseException) -> bool:
     """Whether an error is that of a connection, under any library."""
     kinds = {kind.__name__ for kind in type(error).__mro__}
-    return bool(kinds & {"ConnectionError", "TransportError", "TimeoutException", "ConnectError", "OSError"})
+    return bool(kinds & {"ConnectionError", "TransportError", "TimeoutException", "ConnectError"})

@@ -106,7 +106,7 @@ def _header(path: Path, first: bytes, read: Any, size: int) -> tuple[dict[str, t
     for name, entry in header.items():
         fields: dict[str, Any] = entry if isinstance(entry, dict) else {}
         kind, shape, span = (cast(Any, fields.get(key)) for key in ("dtype", "shape", "data_offsets"))
-        if kind not in TYPES or not _sizes(shape) or not _sizes(span) or len(span) != 2:
+        if not isinstance(kind, str) or kind not in TYPES or not _sizes(shape) or not _sizes(span) or len(span) != 2:
             raise FaceDiffError(f"{path}: its tensor {quoted(name)} is declared as {quoted(entry)}; {DAMAGED}")
         if span[1] - span[0] != math.prod(shape) * TYPES[kind][1]:
             raise FaceDiffError(f"{path}: its tensor {quoted(name)} has other bytes than its shape needs; {DAMAGED}")

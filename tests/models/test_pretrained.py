@@ -1,0 +1,350 @@
+"""Model folders: the same model as the checkpoint, small, without a trace of its training or of this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from facediff.callbacks.averaging import EmaWithWarmup
+from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion, load_model
+from facediff.models.checkpoint import checked_file, read_assets, read_checkpoint
+from facediff.models.pretrained import coded, decoded, stored_once
+from facediff.utils.licences import Licence, commercial_use
+from facediff.utils.safetensors import read_safetensors, write_safetensors
+from tests.fakes.tiny import Tiny, write_tiny
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As training with averaged weights writes it."""
+    import lightning.pytorch as pl
+
+    from facediff import registry
+
+    folder = tmp_path_factory.mktemp("pretrained")
+    torch.manual_seed(0)
+    model = DualPathDiffusion(
+        n_vertices=24, identities=["A", "B"], frame_rate=25.0, dim=8, diffusion_steps=10, decoder=registry.decoder.gru
+    )
+
+    class Saves(pl.Callback):
+        """Saves before training ends, when the model takes over its average."""
+
+        def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+            trainer.save_checkpoint(folder / "model.ckpt")
+
+    trainer = pl.Trainer(
+        accelerator="cpu", max_steps=3, logger=False, enable_progress_bar=False, enable_model_summary=False,
+        enable_checkpointing=False, default_root_dir=folder, limit_val_batches=0, callbacks=[EmaWithWarmup(), Saves()],
+    )  # fmt: skip
+    trainer.fit(model, Tiny(root=str(write_tiny(folder / "tiny"))))
+    return folder / "model.ckpt"
+
+
+@pytest.fixture(scope="module")
+def published(checkpoint: Path) -> Path:
+    return load_model(checkpoint).save_pretrained(checkpoint.parent / "published", license="mit")
+
+
+@pytest.fixture
+def copy(published: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(published, tmp_path / "model"))
+
+
+def change(folder: Path, edit: Callable[[dict[str, Any]], object]) -> Path:
+    config = json.loads((folder / "config.json").read_text())
+    edit(config)
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+def motion(source: Path) -> torch.Tensor:
+    return load_model(source).animate(torch.sin(torch.arange(8000) / 9), identity="B", seed=3).vertices
+
+
+def test_a_folder_animates_bit_for_bit_as_its_checkpoint(checkpoint: Path, published: Path) -> None:
+    assert torch.equal(motion(checkpoint), motion(published))
+
+
+def test_the_weights_are_the_averaged_ones_and_nothing_of_the_training(checkpoint: Path, published: Path) -> None:
+    raw = torch.load(checkpoint, weights_only=True)
+    stored = read_checkpoint(published)["state_dict"]
+    assert all(torch.equal(stored[name], value) for name, value in raw["state_dict"].items())
+    assert any(not torch.equal(stored[name], value) for name, value in raw["current_model_state"].items())
+    size = sum(value.numel() * value.element_size() for value in raw["state_dict"].values())
+    header = 200 * len(raw["state_dict"])  # names weigh in this miniature
+    assert (published / "model.safetensors").stat().st_size <= 1.05 * size + header
+    assert {path.name for path in published.iterdir()} == {
+        *("config.json", "model.safetensors", "assets.npz", "README.md")
+    }
+
+
+def test_every_file_has_the_permissions_of_other_files(published: Path, tmp_path: Path) -> None:
+    (tmp_path / "usual").touch()
+    usual = (tmp_path / "usual").stat().st_mode
+    assert all(path.stat().st_mode == usual for path in published.iterdir())
+
+
+def test_no_path_of_this_machine_leaves_it(checkpoint: Path, published: Path) -> None:
+    words = (published / "config.json").read_text() + (published / "README.md").read_text()
+    assert str(checkpoint.parent) not in words
+    assert os.environ.get("HOME", "/root") + "/" not in words
+
+
+def test_assets_come_back_exactly(checkpoint: Path, published: Path) -> None:
+    before, after = read_assets(checkpoint), read_assets(published)
+    assert before.identities == after.identities
+    assert before.motion_scale == after.motion_scale
+    for name, template in before.templates.items():
+        assert torch.equal(after.templates[name], template)
+    for name, reference in before.references.items():
+        assert after.references[name].clip == reference.clip
+        assert after.references[name].motion.dtype == reference.motion.dtype
+        assert torch.equal(after.references[name].motion, reference.motion)
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.float32])
+def test_motion_is_coded_without_loss(kind: torch.dtype) -> None:
+    value = torch.cat([torch.randn(9, 4, 3).cumsum(0) * 1e-3, torch.tensor([0.0, -0.0, 65504.0]).expand(1, 4, 3)])
+    value = value.to(kind)
+    back = np.ascontiguousarray(decoded(coded(value))).view(value.numpy().dtype).reshape(value.shape)
+    assert back.tobytes() == value.numpy().tobytes()
+
+
+def test_equal_tensors_are_stored_once(checkpoint: Path, published: Path) -> None:
+    one = torch.randn(4)
+    kept, shared = stored_once({"a": one, "b": one.clone(), "c": one.double(), "d": one.view(2, 2)})
+    assert kept.keys() == {"a", "c", "d"}
+    assert shared == {"b": "a"}
+    total = {
+        **read_safetensors(published / "model.safetensors"),
+        **json.loads((published / "config.json").read_text())["shared"],
+    }
+    assert total.keys() == torch.load(checkpoint, weights_only=True)["state_dict"].keys()
+
+
+def test_half_is_smaller_and_near(checkpoint: Path, published: Path, tmp_path: Path) -> None:
+    folder = load_model(checkpoint).save_pretrained(tmp_path / "half", half=True)
+    exact = load_model(checkpoint)
+    rounded = dict(load_model(folder).named_parameters())
+    for name, value in exact.named_parameters():
+        assert torch.equal(rounded[name], value.detach().half().float())
+    for name, value in exact.named_buffers():  # constants of formulas
+        assert torch.equal(dict(load_model(folder).named_buffers())[name], value)
+    assert torch.isfinite(motion(folder)).all()
+    sizes = [(each / "model.safetensors").stat().st_size for each in (folder, published)]
+    assert sizes[0] < 0.8 * sizes[1]
+
+
+def test_a_published_model_is_published_again_alike(published: Path, tmp_path: Path) -> None:
+    again = load_model(published).save_pretrained(tmp_path / "again")
+    assert (again / "model.safetensors").read_bytes() == (published / "model.safetensors").read_bytes()
+    assert (again / "assets.npz").read_bytes() == (published / "assets.npz").read_bytes()
+
+
+def test_lightning_loads_a_folder_too(checkpoint: Path, published: Path) -> None:
+    one, two = (DualPathDiffusion.load_from_checkpoint(path).state_dict() for path in (checkpoint, published))
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    with checked_file(published) as stream:
+        assert stream.tell() == 0
+
+
+# Licences.
+
+
+def test_labels_are_stored_at_training_and_published(checkpoint: Path, published: Path) -> None:
+    trained, made = load_model(checkpoint), load_model(published)
+    assert [each.of for each in trained.licences] == ["corpus tiny"]
+    assert trained.licences[0].commercial == "unknown"
+    assert made.licences[0] == Licence("weights", "mit", "allowed", made.licences[0].source)
+    assert commercial_use(made.licences) == "unknown"  # the strictest decides
+    with pytest.raises(FaceDiffError, match="corpus tiny"):
+        load_model(published, commercial_only=True)
+
+
+@pytest.mark.parametrize(("corpus", "use"), [("puppet", "allowed"), ("biwi", "forbidden"), ("nobody's", "unknown")])
+def test_a_checkpoint_without_labels_has_those_of_its_corpus(
+    checkpoint: Path, tmp_path: Path, corpus: str, use: str
+) -> None:
+    content = torch.load(checkpoint, weights_only=True)
+    del content["facediff_licences"]
+    content["facediff_assets"]["corpus"] = corpus
+    torch.save(content, tmp_path / "old.ckpt")
+    assert commercial_use(load_model(tmp_path / "old.ckpt").licences) == use
+    if use == "allowed":
+        load_model(tmp_path / "old.ckpt", commercial_only=True)
+    else:
+        with pytest.raises(FaceDiffError, match=f"old.ckpt.*{corpus}"):
+            load_model(tmp_path / "old.ckpt", commercial_only=True)
+
+
+def test_the_licence_of_the_weights_is_by_default_that_of_the_data(checkpoint: Path, tmp_path: Path) -> None:
+    content = torch.load(checkpoint, weights_only=True)
+    free, closed = Licence("corpus x", "CC0-1.0", "allowed"), Licence("corpus y", "secret terms", "forbidden")
+    content["facediff_licences"] = [free.state(), closed.state()]
+    torch.save(content, tmp_path / "mixed.ckpt")
+    made = load_model(load_model(tmp_path / "mixed.ckpt").save_pretrained(tmp_path / "mixed"))
+    assert made.licences[0].name == "secret terms"
+    assert commercial_use(made.licences) == "forbidden"
+    head = yaml.safe_load((tmp_path / "mixed" / "README.md").read_text().split("---\n")[1])
+    assert head["license"] == "other"
+    assert head["license_name"] == "secret-terms"
+    assert head["commercial_use"] == "forbidden"
+
+
+# The card.
+
+
+def test_the_card_states_licence_data_and_scores_with_their_conditions(checkpoint: Path, tmp_path: Path) -> None:
+    table = tmp_path / "test_scores.csv"
+    table.write_text(
+        "split,method,unseen_identity,mve,lve,protocol,frames,sequences,lips_vertices,lips_hash\n"
+        "test_a,model,style_only,0.25,1e-3,paper,321,7,12,deadbeef\n"
+        "test_a,still,style_only,0.5,2e-3,paper,321,7,12,deadbeef\n"
+    )
+    folder = load_model(checkpoint).save_pretrained(
+        tmp_path / "card", license="cc-by-nc-4.0", name="ada/face", scores=table, languages=["de"]
+    )
+    _, head, body = (folder / "README.md").read_text().split("---\n", 2)
+    found = yaml.safe_load(head)
+    assert found["license"] == "cc-by-nc-4.0"
+    assert found["library_name"] == "facediff"
+    assert found["language"] == ["de"]
+    assert found["corpus"] == {"name": "tiny", "synthetic": True}
+    (result,) = found["model-index"][0]["results"]
+    assert {each["type"]: each["value"] for each in result["metrics"]} == {"mve": 0.25, "lve": 0.001}
+    assert result["dataset"]["args"]["lips_hash"] == "deadbeef"
+    for word in (
+        "ada/face",
+        "deadbeef",
+        "321",
+        "`paper`",
+        "ynthetic",
+        "Limits",
+        "Intended use",
+        "forbidden",
+        "corpus tiny",
+    ):
+        assert word in body
+
+
+@pytest.mark.parametrize("text", ["a,b\n1,2\n", "", "split,method,protocol,frames,lve\na,model,p,3,<script>\n"])
+def test_scores_of_another_form_are_refused_and_nothing_is_written(checkpoint: Path, tmp_path: Path, text: str) -> None:
+    (tmp_path / "odd.csv").write_text(text)
+    with pytest.raises(FaceDiffError, match="odd.csv"):
+        load_model(checkpoint).save_pretrained(tmp_path / "out", scores=tmp_path / "odd.csv")
+    assert {path.name for path in tmp_path.iterdir()} == {"odd.csv"}
+
+
+def test_a_folder_with_content_is_not_replaced(checkpoint: Path, copy: Path) -> None:
+    before = (copy / "config.json").read_bytes()
+    with pytest.raises(FaceDiffError, match="not empty"):
+        load_model(checkpoint).save_pretrained(copy)
+    assert (copy / "config.json").read_bytes() == before
+
+
+# What is wrong with a folder is told in one sentence.
+
+
+def refused(folder: Path, words: str) -> None:
+    with pytest.raises(FaceDiffError, match=words):
+        load_model(folder)
+
+
+def test_missing_files_are_named(copy: Path) -> None:
+    for name in ("config.json", "model.safetensors", "assets.npz"):
+        kept = (copy / name).read_bytes()
+        (copy / name).unlink()
+        refused(copy, name)
+        (copy / name).write_bytes(kept)
+    (copy / "README.md").unlink()  # for people only
+    load_model(copy)
+
+
+def test_damaged_files_are_named(copy: Path) -> None:
+    for name in ("config.json", "model.safetensors", "assets.npz"):
+        kept = (copy / name).read_bytes()
+        for damaged in (kept[: len(kept) // 2], b"", b"x" * 100):
+            (copy / name).write_bytes(damaged)
+            refused(copy, name)
+        (copy / name).write_bytes(kept)
+
+
+def test_a_later_format_asks_for_an_update(copy: Path) -> None:
+    refused(change(copy, lambda config: config.update(format="facediff model 2")), "later version")
+
+
+@pytest.mark.parametrize("edit", ["missing", "extra", "shape", "infinite", "whole"])
+def test_weights_that_do_not_fit_are_named(copy: Path, edit: str) -> None:
+    weights = read_safetensors(copy / "model.safetensors")
+    name = next(name for name in weights if weights[name].ndim == 2)
+    if edit == "missing":
+        del weights[name]
+    elif edit == "extra":
+        name = "surplus"
+        weights[name] = torch.zeros(2)
+    elif edit == "shape":
+        weights[name] = weights[name][:-1]
+    elif edit == "infinite":
+        weights[name] = weights[name] * float("inf")
+    else:
+        weights[name] = weights[name].long()
+    write_safetensors(copy / "model.safetensors", weights)
+    refused(copy, f"model.*{name}")
+
+
+def test_a_component_of_a_missing_package_is_named(copy: Path) -> None:
+    def edit(config: dict[str, Any]) -> None:
+        config["model"]["decoder"]["class_path"] = "their_package.decoders.Wonder"
+
+    refused(change(copy, edit), "decoder.*their_package.decoders.Wonder")
+
+
+def test_a_model_of_a_missing_package_is_named(copy: Path) -> None:
+    refused(change(copy, lambda config: config["model"].update(_class_path="os.system")), "os.system")
+
+
+WILD = (
+    None,
+    -1,
+    10**30,
+    "x",
+    "${oc.env:HOME}",
+    [],
+    {},
+    {"$tensor": "facediff_assets.faces"},
+    [[]],
+    True,
+    {"a": {"b": 1}},
+)
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:  # noqa: ANN401
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path, *(found for key, part in items for found in leaves(part, (*path, key)))][bool(not path) :]
+
+
+def test_every_leaf_of_a_config_may_be_anything(copy: Path, tmp_path: Path) -> None:
+    text = (copy / "config.json").read_text()
+    places = leaves(json.loads(text))
+    for number, place in list(enumerate(places))[::5]:
+        config = json.loads(text)
+        inner = config
+        for key in place[:-1]:
+            inner = inner[key]
+        inner[place[-1]] = WILD[number % len(WILD)]
+        (copy / "config.json").write_text(json.dumps(config))
+        try:
+            load_model(copy)
+        except FaceDiffError as error:
+            assert str(copy) in str(error)  # noqa: PT017
