@@ -105,10 +105,28 @@ class NoiseProcess:
         return signal.sqrt() * clean + (1 - signal).sqrt() * noise
 
     def draw_steps(
-        self, batch: int, device: torch.device, generator: torch.Generator | None = None
+        self,
+        batch: int,
+        device: torch.device,
+        generator: torch.Generator | None = None,
+        *,
+        min_snr: float | None = None,
     ) -> Int[Tensor, " batch"]:
-        """Uniform random step numbers (algorithm 1, line 3)."""
-        return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
+        """Random step numbers (algorithm 1, line 3).
+
+        Args:
+            batch: how many.
+            device: where they are drawn.
+            generator: random numbers.
+            min_snr: γ, with which steps are drawn in proportion to min(SNR, γ): in expectation, that weights their
+                losses as min-SNR-γ does for a network that predicts clean motion (Hang et al. 2023). None draws them
+                uniformly.
+        """
+        if min_snr is None:
+            return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
+        signal = self.signal.to(device)
+        weights = (signal / (1 - signal)).clamp_max(min_snr)
+        return torch.multinomial(weights, batch, replacement=True, generator=generator)
 
 
 def half_hidden(

@@ -96,6 +96,11 @@ def test_a_training_step_noises_each_clip_as_often_as_asked(model: DualPathDiffu
     model.losses(collate([dataset[i] for i in range(6)]))
     assert len(seen) == 18
     assert len(set(seen)) > 6  # each draw has a step of its own
+    seen.clear()
+    model.min_snr = 1e-3  # so small that only the noisiest steps count less
+    model.process.signal[1:] = 0.0  # and of these, there is nothing to see
+    model.losses(collate([dataset[i] for i in range(6)]))
+    assert set(seen) == {0}
 
 
 def test_losses_of_a_batch_are_those_of_its_clips(model: DualPathDiffusion, tiny: Tiny) -> None:

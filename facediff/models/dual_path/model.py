@@ -89,6 +89,8 @@ class DualPathDiffusion(AnimationModel):
         noise_schedule: ``squaredcos_cap_v2`` (the cosine schedule), ``linear`` or ``scaled_linear``.
         noise_draws: how often a clip is noised in a training step, each time to another step with other noise; speech
             and style are encoded once for all of them.
+        min_snr: γ of min-SNR weighting: steps are drawn in proportion to min(SNR, γ), which leaves out the noisiest, in
+            which a sampler begins; uniformly if None.
         noise_scale: what motion is multiplied by before it is noised; ``auto`` measures on the training split at which
             scale half of its variance shows in the schedule's middle.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
@@ -136,6 +138,7 @@ class DualPathDiffusion(AnimationModel):
         diffusion_steps: Annotated[int, Range(1, 100_000)] = 1000,
         noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
         noise_draws: Annotated[int, Range(1, 64)] = 1,
+        min_snr: Annotated[float, Range(1e-3, 1e6)] | None = None,
         noise_scale: NoiseScale = 1.0,
         style_tokens: TokenForm = "levels",
         identity_dropout: Share = 0.1,
@@ -170,6 +173,7 @@ class DualPathDiffusion(AnimationModel):
         }
         self.face_weight_unit = face_weight_unit
         self.noise_draws = noise_draws
+        self.min_snr = min_snr
         self.style_weights = {"style_identity": style_identity_weight, "style_contrast": style_contrast_weight}
         self.noise_scale: NoiseScale = noise_scale
         self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
@@ -328,7 +332,7 @@ class DualPathDiffusion(AnimationModel):
         if self.training and self.invented_speakers is not None:
             batch = self.invented_speakers(batch, self.scale)
         device, count = batch.motion.device, len(batch) * self.noise_draws
-        step = self.process.draw_steps(count, device, generator)
+        step = self.process.draw_steps(count, device, generator, min_snr=self.min_snr)
         shape = (count, batch.motion.shape[1], self.motion_space.coordinates)
         return self.losses_at(batch, step, unit_noise(shape, device, generator))
 
