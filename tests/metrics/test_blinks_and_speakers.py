@@ -53,6 +53,38 @@ def test_a_blink_is_over_only_when_the_eyes_are_nearly_open_again() -> None:
         fm.BlinkRateRatio(LIDS, closed=0.3, reopened=0.4)
 
 
+def test_a_blink_is_beyond_its_limits_and_not_at_them() -> None:
+    at, beyond = torch.tensor([1.0, 1, 1, 0.5, 1, 1, 1]), torch.tensor([1.0, 1, 1, 0.499, 1, 1, 1])
+    assert (count_blinks(at).item(), count_blinks(beyond).item()) == (0, 1)
+    ajar, apart = (torch.tensor([1.0, 1, 1, 0.1, open_to, 0.1, 1, 1, 1]) for open_to in (0.75, 0.76))
+    found = [count_blinks(each, closed=0.5, reopened=0.25).item() for each in (ajar, apart)]
+    assert found == [1, 2]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"reopened": -0.01}, {"closed": 1.0}, {"closed": 0.3, "reopened": 0.31}, {"closed": float("nan")}],
+    ids=str,
+)
+def test_limits_that_are_no_shares_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="closed is"):
+        fm.BlinkRateRatio(LIDS, **options)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="closed is"):
+        fm.BlinkRate(LIDS, frames_per_second=25, **options)  # type: ignore[arg-type]
+    assert fm.BlinkRateRatio(LIDS, closed=0.0, reopened=0.0).closed == 0.0
+    assert fm.BlinkRateRatio(LIDS, closed=0.4, reopened=0.4).reopened == 0.4
+
+
+def test_limits_count_what_they_say() -> None:
+    half, wide = face(blinking(20, 60, depth=0.6, frames=100)), face(blinking(20, frames=100))
+    for options, ratio in (({}, 2.0), ({"closed": 0.7}, 0.0), ({"closed": 0.05, "reopened": 0.01}, 2.0)):
+        assert fm.blink_rate_ratio(half, wide, LIDS, **options).item() == ratio  # type: ignore[arg-type]
+    words = fm.BlinkRate(LIDS, frames_per_second=12.5, of="truth", closed=0.45, reopened=0.2).describe()
+    assert "blinks of the truth over minutes at 12.5 frames a second" in words
+    assert "above 0.45 after it was below 0.2" in words
+    assert words.endswith("[a minute]")
+
+
 def test_the_ratio_is_one_of_sums_and_the_rate_one_of_minutes() -> None:
     predictions = torch.stack([face(blinking(30, frames=100)), face(blinking(frames=100))])
     truths = torch.stack([face(blinking(20, 50, 80, frames=100)), face(blinking(20, frames=100))])

@@ -78,6 +78,11 @@ def test_a_class_of_ones_own_becomes_a_function() -> None:
         lag(prediction, truth, [0], strength=1.0)
     with pytest.raises(ValueError, match="holds NaN"):
         lag(prediction * torch.nan, truth, [0])
+    documented = (lag.__doc__ or "").splitlines()
+    assert documented[0] == "Lip lag: a metric for this test."
+    assert "    lips: The lips." in documented
+    assert "    power: A power." in documented
+    assert [line for line in documented if line in ("Args:", "Returns:", "Raises:")] == ["Args:", "Returns:", "Raises:"]
     assert LipLag([0, 2]).describe() == f"power of the mean distance over {LipLag([0, 2]).region} [1]"
 
 

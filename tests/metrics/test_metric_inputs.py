@@ -105,7 +105,17 @@ def test_one_sequence_without_batch_axis() -> None:
         ({"lengths": torch.tensor([5.0, 2.0])}, "whole numbers"),
         ({"lengths": [5, 0]}, "clip 1 of the batch has no frame to score"),
         ({"truth": motion(frames=6), "lengths": [5, 5]}, "give `prediction_lengths` too"),
+        ({"lengths": [5, -1]}, "lengths holds -1"),
+        ({"lengths": [[5], [4]]}, "whole numbers"),
+        ({"lengths": torch.ones(2, 4, dtype=torch.bool)}, r"the mask lengths has shape \(2, 4\)"),
+        ({"prediction_lengths": [5, 6]}, "prediction_lengths holds 6"),
+        ({"prediction_lengths": [0, 5]}, "clip 0 of the batch has no frame to score"),
         ({"clip_names": ["a"]}, "1 clip_names for 2 sequences"),
+        ({"clip_names": ["a", "b", "c"]}, "3 clip_names for 2 sequences"),
+        ({"prediction": motion()[:, :, :0], "truth": motion()[:, :, :0]}, "prediction has no vertex"),
+        ({"prediction": motion()[0, :, :0], "truth": motion()[0, :, :0]}, "prediction has no vertex"),
+        ({"truth": motion().long()}, "truth must be floating point"),
+        ({"prediction": motion()[None], "truth": motion()[None]}, "prediction has shape"),
     ],
 )
 def test_misfits_are_refused(changes: dict[str, Any], message: str) -> None:

@@ -148,6 +148,23 @@ class TestReadings:
         features = np.random.default_rng(1).normal(size=(40, 5))
         np.testing.assert_array_equal(align(features, features), np.arange(40))
 
+    @pytest.mark.parametrize(
+        ("frames", "others", "later", "earlier"), [(40, 40, 10, 10), (40, 60, 55, 36), (60, 40, 35, 55)]
+    )
+    def test_readings_may_be_apart_by_a_quarter_of_the_longer_one(
+        self, frames: int, others: int, later: int, earlier: int
+    ) -> None:
+        """One sound in silence is found up to a quarter away, and further where one reading is slower as a whole."""
+        for place, other, found in (
+            (2, 2 + later, True),
+            (2, 3 + later, False),
+            (2 + earlier, 2, True),
+            (3 + earlier, 2, False),
+        ):
+            first, second = np.zeros((frames, 1)), np.zeros((others, 1))
+            first[place], second[other] = 1.0, 1.0
+            assert (align(first, second)[place] == other) == found, (place, other)
+
     def test_slowed_speech_is_aligned(self) -> None:
         """Speech made of changing tones, and the same at two thirds of the pace."""
 
@@ -181,6 +198,24 @@ class TestObjectives:
             gaps += list((gap[0] - gap[1]) ** 2)
         want = np.mean(positions) + 5 * np.mean(velocities) + 2 * np.mean(gaps)
         assert float(got) == pytest.approx(want, rel=1e-5)
+
+    def test_the_upper_face_counts_by_how_much_it_moves(self) -> None:
+        """Mean squared difference over the mean square of the truth, of the upper face on valid frames alone."""
+        motion, truth = torch.randn(2, 5, 4, 3), torch.randn(2, 5, 4, 3)
+        mask, upper, lower = masks(5, 3), torch.tensor([1, 3]), torch.tensor([0, 2])
+        both = [np.concatenate([each[0].numpy(), each[1, :3].numpy()])[:, [1, 3]] for each in (motion, truth)]
+        share = ((both[0] - both[1]) ** 2).mean() / ((both[1] ** 2).mean() + 1e-6)
+        plain, with_face = MotionDistance(1.0, 5.0, 0.0), MotionDistance(1.0, 5.0, 0.0, 0.7)
+        for vertices in (None, lower):
+            got = with_face(motion, truth, mask, vertices=vertices, upper=upper)
+            want = float(plain(motion, truth, mask, vertices=vertices)) + 0.7 * share
+            assert float(got) == pytest.approx(want, rel=1e-5)
+            assert torch.equal(
+                with_face(motion, truth, mask, vertices=vertices), plain(motion, truth, mask, vertices=vertices)
+            )
+        assert float(with_face(truth, truth, mask, upper=upper)) == 0
+        still = torch.zeros_like(truth)
+        assert torch.isfinite(with_face(motion, still, mask, upper=upper))
 
     def test_the_content_pull_cannot_be_won_by_shrinking(self) -> None:
         values, others, mask = torch.randn(2, 9, 4), torch.randn(2, 9, 4), masks(9, 6)
@@ -237,15 +272,23 @@ class Oracle(nn.Module):
 
 
 def test_style_contrast_by_hand() -> None:
-    styles, subjects = torch.randn(5, 3, dtype=torch.float64), ["A", "A", "B", "B", "C"]
+    """Whoever has several styles, two or more; one person has a single one and is only told from."""
+    styles, subjects = torch.randn(7, 3, dtype=torch.float64), ["A", "A", "B", "B", "C", "A", "B"]
     directions = (styles / styles.norm(dim=1, keepdim=True)).numpy()
-    each = []
-    for i in range(4):
-        others = [k for k in range(5) if k != i]
-        logits = np.array([directions[i] @ directions[k] / 0.1 for k in others])
-        chances = logits - np.log(np.exp(logits).sum())
-        each.append(-np.mean([chances[n] for n, k in enumerate(others) if subjects[k] == subjects[i]]))
-    assert float(style_contrast(styles, subjects)) == pytest.approx(np.mean(each), rel=1e-5)
+    for temperature in (0.1, 0.3):
+        each = []
+        for i in (0, 1, 2, 3, 5, 6):
+            others = [k for k in range(7) if k != i]
+            logits = np.array([directions[i] @ directions[k] / temperature for k in others])
+            chances = logits - np.log(np.exp(logits).sum())
+            each.append(-np.mean([chances[n] for n, k in enumerate(others) if subjects[k] == subjects[i]]))
+        assert float(style_contrast(styles, subjects, temperature)) == pytest.approx(np.mean(each), rel=1e-5)
+    assert torch.equal(style_contrast(styles, subjects), style_contrast(styles, subjects, 0.1))
+    leaf = styles.clone().requires_grad_()
+    style_contrast(leaf, subjects).backward()
+    assert leaf.grad is not None
+    assert torch.isfinite(leaf.grad).all()
+    assert leaf.grad.any()
     assert float(style_contrast(styles[:2], ["A", "A"])) == 0, "one person cannot be told from anybody"
     assert float(style_contrast(styles[:2], ["A", "B"])) == 0
 

@@ -286,3 +286,21 @@ def test_personal_modules_are_identity_and_style(model: DualPathDiffusion, make_
     assert bare.network.mesh_encoder is None
     names = ("identity_encoder", "style_encoder", "style_tokens")
     assert bare.personal_modules() == [getattr(bare.network, name) for name in names]
+
+
+def test_without_a_seed_it_is_zero(model: DualPathDiffusion, batch: Batch) -> None:
+    nn.init.normal_(model.network.unembed.weight)
+    nn.init.normal_(model.network.embed.weight)
+    speech = torch.randn(9600, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        for one, other in (
+            (model.generate(batch), [model.generate(batch, seed=seed) for seed in (0, 1)]),
+            (model.generate_clips(batch), [model.generate_clips(batch, seed=seed) for seed in (0, 1)]),
+            (
+                model.animate(speech, identity="A").vertices,
+                [model.animate(speech, identity="A", seed=seed).vertices for seed in (0, 1)],
+            ),
+        ):
+            assert torch.equal(one, other[0])
+            assert not torch.allclose(one, other[1])
+    assert model.stream(identity="A").seeds == [0]
