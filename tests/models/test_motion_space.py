@@ -62,6 +62,34 @@ def test_more_components_than_the_motion_has_change_nothing() -> None:
     assert space.sizes.isfinite().all()
 
 
+def test_components_that_the_motion_does_not_have_are_the_smallest_there_are() -> None:
+    space = components(motion(), count=9)
+    deviations = space.components.deviations
+    torch.testing.assert_close(deviations[5:], 1e-4 * deviations[0].expand(4), rtol=1e-3, atol=0)
+    assert (deviations[:5] > 0.05).all()
+
+
+@pytest.mark.parametrize("whitening", [0.0, 0.3, 1.0])
+def test_the_noise_sees_components_in_the_sizes_that_they_are_given(whitening: float) -> None:
+    """d₁ · (d / d₁)^(1 − w), for the components of a space and for those that only measure the noise's scale."""
+    space = components(motion(), count=5, whitening=whitening)
+    own = space.components.deviations.double().numpy()
+    expected = own[0] * (own / own[0]) ** (1 - whitening)
+    np.testing.assert_allclose(space.sizes.numpy(), expected, rtol=1e-5)
+    several = torch.tensor([16.0, 9.0, 0.25, 0.01])
+    sizes = 4 * (several.sqrt().numpy() / 4) ** (1 - whitening)
+    np.testing.assert_allclose(space.noised_variances(several).numpy(), sizes**2, rtol=1e-5)
+    vertices = registry.motion_space.vertices(n_vertices=6, steps=10)
+    assert torch.equal(vertices.noised_variances(several), several)
+    assert vertices.coordinates == 18
+    assert not vertices.region_weights
+    importance = (space.components.deviations / space.sizes).square().numpy()
+    scales = space.preconditioning
+    for step in (0, 500, 999):
+        wanted = importance / (importance * scales.out[step].numpy() ** 2).sum()
+        np.testing.assert_allclose(scales.loss[step].numpy(), wanted, rtol=1e-3)
+
+
 def test_without_whitening_distances_are_those_of_the_vertices() -> None:
     x = motion()
     z = components(x, count=5, whitening=0.0).encode(x)
@@ -156,6 +184,12 @@ def test_noise_scale_is_motion_of_another_size(scale: float) -> None:
     torch.testing.assert_close(
         torch.cumprod(1 - scaled.variances.double(), 0).float(), scaled.signal, rtol=2e-2, atol=0
     )
+    share = scale**2 * plain.signal.double().numpy()
+    share = share / (share + 1 - plain.signal.double().numpy())
+    np.testing.assert_allclose(scaled.signal.numpy(), share, rtol=1e-6)
+    np.testing.assert_allclose(scaled.variances.numpy(), 1 - share / np.concatenate([[1.0], share[:-1]]), rtol=1e-5)
+    assert (scaled.variances > 0).all()
+    assert (scaled.steps, scaled.schedule, scaled.scale) == (1000, "squaredcos_cap_v2", scale)
 
 
 def test_the_noise_scale_hides_half_of_the_variance() -> None:
@@ -256,6 +290,18 @@ def test_a_wild_noise_scale_in_a_checkpoint_is_refused(scale: object, make_model
     model = make_model(noise_scale="auto")
     with pytest.raises(FaceDiffError, match="noise_scale"):
         model.on_load_checkpoint({"facediff_assets": tiny.assets().state(), "facediff_noise_scale": scale})
+
+
+def test_lips_and_upper_face_count_by_their_own_weights(make_model: Make, tiny: Tiny) -> None:
+    model: DualPathDiffusion = make_model(motion_space=partial(SPACE, upper_face_weight=3.0, lips_weight=0.5))
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    weights, regions = model.motion_weights(), model.assets.regions
+    assert weights.shape == (model.n_vertices, 3)
+    assert (weights[regions["upper_face"]] == 3).all()
+    assert (weights[regions["lips"]] == 0.5).all()
+    plain: DualPathDiffusion = make_model()
+    plain.adopt(tiny.assets().with_motion_scale(1.0))
+    assert (plain.motion_weights() == 1).all()
 
 
 def test_the_upper_face_can_count_more(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) -> None:
