@@ -31,6 +31,9 @@ COMMANDS = {
     "animate": Command("facediff.cli.animate:animate", "animate a face with a recording of speech"),
     "adapt": Command("facediff.cli.adapt:adapt", "fine-tune a trained model on a new speaker"),
     "publish": Command("facediff.cli.publish:publish", "a trained model as a folder for others, and on the hub"),
+    "import-checkpoint": Command(
+        "facediff.cli.import_checkpoint:import_checkpoint", "make a model of a published method's own checkpoint"
+    ),
     "style extract": Command("facediff.cli.style:extract", "write a speaking style as a style vector"),
     "view": Command("facediff.cli.view:view", "one HTML file that plays animations with their speech in any browser"),
     "export": Command("facediff.cli.export:export", "animations for other programs: glb, USD, OBJ, point caches …"),

@@ -103,6 +103,8 @@ class OutlineReader(pickle._Unpickler):  # C's unpickler reserves whatever memor
         ("torch.storage", "UntypedStorage"): NumberType(1),
     }
 
+    folder = ""
+
     def __init__(self, stream: IO[bytes], entries: Mapping[str, int]) -> None:
         super().__init__(stream)
         self._entries = entries
@@ -219,8 +221,13 @@ def load_tensors(stream: IO[bytes], source: object) -> Any:  # noqa: ANN401
         raise FaceDiffError(f"{source}: not a checkpoint that can be loaded safely ({detail}); {EXPECTED}") from error
 
 
-def read_outline(stream: IO[bytes], source: object) -> object:
+def read_outline(stream: IO[bytes], source: object, kind: type[OutlineReader] | None = None) -> object:
     """The content with outlines in place of tensors; see the module's docstring.
+
+    Args:
+        stream: the open file.
+        source: the file's name, for messages.
+        kind: what reads the pickle; :class:`OutlineReader` if None.
 
     Raises:
         FaceDiffError: if it needs more than the budget.
@@ -241,10 +248,11 @@ def read_outline(stream: IO[bytes], source: object) -> object:
         name = f"{folder}/data.pkl"
         if sizes.get(name, PICKLE_BYTES) >= PICKLE_BYTES:
             raise pickle.UnpicklingError("its plain values are missing or too long")
-        reader = OutlineReader(
+        reader = (kind or OutlineReader)(
             io.BytesIO(archive.read(name)),
             {name.removeprefix(f"{folder}/data/"): size for name, size in sizes.items() if "/data/" in name},
         )
+        reader.folder = folder
         outline: object = reader.load()
     LIMITS.check("bytes", reader.bytes, source)
     return outline
@@ -287,3 +295,154 @@ def check_numbers(value: object) -> None:
             raise pickle.UnpicklingError("it holds a whole number of more than 64 bits")
         elif not isinstance(item, Outline | bool | int | float | str | bytes | NumberType | None):
             raise pickle.UnpicklingError(f"it holds a {type(item).__name__}")
+
+
+# Checkpoints of other projects: their tensors alone, whatever else the file holds.
+
+AUTHORS = "expected a checkpoint as its authors distribute it (.pth, .pth.tar, .ckpt), written by torch.save"
+
+
+def read_state_dict(path: Path) -> dict[str, Any]:
+    """The tensors of another project's checkpoint by name, on the CPU, without a leading ``module.``.
+
+    A state dict may lie in the file as it is, or under ``state_dict`` or ``model``. Files with more than tensors and
+    plain data (optimisers, options of a library) are read too: of these objects nothing is imported or run.
+
+    Args:
+        path: the file.
+
+    Raises:
+        FaceDiffError: if the file is missing or damaged, holds no tensors by name, or needs more than the budget.
+    """
+    import torch
+
+    if not path.is_file():
+        raise FaceDiffError(f"{path}: no such file; {AUTHORS}")
+    try:
+        with path.open("rb") as stream:
+            outline = read_outline(stream, path, ForeignReader)
+            found = state_of(outline)
+            if not found:
+                raise FaceDiffError(f"{path}: holds no tensors by name; {AUTHORS}")
+            with zipfile.ZipFile(stream) as archive:
+                read = {each.key: archive.read(each.entry) for each in found.values()}
+    except FaceDiffError:
+        raise
+    except Exception as error:  # whatever a damaged or hostile file makes the readers raise, the reason is the file
+        reason = next(iter(str(error).strip().splitlines()), "") if isinstance(error, pickle.UnpicklingError) else ""
+        detail = reason if 0 < len(reason) < 120 else "it is damaged or cut short"
+        raise FaceDiffError(f"{path}: not a checkpoint that can be read safely ({detail}); {AUTHORS}") from error
+    made: dict[str, Any] = {}
+    for name, each in found.items():
+        numbers = torch.frombuffer(bytearray(read[each.key]), dtype=getattr(torch, each.type))
+        made[name.removeprefix("module.")] = numbers.as_strided(each.shape, each.stride, each.offset).clone()
+    return made
+
+
+def state_of(content: object) -> dict[str, StoredTensor]:
+    """The tensors by name of a state dict, or of what wraps one."""
+    if not isinstance(content, Mapping):
+        return {}
+    own = {name: value for name, value in content.items() if isinstance(name, str) and isinstance(value, StoredTensor)}
+    if own:
+        return own
+    for wrapper in ("state_dict", "model", "model_state_dict"):
+        if found := state_of(content.get(wrapper)):
+            return found
+    return {}
+
+
+@dataclass(frozen=True)
+class StoredTensor(Outline):
+    """In place of a tensor: where its numbers lie in the archive."""
+
+    key: str
+    entry: str
+    type: str
+    offset: int
+    shape: tuple[int, ...]
+    stride: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class StoredNumbers(Storage):
+    """In place of a storage: its key, and the type of its numbers."""
+
+    key: str
+    type: str
+
+
+@dataclass(frozen=True)
+class NamedType(NumberType):
+    """In place of the class of a storage: the bytes of one number, and what PyTorch calls its type."""
+
+    name: str
+
+
+class Foreign:
+    """In place of an object of another package, of which nothing is kept."""
+
+    def __new__(cls, *arguments: object, **named: object) -> Foreign:
+        """Take any arguments."""
+        return super().__new__(cls)
+
+    def __init__(self, *arguments: object, **named: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        """Forget the state."""
+
+    def __setitem__(self, key: object, value: object) -> None:
+        """Forget the entry."""
+
+    def append(self, value: object) -> None:
+        """Forget the value."""
+
+    def extend(self, values: object) -> None:
+        """Forget the values."""
+
+    def __hash__(self) -> int:
+        """By identity, as a key of a dict."""
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        """By identity."""
+        return self is other
+
+
+STORED = {
+    **{f"{name}Storage": kind for name, kind in (("Double", "float64"), ("Float", "float32"), ("Half", "float16"))},
+    **{f"{name}Storage": kind for name, kind in (("BFloat16", "bfloat16"), ("Long", "int64"), ("Int", "int32"))},
+    **{f"{name}Storage": kind for name, kind in (("Short", "int16"), ("Char", "int8"), ("Byte", "uint8"))},
+    "BoolStorage": "bool",
+}
+"""What PyTorch calls the numbers of a storage's class."""
+
+
+class ForeignReader(OutlineReader):
+    """Reads ``data.pkl`` of another project; what is neither plain data nor a tensor becomes a :class:`Foreign`."""
+
+    def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401
+        """The stand-in for a name; nothing is imported."""
+        if module in ("torch", "torch.cuda") and name in STORED:
+            return NamedType(STORAGES[name], STORED[name])
+        if module == "torch._utils" and name in self._rebuild:
+            return self._rebuild[name]
+        return self.names.get((module, name), Foreign)
+
+    def persistent_load(self, pid: Any) -> Storage:  # noqa: ANN401
+        """A storage, once its length agrees with its bytes."""
+        checked = super().persistent_load(pid)
+        if not isinstance(pid[1], NamedType):
+            raise pickle.UnpicklingError("it holds numbers in an unknown form")
+        return StoredNumbers(checked.bytes, checked.item, pid[2], pid[1].name)
+
+    def _outline(
+        self, storage: Storage, item: int, offset: Declared, shape: Declared, stride: Declared, more: list[Any]
+    ) -> Outline:
+        # Hooks and other additions are objects of nobody's here.
+        made = super()._outline(storage, item, offset, shape, stride, [])
+        if not isinstance(storage, StoredNumbers):
+            raise pickle.UnpicklingError("it holds a tensor in an unknown form")
+        entry = f"{self.folder}/data/{storage.key}"
+        return StoredTensor(made.bytes, storage.key, entry, storage.type, offset, shape, stride)

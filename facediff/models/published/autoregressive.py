@@ -20,6 +20,7 @@ from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import StepRule
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.base import PublishedModel
+from facediff.models.published.importing import Found, Weights
 from facediff.utils.ranges import Range
 
 Loop = Literal["cached", "literal"]
@@ -384,3 +385,37 @@ class AutoregressiveNetwork(nn.Module):
             made.append(state.step(token))
             token = F.linear(made[-1], turn, shift) + style[:, None]
         return self.motion_out(torch.cat(made, 1))
+
+
+# What the authors' checkpoints of these methods share.
+
+
+def decoder_sizes(weights: Weights, prefix: str, dim: int) -> dict[str, Any]:
+    """The decoder's options by the shapes of its tensors."""
+    layers = {name.removeprefix(f"{prefix}layers.").split(".")[0] for name in weights.names(f"{prefix}layers.")}
+    hidden, _ = weights.shape(f"{prefix}layers.0.linear1.weight")
+    return {"dim": dim, "num_layers": len(layers), "feed_forward_dim": hidden}
+
+
+def read_period(weights: Weights, name: str, found: Found) -> int:
+    """The period of a table of positions, which must be what the formula gives and fit the data set.
+
+    Raises:
+        FaceDiffError: if it is another table, or that of another frame rate.
+    """
+    table = weights.get(name)[0]
+    same = (table[1:] - table[0]).abs().amax(1) < 1e-6
+    period = int(same.int().argmax()) + 1 if bool(same.any()) else len(table)
+    expected = periodic_positions(len(table), table.shape[1], period)
+    if table.shape != expected.shape or not torch.allclose(table, expected, rtol=0, atol=1e-5):
+        raise FaceDiffError(
+            f"{weights.source}: its table of positions {name} is not what the published formula gives; the checkpoint "
+            f"is of a variant of the method"
+        )
+    if period != round(found.frame_rate):
+        raise FaceDiffError(
+            f"--dataset {found.dataset}: the positions of {weights.source} repeat every {period} frames, and "
+            f"{found.dataset} has {found.frame_rate:g} a second; give the data set that it was trained on"
+        )
+    weights.ignore(name, "the table of positions is computed by its formula")
+    return period

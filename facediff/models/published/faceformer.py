@@ -18,8 +18,14 @@ from facediff import registry
 from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Progress
-from facediff.models.published.autoregressive import AutoregressiveModel, AutoregressiveNetwork
+from facediff.models.published.autoregressive import (
+    AutoregressiveModel,
+    AutoregressiveNetwork,
+    decoder_sizes,
+    read_period,
+)
 from facediff.models.published.base import SpeakerTable, masked_mean
+from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
 from facediff.models.speech_networks import Wav2Vec2Encoder
 
 
@@ -85,3 +91,50 @@ class FaceFormer(AutoregressiveModel):
         style, memory = self.conditions(batch, frames)
         made = self.network.generate(style, memory, self.loop)
         return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+
+
+# The authors' checkpoints.
+
+LAYER_NAMES = (
+    ("self_attn.in_proj_", "self_attention.project."),
+    ("self_attn.out_proj", "self_attention.out"),
+    ("multihead_attn.in_proj_", "cross_attention.project."),
+    ("multihead_attn.out_proj", "cross_attention.out"),
+    ("linear1", "first"),
+    ("linear2", "second"),
+    ("norm1", "norms.0"),
+    ("norm2", "norms.1"),
+    ("norm3", "norms.2"),
+)
+"""What a decoder layer's tensors are called by PyTorch, and here."""
+
+
+def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+    """FaceFormer's tensors under the names of this file, and its options."""
+    dim, _ = weights.shape("audio_feature_map.weight")
+    period = read_period(weights, "PPE.pe", found)
+    encoder = weights.backbone(
+        "audio_encoder.",
+        kind="wav2vec2",
+        request=request,
+        **{name: value for name, value in FaceFormer.published_encoder.keywords.items() if name != "source"},  # type: ignore[attr-defined]
+    )
+    for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("vertice_map_r", "motion_out")):
+        weights.move_all(f"{old}.", f"network.{new}.")
+    weights.made["network.style.weight"] = weights.get("obj_vector.weight").T.contiguous()
+    weights.move_all("transformer_decoder.layers.", "network.decoder.layers.", LAYER_NAMES)
+    return {"audio_encoder": encoder, **decoder_sizes(weights, "transformer_decoder.", dim), "period": period}
+
+
+recogniser(
+    Recogniser(
+        method="FaceFormer",
+        marks=("obj_vector.weight", "vertice_map_r.weight", "PPE.pe", "audio_feature_map.weight"),
+        unless=("gru.", "style_encoder.", "lip_map.", "feat_map."),
+        convert=convert,
+        vertices=lambda weights: weights.shape("vertice_map_r.weight")[0] // 3,
+        count=lambda weights: weights.shape("obj_vector.weight")[1],
+        licence="unknown: no statement on the weights, whose code is under MIT and whose data is for research",
+        licence_source="github.com/EvelynFan/FaceFormer",
+    )
+)
