@@ -644,8 +644,8 @@ def build(weights: Weights, method: Recogniser, found: Found, options: dict[str,
 
 def label(model: AnimationModel, method: Recogniser, dataset: str) -> None:
     """Keep the licences of the authors' weights, of the data set and of the pretrained network with the model."""
-    corpora = {entry.implementation.corpus_name: entry.implementation for entry in registry.corpus}
-    known = corpora.get(dataset)
+    corpora: list[Any] = [entry.implementation for entry in registry.corpus]
+    known = next((each for each in corpora if each.corpus_name == dataset), None)
     data = known.corpus_licence() if known is not None else Licence(f"corpus {dataset}")
     weights = Licence(f"weights of {method.method}", method.licence, method.commercial, method.licence_source)
     model.licences = merged([weights], [data], network_licences(dict(model.hparams)))
