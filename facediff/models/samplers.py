@@ -31,14 +31,18 @@ NoiseSource = Callable[[Tensor], Tensor]
 """New unit Gaussian noise like a tensor; each clip has a source of its own, so that clips do not depend on others."""
 
 
-def cosine_variances(steps: int) -> Float[Tensor, " steps"]:
+def cosine_betas(steps: int) -> list[float]:
     """The cosine schedule (Nichol and Dhariwal 2021, eq. 17): 1 − ᾱ(n+1)/ᾱ(n), at most 0.999."""
 
     def signal(time: float) -> float:
         return math.cos((time + 0.008) / 1.008 * math.pi / 2) ** 2
 
-    variances = [min(1 - signal((n + 1) / steps) / signal(n / steps), 0.999) for n in range(steps)]
-    return torch.tensor(variances, dtype=torch.float32)
+    return [min(1 - signal((n + 1) / steps) / signal(n / steps), 0.999) for n in range(steps)]
+
+
+def cosine_variances(steps: int) -> Float[Tensor, " steps"]:
+    """The same as a tensor."""
+    return torch.tensor(cosine_betas(steps), dtype=torch.float32)
 
 
 SCHEDULES: dict[str, Callable[[int], Tensor]] = {

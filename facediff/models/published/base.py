@@ -7,6 +7,7 @@ column of a table, and train on motion as it is, without a scale, one clip at a 
 from __future__ import annotations
 
 import math
+import zlib
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
@@ -89,7 +90,7 @@ class PublishedModel(AnimationModel):
         Args:
             batch: clips; what is wanted of them is their speech and identity.
             frames: how many each clip gets, at least 1, as :meth:`frames_of` counts them.
-            seeds: of the noise, one for each clip.
+            seeds: of the noise, one for each clip; equal seeds of clips as long as each other give equal noise.
             progress: wraps the iteration over steps.
 
         Returns:
@@ -107,6 +108,10 @@ class PublishedModel(AnimationModel):
         steps = self.steps_of(samples)
         # In this very order and in floating point, as the projects compute it: 205 steps give 122 frames, not 123.
         return steps // 2 if self.pairs else int((steps / 50.0) * self.frame_rate)
+
+    def tested_frames(self, batch: Batch) -> list[int]:
+        """Frames that the method gives for each clip of a corpus."""
+        return [self.frames_of(int(samples)) for samples in batch.audio_lengths]
 
     def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
         """Frames of each clip that training compares: motion that lasts longer than pairs of steps is cut."""
@@ -139,9 +144,9 @@ class PublishedModel(AnimationModel):
 
         The published methods give a frame less than the motion has, or two; scores count all frames of the truth.
         """
-        own = [max(1, self.frames_of(int(samples))) for samples in batch.audio_lengths]
-        frames = torch.tensor(own, device=batch.audio.device)
-        made = self.generate_frames(batch, frames, seeds=[seed] * len(batch), progress=progress)
+        frames = torch.tensor([max(1, own) for own in self.tested_frames(batch)], device=batch.audio.device)
+        seeds = [zlib.crc32(name.encode()) + seed for name in batch.names]
+        made = self.generate_frames(batch, frames, seeds=seeds, progress=progress)
         return held(made, frames, batch.frame_lengths)
 
     def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> BatchMotion:

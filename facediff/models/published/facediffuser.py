@@ -7,6 +7,7 @@ of the published code is an option here.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
@@ -18,13 +19,424 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
-from facediff.models.inference import BatchMotion, ClipNoise, Progress
+from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width
 from facediff.models.published.base import PublishedModel, SpeakerTable, masked_mean
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
-from facediff.models.samplers import NoiseProcess
+from facediff.models.samplers import cosine_betas
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
+
+SamplingSpace = Literal["vertices", "folded"]
+
+
+@registry.model.register("FaceDiffuser")
+class FaceDiffuser(PublishedModel):
+    """FaceDiffuser: diffusion over vertices with HuBERT and recurrent layers.
+
+    Args:
+        dim: channels of speech, noisy motion and step, and of the recurrent layers; 512 at 25 frames a second (BIWI)
+            and 256 otherwise if None.
+        num_layers: recurrent layers.
+        dropout: between them, in training.
+        diffusion_steps: noising steps; all of them are sampled. 500 at 25 frames a second and 1000 otherwise if None.
+        skip_steps: sampling starts so many steps later, from noised zeros.
+        noised: what is noised: ``absolute`` vertices as published, which the noise must first bring to the face's place
+            and size, or ``offsets`` from the template, whose noise is of the motion alone.
+        encode_speech: ``once`` a clip, or in ``every_step`` as the published code does, with the same result.
+        sampling_space: where sampling runs: on the ``vertices``, whose noise is that of the published code for a seed,
+            or ``folded`` into the first map's width, with the same distribution of motion at a cost per step that does
+            not depend on the vertices.
+        options: those of :class:`PublishedModel`, and of every model.
+    """
+
+    samples: ClassVar[bool] = True
+    # HuBERT base as the project's copy of transformers has it; the two lowest layers are frozen.
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder,
+        source="facebook/hubert-base-ls960",
+        frozen_layers=2,
+        spec_augment=True,
+        layer_drop=0.1,
+        epsilon=1e-5,
+        edges=False,
+    )
+
+    def __init__(
+        self,
+        *,
+        dim: Width | None = None,
+        num_layers: Layers = 2,
+        dropout: Share = 0.3,
+        diffusion_steps: Annotated[int, Range(1, 100_000)] | None = None,
+        skip_steps: Annotated[int, Range(0, 99_999)] = 0,
+        noised: Literal["absolute", "offsets"] = "absolute",
+        encode_speech: Literal["once", "every_step"] = "once",
+        sampling_space: SamplingSpace = "vertices",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(**options)
+        self.windows = type(self.windows)(above=math.inf)  # the recurrent layers have no longest speech
+        self.steps = diffusion_steps or (500 if self.pairs else 1000)
+        if skip_steps >= self.steps:
+            raise ArgumentError({"skip_steps": skip_steps, "diffusion_steps": self.steps}, "no step would be left")
+        self.skip_steps, self.noised = skip_steps, noised
+        self.encode_speech, self.sampling_space = encode_speech, sampling_space
+        self.posterior = Posterior(self.steps)
+        self.network = FaceDiffuserNetwork(
+            audio_width=2 * self.audio_width,
+            n_vertices=self.n_vertices,
+            dim=dim or (512 if self.pairs else 256),
+            steps=self.steps,
+            num_layers=num_layers,
+            dropout=dropout,
+            n_identities=len(self.identities),
+        )
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The table of speakers."""
+        return [self.network.style]
+
+    def choose_expressivity(self, expressivity: object) -> None:
+        """Samples as they are (1); the method knows no mean around which they lie.
+
+        Raises:
+            FaceDiffError: if it is anything else.
+        """
+        if isinstance(expressivity, Tensor) or expressivity != 1:
+            raise FaceDiffError("expressivity: FaceDiffuser predicts no mean of its samples; omit the option")
+
+    def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
+        """There is one way to sample, over all steps.
+
+        Raises:
+            FaceDiffError: always.
+        """
+        raise FaceDiffError(
+            f"FaceDiffuser samples by the reverse process over all of its {self.steps} steps: omit --sampler and "
+            f"--steps, or make the model with skip_steps or sampling_space=folded"
+        )
+
+    # Frames.
+
+    def frames_of(self, samples: int) -> int:
+        """A frame less than the speech lasts, in floating point as published; at most as many as pairs of steps."""
+        frames = int(samples / SAMPLE_RATE * self.frame_rate) - 1
+        return min(frames, self.steps_of(samples) // 2) if self.pairs else frames
+
+    def tested_frames(self, batch: Batch) -> list[int]:
+        """As many as the truth has where speech lasts as long, as the published test does."""
+        found = []
+        for samples, wanted in zip(batch.audio_lengths.tolist(), batch.frame_lengths.tolist(), strict=True):
+            own = wanted if int(samples / SAMPLE_RATE * self.frame_rate) >= wanted else self.frames_of(samples)
+            found.append(min(own, self.steps_of(samples) // 2) if self.pairs else own)
+        return found
+
+    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+        """Speech features, two steps side by side for each frame."""
+        rule: StepRule = "hidden_cut" if self.pairs else "hidden"
+        cached = batch.cached_features or ()
+        hidden = self.audio_encoder.at_steps(batch.audio, batch.audio_lengths, 2 * frames, rule, *cached)
+        return hidden.reshape(len(hidden), hidden.shape[1] // 2, -1)
+
+    # Training.
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Huber's loss of the predicted clean motion at a random step."""
+        step = torch.randint(0, self.steps, (len(batch),), device=self.device, generator=generator)
+        noise = torch.randn(batch.motion.flatten(2).shape, device=self.device, generator=generator)
+        error = self.loss_at(batch, step, noise)
+        return {"reconstruction": error, "loss": error}
+
+    def loss_at(
+        self, batch: Batch, step: Int[Tensor, " batch"], noise: Float[Tensor, "batch frames coordinates"]
+    ) -> Float[Tensor, ""]:
+        """The loss with given random numbers."""
+        frames = self.trained_frames(batch)
+        longest = int(frames.max())
+        rest = self.rest(batch)
+        clean = (batch.motion * self.scale).flatten(2)[:, :longest] + rest
+        noisy = self.posterior.add_noise(clean, noise[:, :longest], step)
+        network = self.network
+        audio = network.audio_map(self.hear(batch, frames))
+        made = network(network.motion_in(noisy), step, audio, network.style(self.identity_weights(batch)))
+        error = F.huber_loss(network.motion_out(made) + rest, clean, reduction="none")
+        return masked_mean(error, frames)
+
+    def rest(self, batch: Batch) -> Float[Tensor, "batch 1 coordinates"]:
+        """What is noised where the face does not move: the template, or nothing."""
+        rest = (batch.template * self.scale).flatten(1)[:, None]
+        return rest if self.noised == "absolute" else torch.zeros_like(rest)
+
+    # Sampling.
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """The reverse process over all steps; a clip's noise depends on its seed alone."""
+        return self.sample(batch, frames, SeededNoise(frames.tolist(), seeds, self.device), progress)
+
+    def sample(
+        self,
+        batch: Batch,
+        frames: Int[Tensor, " batch"],
+        noise: Callable[[Tensor], Tensor],
+        progress: Progress | None = None,
+    ) -> BatchMotion:
+        """The reverse process with a given source of noise.
+
+        Args:
+            batch: clips.
+            frames: how many each gets.
+            noise: new noise of the shape of a tensor: the first noisy motion, then one for each step.
+            progress: wraps the iteration over steps.
+        """
+        network, posterior, rest = self.network, self.posterior, self.rest(batch)
+        style = network.style(self.identity_weights(batch))
+        space = VertexSpace(network, rest) if self.sampling_space == "vertices" else FoldedSpace(network, rest)
+        speech = network.audio_map(self.hear(batch, frames))
+        last = self.steps - self.skip_steps - 1
+        state = space.noise(noise, speech.new_empty(len(batch), int(frames.max()), space.width))
+        if self.skip_steps:
+            state = state * posterior.noise_share(last)
+        made = speech
+        for step in progress(range(last, -1, -1)) if progress is not None else range(last, -1, -1):
+            if self.encode_speech == "every_step" and step < last:
+                speech = network.audio_map(self.hear(batch, frames))
+            steps = torch.full((len(batch),), step, device=state.device)
+            made = network(space.mapped(state), steps, speech, style)
+            if step:
+                of_clean, of_noisy, of_noise = posterior.shares(step)
+                state = of_clean * space.clean(made) + of_noisy * state
+                state = state + of_noise * space.noise(noise, state)
+        # At the last step nothing but the prediction of clean motion is left.
+        motion = (network.motion_out(made) + rest - (batch.template * self.scale).flatten(1)[:, None]) / self.scale
+        if self.noised == "offsets":
+            motion = network.motion_out(made) / self.scale
+        return motion.view(*motion.shape[:2], self.n_vertices, 3)
+
+
+class Posterior:
+    """The cosine noise process, and the mean and deviation of its reverse, in float64 as published.
+
+    Args:
+        steps: noising steps.
+
+    Attributes:
+        betas: the noise variance of each step.
+        signal: the share of the clean motion's variance that is left after each step.
+    """
+
+    def __init__(self, steps: int) -> None:
+        self.betas = torch.tensor(cosine_betas(steps), dtype=torch.float64)
+        self.signal = torch.cumprod(1.0 - self.betas, 0)
+        before = torch.cat([self.signal.new_ones(1), self.signal[:-1]])
+        self._clean = self.betas * before.sqrt() / (1.0 - self.signal)
+        self._noisy = (1.0 - before) * (1.0 - self.betas).sqrt() / (1.0 - self.signal)
+        self._deviation = (self.betas * (1.0 - before) / (1.0 - self.signal)).sqrt()
+
+    def shares(self, step: int) -> tuple[float, float, float]:
+        """What clean motion, noisy motion and noise contribute to the motion of the step before."""
+        return float(self._clean[step]), float(self._noisy[step]), float(self._deviation[step])
+
+    def noise_share(self, step: int) -> float:
+        """What noise contributes to the noisy motion of a step."""
+        return math.sqrt(1.0 - float(self.signal[step]))
+
+    def add_noise(self, clean: Tensor, noise: Tensor, step: Int[Tensor, " batch"]) -> Tensor:
+        """√ᾱ · clean + √(1 − ᾱ) · noise."""
+        signal = self.signal.to(clean.device)[step].view(-1, 1, 1)
+        return signal.sqrt().to(clean) * clean + (1.0 - signal).sqrt().to(clean) * noise
+
+
+class SeededNoise:
+    """Unit Gaussian noise as a generator with a clip's seed gives it, zero on the clip's padding.
+
+    Args:
+        frames: of each clip.
+        seeds: one for each clip.
+        device: where the noise is drawn.
+    """
+
+    def __init__(self, frames: Sequence[int], seeds: Sequence[int], device: torch.device) -> None:
+        self.frames = list(frames)
+        self.streams = [torch.Generator(device).manual_seed(seed) for seed in seeds]
+
+    def __call__(self, like: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
+        """The next noise of the shape of ``like``."""
+        noise = torch.zeros_like(like)
+        for row, stream, frames in zip(noise, self.streams, self.frames, strict=True):
+            row[:frames] = torch.randn((frames, like.shape[2]), device=like.device, dtype=like.dtype, generator=stream)
+        return noise
+
+
+class FaceDiffuserNetwork(nn.Module):
+    """Predicts clean motion from noisy motion, speech, the speaker and the step.
+
+    Args:
+        audio_width: channels of a frame's speech.
+        n_vertices: vertices V.
+        dim: channels of each of the three inputs, and of the recurrent layers.
+        steps: noising steps.
+        num_layers: recurrent layers.
+        dropout: between them.
+        n_identities: rows of the table of speakers.
+    """
+
+    def __init__(
+        self,
+        *,
+        audio_width: int,
+        n_vertices: int,
+        dim: int,
+        steps: int,
+        num_layers: int,
+        dropout: float,
+        n_identities: int,
+    ) -> None:
+        super().__init__()
+        self.audio_map = nn.Linear(audio_width, dim)
+        self.motion_in = nn.Linear(3 * n_vertices, 2 * dim)
+        self.smooth = nn.Conv1d(1, 1, kernel_size=9, padding=4)
+        self.step = nn.Linear(steps, dim)
+        self.norm = nn.LayerNorm(3 * dim)
+        self.gru = nn.GRU(3 * dim, dim, num_layers, batch_first=True, dropout=dropout if num_layers > 1 else 0.0)
+        self.style = SpeakerTable(n_identities, dim)
+        self.motion_out = nn.Linear(dim, 3 * n_vertices)
+        nn.init.zeros_(self.motion_out.weight)
+        nn.init.zeros_(self.motion_out.bias)
+
+    def forward(
+        self,
+        mapped: Float[Tensor, "batch frames twice_dim"],
+        step: Int[Tensor, " batch"],
+        audio: Float[Tensor, "batch frames dim"],
+        style: Float[Tensor, "batch dim"],
+    ) -> Float[Tensor, "batch frames dim"]:
+        """From noisy motion after ``motion_in`` to what ``motion_out`` makes clean motion of."""
+        batch, frames, width = mapped.shape
+        # The convolution runs along the channels of a frame, not over time.
+        motion = torch.relu(self.smooth(mapped.reshape(batch * frames, 1, width)))
+        motion = torch.relu(F.max_pool1d(motion, 2)).view(batch, frames, -1)
+        # A one-hot step times a matrix is one of its columns.
+        embedded = F.mish(self.step.weight.T[step] + self.step.bias)[:, None].expand(-1, frames, -1)
+        joined = self.norm(torch.cat([audio, motion, embedded.to(motion.dtype)], -1))
+        return self.gru(joined)[0] * style[:, None]
+
+
+class VertexSpace:
+    """The reverse process on the vertices.
+
+    Args:
+        network: the network.
+        rest: what is added to every prediction.
+    """
+
+    def __init__(self, network: FaceDiffuserNetwork, rest: Tensor) -> None:
+        self.network, self.rest = network, rest
+        self.width = network.motion_in.in_features
+
+    def mapped(self, state: Tensor) -> Tensor:
+        """The state after the network's first map."""
+        return self.network.motion_in(state)
+
+    def clean(self, made: Tensor) -> Tensor:
+        """Clean motion as a state."""
+        return self.network.motion_out(made) + self.rest
+
+    def noise(self, source: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
+        """Noise as a state."""
+        return source(like)
+
+
+class FoldedSpace:
+    """The reverse process in the width of the network's first map.
+
+    Noisy motion enters the network through that map alone, and the reverse process is linear in noisy motion, clean
+    motion and noise. So all of it may be mapped: clean motion by the product of the last and the first map, and unit
+    noise to noise whose covariance is that of the map, W Wᵀ.
+
+    Args:
+        network: the network.
+        rest: what is added to every prediction.
+    """
+
+    def __init__(self, network: FaceDiffuserNetwork, rest: Tensor) -> None:
+        first, last = network.motion_in, network.motion_out
+        self.width = first.out_features
+        with torch.autocast(rest.device.type, enabled=False):
+            # Products over all vertices, in double precision, since they are used in every step.
+            weight = first.weight.double()
+            self._turn = (weight @ last.weight.double()).to(first.weight)
+            self._rest = F.linear(rest.double() + last.bias.double(), weight).to(first.weight)
+            values, vectors = torch.linalg.eigh(weight @ weight.T)
+            self._root = (vectors * values.clamp_min(0).sqrt() @ vectors.T).to(first.weight)
+        self._bias = first.bias
+
+    def mapped(self, state: Tensor) -> Tensor:
+        """The state with the map's bias, which the reverse process must not repeat."""
+        return state + self._bias
+
+    def clean(self, made: Tensor) -> Tensor:
+        """Clean motion as a state."""
+        return F.linear(made, self._turn) + self._rest
+
+    def noise(self, source: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
+        """Noise as a state."""
+        return source(like) @ self._root
+
+
+# The authors' checkpoints.
+
+
+def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+    """FaceDiffuser's tensors under the names of this file, and its options."""
+    dim, _ = weights.shape("cond_projection.weight")
+    _, steps = weights.shape("time_mlp.0.weight")
+    _, width = weights.shape("gru.weight_hh_l0")
+    if width != dim:
+        raise FaceDiffError(
+            f"{weights.source}: its recurrent layers have {width} channels and its conditions {dim}; expected the "
+            f"same, as in every checkpoint of FaceDiffuser for faces"
+        )
+    published = FaceDiffuser.published_encoder.keywords  # type: ignore[attr-defined]
+    settings = {name: value for name, value in published.items() if name not in ("source", "frozen_layers")}
+    layers = {name.split("encoder.layers.")[1].split(".")[0] for name in weights.names("audio_encoder.encoder.layers.")}
+    encoder = weights.backbone(
+        "audio_encoder.", kind="hubert", request=request, frozen_layers=min(2, len(layers)), **settings
+    )
+    for old, new in (
+        ("cond_projection", "audio_map"),
+        ("input_projection.0", "motion_in"),
+        ("input_projection.1", "smooth"),
+        ("time_mlp.0", "step"),
+        ("norm_cond", "norm"),
+        ("gru", "gru"),
+        ("final_layer", "motion_out"),
+    ):
+        weights.move_all(f"{old}.", f"network.{new}.")
+    weights.made["network.style.weight"] = weights.get("obj_vector.weight").T.contiguous()
+    return {
+        "audio_encoder": encoder,
+        "dim": dim,
+        "diffusion_steps": steps,
+        "num_layers": len(weights.names("gru.weight_hh_l")),
+    }
+
+
+recogniser(
+    Recogniser(
+        method="FaceDiffuser",
+        marks=("gru.weight_ih_l0", "input_projection.0.weight", "obj_vector.weight", "final_layer.weight"),
+        unless=("transformer_decoder.",),
+        convert=convert,
+        vertices=lambda weights: weights.shape("final_layer.weight")[0] // 3,
+        count=lambda weights: weights.shape("obj_vector.weight")[1],
+        licence="CC-BY-NC-4.0",
+        commercial="forbidden",
+        licence_source="github.com/uuembodiedsocialai/FaceDiffuser",
+    )
+)

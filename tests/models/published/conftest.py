@@ -18,6 +18,7 @@ SIZES = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": float(RATE)}
 
 METHODS: dict[str, dict[str, Any]] = {
     "FaceFormer": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16},
+    "FaceDiffuser": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "diffusion_steps": 8},
 }
 """Options by which each published method is small."""
 
