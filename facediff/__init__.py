@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from facediff import metrics as metrics
     from facediff.errors import FaceDiffError as FaceDiffError
     from facediff.pipelines.animator import Animator as Animator
+    from facediff.pipelines.animator import import_checkpoint as import_checkpoint
     from facediff.pipelines.animator import load as load
     from facediff.pipelines.motion import Animation as Animation
     from facediff.pipelines.motion import read as read
@@ -28,7 +29,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "errors": "FaceDiffError",
-        "pipelines.animator": "Animator load",
+        "pipelines.animator": "Animator import_checkpoint load",
         "pipelines.motion": "Animation read view",
     },
     packages="metrics",

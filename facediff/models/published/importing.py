@@ -8,7 +8,6 @@ or reported as not needed. Nothing of a file is run.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,6 +29,7 @@ from facediff.models.checkpoint import check_weights
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.licences import Commercial, Licence, merged, network_licences
 from facediff.utils.limits import quoted
+from facediff.utils.plain_files import load_json
 from facediff.utils.plain_options import as_hinted, fits, in_words, is_name, parameters
 from facediff.utils.torch_files import read_state_dict
 
@@ -484,17 +484,10 @@ def read_config(given: str | Path | Mapping[str, Any] | None) -> Mapping[str, An
     """
     if given is None or isinstance(given, Mapping):
         return given
-    path = Path(given)
-    if not path.is_file():
-        raise FaceDiffError(f"--audio-config {path}: no such file; expected the config.json of the audio encoder")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError, RecursionError) as error:
-        raise FaceDiffError(
-            f"--audio-config {path}: is no JSON file; expected the config.json of the encoder"
-        ) from error
+    path, remedy = Path(given), "expected the config.json of the audio encoder"
+    content = load_json(path, name=f"--audio-config {path}", remedy=remedy)
     if not isinstance(content, dict):
-        raise FaceDiffError(f"--audio-config {path}: expected options by name, as config.json has them")
+        raise FaceDiffError(f"--audio-config {path}: holds no options by name; {remedy}")
     return content
 
 
