@@ -156,7 +156,7 @@ def test_the_nearest_speaker_is_that_of_the_documented_distance() -> None:
     known, _, _ = gallery()
     rng = np.random.default_rng(2)
     means, labels = known.means.numpy().reshape(36, -1), np.array(known.speakers)
-    for components, shrinkage in ((3, 0.1), (16, 0.5)):
+    for components, shrinkage in ((3, 0.1), (16, 0.5), (40, 0.2)):  # there are 18
         _, _, axes = np.linalg.svd(means - means.mean(0), full_matrices=False)
         points = (means - means.mean(0)) @ axes[:components].T
         own = np.stack([points[labels == person].mean(0) for person in range(4)])
@@ -183,6 +183,16 @@ def test_the_nearest_speaker_follows_from_offsets_alone() -> None:
         found = fm.NearestSpeakerAccuracy(gallery_of, components=8)
         found.update(motion + shift, [0, 1, 2, 3])
         assert found.compute().item() == 1.0
+
+
+def test_fewer_recordings_than_components_have_one_less_than_themselves() -> None:
+    known, _, _ = gallery(people=3, clips=2)
+    metric = fm.NearestSpeakerAccuracy(known)
+    assert metric.basis.shape == (5, 18)
+    torch.testing.assert_close(metric.basis @ metric.basis.T, torch.eye(5, dtype=torch.float64), rtol=0, atol=1e-9)
+    offsets = known.means.flatten(1) - known.means.flatten(1).mean(0)
+    torch.testing.assert_close(offsets @ metric.basis.T @ metric.basis, offsets, rtol=0, atol=1e-9)
+    assert "among 3, by Mahalanobis distance within speakers in 16 principal components of 6" in metric.describe()
 
 
 def test_one_recording_of_each_speaker_is_compared_in_euclidean_distance() -> None:

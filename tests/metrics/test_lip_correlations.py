@@ -19,6 +19,7 @@ from facediff.metrics import (
     lip_speed_correlation,
     speech_intensity,
 )
+from facediff.metrics.mouth import correlation
 
 Anything = Any  # right and wrong speech
 ADDED = {"waveform": torch.ones(2, 80), "intensity": torch.ones(2, 8)}
@@ -46,6 +47,19 @@ def test_a_face_that_is_still_up_to_rounding_is_still() -> None:
     nearly = torch.zeros(1, 8, 4, 3, dtype=torch.float64)
     nearly[:, ::2] += 1e-17
     assert lip_opening_correlation(nearly, motion(1)[:1].double(), [(0, 1)], offsets_from=neutral).item() == 0
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("share", "varies"), [(1.1e-12, True), (0.9e-12, False)])
+def test_a_series_varies_by_more_than_rounding(share: float, varies: bool, sign: int) -> None:
+    """Its range against its largest absolute value, whatever its unit and its sign."""
+    base = sign * torch.tensor([2.0, 2.0 + 2 * share, 2.0, 2.0 + 2 * share], dtype=torch.float64)
+    other = torch.tensor([0.0, 1.0, 0.0, 1.0], dtype=torch.float64)
+    for unit in (1.0, 1e-6, 1e6):
+        assert float(correlation(other, unit * base)) == pytest.approx(sign if varies else 0, abs=1e-3)
+        assert bool(correlation(unit * base, other).isnan()) != varies
+    assert correlation(other[:1], base[:1]).isnan()
+    assert float(correlation(other[:2], other[:2].flip(0))) == -1
 
 
 def test_lips_that_do_not_vary_follow_no_voice() -> None:

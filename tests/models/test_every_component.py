@@ -12,6 +12,9 @@ from jaxtyping import TypeCheckError
 from torch import Tensor, nn
 
 from facediff import registry
+from facediff.models.dual_path.network import StyleTokens
+from facediff.models.mesh_encoders import SpiralDown
+from facediff.models.style_content.network import WindowedTransformer
 
 Make = Callable[..., nn.Module]
 Call = Callable[..., tuple[Tensor, ...]]
@@ -160,3 +163,28 @@ DEFAULTS: dict[str, dict[str, dict[str, Any]]] = {
 def test_options_that_are_not_named_keep_their_meaning(of: str, component: str) -> None:
     found, promised = registry.defaults(registry.COMPONENTS[of].get(component)), DEFAULTS[of][component]
     assert {option: found.get(option) for option in promised} == promised
+
+
+def test_learnt_positions_and_tokens_start_small() -> None:
+    """So that they do not drown the features at first, and what stands for a missing condition says nothing."""
+    torch.manual_seed(0)
+    style = registry.style_encoder.tcn_gru_transformer(dim=64, n_positions=128)
+    window = WindowedTransformer(in_dim=4, dim=64, out_dim=4, window=128)
+    for positions in (style.positions, window.positions):
+        assert positions.shape == (128, 64)
+        assert float(positions.detach().std()) == pytest.approx(0.02, rel=0.05)
+        assert abs(float(positions.detach().mean())) < 1e-3
+    assert not StyleTokens((), 8, "levels").null.any()  # type: ignore[union-attr]
+    unseen = registry.identity_encoder.hierarchical(dim=64, n_identities=2, unseen="learnt").unseen
+    assert float(unseen.detach().std()) == pytest.approx(1, rel=0.2)
+
+
+def test_spiral_convolutions_start_as_glorot_has_it() -> None:
+    torch.manual_seed(0)
+    step = SpiralDown(40, 10, 9, 16, 32)
+    weight = step.map.weight.detach()
+    bound = (6 / (9 * 16 + 32)) ** 0.5
+    assert weight.shape == (32, 9 * 16)
+    assert 0.98 * bound < float(weight.abs().max()) <= bound
+    assert float(weight.std()) == pytest.approx(bound / 3**0.5, rel=0.03)
+    assert not step.map.bias.any()

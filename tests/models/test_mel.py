@@ -43,6 +43,18 @@ def test_mel_filters_are_triangles_on_the_mel_scale() -> None:
     assert all(rising)
 
 
+@pytest.mark.parametrize(("bands", "size", "low", "high"), [(64, 512, 60.0, 7600.0), (7, 256, 0.0, 4000.0)])
+def test_mel_filters_are_their_formula(bands: int, size: int, low: float, high: float) -> None:
+    """Triangles between neighbours of evenly spaced mels 2595 log₁₀(1 + f/700), of unit area."""
+    mels = [2595 * math.log10(1 + hertz / 700) for hertz in (low, high)]
+    edges = 700 * (10 ** (np.linspace(*mels, bands + 2) / 2595) - 1)
+    hertz = np.arange(size // 2 + 1) * 16_000 / size
+    expected = [
+        np.interp(hertz, edges[band : band + 3], [0, 2 / (edges[band + 2] - edges[band]), 0]) for band in range(bands)
+    ]
+    np.testing.assert_allclose(mel_filters(bands, size, low, high).numpy(), expected, rtol=1e-5, atol=1e-9)
+
+
 def test_mel_filters_are_not_empty(encoder: MelEncoder) -> None:
     """At 31 Hz between bins the lowest triangles could fall between two of them."""
     assert (encoder.filters.sum(1) > 0).all()

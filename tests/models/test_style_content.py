@@ -223,9 +223,30 @@ class TestObjectives:
         torch.testing.assert_close(relative_distance(values * 0.1, others * 0.1, mask), one, rtol=1e-3, atol=0)
         assert float(relative_distance(values, values, mask)) == 0
 
-    def test_dynamics_compare_spreads(self) -> None:
+    @pytest.mark.parametrize("size", [1.0, 0.02])
+    def test_relative_distances_of_small_motion_are_their_formulas(self, size: float) -> None:
+        """What keeps a share finite counts where motion or content is about as small, and not where it is large."""
+        values, others, mask = size * torch.randn(2, 9, 4), size * torch.randn(2, 9, 4), masks(9, 6)
+        one, other = (each.double().numpy()[mask.numpy()] for each in (values, others))
+        want = 2 * ((one - other) ** 2).mean() / (one.var(0).mean() + other.var(0).mean() + 1e-6)
+        assert float(relative_distance(values, others, mask)) == pytest.approx(want, rel=1e-4)
+        single = torch.zeros_like(mask)
+        single[0, 0] = True
+        assert float(relative_distance(values, others, single)) == 0, "one value has no spread"
+        motion, truth, pairs = torch.randn(1, 5, 4, 3), torch.randn(1, 5, 4, 3), torch.tensor([[0, 2], [1, 3]])
+        rest = torch.zeros(1, 4, 3)
+        motion[:, :, 2] = motion[:, :, 0] + 1e-3 * size  # nearly touching
+        gaps = [
+            np.sqrt(((x[:, [0, 1]] - x[:, [2, 3]]) ** 2).sum(-1) + 1e-6)
+            for x in (each[0].double().numpy() for each in (motion, truth))
+        ]
+        got = MotionDistance(0.0, 0.0, 1.0)(motion, truth, masks(5), rest=rest, pairs=pairs)
+        assert float(got) == pytest.approx(((gaps[0] - gaps[1]) ** 2).mean(), rel=1e-5)
+
+    @pytest.mark.parametrize("size", [1.0, 0.03])
+    def test_dynamics_compare_spreads(self, size: float) -> None:
         """Against NumPy's own standard deviations; the order of frames does not count."""
-        motion, truth = torch.randn(3, 40, 6, 3), torch.randn(3, 40, 6, 3)
+        motion, truth = size * torch.randn(3, 40, 6, 3), size * torch.randn(3, 40, 6, 3)
         mask, truth_mask = masks(40, 30, 20), masks(40, 25, 35)
         chosen, vertices = torch.tensor([True, False, True]), torch.tensor([1, 4])
         spreads = []
