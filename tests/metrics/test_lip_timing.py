@@ -141,6 +141,17 @@ def test_lags_reach_the_neighbouring_extrema_and_the_ends_themselves() -> None:
             assert found == ([abs(row - column)] if column in reached else []), (row, column)
 
 
+def test_a_misalignment_says_its_unit_its_moments_and_its_smoothing() -> None:
+    said = [
+        TemporalMisalignment([(0, 1)], **options).describe()  # type: ignore[arg-type]
+        for options in ({}, {"frames_per_second": 25.0, "at": "path", "smoothing": 0.0})
+    ]
+    assert said[0].endswith("[frames]")
+    assert said[1].endswith("[ms]")
+    assert "smoothed over 2 frames), over pairs of like extrema;" in said[0]
+    assert "not smoothed), over all its pairs;" in said[1]
+
+
 def test_options_out_of_range_are_refused() -> None:
     with pytest.raises(ValueError, match='unknown at .paths..*did you mean "path"'):
         TemporalMisalignment([(0, 1)], at="paths")  # type: ignore[arg-type]

@@ -61,6 +61,27 @@ def test_training_asks_the_data_for_what_the_options_say(
     assert not model.alignment_allowed()
 
 
+@pytest.mark.parametrize(("weight", "pairs", "noted"), [(1.0, True, False), (1.0, False, True), (0.0, False, False)])
+def test_a_weight_without_effect_is_noted(
+    tmp_path: Path,
+    make_trainer: MakeTrainer,
+    capsys: pytest.CaptureFixture[str],
+    weight: float,
+    pairs: bool,
+    noted: bool,
+) -> None:
+    """The gap between the inner lips needs a file that says which vertices they are."""
+    root = write_tiny(tmp_path / "tiny", sentences=5)
+    if not pairs:
+        (root / "regions" / "inner_lip_pairs.txt").unlink()
+    model, trainer = make(lip_gap_weight=weight), make_trainer()
+    model.trainer, trainer.datamodule = trainer, Tiny(root=str(root))  # type: ignore[attr-defined]
+    model.setup("fit")
+    assert ("lip_gap_weight" in capsys.readouterr().out) == noted
+    model.setup("validate")
+    assert "lip_gap_weight" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("start", ["pca", "random"])
 def test_a_new_basis_starts_where_it_is_told_to_and_a_trained_one_stays(
     tiny_root: Path, make_trainer: MakeTrainer, start: str
