@@ -4,6 +4,7 @@
   table's first column a page. A page that the index omits fails the strict build.
 - Links that leave docs/ lead to files of the repository. Such a file becomes a page of the site if it is Markdown, and
   is copied otherwise; a link to nothing fails the strict build.
+- A notebook becomes a page with its text and code, and is offered as it is.
 - The API reference has a page per module that mkdocs.yml lists, made from docstrings of the names that it exports.
 - Search works in pages that were opened as files, where browsers start no web workers: `iframe_worker.js`.
 - What a strict build of MkDocs does not notice fails it too: `checks.py`.
@@ -11,6 +12,7 @@
 
 from __future__ import annotations
 
+import json
 import posixpath
 import re
 import sys
@@ -59,6 +61,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the API reference, the files of the repository that pages link to, and the worker of the search."""
     for name in config.extra["api"]:
         files.append(File.generated(config, f"api/{name}.md", content=api_page(name)))
+    for file in [file for file in files if file.src_uri.endswith(".ipynb")]:
+        files.append(File.generated(config, site_path("docs", file.src_uri), content=notebook_page(file)))
     files.append(File.generated(config, "api/README.md", content=api_index(config.extra["api"])))
     files.append(File.generated(config, "assets/iframe-worker.js", abs_src_path=str(HERE / "iframe_worker.js")))
     waiting = [file for file in files.documentation_pages() if file.abs_src_path]
@@ -84,7 +88,8 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:  # noqa: ANN40
 
     def moved(link: re.Match[str]) -> str:
         where = site_path(folder, link[1])
-        if not where.startswith(f"{ELSEWHERE}/") and not here.startswith(ELSEWHERE):
+        inside = not where.startswith(f"{ELSEWHERE}/") and not here.startswith(ELSEWHERE)
+        if inside and not link[1].endswith(".ipynb"):
             return link[0]
         return posixpath.relpath(where, here or ".") + (link[2] or "")
 
@@ -109,8 +114,19 @@ def site_path(folder: str, link: str) -> str:
     """Where the site has what a page in a folder of the repository links to."""
     target = posixpath.normpath(posixpath.join(folder, link))
     if target.startswith("docs/"):
-        return target.removeprefix("docs/")
+        return re.sub(r"\.ipynb$", ".md", target.removeprefix("docs/"))
     return f"{ELSEWHERE}/{target.lstrip('.')}"  # servers and MkDocs leave out names that begin with a dot
+
+
+def notebook_page(file: File) -> str:
+    """A notebook's text and code as Markdown, with a link to the notebook itself."""
+    parts = []
+    for cell in json.loads(file.content_string)["cells"]:
+        text = "".join(cell["source"])
+        parts.append(f"```python\n{text}\n```" if cell["cell_type"] == "code" else text.replace(".ipynb)", ".md)"))
+    title, _, rest = parts[0].partition("\n")
+    parts[0] = f"{title}\n\n[The notebook]({file.name}.ipynb), to be run in Jupyter.\n{rest}"
+    return "\n\n".join(parts) + "\n"
 
 
 def public_names(module: griffe.Module) -> list[str]:

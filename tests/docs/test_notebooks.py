@@ -1,0 +1,81 @@
+"""The notebooks run from top to bottom, with a small corpus and a few steps of training, and hold no outputs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import nbformat
+import pytest
+from jupyter_client.manager import KernelManager, start_new_kernel
+from nbclient import NotebookClient
+from nbformat import NotebookNode
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+
+SMALL = """
+from facediff import synthetic
+from facediff.synthetic import corpus
+
+for module in (synthetic, corpus):  # 32 clips instead of 250
+    module.TRAIN_SENTENCES = module.REFERENCE_SENTENCES = (2, 3)
+    module.VAL_SENTENCES, module.TEST_SENTENCES = (25,), (28,)
+"""
+"""Runs before a notebook."""
+
+OPTIONS = ["--trainer.limit_train_batches=2", "--trainer.limit_val_batches=1", "--trainer.enable_progress_bar=false"]
+OPTIONS += ["--trainer.callbacks=[]", "--model.dim=32", "--model.sampler.steps=2"]
+PARAMETERS = {"epochs": 1, "options": OPTIONS, "clips": ["F1_e28", "M1_e28"]}
+"""What a notebook's cell with the tag ``parameters`` may set, and what it is here."""
+
+
+@pytest.fixture(scope="module")
+def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KernelManager]:
+    """One kernel for all notebooks, so that torch is imported once."""
+    folder = tmp_path_factory.mktemp("notebooks")
+    environment = {"FACEDIFF_CACHE": str(folder / "cache"), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    manager, client = start_new_kernel(kernel_name="python3", env={**os.environ, **environment}, cwd=str(folder))
+    client.stop_channels()
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
+def run(path: Path, kernel: KernelManager, folder: Path) -> NotebookNode:
+    """The notebook with what it shows, run in a folder of its own."""
+    notebook = nbformat.read(path, as_version=4)
+    (cell,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
+    names = [name for name in PARAMETERS if f"\n{name} = " in f"\n{cell.source}"]
+    cell.source += "".join(f"\n{name} = {PARAMETERS[name]!r}" for name in names)
+    first = f"%reset -f\n%cd -q {folder}\n{SMALL}"
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(first))
+    runner = NotebookClient(notebook, timeout=120, km=kernel)
+    try:
+        return runner.execute()
+    finally:
+        runner.kc.stop_channels()  # the client of a kernel that is used on leaves them open
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_the_notebook_runs(path: Path, kernel: KernelManager, tmp_path: Path) -> None:
+    shown = run(path, kernel, tmp_path)
+    text = "\n".join(
+        output.data.get("text/html", "")
+        for cell in shown.cells
+        for output in cell.get("outputs", [])
+        if "data" in output
+    )
+    # What animates shows a face that plays: a page that loads nothing from elsewhere.
+    assert ("animate(" in path.read_text()) == ("<iframe srcdoc=" in text)
+    assert 'src="http' not in text
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_the_notebook_is_committed_without_outputs(path: Path) -> None:
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert path.stat().st_size < 20_000
+    for cell in notebook.cells:
+        assert cell.get("outputs", []) == []
+        assert cell.get("execution_count") is None
