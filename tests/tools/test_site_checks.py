@@ -65,3 +65,9 @@ def test_style_sheets_fetch_nothing(tmp_path: Path) -> None:
 def test_every_picture_of_the_manual_is_shown_somewhere() -> None:
     shown = "".join(page.read_text() for page in DOCS.rglob("*.md"))
     assert [picture.name for picture in (DOCS / "images").iterdir() if picture.name not in shown] == []
+
+
+def test_every_page_is_in_the_index() -> None:
+    index = (DOCS / "README.md").read_text()
+    pages = [page.relative_to(DOCS).as_posix() for suffix in ("md", "ipynb") for page in DOCS.rglob(f"*.{suffix}")]
+    assert [page for page in sorted(pages) if page != "README.md" and f"]({page})" not in index] == []

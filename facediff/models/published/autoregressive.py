@@ -247,7 +247,7 @@ class MotionDecoder(nn.Module):
         return x
 
     def start(self, memory: Float[Tensor, "batch steps dim"]) -> Continuation:
-        """The state before the first frame, for :meth:`step`."""
+        """The state before the first frame, for ``step``."""
         speech = [layer.cross_attention.keys_values(memory) for layer in self.layers]  # type: ignore[union-attr, operator]
         return Continuation(self, speech, memory.shape[1] // self.steps)
 

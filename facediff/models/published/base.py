@@ -37,7 +37,7 @@ NO_STYLE = Style("none", torch.zeros(0))
 class PublishedModel(AnimationModel):
     """Base of the published methods.
 
-    A method adds ``losses`` and :meth:`generate_frames`; it hears speech through :attr:`audio_encoder`, and finds what
+    A method adds ``losses`` and :meth:`generate_frames`; it hears speech through ``audio_encoder``, and finds what
     it knows of a clip's speaker in :meth:`identity_weights`.
 
     Class attributes:
