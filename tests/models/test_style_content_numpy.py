@@ -217,6 +217,20 @@ def test_windows_are_aligned_where_the_data_set_says_so(tiny: Tiny) -> None:
     assert not pair_up(batch, None).aligned.any()
 
 
+@pytest.mark.parametrize(("ratio", "frames"), [(1.0, None), (0.5, None), (2.0, 4), (1.0, 6), (1.0, 12)])
+def test_windows_of_speech_are_as_many_as_frames(ratio: float, frames: int | None) -> None:
+    """As many as features where no number is given; the last feature stands for those that rounding lost."""
+    part = WindowedTransformer(in_dim=3, dim=8, out_dim=4, window=4, num_heads=2, num_layers=0)
+    features = torch.randn(2, 9, 3)
+    made = part.windows(features, frames, ratio)
+    count = 9 if frames is None else frames
+    assert made.shape == (2, count, 4, 3)
+    padded = np.pad(double(features), ((0, 0), (2, 1), (0, 0)))
+    for frame in range(count):
+        middle = min(math.floor((frame + 0.5) * ratio), 8)
+        np.testing.assert_array_equal(double(made[:, frame]), padded[:, middle : middle + 4])
+
+
 # The objective, written out from its formulas: the networks are called, everything between them is NumPy.
 
 
