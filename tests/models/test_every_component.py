@@ -11,6 +11,7 @@ import torch
 from jaxtyping import TypeCheckError
 from torch import Tensor, nn
 
+import facediff.models
 from facediff import registry
 from facediff.models.dual_path.network import StyleTokens
 from facediff.models.mesh_encoders import SpiralDown
@@ -162,6 +163,88 @@ DEFAULTS: dict[str, dict[str, dict[str, Any]]] = {
 @pytest.mark.parametrize(("of", "component"), [(of, one) for of, several in DEFAULTS.items() for one in several])
 def test_options_that_are_not_named_keep_their_meaning(of: str, component: str) -> None:
     found, promised = registry.defaults(registry.COMPONENTS[of].get(component)), DEFAULTS[of][component]
+    assert {option: found.get(option) for option in promised} == promised
+
+
+OF_EVERY_MODEL: dict[str, Any] = {
+    "motion_scale": "unit",
+    "learning_rate": 1e-4,
+    "lr_schedule": "constant",
+    "lr_decay": 0.9,
+    "lr_decay_epoch": 30,
+    "warmup_steps": 0,
+    "protocol": "paper",
+    "unseen_identity": "style_only",
+    "style_source": "reference",
+    "validation_samples": 2,
+}
+OF_MODELS: dict[str, dict[str, Any]] = {
+    "DualPathDiffusion": {
+        "weight_decay": 0.05,
+        "dim": 256,
+        "sampling_space": "folded",
+        "diffusion_steps": 1000,
+        "noise_schedule": "squaredcos_cap_v2",
+        "noise_draws": 1,
+        "noise_scale": 1.0,
+        "style_tokens": "levels",
+        "identity_dropout": 0.1,
+        "invented_speakers": 0.0,
+        "invented_gain": 0.1,
+        "style_dropout": 0.0,
+        "speech_dropout": 0.0,
+        "speech_guidance": 1.0,
+        "identity_guidance": 1.0,
+        "style_guidance": 1.0,
+        "expressivity": 1.0,
+        "velocity_weight": 0.003,
+        "acceleration_weight": 0.003,
+        "face_weight": 0.0005,
+        "face_weight_unit": "scaled",
+        "style_identity_weight": 0.0,
+        "style_contrast_weight": 0.0,
+    },
+    "StyleContentDisentanglement": {
+        "weight_decay": 0.0,
+        "dim": 64,
+        "content_dim": 64,
+        "window_seconds": 0.64,
+        "speech_rate": None,
+        "speech_layers": 3,
+        "speech_heads": 4,
+        "decoder_channels": (64, 128, 256),
+        "decoder_kernels": (5, 3, 3),
+        "decoder_hidden": (256, 256, 128),
+        "basis_size": 50,
+        "basis_start": "pca",
+        "content_scale": "clip",
+        "vertices": "all",
+        "aligned_pairs": True,
+        "aligned_windows": False,
+        "window_context": False,
+        "swap_region": "lower_face",
+        "reconstruction_weight": 1.0,
+        "swap_weight": 3.0,
+        "cycle_weight": 1.0,
+        "swap_dynamics_weight": 3.0,
+        "speech_weight": 2.0,
+        "speech_style": "other_clip",
+        "content_pull": "relative",
+        "style_pull": "contrast",
+        "recording_content_weight": 5.0,
+        "identity_style_weight": 10.0,
+        "speech_content_weight": 5.0,
+        "position_weight": 1.0,
+        "velocity_weight": 5.0,
+        "lip_gap_weight": 1.0,
+        "upper_face_weight": 0.0,
+    },
+}
+
+
+@pytest.mark.parametrize("model", OF_MODELS)
+def test_options_of_models_that_are_not_named_keep_their_meaning(model: str) -> None:
+    found, promised = registry.defaults(getattr(facediff.models, model)), OF_EVERY_MODEL | OF_MODELS[model]
     assert {option: found.get(option) for option in promised} == promised
 
 

@@ -292,6 +292,34 @@ def test_a_wild_noise_scale_in_a_checkpoint_is_refused(scale: object, make_model
         model.on_load_checkpoint({"facediff_assets": tiny.assets().state(), "facediff_noise_scale": scale})
 
 
+@pytest.mark.parametrize(
+    ("scale", "space", "wanted"), [("auto", None, 64), (1.0, None, None), (1.0, 9, 9), ("auto", 70, 70)]
+)
+def test_the_noise_scale_is_measured_by_the_64_largest_components(
+    make_model: Make, tiny: Tiny, scale: object, space: int | None, wanted: int | None
+) -> None:
+    """Of a corpus that has more; whatever a motion space may need itself."""
+    options = {} if space is None else {"motion_space": partial(registry.motion_space.components, count=space)}
+    model: DualPathDiffusion = make_model(noise_scale=scale, **options)
+    model.adopt(tiny.assets().with_motion_scale(2.0))
+    asked: list[int] = []
+    basis = torch.linalg.qr(torch.randn(72, 72, generator=torch.Generator().manual_seed(0)))[0]
+    sizes = torch.linspace(1.0, 0.1, 72)
+
+    class Motion:
+        def principal_motion(self, count: int, weights: Tensor) -> tuple[Tensor, Tensor]:
+            asked.append(count)
+            return torch.zeros(72), (sizes[:, None] * basis)[:count]
+
+    shapes = model.measure(Motion())
+    assert asked == ([] if wanted is None else [wanted])
+    assert (shapes is None) == (wanted is None)
+    if scale == "auto":
+        variances = (2 * sizes[:64]).square()
+        seen = model.motion_space.noised_variances(variances)
+        assert model.process.scale == pytest.approx(half_hidden(seen, variances), rel=1e-4)
+
+
 def test_lips_and_upper_face_count_by_their_own_weights(make_model: Make, tiny: Tiny) -> None:
     model: DualPathDiffusion = make_model(motion_space=partial(SPACE, upper_face_weight=3.0, lips_weight=0.5))
     model.adopt(tiny.assets().with_motion_scale(1.0))
