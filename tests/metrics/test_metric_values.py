@@ -21,6 +21,7 @@ from facediff.metrics import (
     mean_vertex_error,
 )
 from facediff.metrics.base import Pooling, Reduction, Sign
+from facediff.metrics.vertex_errors import VertexError
 
 Corpus = Any  # the class of that name in conftest.py, which test files cannot import
 BATCHINGS = ([[0], [1], [2], [3], [4]], [[0, 1, 2, 3, 4]], [[4, 2], [0, 3, 1]])
@@ -53,6 +54,14 @@ def test_mean_vertex_error(
     batch = corpus.batch(range(5))
     batch.pop("template")
     assert mean_vertex_error(**batch, **options).item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_vertex_error_of_ones_own_region_is_the_mean_distance_over_all_frames(
+    corpus: Corpus, vertex_error_reference: Callable[..., float]
+) -> None:
+    region, options = [1, 4, 7], {"reduction": "mean", "squared": False, "pooling": "frames"}
+    expected = vertex_error_reference(corpus, region, **options)
+    assert accumulate(VertexError(region), corpus, BATCHINGS[1]) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("batching", BATCHINGS, ids=("singly", "at_once", "shuffled"))
