@@ -60,6 +60,8 @@ FIRST = 4
 """How many of the best killers are tried first; how many files are imported before all others are."""
 QUICK = 0.1
 """Seconds of a quick test."""
+SIGNATURES = "facediff/registry.py:defaults"
+"""What a test calls that looks at the defaults of arguments, and perhaps never at the function that has them."""
 IMPORTING = 60.0
 """Seconds that a new process may take to import what it tests."""
 
@@ -80,7 +82,12 @@ class Test:
         """Whether it calls the changed function; for a class's or a module's own lines, anything in it."""
         name = f"{mutant.file}:{mutant.function}"
         within = f"{name}." if mutant.function else name
-        return any(call == name or call.startswith(within) for call in self.calls)
+        return self.reads(mutant) or any(call == name or call.startswith(within) for call in self.calls)
+
+    def reads(self, mutant: Mutant) -> bool:
+        """Whether it may feel a changed default by reading signatures alone; every test that makes a model does so."""
+        of_default = mutant.function != "" and not mutant.exchangeable
+        return of_default and self.seconds < QUICK and SIGNATURES in self.calls
 
 
 class Recorder:
@@ -402,7 +409,14 @@ class Workshop:
         first = [name for name, _ in killers.most_common(FIRST) if name in touching]
         rest = [name for name in found if name not in first]
         # By file, since fixtures are shared within one.
-        rest.sort(key=lambda name: (turn[name] > 0, touching[name].seconds > QUICK, name.split("::")[0]))
+        rest.sort(
+            key=lambda name: (
+                not touching[name].reads(mutant),
+                turn[name] > 0,
+                touching[name].seconds > QUICK,
+                name.split("::")[0],
+            )
+        )
         return first + rest
 
     def try_out(self, mutant: Mutant) -> Outcome:
