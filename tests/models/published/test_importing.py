@@ -1,0 +1,176 @@
+"""Files that cannot be imported: one sentence, no model, nothing run."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from facediff.models import import_checkpoint
+from facediff.models.published.importing import import_files
+from tests.fakes import published
+from tests.fakes.published import IDENTITIES, VERTICES
+
+Change = Callable[[published.State], object]
+
+
+def write(folder: Path, change: Change = lambda state: None) -> Path:
+    state = published.faceformer_state("vocaset")
+    change(state)
+    torch.save(state, folder / "author.pth")
+    faces = {name: np.full((VERTICES, 3), float(i)) for i, name in enumerate(IDENTITIES)}
+    (folder / "templates.pkl").write_bytes(pickle.dumps(faces))
+    (folder / "config.json").write_text(json.dumps(published.AUDIO_CONFIG))
+    return folder / "author.pth"
+
+
+def words(folder: Path, **changed: str | None) -> list[str]:
+    options: dict[str, str | None] = {
+        "dataset": "vocaset",
+        "identities": "A,B,C",
+        "templates": str(folder / "templates.pkl"),
+        "audio-config": str(folder / "config.json"),
+        "output": str(folder / "model.ckpt"),
+        **changed,
+    }
+    given = [[f"--{name}", value] for name, value in options.items() if value is not None]
+    return ["import-checkpoint", str(folder / "author.pth"), *(word for pair in given for word in pair)]
+
+
+def test_what_became_of_every_tensor_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(tmp_path)
+    assert main(words(tmp_path)) == 0
+    printed = capsys.readouterr()
+    assert "PPE.pe" in printed.out + printed.err
+    assert "12 vertices" in printed.out + printed.err
+    assert (tmp_path / "model.ckpt").is_file()
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"dataset": None}, "--dataset"),
+        ({"dataset": "biwi"}, "--dataset biwi"),
+        ({"identities": None}, "--identities"),
+        ({"identities": "A,B"}, "--identities"),
+        ({"identities": "A,B,B"}, "--identities"),
+        ({"templates": None}, "--templates"),
+        ({"audio-config": None}, "--audio-config"),
+        ({"option": "no_such=1"}, "no_such"),
+        ({"option": "period=many"}, "period"),
+        ({"option": "loop"}, "--option loop"),
+        ({"output": "model.txt"}, "model.txt"),
+    ],
+)
+def test_what_is_missing_or_wrong_is_named(
+    changed: dict[str, str | None], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path)
+    assert main(words(tmp_path, **changed)) == 2
+    printed = capsys.readouterr().err
+    assert named in printed
+    assert printed.count("\n") == 1
+    assert not (tmp_path / "model.ckpt").exists()
+
+
+def test_a_face_of_another_topology_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(tmp_path)
+    (tmp_path / "templates.pkl").write_bytes(pickle.dumps({"A": np.zeros((VERTICES + 1, 3))}))
+    assert main(words(tmp_path)) == 2
+    assert "templates.pkl" in capsys.readouterr().err
+
+
+CHANGES: dict[str, tuple[Change, str]] = {
+    "a tensor is missing": (lambda s: s.pop("vertice_map.weight"), "vertice_map|motion_in"),
+    "a layer's tensor is missing": (lambda s: s.pop("transformer_decoder.layers.0.norm2.bias"), "norms.1.bias"),
+    "a tensor of no use": (lambda s: s.update(extra=torch.ones(2)), "extra"),
+    "another shape": (lambda s: s.update({"vertice_map.weight": torch.ones(16, 5)}), "motion_in"),
+    "no dimensions": (lambda s: s.update({"vertice_map_r.weight": torch.tensor(1.0)}), "vertice_map_r"),
+    "not finite": (lambda s: s["vertice_map.bias"].fill_(torch.nan), "NaN"),
+    "another table": (lambda s: s["PPE.pe"].add_(0.5), "PPE.pe"),
+    "another project": (lambda s: (s.clear(), s.update(weight=torch.ones(2))), "FaceFormer"),
+    "whole numbers": (lambda s: s.update({"vertice_map.bias": torch.ones(16).long()}), "motion_in.bias"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_tensors_that_do_not_fit_are_named(name: str, tmp_path: Path) -> None:
+    change, named = CHANGES[name]
+    path = write(tmp_path, change)
+    options: dict[str, Any] = {"templates": tmp_path / "templates.pkl", "audio_config": published.AUDIO_CONFIG}
+    with pytest.raises(FaceDiffError, match=named) as caught:
+        import_checkpoint(path, dataset="vocaset", identities=IDENTITIES, **options)
+    assert str(caught.value).count(". ") <= 1
+
+
+def test_tensors_of_no_use_may_be_left_out_and_are_reported(tmp_path: Path) -> None:
+    path = write(tmp_path, lambda state: state.update({"extra.a": torch.ones(2), "extra.b": torch.ones(2)}))
+    options: dict[str, Any] = {"templates": tmp_path / "templates.pkl", "audio_config": published.AUDIO_CONFIG}
+    made = import_files(path, dataset="vocaset", identities=IDENTITIES, ignore="extra.", **options)
+    assert {"extra.a", "extra.b", "PPE.pe"} == set(made.ignored)
+
+
+def test_new_and_old_names_of_weight_norm_are_the_same(tmp_path: Path) -> None:
+    def rename(state: published.State) -> None:
+        conv = "audio_encoder.encoder.pos_conv_embed.conv"
+        for old, new in (("weight_g", "original0"), ("weight_v", "original1")):
+            state[f"{conv}.parametrizations.weight.{new}"] = state.pop(f"{conv}.{old}")
+
+    options: dict[str, Any] = {"audio_config": published.AUDIO_CONFIG, "dataset": "vocaset", "identities": IDENTITIES}
+    weights = []
+    for change in (lambda state: None, rename):
+        path = write(tmp_path, change)
+        model = import_checkpoint(path, templates=tmp_path / "templates.pkl", **options)
+        weights.append(model.state_dict())
+    assert weights[0].keys() == weights[1].keys()
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+class Hostile:
+    def __reduce__(self) -> tuple[Any, ...]:
+        import os
+
+        return os.system, ("touch harm",)
+
+
+def test_a_hostile_pickle_runs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    torch.save({"state_dict": {"weight": torch.ones(2)}, "hyper_parameters": Hostile()}, "author.ckpt")
+    with pytest.raises(FaceDiffError, match=r"author\.ckpt"):
+        import_checkpoint("author.ckpt")
+    assert not Path("harm").exists()
+
+
+def test_a_container_with_other_objects_is_read_without_them(tmp_path: Path) -> None:
+    """As Lightning's, which keeps options and optimisers next to the tensors."""
+    import argparse
+
+    path = write(tmp_path)
+    state = published.faceformer_state("vocaset")
+    content = {"state_dict": state, "hyper_parameters": argparse.Namespace(lr=1.0), "callbacks": {Path: 1}}
+    torch.save(content, path)
+    made = import_checkpoint(
+        path,
+        dataset="vocaset",
+        identities=IDENTITIES,
+        templates=tmp_path / "templates.pkl",
+        audio_config=published.AUDIO_CONFIG,
+    )
+    assert torch.equal(made.state_dict()["network.motion_in.bias"], state["vertice_map.bias"])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+def test_a_truncated_file_is_refused(share: float, tmp_path: Path) -> None:
+    path = write(tmp_path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(FaceDiffError, match=r"author\.pth"):
+        import_checkpoint(path)
