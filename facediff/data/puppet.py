@@ -92,6 +92,9 @@ class Puppet(SpeechMotionDataModule):
         )
         self.seed = seed
         self.drawn_speakers = drawn_speakers
+        # The first identity is the one that is animated unless another is named: one that people know.
+        drawn = drawn_names(drawn_speakers)
+        self.identities = [*(name for name in self.identities if name not in drawn), *drawn]
 
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
