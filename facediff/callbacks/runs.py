@@ -16,7 +16,7 @@ from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
 from facediff.errors import FaceDiffError
 from facediff.utils.files import atomic
-from facediff.utils.hub import check_model_source, model_path
+from facediff.utils.hub import check_model_source, check_training_source, model_path
 
 STATE_KEY = "facediff_training_state"
 """Where a checkpoint holds what Lightning does not keep."""
@@ -129,13 +129,8 @@ def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
     if asked is not None:
         if asked == "last":
             return newest_run(trainer) / LAST
-        found = find_scored(trainer, asked)
-        if found is not None and found.is_dir():
-            raise FaceDiffError(
-                f"--ckpt_path {asked}: a model that was published holds no state of a training that could go on; "
-                f"expected a .ckpt file of `facediff fit`, or the word last"
-            )
-        return found
+        check_training_source(asked)
+        return Path(asked)
     if int(os.environ.get("SLURM_RESTART_COUNT") or 0):
         job = os.environ.get("SLURM_JOB_ID", "")
         for run in runs_folder(trainer).glob("*"):

@@ -22,7 +22,7 @@ from facediff.cli.process import StoppedBySignal, tell
 from facediff.errors import FaceDiffError, choices
 from facediff.registry import defaults, plain
 from facediff.utils.files import config_dir
-from facediff.utils.hub import check_model_source, model_path
+from facediff.utils.hub import check_model_source, check_training_source, model_path
 
 if TYPE_CHECKING:
     from facediff.cli.lightning_cli import FaceDiffCLI
@@ -64,6 +64,8 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     checkpoint = value_of(words, "--ckpt_path")
     if checkpoint is not None and checkpoint != "last":  # that depends on the config
         check_model_source(checkpoint, "--ckpt_path")
+        if name == "fit":
+            check_training_source(checkpoint)
         found = model_path(checkpoint)
         words = change_values(words, lambda flag, value: str(found) if flag == "--ckpt_path" else value)
         words = [*words_of_checkpoint(name, found, words), *words]

@@ -69,6 +69,20 @@ def check_model_source(source: str | os.PathLike[str], option: str = "") -> None
         raise FaceDiffError(f"{shown}: no such checkpoint; {EXPECTED}")
 
 
+def check_training_source(source: str | os.PathLike[str]) -> None:
+    """Refuse to train on from a published model.
+
+    Raises:
+        FaceDiffError: if there is no such checkpoint, or it is a folder, or a name of the hub.
+    """
+    check_model_source(source, "--ckpt_path")
+    if not os.path.isfile(source):  # noqa: PTH113
+        raise FaceDiffError(
+            f"--ckpt_path {source}: a model that was published holds no state of a training that could go on; expected "
+            f"a .ckpt file of `facediff fit`, or the word last"
+        )
+
+
 def model_path(source: str | os.PathLike[str]) -> Path:
     """The checkpoint or the model folder that a name stands for; a model of the hub is fetched.
 
