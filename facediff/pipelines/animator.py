@@ -422,7 +422,7 @@ class Animator:
             folder: a folder that does not exist, or is empty.
             half: store the parameters in 16 bits; the motion differs a little.
             license: licence of the weights, such as ``apache-2.0``; that of the data if None.
-            card: further facts for the model card, as :func:`facediff.models.model_card.write_card` takes them.
+            card: further facts for the model card, as :class:`facediff.models.model_card.Facts` holds them.
 
         Raises:
             FaceDiffError: if the folder is not empty or cannot be written.
