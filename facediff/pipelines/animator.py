@@ -507,7 +507,11 @@ def waveform(samples: Waveform, name: str) -> npt.NDArray[np.float32]:
             f"point, int16, int32 or uint8, or the path of a recording"
         )
     with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, and is refused
-        plain = array.astype(np.float32) if scale is None else ((array - scale[1]) / scale[0]).astype(np.float32)
+        plain = (
+            array.astype(np.float32)
+            if scale is None
+            else ((array.astype(np.float64) - scale[1]) / scale[0]).astype(np.float32)
+        )
     if plain.ndim == 2:
         plain = plain.mean(axis=int(np.argmin(plain.shape)))
     return plain

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 INLINE_MB = 8.0
 """The largest page that a notebook shows; of a larger one, it shows the beginning. A notebook keeps what it shows."""
+TRIED_FRAMES = 64
+"""Frames by which the size of a page is estimated."""
 INLINE_HEIGHT = 540
 """Pixels that a page takes in a notebook."""
 
@@ -311,23 +313,32 @@ class Page:
 
         return "".join(page_parts(self.animations, truth=self.truth))
 
+    def beginning(self, frames: int) -> Page:
+        """The page with the first frames only."""
+        return Page([replace(each, vertices=each.vertices[:frames]) for each in self.animations], self.truth)
+
     def _repr_html_(self) -> str | None:
         """The page in a frame of a notebook; of a page that is too large, the beginning; None without a mesh."""
         if any(animation.faces is None or not len(animation.faces) for animation in self.animations):
             return None
-        frames, shown = len(self.animations[0].vertices), self
-        text = self.html()
+        whole = frames = len(self.animations[0].vertices)
+        # A page grows with its frames nearly in proportion, but for the meshes. Tried on few frames first: packing an
+        # hour only to see that it is too large would take minutes.
+        shown = self if whole <= TRIED_FRAMES else self.beginning(TRIED_FRAMES)
+        text = shown.html()
+        if shown is not self:
+            frames = min(whole, max(TRIED_FRAMES, int(TRIED_FRAMES * INLINE_MB / (len(text) / 1e6))))
+            shown = self if frames == whole else self.beginning(frames)
+            text = shown.html()
         while (size := len(text) / 1e6) > INLINE_MB and frames > 1:
-            # A page grows with its frames nearly in proportion, but for the meshes, so that this ends soon.
             frames = max(1, min(frames - 1, int(0.95 * frames * INLINE_MB / size)))
-            shown = Page([replace(each, vertices=each.vertices[:frames]) for each in self.animations], self.truth)
+            shown = self.beginning(frames)
             text = shown.html()
         note = ""
         if shown is not self:
-            first, whole = shown.animations[0], self.animations[0]
             note = (
-                f"<p>The first {first.seconds:.1f} of {whole.seconds:.1f} s, since a notebook keeps what it shows; "
-                f"<code>save(&quot;page.html&quot;)</code> writes all of it.</p>"
+                f"<p>The first {shown.animations[0].seconds:.1f} of {self.animations[0].seconds:.1f} s, since a "
+                f"notebook keeps what it shows; <code>save(&quot;page.html&quot;)</code> writes all of it.</p>"
             )
         title = html.escape(" · ".join(animation.name for animation in self.animations))
         # In a frame of its own origin, the page's script can do nothing to the notebook; and it may load nothing.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import lightning.pytorch as pl
@@ -45,9 +46,17 @@ def saved_model(
     return path
 
 
+@cache
+def loaded(path: Path) -> facediff.Animator:
+    return facediff.load(path, device="cpu")
+
+
 @pytest.fixture
-def model(saved_model: Path) -> facediff.Animator:
-    return facediff.load(saved_model, device="cpu")
+def model(saved_model: Path) -> Iterator[facediff.Animator]:
+    """Loaded once, since no call changes it."""
+    found = loaded(saved_model)
+    with found.module.choosing():
+        yield found
 
 
 @pytest.fixture
