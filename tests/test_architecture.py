@@ -30,7 +30,7 @@ ALLOWED: dict[str, set[str]] = {
     "animation": {"mesh", *BASE},
     "data": {"metrics", "mesh", "synthetic", *BASE},
     "editing": {"animation", "metrics", "mesh", "synthetic", *BASE},
-    "models": {"animation", "data", "metrics", "mesh", *BASE},
+    "models": {"version", "animation", "data", "metrics", "mesh", *BASE},
     "callbacks": {"version", "models", "data", "metrics", "mesh", "render", *BASE},
     "export": {"animation", "editing", "render", "mesh", *BASE},
     "evaluation": {"data", "metrics", "mesh", "render", *BASE},

@@ -111,6 +111,7 @@ DRILLS = [
         "--checkpoint model.ckpt --person C --data-root corpus --epochs 1 --accelerator cpu --quiet -o C.ckpt",
         "--checkpoint model.ckpt --person C --data-root corpus --epochs 1 --accelerator cpu --quiet --seed 5 -o C.ckpt",
     ),
+    Drill("publish", "model.ckpt face --license mit", also="test_scores.csv"),
     Drill(
         "style extract",
         "A_e01.npy --checkpoint model.ckpt -o style.npy",

@@ -17,9 +17,7 @@ nothing in a folder can name anything to import, to open or to run.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -38,6 +36,7 @@ from facediff.utils.limits import LIMITS, check_format, quoted
 from facediff.utils.plain_files import json_text, load_json
 from facediff.utils.plain_options import is_plain_text
 from facediff.utils.safetensors import TYPES, read_safetensors, write_safetensors
+from facediff.version import __version__
 
 if TYPE_CHECKING:
     from facediff.models.base import AnimationModel
@@ -141,7 +140,7 @@ def write_model(model: AnimationModel, folder: Path, *, half: bool = False) -> d
     tensors: dict[str, Tensor] = {}
     config = {
         "format": FORMAT,
-        "version": facediff_version(),
+        "version": __version__,
         "model": as_plain(content.pop("hyper_parameters"), tensors, "model"),
         "state": as_plain(content, tensors, ""),
         "shared": shared,
@@ -152,13 +151,6 @@ def write_model(model: AnimationModel, folder: Path, *, half: bool = False) -> d
         np.savez_compressed(stream, **cast(Any, arrays))
     (folder / CONFIG).write_text(json_text(folder / CONFIG, config) + "\n", encoding="utf-8")
     return config
-
-
-def facediff_version() -> str:
-    """The version that writes."""
-    with suppress(PackageNotFoundError):  # run from a folder that was never installed
-        return version("facediff")
-    return "unknown"
 
 
 def content_of(model: AnimationModel) -> dict[str, Any]:

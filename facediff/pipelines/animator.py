@@ -16,6 +16,7 @@ from facediff.pipelines.motion import Animation, Samples, _given, controls_of
 from facediff.pipelines.words import Scales, in_python_words, words_of
 from facediff.utils import SAMPLE_RATE, ranges
 from facediff.utils.hub import EXPECTED, check_model_source
+from facediff.utils.licences import Commercial, commercial_use, in_words
 from facediff.utils.limits import LIMITS, SAMPLE_RATES, check_number
 
 if TYPE_CHECKING:
@@ -162,6 +163,16 @@ class Animator:
         """The corpus that it was trained on."""
         assets = self.module.assets
         return f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
+
+    @property
+    def licence(self) -> str:
+        """The licences of its data and its weights, in a line; see docs/publishing.md."""
+        return in_words(self.module.licences)
+
+    @property
+    def commercial_use(self) -> Commercial:
+        """Whether the strictest of its licences allows commercial use: allowed, forbidden or unknown."""
+        return commercial_use(self.module.licences)
 
     @property
     def device(self) -> str:
@@ -422,7 +433,7 @@ class Animator:
             folder: a folder that does not exist, or is empty.
             half: store the parameters in 16 bits; the motion differs a little.
             license: licence of the weights, such as ``apache-2.0``; that of the data if None.
-            card: further facts for the model card, as :class:`facediff.models.model_card.Facts` holds them.
+            card: ``name``, ``scores`` (test_scores.csv of ``facediff test``) and ``languages`` for the model card.
 
         Raises:
             FaceDiffError: if the folder is not empty or cannot be written.
@@ -434,7 +445,8 @@ class Animator:
         known += f" (not trained on: {', '.join(self.other_identities)})" if self.other_identities else ""
         return (
             f"Animator({str(self.source)!r}: {type(self.module).__name__} of {self.corpus}, {known}, "
-            f"{self.frame_rate:g} frames a second, {self.n_vertices} vertices in {self.unit}, on {self.device})"
+            f"{self.frame_rate:g} frames a second, {self.n_vertices} vertices in {self.unit}, on {self.device}; "
+            f"{self.licence})"
         )
 
     def _options(self, **options: Any) -> AnimationOptions:  # noqa: ANN401 - its fields

@@ -58,6 +58,7 @@ DRAWN = "WORLD/ours WORLD/corpus --topology tests.fakes.tiny.Tiny -o out.png --d
 BASES: dict[str, str] = {
     "animate": "WORLD/speech.wav --checkpoint WORLD/model.ckpt -o out.npy --quiet",
     "adapt": "--checkpoint WORLD/model.ckpt --person C -o out.ckpt --epochs 1 --accelerator cpu --quiet",
+    "publish": "WORLD/model.ckpt published --license mit --languages en",
     "style extract": "B_e02 --checkpoint WORLD/model.ckpt -o style.npy",
     "view": "WORLD/clicks.npz -o page.html",
     "export": "WORLD/clicks.npz -o out.glb --quiet",
