@@ -112,7 +112,7 @@ def animate(
         guidance: follow conditions more than the model would by itself, style=1.5,speech=1.2,identity=1.3, where it was
             trained for that (default: the checkpoint's, usually 1)
         seed: seed of the noise
-        device: cpu, cuda …
+        device: cpu, cuda …; auto for CUDA where there is one
         commercial_only: refuse a model that is not cleared for commercial use
         precision: bf16 multiplies in 16 bits, where the processor is faster at it; the motion differs a little
         target_mesh: transfer the motion to this mesh

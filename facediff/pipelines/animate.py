@@ -415,12 +415,19 @@ def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
     }
 
 
+def on_processor(device: str) -> bool:
+    """Whether a device is the processor, of which every process has a share."""
+    import torch
+
+    return device == "cpu" or (device == "auto" and not torch.cuda.is_available())
+
+
 def usable_device(name: str) -> str:
     """The device's name; ``auto`` is a CUDA device where there is one, and the processor elsewhere."""
     import torch
 
     if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
+        name = "cpu" if on_processor(name) else "cuda"
     try:
         # Memory is allocated and read back, which devices that exist in name only cannot do (meta).
         float(torch.ones(1, device=torch.device(name)).sum())

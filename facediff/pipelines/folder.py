@@ -16,7 +16,7 @@ from facediff.errors import FaceDiffError, choices, printable
 from facediff.export import FORMATS
 from facediff.models.checkpoint import read_assets
 from facediff.models.styles import style_paths
-from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, facts_of, read_recording
+from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, facts_of, on_processor, read_recording
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
@@ -94,7 +94,7 @@ def animate_folder(
         [f"{name}={json.dumps(value, default=str)}" for name, value in decides.items()],
         make_worker=partial(_load_pipeline, quiet, seed, max_seconds),
         files=_deciding_files(options),
-        workers=workers or (None if options.device == "cpu" else 1),
+        workers=workers or (None if on_processor(options.device) else 1),
         retry_failed=retry_failed,
     )
 

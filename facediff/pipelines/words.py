@@ -20,7 +20,8 @@ Scales = str | float | Mapping[str, float]
 """One number, or numbers by name: as the command line takes them, or as a mapping."""
 
 _OPTION = re.compile(r"(?<![\w./-])--([a-z]+(?:-[a-z]+)*)\b(?!\.)")
-_OWNER = re.compile(r"\b(?:Animation|Export|Solve)(?:Options|Controls)\.")
+_OWNER = re.compile(r"\b(?:(?:Animation|Export|Solve)(?:Options|Controls)|Source|save|check_seed)\.(?=\w+ \S+: )")
+"""Whose argument is out of range; a function's own name says nothing where it is another one that was called."""
 
 
 def in_python_words(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
