@@ -126,6 +126,7 @@ class Finder(ast.NodeVisitor):
         self.body = False
         self.found: list[tuple[ast.AST, str, str, str, bool]] = []
         self.signless: set[ast.AST] = set()
+        self.written: set[ast.AST] = set()
 
     # Where a node stands; ast counts columns in bytes.
     def span(self, node: ast.AST) -> tuple[int, int]:
@@ -199,6 +200,7 @@ class Finder(ast.NodeVisitor):
             return
         if self.inside and isinstance(node.value, ast.Call):
             self.add(node, "statement removed", "pass")
+            self.written.add(node.value)
         self.visit(node.value)
 
     def visit_Subscript(self, node: ast.Subscript) -> None:
@@ -302,7 +304,9 @@ class Finder(ast.NodeVisitor):
             args = [plain[1], plain[0], *plain[2:]]
             self.add(node, "arguments swapped", ast.Call(node.func, args, node.keywords))
         for i, keyword in enumerate(node.keywords):
-            if keyword.arg is not None and keyword.arg not in BESIDES:
+            # Where the value is used, ``out`` says only in which memory it is.
+            besides = BESIDES if node in self.written else BESIDES | {"out"}
+            if keyword.arg is not None and keyword.arg not in besides:
                 rest = [*node.keywords[:i], *node.keywords[i + 1 :]]
                 self.add(node, f"{keyword.arg}= dropped", ast.Call(node.func, node.args, rest))
         self.generic_visit(node)

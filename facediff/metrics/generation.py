@@ -158,7 +158,7 @@ class SpectrumDistance(SequenceMetric):
             power = transformed.abs().square().sum(1) / window.square().sum()
             # Frequencies as shares of Nyquist's; the octave k holds those in (2^-(k+1), 2^-k].
             share = 2 * torch.fft.fftfreq(frames, dtype=torch.float64, device=motion.device).abs()
-            octave = (-share.clamp_min(1e-9).log2()).floor().clamp(0, self.octaves - 1).long()
+            octave = (-share.clamp_min(1e-9).log2()).floor().clamp_max(self.octaves - 1).long()
             power[0] = 0.0  # what windowing leaves of the mean
             found.append(power.new_zeros(self.octaves).index_add(0, octave, power))
         return torch.stack(found)

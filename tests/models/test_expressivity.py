@@ -195,3 +195,28 @@ def test_a_deterministic_model_takes_no_expressivity_but_one(tiny: Tiny) -> None
             model.choose_expressivity(expressivity)
     with pytest.raises(FaceDiffError, match="guidance"):
         model.choose_guidance({"style": 1.5})
+
+
+def test_what_is_chosen_for_a_while_is_forgotten(ready: Ready) -> None:
+    """Earlier choices can be held again, and whatever is chosen meanwhile ends with that."""
+    model = ready()
+    plain = model.choices()
+    model.choose_expressivity(0.3)
+    kept = model.choices()
+    model.choose_expressivity(0.7)
+    sampler, windows = model.sampler, model.windows
+    with model.choosing(kept):
+        assert model.expressivity == 0.3
+        model.choose_sampler("ddpm", 3)
+        model.windows = WindowPlan(seconds=2.0)
+        assert model.sampler is not sampler
+    assert model.expressivity == 0.7
+    assert model.sampler is sampler
+    assert model.windows is windows
+    with model.choosing():
+        assert model.expressivity == 0.7
+        model.choose_expressivity(0.1)
+    assert model.expressivity == 0.7
+    with model.choosing(plain):
+        assert model.expressivity == 1.0
+    assert model.expressivity == 0.7
