@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from facediff.cli.app import main
+from facediff.utils.arrays import read_arrays
 
 SCORES = (
     "split,method,unseen_identity,lve,protocol,frames,sequences\ntest_a,model,style_only,0.125,paper,33,2\n"
@@ -35,7 +36,7 @@ def test_a_folder_animates_as_its_checkpoint_and_states_its_licence(
     for name, source in (("ckpt", checkpoint), ("folder", published)):
         made[name] = tmp_path / f"{name}.npz"
         assert main(["animate", speech, "--checkpoint", str(source), "--quiet", "-o", str(made[name])]) == 0
-    arrays = {name: np.load(path) for name, path in made.items()}
+    arrays = {name: read_arrays(path) for name, path in made.items()}
     assert np.array_equal(arrays["ckpt"]["vertices"], arrays["folder"]["vertices"])
     metadata = json.loads(str(arrays["folder"]["about"]))["metadata"]
     assert metadata["checkpoint"] == "face"
@@ -115,6 +116,7 @@ def test_a_folder_with_content_and_a_missing_model_are_refused(
     assert "none.ckpt" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_corpus_of_a_folder_is_scored_where_the_user_says(
     published: Path, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
