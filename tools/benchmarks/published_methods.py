@@ -1,0 +1,99 @@
+"""How quickly the published methods animate, at the size of VOCASET and BIWI, and what their literal ways cost.
+
+The weights are random, which changes no time. Every ratio is of one run on one machine:
+
+    python tools/benchmarks/published_methods.py --seconds 10
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+
+from facediff.data import Assets
+from facediff.models import AnimationModel, FaceDiffuser, FaceFormer
+from facediff.models.published.autoregressive import Loop
+from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.utils.tables import print_table
+
+SETS = {"VOCASET": (5023, 30.0, 8), "BIWI": (23_370, 25.0, 6)}
+BASE = {"model_type": "wav2vec2", "hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12}
+
+
+ENCODER = partial(Wav2Vec2Encoder, config=BASE, edges=False, epsilon=1e-5)
+"""A wav2vec 2.0 base of random weights."""
+
+
+def made(kind: type[AnimationModel], vertices: int, rate: float, count: int, **options: Any) -> AnimationModel:  # noqa: ANN401
+    """A model of random weights with a face."""
+    names = [f"speaker{i}" for i in range(count)]
+    model = kind(n_vertices=vertices, identities=names, frame_rate=rate, audio_encoder=ENCODER, **options)
+    everything = torch.arange(vertices)
+    templates = {name: torch.randn(vertices, 3) for name in names}
+    model.adopt(Assets("none", True, "m", rate, names, templates, None, {"lips": everything, "upper_face": everything}))
+    return model.eval()
+
+
+def seconds_of(work: Callable[[], object]) -> float:
+    """Seconds that some work takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    """Print one row for each method, data set and way."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the speech")
+    parser.add_argument("--steps", type=int, default=10, help="denoising steps of FaceDiffuser that are timed")
+    parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS), help="sizes of faces")
+    asked = parser.parse_args()
+    speech = 0.1 * torch.randn(int(asked.seconds * 16_000))
+    rows: list[tuple[object, ...]] = []
+    for name in asked.sets:
+        vertices, rate, count = SETS[name]
+
+        def note(method: str, way: str, model: AnimationModel, taken: float, name: str = name) -> None:
+            parameters = sum(p.numel() for p in model.parameters()) / 1e6
+            rows.append((method, name, way, f"{parameters:.1f} M", f"{taken:.2f}", f"{taken / asked.seconds:.2f}"))
+            print(*rows[-1], flush=True)
+
+        former = made(FaceFormer, vertices, rate, count)
+        assert isinstance(former, FaceFormer)
+        former.animate(speech[:16_000], identity="speaker0")  # the first call is slower
+        loops: tuple[Loop, Loop] = ("cached", "literal")
+        spent = []
+        for former.loop in loops:
+            spent.append(seconds_of(partial(former.animate, speech, identity="speaker0")))
+            note("FaceFormer", former.loop, former, spent[-1])
+        print(f"FaceFormer, {name}: cached is {spent[1] / spent[0]:.1f} times as fast as literal")
+        diffuser = made(FaceDiffuser, vertices, rate, count)
+        assert isinstance(diffuser, FaceDiffuser)
+        # All steps cost the same, and so some of them are timed; the speech of one way is encoded once among them.
+        part = diffuser.steps / asked.steps
+        diffuser.skip_steps = diffuser.steps - asked.steps
+        clip = diffuser.clip_of(speech, "speaker0", None)
+        heard = seconds_of(partial(torch.no_grad()(diffuser.hear), clip, clip.frame_lengths))
+        found = {}
+        for way, encode, space in (
+            ("literal", "every_step", "vertices"),
+            ("speech once", "once", "vertices"),
+            ("speech once, folded", "once", "folded"),
+        ):
+            diffuser.encode_speech, diffuser.sampling_space = encode, space  # type: ignore[assignment]
+            taken = seconds_of(partial(diffuser.animate, speech, identity="speaker0"))
+            taken = taken * part if encode == "every_step" else heard + max(taken - heard, 0.0) * part
+            found[way] = taken
+            note("FaceDiffuser", way, diffuser, taken)
+        for way in ("speech once", "speech once, folded"):
+            print(f"FaceDiffuser, {name}: {way} is {found['literal'] / found[way]:.1f} times as fast as literal")
+    print_table(["method", "faces", "way", "parameters", "seconds", "seconds per second of speech"], rows)
+
+
+if __name__ == "__main__":
+    main()
