@@ -50,13 +50,14 @@ def run(path: Path, kernel: KernelManager, folder: Path) -> NotebookNode:
     cell.source += "".join(f"\n{name} = {PARAMETERS[name]!r}" for name in names)
     first = f"%reset -f\n%cd -q {folder}\n{SMALL}"
     notebook.cells.insert(0, nbformat.v4.new_code_cell(first))
-    runner = NotebookClient(notebook, timeout=120, km=kernel)
+    runner = NotebookClient(notebook, timeout=240, km=kernel)
     try:
         return runner.execute()
     finally:
         runner.kc.stop_channels()  # the client of a kernel that is used on leaves them open
 
 
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_the_notebook_runs(path: Path, kernel: KernelManager, tmp_path: Path) -> None:
     shown = run(path, kernel, tmp_path)
