@@ -111,6 +111,11 @@ DRILLS = [
         "--checkpoint model.ckpt --person C --data-root corpus --epochs 1 --accelerator cpu --quiet -o C.ckpt",
         "--checkpoint model.ckpt --person C --data-root corpus --epochs 1 --accelerator cpu --quiet --seed 5 -o C.ckpt",
     ),
+    Drill(
+        "import-checkpoint",
+        "author.pth --dataset vocaset --identities A,B,C --templates faces.pkl --audio-config audio.json -o made.ckpt",
+        "author.pth --dataset vocaset --identities A,B,D --templates faces.pkl --audio-config audio.json -o made.ckpt",
+    ),
     Drill("publish", "model.ckpt face --license mit", also="test_scores.csv"),
     Drill(
         "style extract",
@@ -194,7 +199,7 @@ def write_inputs(folder: Path, run: object) -> None:
     import trimesh
 
     from facediff.animation import Animation, write_archive
-    from tests.fakes import biwi, flame, mead3d, person, vocaset
+    from tests.fakes import biwi, flame, mead3d, person, published, vocaset
     from tests.fakes.tiny import write_tiny
 
     assert callable(run)
@@ -252,6 +257,8 @@ def write_inputs(folder: Path, run: object) -> None:
     flame.write_flame(folder / "flame.pkl")
     masks = vocaset.python2_pickle(vocaset.flame_masks(flame.VERTICES))
     (folder / "FLAME_masks.pkl").write_bytes(masks)
+
+    published.write_author_files(folder)
 
     person.write_auxiliary(folder / "persons")
     person.write_speech(folder / "person.wav", person.FRAMES / person.RATE)

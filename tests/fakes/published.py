@@ -6,7 +6,11 @@ share no code with facediff's models. Speech is (samples,), motion (frames, 3V).
 
 from __future__ import annotations
 
+import json
 import math
+import pickle
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -323,3 +327,14 @@ def facediffuser_reference(
             + (math.sqrt(betas[t] * (1 - before) / (1 - signal[t])) * noise if t else 0.0)
         )
     return x
+
+
+def write_author_files(folder: Path, change: Callable[[State], object] = lambda state: None) -> Path:
+    """A FaceFormer checkpoint as its authors write one, with neutral faces and the audio encoder's configuration."""
+    state = faceformer_state("vocaset")
+    change(state)
+    torch.save(state, folder / "author.pth")
+    faces = {name: np.full((VERTICES, 3), float(i)) for i, name in enumerate(IDENTITIES)}
+    (folder / "faces.pkl").write_bytes(pickle.dumps(faces))
+    (folder / "audio.json").write_text(json.dumps(AUDIO_CONFIG), encoding="utf-8")
+    return folder / "author.pth"

@@ -58,6 +58,8 @@ DRAWN = "WORLD/ours WORLD/corpus --topology tests.fakes.tiny.Tiny -o out.png --d
 BASES: dict[str, str] = {
     "animate": "WORLD/speech.wav --checkpoint WORLD/model.ckpt -o out.npy --quiet",
     "adapt": "--checkpoint WORLD/model.ckpt --person C -o out.ckpt --epochs 1 --accelerator cpu --quiet",
+    "import-checkpoint": "WORLD/author.pth --dataset vocaset --identities A,B,C --templates WORLD/faces.pkl "
+    "--audio-config WORLD/audio.json -o out.ckpt",
     "publish": "WORLD/model.ckpt published --license mit --languages en",
     "style extract": "B_e02 --checkpoint WORLD/model.ckpt -o style.npy",
     "view": "WORLD/clicks.npz -o page.html",
@@ -93,6 +95,7 @@ def build_world(folder: Path) -> Path:
     from facediff.animation import write_archive
     from tests.fakes.clicks import clicks
     from tests.fakes.person import person, write_auxiliary, write_speech
+    from tests.fakes.published import write_author_files
     from tests.fakes.tiny import write_tiny
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -121,6 +124,7 @@ def build_world(folder: Path) -> Path:
         (folder / name).touch()
     (folder / "text.txt").write_text("no file of any format\n")
     write_checkpoint(folder / "model.ckpt", corpus)
+    write_author_files(folder)
     return folder
 
 

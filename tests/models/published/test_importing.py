@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -17,27 +16,17 @@ from facediff.errors import FaceDiffError
 from facediff.models import import_checkpoint
 from facediff.models.published.importing import import_files
 from tests.fakes import published
-from tests.fakes.published import IDENTITIES, VERTICES
+from tests.fakes.published import IDENTITIES, VERTICES, write_author_files
 
 Change = Callable[[published.State], object]
-
-
-def write(folder: Path, change: Change = lambda state: None) -> Path:
-    state = published.faceformer_state("vocaset")
-    change(state)
-    torch.save(state, folder / "author.pth")
-    faces = {name: np.full((VERTICES, 3), float(i)) for i, name in enumerate(IDENTITIES)}
-    (folder / "templates.pkl").write_bytes(pickle.dumps(faces))
-    (folder / "config.json").write_text(json.dumps(published.AUDIO_CONFIG))
-    return folder / "author.pth"
 
 
 def words(folder: Path, **changed: str | None) -> list[str]:
     options: dict[str, str | None] = {
         "dataset": "vocaset",
         "identities": "A,B,C",
-        "templates": str(folder / "templates.pkl"),
-        "audio-config": str(folder / "config.json"),
+        "templates": str(folder / "faces.pkl"),
+        "audio-config": str(folder / "audio.json"),
         "output": str(folder / "model.ckpt"),
         **changed,
     }
@@ -46,7 +35,7 @@ def words(folder: Path, **changed: str | None) -> list[str]:
 
 
 def test_what_became_of_every_tensor_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write(tmp_path)
+    write_author_files(tmp_path)
     assert main(words(tmp_path)) == 0
     printed = capsys.readouterr()
     assert "PPE.pe" in printed.out + printed.err
@@ -73,7 +62,7 @@ def test_what_became_of_every_tensor_is_printed(tmp_path: Path, capsys: pytest.C
 def test_what_is_missing_or_wrong_is_named(
     changed: dict[str, str | None], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write(tmp_path)
+    write_author_files(tmp_path)
     assert main(words(tmp_path, **changed)) == 2
     printed = capsys.readouterr().err
     assert named in printed
@@ -82,10 +71,10 @@ def test_what_is_missing_or_wrong_is_named(
 
 
 def test_a_face_of_another_topology_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write(tmp_path)
-    (tmp_path / "templates.pkl").write_bytes(pickle.dumps({"A": np.zeros((VERTICES + 1, 3))}))
+    write_author_files(tmp_path)
+    (tmp_path / "faces.pkl").write_bytes(pickle.dumps({"A": np.zeros((VERTICES + 1, 3))}))
     assert main(words(tmp_path)) == 2
-    assert "templates.pkl" in capsys.readouterr().err
+    assert "faces.pkl" in capsys.readouterr().err
 
 
 CHANGES: dict[str, tuple[Change, str]] = {
@@ -104,16 +93,18 @@ CHANGES: dict[str, tuple[Change, str]] = {
 @pytest.mark.parametrize("name", CHANGES)
 def test_tensors_that_do_not_fit_are_named(name: str, tmp_path: Path) -> None:
     change, named = CHANGES[name]
-    path = write(tmp_path, change)
-    options: dict[str, Any] = {"templates": tmp_path / "templates.pkl", "audio_config": published.AUDIO_CONFIG}
+    path = write_author_files(tmp_path, change)
+    options: dict[str, Any] = {"templates": tmp_path / "faces.pkl", "audio_config": published.AUDIO_CONFIG}
     with pytest.raises(FaceDiffError, match=named) as caught:
         import_checkpoint(path, dataset="vocaset", identities=IDENTITIES, **options)
     assert str(caught.value).count(". ") <= 1
 
 
 def test_tensors_of_no_use_may_be_left_out_and_are_reported(tmp_path: Path) -> None:
-    path = write(tmp_path, lambda state: state.update({"extra.a": torch.ones(2), "extra.b": torch.ones(2)}))
-    options: dict[str, Any] = {"templates": tmp_path / "templates.pkl", "audio_config": published.AUDIO_CONFIG}
+    path = write_author_files(
+        tmp_path, lambda state: state.update({"extra.a": torch.ones(2), "extra.b": torch.ones(2)})
+    )
+    options: dict[str, Any] = {"templates": tmp_path / "faces.pkl", "audio_config": published.AUDIO_CONFIG}
     made = import_files(path, dataset="vocaset", identities=IDENTITIES, ignore="extra.", **options)
     assert {"extra.a", "extra.b", "PPE.pe"} == set(made.ignored)
 
@@ -127,8 +118,8 @@ def test_new_and_old_names_of_weight_norm_are_the_same(tmp_path: Path) -> None:
     options: dict[str, Any] = {"audio_config": published.AUDIO_CONFIG, "dataset": "vocaset", "identities": IDENTITIES}
     weights = []
     for change in (lambda state: None, rename):
-        path = write(tmp_path, change)
-        model = import_checkpoint(path, templates=tmp_path / "templates.pkl", **options)
+        path = write_author_files(tmp_path, change)
+        model = import_checkpoint(path, templates=tmp_path / "faces.pkl", **options)
         weights.append(model.state_dict())
     assert weights[0].keys() == weights[1].keys()
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
@@ -153,7 +144,7 @@ def test_a_container_with_other_objects_is_read_without_them(tmp_path: Path) -> 
     """As Lightning's, which keeps options and optimisers next to the tensors."""
     import argparse
 
-    path = write(tmp_path)
+    path = write_author_files(tmp_path)
     state = published.faceformer_state("vocaset")
     content = {"state_dict": state, "hyper_parameters": argparse.Namespace(lr=1.0), "callbacks": {Path: 1}}
     torch.save(content, path)
@@ -161,7 +152,7 @@ def test_a_container_with_other_objects_is_read_without_them(tmp_path: Path) -> 
         path,
         dataset="vocaset",
         identities=IDENTITIES,
-        templates=tmp_path / "templates.pkl",
+        templates=tmp_path / "faces.pkl",
         audio_config=published.AUDIO_CONFIG,
     )
     assert torch.equal(made.state_dict()["network.motion_in.bias"], state["vertice_map.bias"])
@@ -169,7 +160,7 @@ def test_a_container_with_other_objects_is_read_without_them(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
 def test_a_truncated_file_is_refused(share: float, tmp_path: Path) -> None:
-    path = write(tmp_path)
+    path = write_author_files(tmp_path)
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(FaceDiffError, match=r"author\.pth"):
