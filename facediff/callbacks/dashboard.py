@@ -120,9 +120,11 @@ class GradientNorm(Callback):
 def gradients_by_part(module: LightningModule) -> dict[str, list[Tensor]]:
     """The gradients of all parameters that have one, by the part of the module that the parameter belongs to.
 
-    The part is the first word in which the parameters' names differ: ``network.decoder.…`` belongs to ``decoder``.
+    The part is the first word in which the parameters' names differ: ``network.decoder.…`` belongs to ``decoder``, also
+    where the model has parts beside its network.
     """
-    found = [(name.split("."), p.grad) for name, p in module.named_parameters() if p.requires_grad]
+    named = [(name.removeprefix("network."), p) for name, p in module.named_parameters() if p.requires_grad]
+    found = [(name.split("."), parameter.grad) for name, parameter in named]
     shared = len(commonprefix([words[:-1] for words, _ in found])) if found else 0
     parts: dict[str, list[Tensor]] = {}
     for words, gradient in found:

@@ -173,7 +173,7 @@ def test_wild_arguments_of_a_component(
     entry: registry.Entry, use_model: Callable[[AnimationModel], None], hubert_source: object
 ) -> None:
     kind = entry.alias.__qualname__.partition(".")[0]
-    base: dict[str, Any] = {"source": str(hubert_source)} if entry.name == "hubert" else {}
+    base: dict[str, Any] = {"source": str(hubert_source)} if entry.name in ("hubert", "wav2vec2") else {}
     if entry.name == "spiral":
         base = {"channels": (4,), "spiral_length": 4}
     if kind == "sampler":

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
-from facediff.models import DualPathDiffusion, dual_path, folding
+from facediff.models import DualPathDiffusion, folding
+from facediff.models.dual_path import network
 from facediff.models.folding import Fold, FoldedSpace, Space, VertexSpace, WeightCache, fold
 from tests.fakes.tiny import Tiny
 
@@ -309,8 +310,8 @@ def test_folded_sampling_follows_changed_weights(ready: Make, batch: Batch) -> N
 
 def test_fold_is_computed_once(ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
-    real = dual_path.fold
-    monkeypatch.setattr(dual_path, "fold", lambda *maps: (calls.append(1), real(*maps))[1])
+    real = network.fold
+    monkeypatch.setattr(network, "fold", lambda *maps: (calls.append(1), real(*maps))[1])
     model = ready()
     for seed in range(3):
         model.generate(batch, seed=seed)

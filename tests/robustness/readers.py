@@ -534,6 +534,51 @@ def read_a_checkpoint(path: Path) -> object:
     return load_model(path)
 
 
+@functools.cache
+def model_folder() -> Path:
+    """The checkpoint as a folder that can be handed to others."""
+    folder = new_folder() / "model"
+    read_a_checkpoint(shared("checkpoint")).save_pretrained(folder)  # type: ignore[attr-defined]
+    return folder
+
+
+def published(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """Writes one file of a model folder, and loads the model with it."""
+
+    def read(path: Path) -> object:
+        folder = path.parent / "model"
+        shutil.copytree(model_folder(), folder)
+        shutil.copy(path, folder / name)
+        return read_a_checkpoint(folder)
+
+    return lambda path: shutil.copy(model_folder() / name, path), read
+
+
+@functools.cache
+def author_folder() -> Path:
+    """A checkpoint of a published method as its authors write it, with what else the import needs."""
+    from tests.fakes.published import write_author_files
+
+    folder = new_folder()
+    write_author_files(folder)
+    return folder
+
+
+def authors(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """Writes one file of a published method, and imports the method with it."""
+
+    def read(path: Path) -> object:
+        from facediff.models import import_checkpoint
+
+        folder = path.parent / "authors"
+        shutil.copytree(author_folder(), folder)
+        shutil.copy(path, folder / name)
+        options = {"templates": folder / "faces.pkl", "audio_config": folder / "audio.json"}
+        return import_checkpoint(folder / "author.pth", dataset="vocaset", identities=["A", "B", "C"], **options)
+
+    return lambda path: shutil.copy(author_folder() / name, path), read
+
+
 def curves(path: Path) -> None:
     path.write_text("epoch,step,train/loss\n0,0,1.0\n0,1,0.5\n1,2,0.25\n")
 
@@ -649,6 +694,14 @@ READERS = {
         for name in ("data_verts.npy", "subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl")
     },
     "checkpoint": Reader(".ckpt", checkpoint, read_a_checkpoint, 0.3),
+    **{
+        f"model folder, {name}": Reader(Path(name).suffix, *published(name), 0.2)
+        for name in ("config.json", "assets.npz", "model.safetensors")
+    },
+    **{
+        f"published method, {name}": Reader(Path(name).suffix, *authors(name), 0.2)
+        for name in ("author.pth", "faces.pkl", "audio.json")
+    },
     "curves": Reader(".csv", curves, read_the_curves),
     "hubert, config": Reader(".json", *hubert("config.json"), 0.2),
     "hubert, weights": Reader(".safetensors", *hubert("model.safetensors"), 0.2),

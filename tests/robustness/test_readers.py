@@ -47,6 +47,7 @@ NOT_FROM_ELSEWHERE = {
     "facediff/pipelines": "hands files over to the readers of other packages",
     "facediff/render": "writes",
     "facediff/models/styles.py:given_face": "hands files over to the readers of meshes and arrays",
+    "facediff/models/published/importing.py:read_value": "a word of the command line",
     "facediff/callbacks": "the log of a run of our own, which the fault drill covers",
     "facediff/data/prepare": "hands files over to readers that have entries, or to the command drilled as a whole",
     "facediff/data/person": "likewise",
