@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from wandb_workspaces.workspaces import Workspace
 
 STEP = "trainer/global_step"
-TERMS = ("reconstruction", "velocity", "acceleration", "face")
+TERMS = ("reconstruction", "velocity", "acceleration", "face", "style_identity")
 METRICS = ("mve", "lve", "fdd", "fdd_absolute")
 SPLITS = {"test_a": "test A, seen people", "test_b": "test B, unseen people"}
 COLUMNS = (
