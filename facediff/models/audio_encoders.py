@@ -7,7 +7,7 @@ import json
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
@@ -506,27 +506,47 @@ def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
 
 def load_recogniser(source: str, config: dict[str, Any] | None) -> PreTrainedModel:
     """A network with a CTC head from a directory, from the hub, or from a plain configuration without weights."""
+    return load_typed(source, config, RECOGNISERS, "ForCTC", "recogniser with a CTC head", encoder="ctc")
+
+
+def load_typed(
+    source: str, config: dict[str, Any] | None, kinds: Mapping[str, str], head: str, what: str, *, encoder: str
+) -> PreTrainedModel:
+    """A network whose own configuration says its type, from a directory, the hub, or a configuration without weights.
+
+    Args:
+        source: the directory, or the name on the hub.
+        config: the configuration as plain data; None to read it from ``source``.
+        kinds: how the names of transformers' classes begin, by type.
+        head: how they end for a network with this head.
+        what: what is expected, in errors.
+        encoder: the audio encoder that needs it, in errors.
+
+    Raises:
+        FaceDiffError: if ``source`` cannot be read, or is of another type.
+        MissingExtraError: if transformers is not installed.
+    """
     try:
         import transformers
     except ImportError as error:
-        raise MissingExtraError("transformers", "train", "the ctc audio encoder") from error
+        raise MissingExtraError("transformers", "train", f"the {encoder} audio encoder") from error
     if config is None:
         check_source(source)
         try:
             kind = transformers.PretrainedConfig.get_config_dict(os.path.expanduser(source))[0].get("model_type")
         except Exception as error:  # the hub's errors are of many classes
-            raise unreadable(source, "a recogniser", error) from error
+            raise unreadable(source, f"a {what}", error) from error
     else:
         kind = config.get("model_type")
-    if kind not in RECOGNISERS:
+    if kind not in kinds:
         raise FaceDiffError(
-            f'audio_encoder.source: "{source}" is of the type {kind}; expected a recogniser with a CTC head of the '
-            f"type {', '.join(RECOGNISERS)}, such as facebook/wav2vec2-base-960h"
+            f'audio_encoder.source: "{source}" is of the type {kind}; expected a {what} of the type '
+            f"{' or '.join(kinds)}, such as facebook/wav2vec2-base-960h"
         )
-    network: type[PreTrainedModel] = getattr(transformers, f"{RECOGNISERS[kind]}ForCTC")
+    network: type[PreTrainedModel] = getattr(transformers, f"{kinds[kind]}{head}")
     if config is not None:
-        return network(known_options(getattr(transformers, f"{RECOGNISERS[kind]}Config"), config))
-    return load_pretrained(network, source, "recogniser with a CTC head")
+        return network(known_options(getattr(transformers, f"{kinds[kind]}Config"), config))
+    return load_pretrained(network, source, what)
 
 
 RECOGNISERS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}

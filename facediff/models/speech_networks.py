@@ -7,7 +7,6 @@ frozen; the network is the same. Its convolutions are frozen in all of them.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
+from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import (
     AudioEncoder,
     Features,
@@ -23,12 +22,9 @@ from facediff.models.audio_encoders import (
     StepRule,
     Waves,
     by_length,
-    check_source,
     convolved,
     fingerprint,
-    known_options,
-    load_pretrained,
-    unreadable,
+    load_typed,
     with_edges,
 )
 from facediff.models.layers import Frames, Share, Width, interpolate_ends, interpolate_frames
@@ -204,25 +200,4 @@ def by_lengths(padded: Tensor, lengths: Tensor, steps: Tensor, encode: Callable[
 
 def load_network(source: str, config: dict[str, Any] | None) -> PreTrainedModel:
     """A wav2vec 2.0 or HuBERT from a directory, from the hub, or from a plain configuration without weights."""
-    try:
-        import transformers
-    except ImportError as error:
-        raise MissingExtraError("transformers", "train", "the wav2vec2 audio encoder") from error
-    if config is None:
-        check_source(source)
-        try:
-            kind = transformers.PretrainedConfig.get_config_dict(os.path.expanduser(source))[0].get("model_type")
-        except Exception as error:  # the hub's errors are of many classes
-            raise unreadable(source, "a network", error) from error
-    else:
-        kind = config.get("model_type")
-    if kind not in NETWORKS:
-        raise FaceDiffError(
-            f'audio_encoder.source: "{source}" is of the type {kind}; expected a network of the type '
-            f"{' or '.join(NETWORKS)}, such as facebook/wav2vec2-base-960h"
-        )
-    network: type[PreTrainedModel] = getattr(transformers, f"{NETWORKS[kind]}Model")
-    if config is not None:
-        return network(known_options(getattr(transformers, f"{NETWORKS[kind]}Config"), config))
-    made: PreTrainedModel = load_pretrained(network, source, f"{NETWORKS[kind]} network")
-    return made
+    return load_typed(source, config, NETWORKS, "Model", "network", encoder="wav2vec2")

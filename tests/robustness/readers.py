@@ -534,6 +534,20 @@ def read_a_checkpoint(path: Path) -> object:
     return load_model(path)
 
 
+def one_of(
+    made: Callable[[], Path], name: str, read: Callable[[Path], object]
+) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """Writes one file of a valid folder, and reads the folder with that file in its place."""
+
+    def read_with(path: Path) -> object:
+        folder = path.parent / "folder"
+        shutil.copytree(made(), folder)
+        shutil.copy(path, folder / name)
+        return read(folder)
+
+    return lambda path: shutil.copy(made() / name, path), read_with
+
+
 @functools.cache
 def model_folder() -> Path:
     """The checkpoint as a folder that can be handed to others."""
@@ -544,14 +558,7 @@ def model_folder() -> Path:
 
 def published(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
     """Writes one file of a model folder, and loads the model with it."""
-
-    def read(path: Path) -> object:
-        folder = path.parent / "model"
-        shutil.copytree(model_folder(), folder)
-        shutil.copy(path, folder / name)
-        return read_a_checkpoint(folder)
-
-    return lambda path: shutil.copy(model_folder() / name, path), read
+    return one_of(model_folder, name, read_a_checkpoint)
 
 
 @functools.cache
@@ -567,16 +574,13 @@ def author_folder() -> Path:
 def authors(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
     """Writes one file of a published method, and imports the method with it."""
 
-    def read(path: Path) -> object:
+    def read(folder: Path) -> object:
         from facediff.models import import_checkpoint
 
-        folder = path.parent / "authors"
-        shutil.copytree(author_folder(), folder)
-        shutil.copy(path, folder / name)
         options = {"templates": folder / "faces.pkl", "audio_config": folder / "audio.json"}
         return import_checkpoint(folder / "author.pth", dataset="vocaset", identities=["A", "B", "C"], **options)
 
-    return lambda path: shutil.copy(author_folder() / name, path), read
+    return one_of(author_folder, name, read)
 
 
 def curves(path: Path) -> None:
@@ -606,15 +610,12 @@ def hubert_folder() -> Path:
 def hubert(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
     """Writes one file of a pretrained audio encoder, and loads the encoder with it."""
 
-    def read(path: Path) -> object:
+    def read(folder: Path) -> object:
         from facediff.models.audio_encoders import load_hubert
 
-        folder = path.parent / "hubert"
-        shutil.copytree(hubert_folder(), folder)
-        shutil.copy(path, folder / name)
         return load_hubert(str(folder), None)
 
-    return lambda path: shutil.copy(hubert_folder() / name, path), read
+    return one_of(hubert_folder, name, read)
 
 
 def config(path: Path) -> None:
