@@ -27,6 +27,7 @@ def blendshapes(
     region: Annotated[str | None, Option(metavar="NAME")] = None,
     only_arkit: bool = False,
     plain: bool = False,
+    csv_rate: Annotated[ranges.FrameRate | None, Option(metavar="F")] = None,
     show: Picture = None,
     write_puppet_shapes: Annotated[Path | None, Option(metavar="DIR", writes="folder")] = None,
     source: SourceOptions,
@@ -47,6 +48,7 @@ def blendshapes(
         region: look at a region of the face only, such as lips
         only_arkit: leave out shapes whose names are not ARKit's
         plain: columns time, the set's own names, residuals in mm
+        csv_rate: rows a second, interpolated between the frames (default: a row for each frame)
         show: picture of the frame that the shapes fit worst
         write_puppet_shapes: write shapes of the built-in puppet's face (of the speaker --identity) and do nothing else
         source: what completes a bare .npy.
@@ -54,7 +56,7 @@ def blendshapes(
     if write_puppet_shapes is not None:
         if animation is not None:
             raise FaceDiffError("--write-puppet-shapes: writes shapes and solves for none; omit the animation")
-        asked = {"output": output, "shapes": shapes, "region": region, "show": show}
+        asked = {"output": output, "shapes": shapes, "region": region, "csv_rate": csv_rate, "show": show}
         others = {name: is_changed for name, is_changed in changed(source).items() if name != "identity"}
         switches = {"carry": carry, "only_arkit": only_arkit, "plain": plain}
         refuse_idle(
@@ -90,7 +92,7 @@ def blendshapes(
     if show is not None:
         _ = own.triangles  # refuses an animation without triangles before anything is written
     found, weights = solve_weights(own, shapes, options, carry=carry, only_arkit=only_arkit)
-    weights.save(output, plain=plain)
+    (weights if csv_rate is None else weights.at_rate(csv_rate)).save(output, plain=plain)
     if show is not None:
         from facediff.export.pictures import draw_worst_frame
 

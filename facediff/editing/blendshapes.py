@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +102,38 @@ class Weights:
         if self.amplitude_mm <= 0:
             return np.zeros_like(self.residual_rms_mm)
         return self.residual_rms_mm / self.amplitude_mm
+
+    @ranges.checked
+    def at_rate(self, frame_rate: ranges.FrameRate) -> Weights:
+        """The weights at another frame rate, interpolated linearly; residuals likewise, since nothing is solved again.
+
+        The last frame is the last one that does not lie after the motion's end.
+
+        Args:
+            frame_rate: frames a second.
+
+        Raises:
+            FaceDiffError: if the frame rate is out of range.
+
+        Example:
+            >>> curve = Weights(("jawOpen",), np.array([[0.0], [1.0]]), np.zeros(2), np.zeros(2), 1.0, frame_rate=30.0)
+            >>> curve.at_rate(60.0).values.ravel().tolist()
+            [0.0, 0.5, 1.0]
+        """
+        at = np.arange(len(self.values)) / self.frame_rate
+        # The small share keeps a frame that rounding puts just after the end.
+        wanted = np.arange(int(at[-1] * frame_rate + 1e-6) + 1) / frame_rate
+
+        def interpolated(of: Array) -> Array:
+            return np.interp(wanted, at, of).astype(np.float64)
+
+        return replace(
+            self,
+            values=np.stack([interpolated(of) for of in self.values.T], axis=1),
+            residual_rms_mm=interpolated(self.residual_rms_mm),
+            residual_max_mm=interpolated(self.residual_max_mm),
+            frame_rate=frame_rate,
+        )
 
     def save(self, path: str | Path, *, plain: bool = False) -> Path:
         """Write the table, and what it cannot say in a .json next to it.
@@ -381,6 +414,7 @@ def _newton(problem: Problem, right: Array, free: Mask) -> Array:
 
 FORMAT = "facediff blendshape weights 1"
 DAY = 24 * 3600
+SURELY_SIXTIETHS = 31 / 60  # A table with a row at this time is read as one of sixtieths
 
 
 def write_live_link(path: Path, weights: Weights) -> None:
@@ -390,22 +424,31 @@ def write_live_link(path: Path, weights: Weights) -> None:
     without a shape and all rotations are 0; the JSON file declares them, and holds the frame rate and each frame's
     residual. Both files appear whole or not at all.
 
+    A table that ends before frame number 31 of a second gets one more row there, which holds the last frame: Unreal
+    Engine's importer takes a table for one of 30 frames a second unless it finds a greater number than 30.
+
     Raises:
         FaceDiffError: if a file cannot be written.
     """
     column = {name: index for index, name in enumerate(weights.names)}
     header = ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
+    times = [frame / weights.frame_rate for frame in range(len(weights.values))]
+    held = [*times, SURELY_SIXTIETHS] if times and times[-1] < SURELY_SIXTIETHS else times
     rows = (
         [
-            timecode(frame, weights.frame_rate),
+            timecode(seconds),
             str(len(ARKIT) + len(ROTATIONS)),
             *(f"{values[column[name]]:.8f}" if name in column else "0.00000000" for name in ARKIT),
             *("0.00000000" for _ in ROTATIONS),
         ]
-        for frame, values in enumerate(weights.values)
+        for seconds, values in zip_longest(held, weights.values, fillvalue=weights.values[-1])
     )
-    rotations = {"rotations": "head and eyes were not solved for: their columns are 0 and say nothing"}
-    _write_both(path, header, rows, _about(weights, in_table=ARKIT, more=rotations))
+    more = {
+        "rotations": "head and eyes were not solved for: their columns are 0 and say nothing",
+        "timecode": "frames are sixtieths of a second with a fraction, whatever the frame rate",
+        "rows_held": len(held) - len(times),
+    }
+    _write_both(path, header, rows, _about(weights, in_table=ARKIT, more=more))
 
 
 def write_weights(path: Path, weights: Weights) -> None:
@@ -427,18 +470,18 @@ def write_weights(path: Path, weights: Weights) -> None:
     _write_both(path, header, rows, _about(weights, in_table=weights.names, more={}))
 
 
-def timecode(frame: int, frame_rate: float) -> str:
-    """HH:MM:SS:FF.mmm of a frame, from midnight on; a fractional frame rate counts as the nearest whole one.
+def timecode(seconds: float) -> str:
+    """HH:MM:SS:FF.fff of a time, from midnight on, with FF.fff in sixtieths of a second.
 
-    Frames are counted within the second and none is dropped; the digits after the point are thousandths of a frame,
-    always 0 here.
+    Unreal Engine's importer of such tables divides the frames by 60 (its later versions by 30 where no frame number
+    exceeds 30), whatever rate was recorded, and reads the fraction; sixtieths therefore put each frame at its time.
     """
-    whole = max(1, round(frame_rate))
-    seconds = frame // whole % DAY
-    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}:{frame % whole:02d}.000"
+    thousandths = round(seconds * 60_000) % (DAY * 60_000)
+    whole, fraction = divmod(thousandths, 60_000)
+    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{fraction // 1000:02d}.{fraction % 1000:03d}"
 
 
-def _about(weights: Weights, *, in_table: Sequence[str], more: Mapping[str, str]) -> dict[str, object]:
+def _about(weights: Weights, *, in_table: Sequence[str], more: Mapping[str, object]) -> dict[str, object]:
     """What a table does not say."""
     return {
         "format": FORMAT,

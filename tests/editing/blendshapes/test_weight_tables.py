@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,24 +60,61 @@ def test_a_plain_table(tmp_path: Path, weights: Weights) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frame", "rate", "text"),
+    ("seconds", "text"),
     [
-        (0, 30, "00:00:00:00.000"),
-        (29, 30, "00:00:00:29.000"),
-        (30, 30, "00:00:01:00.000"),
-        (60 * 60 * 25 + 61 * 25 + 24, 25, "01:01:01:24.000"),
-        (61, 60, "00:00:01:01.000"),
-        (30, 29.97, "00:00:01:00.000"),
+        (0, "00:00:00:00.000"),
+        (29 / 30, "00:00:00:58.000"),
+        (1, "00:00:01:00.000"),
+        (1 / 25, "00:00:00:02.400"),
+        (60 * 61 + 61 + 24 / 25, "01:02:01:57.600"),
+        (61 / 60, "00:00:01:01.000"),
+        (1 - 1e-7, "00:00:01:00.000"),
+        (30 / 29.97, "00:00:01:00.060"),
+        (24 * 3600 + 1, "00:00:01:00.000"),
     ],
 )
-def test_timecodes(frame: int, rate: float, text: str) -> None:
-    assert timecode(frame, rate) == text
+def test_timecodes(seconds: float, text: str) -> None:
+    assert timecode(seconds) == text
 
 
-def test_readers_formula_gives_the_time_back() -> None:
-    for frame in range(0, 20_000, 77):
-        hours, minutes, seconds, frames = timecode(frame, 60).split(":")
-        assert int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(frames) / 60 == pytest.approx(frame / 60)
+def read_like_unreal(path: Path, *, infers: bool) -> tuple[list[float], list[dict[str, str]]]:
+    """Times and rows as the importer of Unreal Engine has them.
+
+    Its first versions take the frames as sixtieths; the later ones infer 30 frames a second unless a frame number
+    exceeds 30.
+    """
+    with path.open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    codes = [[float(part) for part in row["Timecode"].split(":")] for row in rows]
+    rate = 60 if not infers or any(code[3] > 30 for code in codes) else 30
+    return [code[0] * 3600 + code[1] * 60 + code[2] + code[3] / rate for code in codes], rows
+
+
+@pytest.mark.parametrize("infers", [False, True])
+@pytest.mark.parametrize("rate", [24.0, 25.0, 29.97, 30.0, 50.0, 60.0, 120.0])
+@pytest.mark.parametrize("frames", [1, 5, 16, 31, 32, 400])
+def test_unreal_reads_every_frame_at_its_time(
+    tmp_path: Path, weights: Weights, infers: bool, rate: float, frames: int
+) -> None:
+    made = replace(weights, values=np.resize(weights.values, (frames, 4)), frame_rate=rate)
+    write_live_link(tmp_path / "a.csv", made)
+    times, rows = read_like_unreal(tmp_path / "a.csv", infers=infers)
+    assert times[:frames] == pytest.approx(np.arange(frames) / rate, abs=1e-4)
+    # A table that would be taken for one of 30 frames a second is held until it cannot be.
+    assert len(rows) - frames == json.loads((tmp_path / "a.json").read_text())["rows_held"] <= 1
+    assert {row["JawOpen"] for row in rows[frames - 1 :]} == {rows[frames - 1]["JawOpen"]}
+
+
+def test_another_rate_keeps_the_curve(weights: Weights) -> None:
+    resampled = weights.at_rate(60.0)
+    assert len(resampled.values) == 2 * 70 - 1
+    assert resampled.values[::2] == pytest.approx(weights.values)
+    assert resampled.values[1::2] == pytest.approx((weights.values[1:] + weights.values[:-1]) / 2)
+    assert resampled.residual_rms_mm[::2] == pytest.approx(weights.residual_rms_mm)
+    slower = weights.at_rate(25.0)
+    assert (len(slower.values) - 1) / 25 <= 69 / 30 < len(slower.values) / 25
+    with pytest.raises(FaceDiffError, match="frame_rate"):
+        weights.at_rate(0.0)
 
 
 def test_both_files_or_none(tmp_path: Path, weights: Weights) -> None:
