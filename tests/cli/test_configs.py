@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from facediff.cli.app import main
-from facediff.cli.configs import check_config, check_yaml
+from facediff.cli.configs import check_config
 from facediff.errors import FaceDiffError
+from facediff.utils.yaml_files import check_yaml, load_yaml
 
 LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefghij", "bcdefghijk", strict=True)
@@ -80,3 +82,21 @@ def test_tags_run_nothing(
 def test_expansion_is_counted_without_expanding() -> None:
     with pytest.raises(FaceDiffError, match="FACEDIFF_MAX_ENTRIES"):
         check_yaml(LAUGHS, "mine.yaml")
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_plain_yaml_is_refused_for_the_same_reasons(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_bytes(BAD[name])
+    with pytest.raises(FaceDiffError, match=re.escape(str(path))):
+        load_yaml(path, "expected a plan")
+
+
+def test_plain_yaml_holds_numbers_and_texts_and_no_objects(tmp_path: Path) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_text("a: 1\nb: [x, 2.5, null, true]\nday: 2026-01-02\n")
+    assert load_yaml(path, "") == {"a": 1, "b": ["x", 2.5, None, True], "day": "2026-01-02"}
+    for text in ("a: !!python/name:os.system\n", "1: x\n", "[a]: x\n", "{[a]: x}\n"):
+        path.write_text(text)
+        with pytest.raises(FaceDiffError, match=re.escape(str(path))):
+            load_yaml(path, "expected a plan")

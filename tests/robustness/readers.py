@@ -110,6 +110,19 @@ def in_a_corpus(path: Path, name: str) -> Path:
     return root
 
 
+# Plans
+
+
+def plan(path: Path) -> None:
+    path.write_text("name: trial\nseeds: [0, 1]\noptions: &all {steps: 10, scale: 0.5}\nother: *all\n")
+
+
+def read_plan(path: Path) -> object:
+    from facediff.utils.yaml_files import load_yaml
+
+    return load_yaml(path, "expected a plan")
+
+
 # Speech
 
 
@@ -642,6 +655,7 @@ def _output_to(stream: object) -> object:
 
 
 READERS = {
+    "plan": Reader(".yaml", plan, read_plan),
     **{suffix: Reader(f".{suffix}", sound, read_sound) for suffix in ("wav", "flac", "ogg", "opus", "mp3", "aiff")},
     "wav, a part": Reader(".wav", sound, read_a_stretch),
     **{
