@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Annotated
 
 import torch
+from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
+from facediff.data import SpeechMotionDataModule
+from facediff.models.base import AnimationModel
 from facediff.registry import checks_arguments
 from facediff.utils.ranges import Range
 
@@ -38,6 +41,13 @@ class EmaWithWarmup(WeightAveraging):
         self.decay = decay
         self.warmup = warmup
         super().__init__(device=device, use_buffers=False, avg_fn=self.averaged)
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Copy the model, whole: its own set-up, where it would make what the corpus decides, comes later."""
+        data = getattr(trainer, "datamodule", None)
+        if stage == "fit" and isinstance(pl_module, AnimationModel) and isinstance(data, SpeechMotionDataModule):
+            pl_module.make_parts(data.assets())
+        super().setup(trainer, pl_module, stage)
 
     def decay_at(self, step: Tensor) -> Tensor:
         """The decay after a number of averaged steps."""

@@ -445,6 +445,16 @@ class AnimationModel(LightningModule, Inference, ABC):
                     f"in the corpus; use a checkpoint that was trained on this topology and these identities"
                 )
         self._assets = assets
+        self.make_parts(assets)
+
+    def make_parts(self, assets: Assets) -> None:
+        """Make modules whose size only the corpus knows; by itself a model has none.
+
+        Called when assets are adopted, also a second time, and before that by what copies the model for a training.
+
+        Args:
+            assets: those of the corpus.
+        """
 
     def setup(self, stage: str) -> None:
         """Take the assets from the data module; a checkpoint's own replace them when it is loaded."""
