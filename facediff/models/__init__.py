@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from facediff.models.published.facediffuser import FaceDiffuser as FaceDiffuser
     from facediff.models.published.faceformer import FaceFormer as FaceFormer
     from facediff.models.published.importing import import_checkpoint as import_checkpoint
+    from facediff.models.published.selftalk import SelfTalk as SelfTalk
+    from facediff.models.published.talkingstyle import TalkingStyle as TalkingStyle
     from facediff.models.style_content import StyleContentDisentanglement as StyleContentDisentanglement
 
 __getattr__, __dir__, __all__ = lazy_names(
@@ -24,6 +26,8 @@ __getattr__, __dir__, __all__ = lazy_names(
         "published.facediffuser": "FaceDiffuser",
         "published.faceformer": "FaceFormer",
         "published.importing": "import_checkpoint",
+        "published.selftalk": "SelfTalk",
+        "published.talkingstyle": "TalkingStyle",
         "style_content": "StyleContentDisentanglement",
     },
 )

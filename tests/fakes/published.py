@@ -329,6 +329,171 @@ def facediffuser_reference(
     return x
 
 
+# TalkingStyle.
+
+
+def talkingstyle_state(dataset: str, seed: int = 0, dim: int = 16, layers: int = 3) -> State:
+    draw, period = Drawn(seed), RATES[dataset]
+    made = backbone_state("audio_encoder.", draw, large=True)
+    made |= linear_state("audio_feature_map", dim, HIDDEN, draw)
+    made |= linear_state("vertice_encoder", dim, COORDINATES, draw)
+    made |= linear_state("vertice_decoder", COORDINATES, dim, draw)
+    made["PPE.pe"] = positions(period * (600 // period + 1), dim, period)[None]
+    made |= decoder_state("transformer_decoder.", dim, layers, draw)
+    style = "style_encoder"
+    made |= linear_state(f"{style}.obj_vector", dim, len(IDENTITIES), draw, bias=False)
+    made[f"{style}.my_obj_vector.weight"] = draw(len(IDENTITIES), dim, spread=1.0)
+    attention = f"{style}.attention"
+    made |= {f"{attention}.attention.in_proj_weight": draw(12, 4), f"{attention}.attention.in_proj_bias": draw(12)}
+    made |= linear_state(f"{attention}.attention.out_proj", 4, 4, draw)
+    for name in ("Wq", "Wk", "Wv"):
+        made |= linear_state(f"{attention}.{name}", 4, 1, draw)
+    return made | norm_state(f"{attention}.norm", 4, draw) | linear_state(f"{attention}.head", 1, 4, draw)
+
+
+def talkingstyle_style(s: State, identity: int, *, components: bool = False) -> Tensor:
+    """(dim,): each component attends to itself alone, or to all components."""
+    name = "style_encoder.attention"
+    row = s["style_encoder.my_obj_vector.weight"][identity]
+    query, key, value = (
+        F.linear(
+            linear(row[:, None], s, f"{name}.W{part}"),
+            s[f"{name}.attention.in_proj_weight"][4 * third : 4 * third + 4],
+            s[f"{name}.attention.in_proj_bias"][4 * third : 4 * third + 4],
+        )
+        for third, part in enumerate("qkv")
+    )
+    own = torch.full((len(row), len(row)), -torch.inf).fill_diagonal_(0.0)
+    mixed = attend(query, key, value, 1, 0.0 if components else own)
+    mixed = layer_norm(linear(mixed, s, f"{name}.attention.out_proj"), s, f"{name}.norm")
+    return torch.relu(s["style_encoder.obj_vector.weight"][:, identity] + linear(mixed, s, f"{name}.head")[:, 0])
+
+
+def talkingstyle_offsets(
+    s: State, speech: Tensor, dataset: str, identity: int, frames: int | None = None, *, components: bool = False
+) -> Tensor:
+    """Offsets (frames, 3V), each frame from all earlier frames again."""
+    features = features_of(standardised(speech, 1e-7), s, "audio_encoder.")
+    features, frames = resampled(features, dataset, frames)
+    memory = linear(hidden_of(features, s, "audio_encoder."), s, "audio_feature_map")
+    style, table = talkingstyle_style(s, identity, components=components), s["PPE.pe"][0]
+    tokens = style[None]
+    for i in range(frames):
+        made = decoded(tokens + table[: i + 1], memory, s, "transformer_decoder.", dataset)
+        offsets = linear(made, s, "vertice_decoder")
+        tokens = torch.cat([tokens, linear(offsets[-1:], s, "vertice_encoder") + style])
+    return offsets
+
+
+# SelfTalk.
+
+LIPS = [7, 2, 2, 11, 5]
+LETTERS = 33
+
+
+def unmasked_layer_state(name: str, dim: int, hidden: int, draw: Drawn, *, cross: bool) -> State:
+    made: State = {}
+    for part in ("self_attn", "multihead_attn")[: 2 if cross else 1]:
+        made |= {f"{name}.{part}.in_proj_weight": draw(3 * dim, dim)}
+        made |= {f"{name}.{part}.in_proj_bias": draw(3 * dim, spread=0.1)}
+        made |= linear_state(f"{name}.{part}.out_proj", dim, dim, draw)
+    made |= linear_state(f"{name}.linear1", hidden, dim, draw) | linear_state(f"{name}.linear2", dim, hidden, draw)
+    for norm in ("norm1", "norm2", "norm3")[: 3 if cross else 2]:
+        made |= norm_state(f"{name}.{norm}", dim, draw)
+    return made
+
+
+def selftalk_state(dataset: str, seed: int = 0, dim: int = 16, reader_layers: int = 2) -> State:
+    draw = Drawn(seed)
+    made = backbone_state("audio_encoder.", draw, large=True)
+    made |= backbone_state("text_encoder.wav2vec2.", draw, large=True)
+    made |= linear_state("text_encoder.lm_head", LETTERS, HIDDEN, draw)
+    made |= linear_state("lip_map", HIDDEN, 3 * len(LIPS), draw)
+    made |= unmasked_layer_state("transformer_decoder.layers.0", dim, 2 * dim, draw, cross=True)
+    made |= linear_state("audio_feature_map", dim, HIDDEN * (2 if dataset == "biwi" else 1), draw)
+    for half in ("encoder", "decoder"):
+        for j in range(reader_layers):
+            made |= unmasked_layer_state(f"transformer.{half}.layers.{j}", HIDDEN, 24, draw, cross=half == "decoder")
+        made |= norm_state(f"transformer.{half}.norm", HIDDEN, draw)
+    made |= linear_state("vertice_map_r", COORDINATES, dim, draw)
+    return made | linear_state("lm_head", LETTERS, HIDDEN, draw)
+
+
+def unmasked_layer(x: Tensor, memory: Tensor | None, s: State, name: str, heads: int) -> Tensor:
+    """Post-norm, ReLU; with a memory, of the decoder's form."""
+
+    def heard(x: Tensor, context: Tensor, part: str) -> Tensor:
+        thirds = zip(
+            (x, context, context),
+            s[f"{name}.{part}.in_proj_weight"].chunk(3),
+            s[f"{name}.{part}.in_proj_bias"].chunk(3),
+            strict=True,
+        )
+        return linear(attend(*(F.linear(*each) for each in thirds), heads), s, f"{name}.{part}.out_proj")
+
+    x = layer_norm(x + heard(x, x, "self_attn"), s, f"{name}.norm1")
+    if memory is not None:
+        x = layer_norm(x + heard(x, memory, "multihead_attn"), s, f"{name}.norm2")
+    fed = linear(torch.relu(linear(x, s, f"{name}.linear1")), s, f"{name}.linear2")
+    return layer_norm(x + fed, s, f"{name}.norm{2 if memory is None else 3}")
+
+
+def selftalk_offsets(s: State, speech: Tensor, dataset: str, frames: int | None = None) -> Tensor:
+    """Offsets (frames, 3V)."""
+    features = features_of(standardised(speech, 1e-7), s, "audio_encoder.")
+    if dataset == "biwi":
+        hidden = hidden_of(features, s, "audio_encoder.")
+        count = len(hidden) // 2 if frames is None else frames
+        speech = hidden[: 2 * count].reshape(count, -1)
+    else:
+        features, count = resampled(features, dataset, frames)
+        speech = hidden_of(features, s, "audio_encoder.")
+    x = linear(speech, s, "audio_feature_map")
+    return linear(unmasked_layer(x, x, s, "transformer_decoder.layers.0", 4), s, "vertice_map_r")
+
+
+def selftalk_reading(s: State, offsets: Tensor, steps: int, heads: int = 8) -> tuple[Tensor, Tensor]:
+    """The lip reader's features and letters, both (steps, …), of offsets (frames, 3V)."""
+    columns = [3 * vertex + axis for vertex in LIPS for axis in range(3)]
+    given = interpolated(linear(offsets[:, columns], s, "lip_map"), steps)
+    layers = len({name.split(".")[3] for name in s if name.startswith("transformer.encoder.layers.")})
+    memory = x = given
+    for j in range(layers):
+        memory = unmasked_layer(memory, None, s, f"transformer.encoder.layers.{j}", heads)
+    memory = layer_norm(memory, s, "transformer.encoder.norm")
+    for j in range(layers):
+        x = unmasked_layer(x, memory, s, f"transformer.decoder.layers.{j}", heads)
+    x = layer_norm(x, s, "transformer.decoder.norm")
+    return x, linear(x, s, "lm_head")
+
+
+def selftalk_text(s: State, speech: Tensor) -> tuple[Tensor, list[int]]:
+    """The recogniser's hidden states and its greedy transcript, of which letter 0 is the blank."""
+    prefix = "text_encoder.wav2vec2."
+    hidden = hidden_of(features_of(standardised(speech, 1e-7), s, prefix), s, prefix)
+    letters = linear(hidden, s, "text_encoder.lm_head").argmax(1).tolist()
+    kept = [letter for i, letter in enumerate(letters) if i == 0 or letter != letters[i - 1]]
+    return hidden, [letter for letter in kept if letter]
+
+
+def ctc_of(logits: np.ndarray, transcript: list[int]) -> float:
+    """−log p(transcript), the sum over all alignments by the forward recursion (Graves et al. 2006, section 4.1)."""
+    exponential = np.exp(logits - logits.max(1, keepdims=True))
+    p = exponential / exponential.sum(1, keepdims=True)
+    states = [0] + [part for letter in transcript for part in (letter, 0)]
+    alpha = np.zeros(len(states))
+    alpha[:2] = p[0, states[:2]]
+    for row in p[1:]:
+        before = alpha
+        alpha = before.copy()
+        alpha[1:] += before[:-1]
+        for i in range(2, len(states)):
+            if states[i] and states[i] != states[i - 2]:
+                alpha[i] += before[i - 2]
+        alpha *= row[states]
+    return -math.log(alpha[-2:].sum())
+
+
 def write_author_files(folder: Path, change: Callable[[State], object] = lambda state: None) -> Path:
     """A FaceFormer checkpoint as its authors write one, with neutral faces and the audio encoder's configuration."""
     state = faceformer_state("vocaset")

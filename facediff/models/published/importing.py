@@ -88,6 +88,7 @@ class Weights:
     Attributes:
         made: tensors by the names of facediff's model.
         ignored: why tensors are not needed, by the authors' names.
+        notes: what the user should know of them.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor], source: str) -> None:
@@ -95,6 +96,7 @@ class Weights:
         self.tensors = dict(tensors)
         self.made: dict[str, Tensor] = {}
         self.ignored: dict[str, str] = {}
+        self.notes: list[str] = []
         self._used: set[str] = set()
 
     def __contains__(self, name: str) -> bool:
@@ -398,7 +400,7 @@ def import_files(
     model = build(weights, method, found, with_options(method.method, made, request.options))
     model.adopt(assets)
     label(model, method, found.dataset)
-    return Imported(model.eval(), found.dataset, len(weights.made), weights.ignored, notes)
+    return Imported(model.eval(), found.dataset, len(weights.made), weights.ignored, [*weights.notes, *notes])
 
 
 def read_weights(files: Sequence[Path]) -> Weights:
@@ -518,14 +520,16 @@ def with_options(method: str, made: dict[str, Any], given: Mapping[str, Any]) ->
 
 
 def read_value(text: object) -> object:
-    """A value from the command line: a number, true, false, null, or the text itself."""
+    """A value from the command line: a number, true, false, null, a list of such, or the text itself."""
     if not isinstance(text, str):
         return text
     try:
         value: object = yaml.safe_load(text)
     except yaml.YAMLError:
         return text
-    return value if isinstance(value, int | float | bool | None) else text
+    plain = int | float | bool | None
+    listed = isinstance(value, list) and all(isinstance(item, plain) for item in value)
+    return value if listed or isinstance(value, plain) else text
 
 
 def read_assets(

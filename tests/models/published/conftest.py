@@ -16,9 +16,35 @@ from tests.fakes.tiny import RATE, SEEN, VERTICES
 MEL = partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0)
 SIZES = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": float(RATE)}
 
+TEXT: dict[str, Any] = {
+    "model_type": "wav2vec2",
+    "hidden_size": 8,
+    "num_hidden_layers": 1,
+    "num_attention_heads": 2,
+    "intermediate_size": 8,
+    "conv_dim": [4] * 7,
+    "num_conv_pos_embeddings": 4,
+    "num_conv_pos_embedding_groups": 2,
+    "vocab_size": 6,
+}
+"""A tiny speech recogniser of random weights."""
+
 METHODS: dict[str, dict[str, Any]] = {
     "FaceFormer": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16},
     "FaceDiffuser": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "diffusion_steps": 8},
+    "SelfTalk": {
+        "audio_encoder": MEL,
+        "audio_dim": 16,
+        "dim": 16,
+        "text_config": TEXT,
+        "lip_layers": 1,
+        "lip_heads": 2,
+        "lip_feed_forward_dim": 16,
+        # So that the lip reader's terms count in whatever is tested.
+        "consistency_weight": 1.0,
+        "ctc_weight": 1.0,
+    },
+    "TalkingStyle": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 2},
 }
 """Options by which each published method is small."""
 

@@ -1,0 +1,485 @@
+"""SelfTalk (Peng et al.: "A Self-Supervised Commutative Training Diagram to Comprehend 3D Talking Faces", 2023).
+
+A Transformer decoder that makes all frames in one pass, and in training a lip reader, which reads the generated lips
+and must find what a frozen speech recogniser finds in the speech. From top to bottom: the model, its network, the lip
+reader, the authors' checkpoints. docs/methods/selftalk.md says what of the published code is an option here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Assets, Batch
+from facediff.errors import ArgumentError, FaceDiffError
+from facediff.models.audio_encoders import (
+    AudioEncoderFactory,
+    Lengths,
+    StepRule,
+    Waves,
+    by_length,
+    load_recogniser,
+    standardise,
+)
+from facediff.models.evaluation import IdentityPolicy
+from facediff.models.inference import BatchMotion, Progress
+from facediff.models.layers import Heads, Layers, Share, Weight, Width, frame_mask, interpolate_ends, needed_mask
+from facediff.models.published.base import PublishedModel, masked_mean
+from facediff.models.published.importing import Found, Recogniser, Request, Weights, backbone_config, recogniser
+from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.utils.ranges import Range
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel
+
+LipReading = Literal["text", "none"]
+"""What a lip reader learns from in training: a frozen recogniser's ``text``; with ``none`` there is no lip reader."""
+
+
+@registry.model.register("SelfTalk")
+class SelfTalk(PublishedModel):
+    """SelfTalk: all frames in one pass, trained with a lip reader.
+
+    Args:
+        dim: channels of the decoder; 1024 at 25 frames a second (BIWI) and 512 otherwise if None.
+        num_layers: its layers.
+        num_heads: its attention heads.
+        feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
+        dropout: in the decoder and the lip reader.
+        lip_reader: what reads the generated lips in training: as published, a Transformer that learns from the ``text``
+            that a frozen recogniser hears; or ``none``, which needs no recogniser and leaves its two losses out.
+            Inference needs neither.
+        lip_vertices: vertices that the lip reader sees, in its map's order, repeats kept; the corpus's lips if None.
+        lip_layers: encoder layers of the lip reader, and as many decoder layers.
+        lip_heads: its attention heads.
+        lip_feed_forward_dim: channels between the two maps of its feed-forward layers.
+        text_source: the recogniser, a wav2vec 2.0 with a CTC head: a name on the Hugging Face hub or a directory. The
+            lip reader has its width and its letters.
+        text_config: the recogniser's configuration as plain data; if given, its weights are not read from
+            ``text_source`` but left for a checkpoint to fill in. Checkpoints use it.
+        vertex_weight: factor of the squared error of positions.
+        velocity_weight: factor of the squared error of what changes from frame to frame.
+        consistency_weight: factor of the squared distance of the lip reader's features from the recogniser's.
+        ctc_weight: factor of the CTC loss of the lip reader's letters and the recogniser's transcript.
+        unseen_identity: as for every model; the method knows no identities, so it is tested once.
+        options: those of :class:`PublishedModel`, and of every model.
+    """
+
+    checkpoint_options = ("text_config",)  # without it, a file could have weights fetched from anywhere
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder,
+        source="jonatasgrosman/wav2vec2-large-xlsr-53-english",
+        spec_augment=True,
+        layer_drop=0.1,
+        epsilon=1e-7,
+        edges=False,
+    )
+
+    def __init__(
+        self,
+        *,
+        dim: Width | None = None,
+        num_layers: Layers = 1,
+        num_heads: Heads = 4,
+        feed_forward_dim: Width | None = None,
+        dropout: Share = 0.1,
+        lip_reader: LipReading = "text",
+        lip_vertices: Annotated[list[int], Range(0, 2_000_000, items=(1, 1_000_000))] | None = None,
+        lip_layers: Layers = 6,
+        lip_heads: Heads = 8,
+        lip_feed_forward_dim: Width = 2048,
+        text_source: str = "jonatasgrosman/wav2vec2-large-xlsr-53-english",
+        text_config: dict[str, Any] | None = None,
+        vertex_weight: Weight = 1000.0,
+        velocity_weight: Weight = 1000.0,
+        consistency_weight: Weight = 1e-3,
+        ctc_weight: Weight = 1e-4,
+        unseen_identity: IdentityPolicy = "style_only",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(unseen_identity=unseen_identity, **options)
+        self.windows = type(self.windows)(above=math.inf)  # the decoder has no table of positions
+        dim = dim or (1024 if self.pairs else 512)
+        if dim % num_heads:
+            raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be a multiple of heads")
+        self.vertex_weight, self.velocity_weight = vertex_weight, velocity_weight
+        self.consistency_weight, self.ctc_weight = consistency_weight, ctc_weight
+        self.network = SelfTalkNetwork(
+            audio_width=self.audio_width * (2 if self.pairs else 1),
+            n_vertices=self.n_vertices,
+            dim=dim,
+            num_layers=num_layers,
+            num_heads=num_heads,
+            hidden_dim=feed_forward_dim or 2 * dim,
+            dropout=dropout,
+        )
+        self.text: TextNetwork | None = None
+        self.reader: LipReader | None = None
+        self._reader_options: dict[str, Any] = {
+            "num_layers": lip_layers,
+            "num_heads": lip_heads,
+            "hidden_dim": lip_feed_forward_dim,
+            "dropout": dropout,
+        }
+        if lip_reader == "text":
+            self.text = TextNetwork(text_source, text_config)
+            if self.text.width % lip_heads:
+                raise ArgumentError(
+                    {"lip_heads": lip_heads}, f"the recogniser's {self.text.width} channels must be a multiple of them"
+                )
+            if lip_vertices is not None:
+                self.reader = self._make_reader(self.text, lip_vertices)
+
+    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
+        """Save the arguments as every model does, with the recogniser's configuration in place of its source."""
+        config = {} if self.text is None else self.text.network.config.to_dict()
+        super().keep_hyperparameters({**given, "text_config": config})
+
+    def make_parts(self, assets: Assets) -> None:
+        """Make the lip reader for the corpus's lips, if it was given no vertices of its own."""
+        if self.text is not None and self.reader is None:
+            lips: list[int] = assets.regions["lips"].tolist()
+            self.reader = self._make_reader(self.text, lips).to(self.device)
+            # So that whoever rebuilds the model from its options, as loading and adaptation do, makes the same reader.
+            self.hparams["lip_vertices"] = lips
+
+    def _make_reader(self, text: TextNetwork, vertices: Sequence[int]) -> LipReader:
+        """A lip reader of these vertices, with the recogniser's width and letters."""
+        if max(vertices) >= self.n_vertices:
+            raise ArgumentError({"lip_vertices": max(vertices)}, f"the faces have {self.n_vertices} vertices")
+        return LipReader(vertices, dim=text.width, letters=text.letters, **self._reader_options)
+
+    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+        """Speech features of each frame; where speech comes in pairs, two hidden states side by side."""
+        rule: StepRule = "hidden_cut" if self.pairs else "features"
+        steps = 2 * frames if self.pairs else frames
+        cached = batch.cached_features or ()
+        hidden = self.audio_encoder.at_steps(batch.audio, batch.audio_lengths, steps, rule, *cached)
+        return hidden.reshape(len(hidden), int(frames.max()), -1)
+
+    # Training.
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Squared errors of positions and velocities, and what the lip reader makes of the generated lips."""
+        frames = self.trained_frames(batch)
+        longest = int(frames.max())
+        truth = (batch.motion * self.scale).flatten(2)[:, :longest]
+        made = self.network(self.hear(batch, frames), frames)
+        error = made - truth
+        found = {
+            "reconstruction": masked_mean(error.square(), frames),
+            "velocity": masked_mean(error.diff(dim=1).square(), (frames - 1).clamp_min(0)),
+        }
+        loss = self.vertex_weight * found["reconstruction"] + self.velocity_weight * found["velocity"]
+        if self.text is not None and self.reader is not None:
+            heard = self.text(batch.audio, batch.audio_lengths)
+            read = self.reader(made, frames, heard.steps)
+            found["consistency"] = masked_mean((read.features - heard.features).square(), heard.steps)
+            found["ctc"] = ctc(read.letters, heard.transcripts(), heard.steps, self.text.blank)
+            loss = loss + self.consistency_weight * found["consistency"] + self.ctc_weight * found["ctc"]
+        return {**found, "loss": loss}
+
+    # Inference.
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """All frames in one pass; nothing is random."""
+        made = self.network(self.hear(batch, frames), frames)
+        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+
+    def lip_steps_of(self, frames: int) -> int:
+        """Steps at 50 a second for which the lip reader reads so many frames."""
+        # In floating point as published: 69 frames at 30 a second are 114 steps, not 115.
+        return max(1, int(frames / self.frame_rate * 50))
+
+    @torch.no_grad()
+    def read_lips(
+        self, motion: BatchMotion, frames: Int[Tensor, " batch"] | None = None
+    ) -> Float[Tensor, "batch steps letters"]:
+        """What the lip reader reads: one number for each letter of its recogniser, at 50 steps a second.
+
+        Args:
+            motion: offsets from the template, in the corpus's unit.
+            frames: valid frames of each clip; all if None.
+
+        Raises:
+            FaceDiffError: if the model was made or imported without its lip reader.
+        """
+        if self.reader is None:
+            raise FaceDiffError(
+                "lip_reader: the model has none, since animation needs none; train it with lip_reader=text, or import "
+                "the checkpoint with --option lip_reader=text"
+            )
+        if frames is None:
+            frames = torch.full((len(motion),), motion.shape[1], device=motion.device)
+        steps = torch.tensor([self.lip_steps_of(count) for count in frames.tolist()], device=motion.device)
+        letters: Tensor = self.reader((motion * self.scale).flatten(2), frames, steps).letters
+        return letters
+
+
+class SelfTalkNetwork(nn.Module):
+    """Features of speech to offsets of the vertices, all frames in one pass.
+
+    Args:
+        audio_width: channels of a frame's speech.
+        n_vertices: vertices V.
+        dim: channels of the decoder.
+        num_layers: its layers.
+        num_heads: its attention heads.
+        hidden_dim: channels of its feed-forward layers.
+        dropout: everywhere.
+    """
+
+    def __init__(
+        self,
+        *,
+        audio_width: int,
+        n_vertices: int,
+        dim: int,
+        num_layers: int,
+        num_heads: int,
+        hidden_dim: int,
+        dropout: float,
+    ) -> None:
+        super().__init__()
+        self.audio_map = nn.Linear(audio_width, dim)
+        layer = nn.TransformerDecoderLayer(dim, num_heads, hidden_dim, dropout, batch_first=True)
+        self.decoder = nn.TransformerDecoder(layer, num_layers)
+        self.motion_out = nn.Linear(dim, 3 * n_vertices)
+        nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
+        nn.init.zeros_(self.motion_out.bias)
+
+    def forward(
+        self, speech: Float[Tensor, "batch frames width"], frames: Int[Tensor, " batch"]
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Speech is what is decoded, and what is attended to; every frame sees all of it, and no frame its number."""
+        tokens = self.audio_map(speech)
+        padding = padding_of(frames, tokens.shape[1])
+        made = self.decoder(tokens, tokens, tgt_key_padding_mask=padding, memory_key_padding_mask=padding)
+        moved: Tensor = self.motion_out(made)
+        return moved
+
+
+def padding_of(lengths: Int[Tensor, " batch"], longest: int) -> Tensor | None:
+    """True on padding, as PyTorch's Transformers take it; None where nothing is padded."""
+    valid = needed_mask(frame_mask(lengths, longest))
+    return None if valid is None else ~valid
+
+
+# The lip reader.
+
+
+class Read(NamedTuple):
+    """What the lip reader makes of lips: its features, and a number for each letter, both (batch, steps, …)."""
+
+    features: Tensor
+    letters: Tensor
+
+
+class LipReader(nn.Module):
+    """A Transformer that reads lips: from offsets of their vertices to letters, 50 times a second.
+
+    Args:
+        vertices: which vertices it sees, in this order; repeats count.
+        dim: channels, those of the recogniser that it learns from.
+        letters: how many there are.
+        num_layers: encoder layers, and as many decoder layers.
+        num_heads: attention heads.
+        hidden_dim: channels of the feed-forward layers.
+        dropout: everywhere.
+    """
+
+    columns: Tensor
+
+    def __init__(
+        self,
+        vertices: Sequence[int],
+        *,
+        dim: int,
+        letters: int,
+        num_layers: int,
+        num_heads: int,
+        hidden_dim: int,
+        dropout: float,
+    ) -> None:
+        super().__init__()
+        places = 3 * torch.tensor(list(vertices))[:, None] + torch.arange(3)
+        self.register_buffer("columns", places.flatten(), persistent=False)
+        self.lip_map = nn.Linear(3 * len(vertices), dim)
+        layer = nn.TransformerEncoderLayer(dim, num_heads, hidden_dim, dropout, batch_first=True)
+        # Nested tensors, PyTorch's default here, warn that they are a prototype.
+        encoder = nn.TransformerEncoder(layer, num_layers, nn.LayerNorm(dim), enable_nested_tensor=False)
+        self.transformer = nn.Transformer(
+            dim, num_heads, num_layers, num_layers, hidden_dim, dropout, custom_encoder=encoder, batch_first=True
+        )
+        self.lm_head = nn.Linear(dim, letters)
+
+    def forward(
+        self,
+        motion: Float[Tensor, "batch frames coordinates"],
+        frames: Int[Tensor, " batch"],
+        steps: Int[Tensor, " batch"],
+    ) -> Read:
+        """Read offsets of all vertices, each clip in so many steps."""
+        mapped = self.lip_map(motion[..., self.columns])
+        counts = zip(mapped, frames.tolist(), steps.tolist(), strict=True)
+        parts = [interpolate_ends(clip[None, :count], wanted)[0] for clip, count, wanted in counts]
+        x = nn.utils.rnn.pad_sequence(parts, batch_first=True)
+        padding = padding_of(steps, x.shape[1])
+        features = self.transformer(
+            x, x, src_key_padding_mask=padding, tgt_key_padding_mask=padding, memory_key_padding_mask=padding
+        )
+        return Read(features, self.lm_head(features))
+
+
+class Heard(NamedTuple):
+    """What a recogniser hears: hidden states (batch, steps, dim), likeliest letters (batch, steps), valid steps."""
+
+    features: Tensor
+    letters: Tensor
+    steps: Lengths
+    blank: int
+
+    def transcripts(self) -> list[Tensor]:
+        """Each clip's letters without repeats and then without blanks, as CTC reads them."""
+        found = (row[:count].unique_consecutive() for row, count in zip(self.letters, self.steps.tolist(), strict=True))
+        return [letters[letters != self.blank] for letters in found]
+
+
+class TextNetwork(nn.Module):
+    """A frozen speech recogniser with a CTC head, without dropout also in training.
+
+    Args:
+        source: a name on the Hugging Face hub or a directory.
+        config: its configuration; if given, the weights are left for a checkpoint to fill in.
+    """
+
+    def __init__(self, source: str, config: dict[str, Any] | None) -> None:
+        super().__init__()
+        self.network: PreTrainedModel = load_recogniser(source, config)
+        self.network.requires_grad_(False)
+        self.network.eval()
+        settings = self.network.config
+        self.width, self.letters, self.blank = settings.hidden_size, settings.vocab_size, settings.pad_token_id or 0
+
+    def train(self, mode: bool = True) -> TextNetwork:
+        """Nothing of it is trained."""
+        super().train(mode)
+        self.network.eval()
+        return self
+
+    @torch.no_grad()
+    def forward(self, audio: Waves, audio_lengths: Lengths) -> Heard:
+        """Hear speech, each clip by itself."""
+        features, steps = by_length(standardise(audio, audio_lengths), audio_lengths, self._hidden)
+        letters: Tensor = self.network.lm_head(features).argmax(-1)
+        return Heard(features, letters, steps, self.blank)
+
+    def _hidden(self, wave: Tensor) -> Tensor:
+        # At least one step, however short the speech is.
+        wave = F.pad(wave, (0, max(0, 400 - wave.shape[1])))
+        hidden: Tensor = self.network.base_model(wave).last_hidden_state
+        return hidden
+
+
+def ctc(
+    letters: Float[Tensor, "batch steps letters"], transcripts: list[Tensor], steps: Lengths, blank: int
+) -> Float[Tensor, ""]:
+    """The CTC loss, divided by each transcript's letters; the mean over clips."""
+    lengths = torch.tensor([len(row) for row in transcripts], device=steps.device)
+    targets = nn.utils.rnn.pad_sequence(transcripts, batch_first=True)
+    logits = letters.float().log_softmax(-1).transpose(0, 1)
+    return F.ctc_loss(logits, targets, steps, lengths, blank)
+
+
+# The authors' checkpoints.
+
+LIP_PARTS = ("text_encoder.", "lip_map.", "transformer.", "lm_head.")
+"""How the names of the lip reader's tensors begin, and of those of the recogniser that it learns from."""
+
+
+def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+    """SelfTalk's tensors under the names of this file, and its options."""
+    settings = {
+        name: value
+        for name, value in SelfTalk.published_encoder.keywords.items()  # type: ignore[attr-defined]
+        if name != "source"
+    }
+    encoder = weights.backbone("audio_encoder.", kind="wav2vec2", request=request, **settings)
+    dim, _ = weights.shape("audio_feature_map.weight")
+    hidden, _ = weights.shape("transformer_decoder.layers.0.linear1.weight")
+    weights.move_all("audio_feature_map.", "network.audio_map.")
+    weights.move_all("transformer_decoder.", "network.decoder.")
+    weights.move_all("vertice_map_r.", "network.motion_out.")
+    made: dict[str, Any] = {
+        "audio_encoder": encoder,
+        "dim": dim,
+        "num_layers": count_layers(weights, "transformer_decoder.layers."),
+        "feed_forward_dim": hidden,
+        "lip_reader": "none",
+    }
+    if request.options.get("lip_reader") != "text":
+        for prefix in LIP_PARTS:
+            weights.ignore(prefix, "only training needs the lip reader (--option lip_reader=text keeps it)")
+        return made
+    return {**made, **convert_reader(weights, request, found)}
+
+
+def convert_reader(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+    """The lip reader's tensors and the recogniser's, and their options.
+
+    Raises:
+        FaceDiffError: if the vertices that the lip reader sees are not given; no file holds them.
+    """
+    _, columns = weights.shape("lip_map.weight")
+    given = request.options.get("lip_vertices")
+    if given is None and columns != 3 * found.n_vertices:
+        raise FaceDiffError(
+            f"--option lip_reader=text: no file holds the {columns // 3} vertices that the lip reader sees; give them "
+            f"in the authors' order as --option lip_vertices=[0,1,...], or omit the option, since animation needs none"
+        )
+    prefix = "text_encoder.wav2vec2."
+    config = backbone_config(weights, prefix, "wav2vec2", request.audio_config)
+    if f"{prefix}masked_spec_embed" not in weights:
+        config.update(mask_time_prob=0.0, mask_feature_prob=0.0)
+    old = ("weight_g", "parametrizations.weight.original0"), ("weight_v", "parametrizations.weight.original1")
+    weights.move_all("text_encoder.", "text.network.", old)
+    config["vocab_size"], _ = weights.shape("text_encoder.lm_head.weight")
+    hidden, _ = weights.shape("transformer.encoder.layers.0.linear1.weight")
+    for part in LIP_PARTS[1:]:
+        weights.move_all(part, f"reader.{part}")
+    return {
+        "lip_vertices": list(range(found.n_vertices)) if given is None else given,
+        "lip_layers": count_layers(weights, "transformer.encoder.layers."),
+        "lip_feed_forward_dim": hidden,
+        "text_config": config,
+    }
+
+
+def count_layers(weights: Weights, prefix: str) -> int:
+    """How many layers there are below such names."""
+    return len({name.removeprefix(prefix).split(".")[0] for name in weights.names(prefix)})
+
+
+recogniser(
+    Recogniser(
+        method="SelfTalk",
+        marks=("lip_map.weight", "vertice_map_r.weight", "audio_feature_map.weight"),
+        unless=("PPE.", "obj_vector.", "style_encoder.", "gru."),
+        convert=convert,
+        vertices=lambda weights: weights.shape("vertice_map_r.weight")[0] // 3,
+        count=lambda weights: 0,
+        licence="CC-BY-NC-4.0",
+        commercial="forbidden",
+        licence_source="github.com/psyai-net/SelfTalk_release",
+    )
+)

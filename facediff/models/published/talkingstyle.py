@@ -1,0 +1,220 @@
+"""TalkingStyle (Song et al.: "Personalized Speech-Driven 3D Facial Animation with Style Preservation", 2024).
+
+FaceFormer's autoregressive decoder with six layers over HuBERT large, and a style of two tables of speakers. From top
+to bottom: the model, the style, the authors' checkpoints. docs/methods/talkingstyle.md says what of the published code
+is an option here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch
+from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.inference import BatchMotion, Progress
+from facediff.models.layers import Layers, Share
+from facediff.models.published.autoregressive import (
+    AutoregressiveModel,
+    AutoregressiveNetwork,
+    decoder_sizes,
+    read_period,
+)
+from facediff.models.published.base import SpeakerTable, masked_mean
+from facediff.models.published.faceformer import LAYER_NAMES
+from facediff.models.published.importing import Found, Recogniser, Request, Weights, dataset_facts, recogniser
+from facediff.models.speech_networks import Wav2Vec2Encoder
+
+StyleAttention = Literal["one_key", "components"]
+"""What an attention over a speaker's row attends to: each component to itself alone, or to all of them."""
+
+MouthLoss = Literal["flattened", "vertices"]
+"""What the numbers of the lips' vertices count: the flattened coordinates, or vertices."""
+
+
+@registry.model.register("TalkingStyle")
+class TalkingStyle(AutoregressiveModel):
+    """TalkingStyle: FaceFormer's decoder, deeper, with HuBERT large and a style of its own.
+
+    Args:
+        num_layers: layers of the decoder.
+        teacher_forcing: train on the true motion of the frame before, in one pass, and not on the generated one; the
+            published training generates.
+        mouth_weight: share of the mouth in the loss; the rest is that of all coordinates.
+        mouth_loss: what the mouth is there: as published, the numbers of the lips' vertices count the ``flattened``
+            coordinates, x, y and z of vertex 0 first, so that other places than the mouth get the weight; or the
+            ``vertices`` that are meant.
+        style_attention: as published, the attention over the components of a speaker's row sees them as items of a
+            batch, each with itself as the only key (``one_key``), so that its weights are 1 whatever it learns; over
+            all ``components``, as is meant, it has something to weigh.
+        options: those of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
+    """
+
+    # HuBERT large; all but the convolutions is trained, with masks and layer drop.
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder,
+        source="facebook/hubert-large-ls960-ft",
+        spec_augment=True,
+        layer_drop=0.1,
+        epsilon=1e-7,
+        edges=False,
+    )
+
+    def __init__(
+        self,
+        *,
+        num_layers: Layers = 6,
+        teacher_forcing: bool = False,
+        mouth_weight: Share = 0.6,
+        mouth_loss: MouthLoss = "flattened",
+        style_attention: StyleAttention = "one_key",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(num_layers=num_layers, **options)
+        self.teacher_forcing = teacher_forcing
+        self.mouth_weight, self.mouth_loss = mouth_weight, mouth_loss
+        self.network = AutoregressiveNetwork(
+            audio_width=self.audio_width,
+            n_vertices=self.n_vertices,
+            style=SpeakerStyle(len(self.identities), self.dim, style_attention),
+            decoder=self.decoder_options,
+        )
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The two tables of speakers."""
+        style: SpeakerStyle = self.network.style  # type: ignore[assignment]
+        return [style.first, style.second]
+
+    def conditions(
+        self, batch: Batch, frames: Int[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, "batch dim"], Float[Tensor, "batch steps dim"]]:
+        """The speaker's style and the speech of so many frames."""
+        memory = self.network.audio_map(self.hear(batch, frames))
+        return self.network.style(self.identity_weights(batch)), memory
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """The mean squared error of all coordinates and that of the mouth."""
+        frames = self.trained_frames(batch)
+        self.check_length(frames, batch.names[0])
+        style, memory = self.conditions(batch, frames)
+        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
+        if self.teacher_forcing:
+            made = self.network.teacher_forced(style, memory, truth)
+        else:
+            made = self.network.generate(style, memory, self.loop)
+        error = (made - truth).square()
+        whole, mouth = masked_mean(error, frames), masked_mean(error[..., self.mouth_columns()], frames)
+        loss = (1.0 - self.mouth_weight) * whole + self.mouth_weight * mouth
+        return {"reconstruction": whole, "mouth": mouth, "loss": loss}
+
+    def mouth_columns(self) -> Int[Tensor, " columns"]:
+        """The coordinates that the loss takes for the mouth's."""
+        lips = self.assets.regions["lips"].to(self.device)
+        if self.mouth_loss == "flattened":
+            return lips
+        return (3 * lips[:, None] + torch.arange(3, device=self.device)).flatten()
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """Frame by frame; nothing is random."""
+        self.check_length(frames, batch.names[0])
+        style, memory = self.conditions(batch, frames)
+        made = self.network.generate(style, memory, self.loop)
+        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+
+
+class SpeakerStyle(nn.Module):
+    """ReLU(a + head(norm(attention(e)))) of two rows a and e for each speaker, component by component.
+
+    Each of the numbers of e becomes three vectors of four numbers, by which the attention has its query, key and value.
+
+    Args:
+        count: speakers.
+        dim: channels of a style.
+        over: what the attention attends to.
+    """
+
+    LIFTED = 4
+
+    def __init__(self, count: int, dim: int, over: StyleAttention) -> None:
+        super().__init__()
+        self.over = over
+        self.first, self.second = SpeakerTable(count, dim), SpeakerTable(count, dim, "embedding")
+        self.query, self.key, self.value = (nn.Linear(1, self.LIFTED) for _ in range(3))
+        self.attention = nn.MultiheadAttention(self.LIFTED, 1, batch_first=True)
+        self.norm, self.head = nn.LayerNorm(self.LIFTED), nn.Linear(self.LIFTED, 1)
+        if over == "one_key":  # no gradient would reach them
+            self.query.requires_grad_(False)
+            self.key.requires_grad_(False)
+
+    def forward(self, weights: Float[Tensor, "batch identities"]) -> Float[Tensor, "batch dim"]:
+        """Styles of speakers, or of mixtures of them."""
+        each = self.second(weights)[..., None]
+        if self.over == "one_key":
+            # The softmax over one key is 1: what is left of the attention are the maps of its values.
+            width = self.LIFTED
+            into, shift = self.attention.in_proj_weight[2 * width :], self.attention.in_proj_bias[2 * width :]
+            mixed = self.attention.out_proj(F.linear(self.value(each), into, shift))
+        else:
+            mixed, _ = self.attention(self.query(each), self.key(each), self.value(each), need_weights=False)
+        return torch.relu(self.first(weights) + self.head(self.norm(mixed))[..., 0])
+
+
+# The authors' checkpoints.
+
+
+def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+    """TalkingStyle's tensors under the names of this file, and its options."""
+    dim, _ = weights.shape("audio_feature_map.weight")
+    usual = len(dataset_facts()[found.dataset].identities)
+    if len(found.identities) != usual:
+        weights.notes.append(
+            f"its table has {len(found.identities)} speakers, and {found.dataset} {usual}: it is run as one of "
+            f"{found.dataset}; if it is the authors' mead.pth, their code does not say how that is run, so nothing can "
+            f"be compared with it"
+        )
+    period = read_period(weights, "PPE.pe", found)
+    settings = {
+        name: value
+        for name, value in TalkingStyle.published_encoder.keywords.items()  # type: ignore[attr-defined]
+        if name != "source"
+    }
+    encoder = weights.backbone("audio_encoder.", kind="hubert", request=request, **settings)
+    for old, new in (
+        ("audio_feature_map.", "audio_map."),
+        ("vertice_encoder.", "motion_in."),
+        ("vertice_decoder.", "motion_out."),
+        ("style_encoder.attention.Wq.", "style.query."),
+        ("style_encoder.attention.Wk.", "style.key."),
+        ("style_encoder.attention.Wv.", "style.value."),
+        ("style_encoder.attention.attention.", "style.attention."),
+        ("style_encoder.attention.norm.", "style.norm."),
+        ("style_encoder.attention.head.", "style.head."),
+    ):
+        weights.move_all(old, f"network.{new}")
+    weights.made["network.style.first.weight"] = weights.get("style_encoder.obj_vector.weight").T.contiguous()
+    weights.move("style_encoder.my_obj_vector.weight", "network.style.second.weight")
+    weights.move_all("transformer_decoder.layers.", "network.decoder.layers.", LAYER_NAMES)
+    return {"audio_encoder": encoder, **decoder_sizes(weights, "transformer_decoder.", dim), "period": period}
+
+
+recogniser(
+    Recogniser(
+        method="TalkingStyle",
+        marks=("style_encoder.my_obj_vector.weight", "vertice_decoder.weight", "PPE.pe", "audio_feature_map.weight"),
+        unless=("lip_map.", "gru.", "feat_map."),
+        convert=convert,
+        vertices=lambda weights: weights.shape("vertice_decoder.weight")[0] // 3,
+        count=lambda weights: weights.shape("style_encoder.my_obj_vector.weight")[0],
+        licence="unknown: neither code nor weights state one, and the data is for research",
+        licence_source="github.com/wangxuanx/TalkingStyle",
+    )
+)
