@@ -16,23 +16,37 @@ from typing import Any
 import torch
 
 from facediff.data import Assets
-from facediff.models import AnimationModel, FaceDiffuser, FaceFormer
-from facediff.models.published.autoregressive import Loop
+from facediff.models import AnimationModel, FaceDiffuser, FaceFormer, SelfTalk, TalkingStyle
+from facediff.models.published.autoregressive import AutoregressiveModel, Loop
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.tables import print_table
 
 SETS = {"VOCASET": (5023, 30.0, 8), "BIWI": (23_370, 25.0, 6)}
 BASE = {"model_type": "wav2vec2", "hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12}
+LARGE = {
+    "model_type": "wav2vec2",
+    "hidden_size": 1024,
+    "num_hidden_layers": 24,
+    "num_attention_heads": 16,
+    "intermediate_size": 4096,
+    "conv_bias": True,
+    "feat_extract_norm": "layer",
+    "do_stable_layer_norm": True,
+}
 
 
-ENCODER = partial(Wav2Vec2Encoder, config=BASE, edges=False, epsilon=1e-5)
-"""A wav2vec 2.0 base of random weights."""
-
-
-def made(kind: type[AnimationModel], vertices: int, rate: float, count: int, **options: Any) -> AnimationModel:  # noqa: ANN401
+def made(
+    kind: type[AnimationModel],
+    vertices: int,
+    rate: float,
+    count: int,
+    network: dict[str, Any] = BASE,
+    **options: Any,  # noqa: ANN401
+) -> AnimationModel:
     """A model of random weights with a face."""
     names = [f"speaker{i}" for i in range(count)]
-    model = kind(n_vertices=vertices, identities=names, frame_rate=rate, audio_encoder=ENCODER, **options)
+    encoder = partial(Wav2Vec2Encoder, config=network, edges=False, epsilon=1e-5)
+    model = kind(n_vertices=vertices, identities=names, frame_rate=rate, audio_encoder=encoder, **options)
     everything = torch.arange(vertices)
     templates = {name: torch.randn(vertices, 3) for name in names}
     model.adopt(Assets("none", True, "m", rate, names, templates, None, {"lips": everything, "upper_face": everything}))
@@ -63,15 +77,22 @@ def main() -> None:
             rows.append((method, name, way, f"{parameters:.1f} M", f"{taken:.2f}", f"{taken / asked.seconds:.2f}"))
             print(*rows[-1], flush=True)
 
-        former = made(FaceFormer, vertices, rate, count)
-        assert isinstance(former, FaceFormer)
-        former.animate(speech[:16_000], identity="speaker0")  # the first call is slower
-        loops: tuple[Loop, Loop] = ("cached", "literal")
-        spent = []
-        for former.loop in loops:
-            spent.append(seconds_of(partial(former.animate, speech, identity="speaker0")))
-            note("FaceFormer", former.loop, former, spent[-1])
-        print(f"FaceFormer, {name}: cached is {spent[1] / spent[0]:.1f} times as fast as literal")
+        kinds: list[tuple[type[AutoregressiveModel], dict[str, Any]]] = [(FaceFormer, BASE), (TalkingStyle, LARGE)]
+        for kind, network in kinds:
+            former = made(kind, vertices, rate, count, network)
+            assert isinstance(former, AutoregressiveModel)
+            former.animate(speech[:16_000], identity="speaker0")  # the first call is slower
+            loops: tuple[Loop, Loop] = ("cached", "literal")
+            spent = []
+            for former.loop in loops:
+                spent.append(seconds_of(partial(former.animate, speech, identity="speaker0")))
+                note(kind.__name__, former.loop, former, spent[-1])
+            print(f"{kind.__name__}, {name}: cached is {spent[1] / spent[0]:.1f} times as fast as literal")
+            del former
+        talker = made(SelfTalk, vertices, rate, count, LARGE, lip_reader="none")
+        talker.animate(speech[:16_000], identity="speaker0")
+        note("SelfTalk", "one pass", talker, seconds_of(partial(talker.animate, speech, identity="speaker0")))
+        del talker
         diffuser = made(FaceDiffuser, vertices, rate, count)
         assert isinstance(diffuser, FaceDiffuser)
         # All steps cost the same, and so some of them are timed; the speech of one way is encoded once among them.
