@@ -198,7 +198,8 @@ sampler = Kind("sampler", "facediff.models.samplers", "runs the reverse diffusio
 model = Kind(
     "model",
     "facediff.models.dual_path facediff.models.style_content facediff.models.published.faceformer "
-    "facediff.models.published.facediffuser facediff.models.published.selftalk facediff.models.published.talkingstyle",
+    "facediff.models.published.facediffuser facediff.models.published.selftalk facediff.models.published.talkingstyle "
+    "facediff.models.published.codetalker",
     "a method, as a LightningModule",
     aliases=False,  # Lightning refuses to reload a module that is named by a nested alias
 )

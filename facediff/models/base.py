@@ -35,7 +35,7 @@ from facediff.utils.limits import LIMITS, quoted
 from facediff.utils.plain_options import is_name, is_plain_text
 from facediff.utils.ranges import Range, Vertices
 
-Schedule = Literal["constant", "cosine", "exponential"]
+Schedule = Literal["constant", "cosine", "exponential", "step"]
 StyleSource = Literal["reference", "person"]
 MotionScale = Literal["unit", "none"]
 Decay = Annotated[float, Range(0, 1000)]
@@ -67,17 +67,20 @@ def lr_factor(
         step: the step, counted from 0.
         total: steps of the whole training.
         warmup_steps: steps over which the factor rises from zero.
-        schedule: constant; half a cosine down to zero at the end; or exponential, which multiplies by ``decay`` in
-            every epoch from ``decay_epoch`` on.
+        schedule: constant; half a cosine down to zero at the end; exponential, which multiplies by ``decay`` in
+            every epoch from ``decay_epoch`` on; or step, which does so once in every ``decay_epoch`` epochs.
         epoch_steps: steps of an epoch.
         decay: the factor of an epoch.
-        decay_epoch: the first epoch with the factor, counted from 0 as Lightning counts.
+        decay_epoch: the first epoch with the factor, counted from 0 as Lightning counts; of step, how many epochs lie
+            between two decays.
     """
     warm = min(1.0, (step + 1) / max(1, warmup_steps))
     if schedule == "constant":
         return warm
     if schedule == "exponential":
         return warm * decay ** max(0, step // max(1, epoch_steps) - decay_epoch + 1)
+    if schedule == "step":
+        return warm * decay ** (step // max(1, epoch_steps) // max(1, decay_epoch))
     return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / max(1, total))))
 
 
@@ -101,9 +104,10 @@ class AnimationModel(LightningModule, Inference, ABC):
             leaves it as it is.
         learning_rate: AdamW's learning rate.
         weight_decay: AdamW's weight decay.
-        lr_schedule: constant, a cosine down to zero at the end of training, or ``exponential``.
-        lr_decay: what ``exponential`` multiplies the learning rate by in every epoch from ``lr_decay_epoch`` on.
-        lr_decay_epoch: the first epoch that it does so, counted from 0.
+        lr_schedule: constant, a cosine down to zero at the end of training, ``exponential``, or ``step``.
+        lr_decay: what ``exponential`` multiplies the learning rate by in every epoch from ``lr_decay_epoch`` on, and
+            ``step`` once in every ``lr_decay_epoch`` epochs.
+        lr_decay_epoch: the first epoch that ``exponential`` does so, counted from 0; see ``lr_decay`` for ``step``.
         warmup_steps: optimiser steps over which the learning rate rises from zero.
         protocol: the metrics' protocol for validation and test.
         metrics: further metrics for validation and test, by name with their options, such as
@@ -278,7 +282,7 @@ class AnimationModel(LightningModule, Inference, ABC):
             total=total,
             warmup_steps=self.warmup_steps,
             schedule=self.lr_schedule,
-            epoch_steps=self._steps_an_epoch() if self.lr_schedule == "exponential" else 1,
+            epoch_steps=self._steps_an_epoch() if self.lr_schedule in ("exponential", "step") else 1,
             decay=self.lr_decay,
             decay_epoch=self.lr_decay_epoch,
         )

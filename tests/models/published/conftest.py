@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 
 from facediff import registry
 from facediff.models import AnimationModel
+from facediff.models.published.importing import save_model
 from tests.fakes.tiny import RATE, SEEN, VERTICES
 
 MEL = partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0)
@@ -31,6 +33,10 @@ TEXT: dict[str, Any] = {
 
 METHODS: dict[str, dict[str, Any]] = {
     "FaceFormer": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16},
+    "CodeTalker": {
+        **{"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 1, "prior_dim": 16, "prior_layers": 1},
+        **{"prior_heads": 2, "prior_feed_forward_dim": 24, "tokens": 2, "codes": 8},
+    },
     "FaceDiffuser": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "diffusion_steps": 8},
     "SelfTalk": {
         "audio_encoder": MEL,
@@ -57,12 +63,26 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("method", METHODS)
 
 
+@pytest.fixture(scope="session")
+def prior_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint of CodeTalker's prior, on which its predictor is trained."""
+    from tests.models.published.test_laws import with_assets
+
+    torch.manual_seed(7)
+    options = {**SIZES, **METHODS["CodeTalker"], "stage": "prior"}
+    path = tmp_path_factory.mktemp("prior") / "prior.ckpt"
+    save_model(with_assets(registry.model.get("CodeTalker")(**options)), path)
+    return path
+
+
 @pytest.fixture
-def make_method() -> MakeMethod:
+def make_method(prior_file: Path) -> MakeMethod:
     """A small model by name, with reproducible weights; what starts at zero is random too."""
 
     def make(name: str, seed: int = 0, **options: Any) -> AnimationModel:  # noqa: ANN401
         torch.manual_seed(seed)
+        if name == "CodeTalker" and options.get("stage") != "prior":
+            options = {"prior": str(prior_file), **options}
         model: AnimationModel = registry.model.get(name)(**{**SIZES, **METHODS[name], **options})
         for parameter in model.parameters():
             if parameter.requires_grad and not parameter.any():

@@ -1,0 +1,597 @@
+"""CodeTalker, after the paper of that name (2023).
+
+Xing, Xia, Zhang, Cun, Wang, Wong: "CodeTalker: Speech-Driven 3D Facial Animation with Discrete Motion Prior". Two
+stages of one model: a prior, which learns to write motion in a table of codes (``motion_prior.py``), and a predictor,
+FaceFormer's decoder, which finds the codes that speech asks for. From top to bottom: the model, the predictor, the
+authors' checkpoints. docs/methods/codetalker.md says what of the published code is an option here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch, Reference
+from facediff.errors import ArgumentError, FaceDiffError
+from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, Lengths, Waves
+from facediff.models.base import AnimationModel
+from facediff.models.inference import BatchMotion, Motion, Progress, Style
+from facediff.models.layers import Frames, Heads, Layers, Weight, Width, frame_mask
+from facediff.models.published.autoregressive import AutoregressiveModel, MotionDecoder, decoder_sizes, read_period
+from facediff.models.published.base import SpeakerTable, masked_mean
+from facediff.models.published.faceformer import LAYER_NAMES
+from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
+from facediff.models.published.motion_prior import MotionPrior, PriorPositions, PriorScale, perplexity
+from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.utils.ranges import Range
+
+Stage = Literal["prior", "predictor"]
+"""What is trained: the autoencoder of motion, or what finds its codes by the speech."""
+
+FirstFrame = Literal["duplicated", "still"]
+"""What the second frame follows: a decoding of the first frame alone, or a face that does not move."""
+
+Output = Literal["together", "fed_back"]
+"""Which motion is given: all codes decoded together at the end, or the frames that were fed back."""
+
+RECIPE = "configs/experiment/puppet_codetalker_prior.yaml"
+
+
+@registry.model.register("CodeTalker")
+class CodeTalker(AutoregressiveModel):
+    """CodeTalker: an autoregressive Transformer over the codes of a discrete prior of motion.
+
+    Train it twice: with ``stage=prior``, then with ``stage=predictor`` and ``prior`` the first run's checkpoint; the
+    second run's holds both. A prior alone hears nothing: a test of it scores how well it reconstructs motion.
+
+    Args:
+        stage: ``prior`` is the autoencoder alone; ``predictor`` trains what finds its codes, and leaves it as it is.
+        prior: checkpoint whose prior a new predictor is trained with; its sizes must be this model's.
+        dim: channels of the predictor; 1024 if None.
+        num_layers: its layers; 12 at 25 frames a second (BIWI) and 6 otherwise if None.
+        prior_dim: channels of the prior's two halves.
+        prior_layers: Transformer layers of each half.
+        prior_heads: their attention heads.
+        prior_feed_forward_dim: channels of their feed-forward layers.
+        kernel: frames that the convolution of each half sees; odd.
+        tokens: codes of a frame; 8 at 25 frames a second and 16 otherwise if None.
+        token_dim: channels of a code; an equal part of ``prior_dim`` if None.
+        codes: rows of the table of codes.
+        token_maps: a linear map between the halves and the tokens; at 25 frames a second alone if None.
+        out_bias: a bias of the prior's map to vertices; not at 25 frames a second if None.
+        leak: slope of the prior's activation below zero.
+        positions: what the prior adds to frames: the ``constant`` vector of position 0 to each, as the published code
+            does since it counts clips in place of frames; or each of ``frames`` its own.
+        attention_scale: the root of the ``width`` of the whole layer by which the prior divides scores, as published,
+            which flattens its attention; or, as is usual, that of its ``heads``.
+        first_frame: what the second frame follows: the first frame's codes ``duplicated`` and decoded as published,
+            which gives one constant face whatever the speech is, since normalisation over equal frames leaves nothing
+            of them; or a ``still`` face.
+        output: which motion is given: all codes decoded ``together`` as published, or the frames that were ``fed_back``
+            while it was generated, each decoded with those before it only.
+        commitment: weight with which tokens are drawn to their codes.
+        quantisation_weight: of both terms that bring tokens and codes together, in training the prior.
+        feature_weight: of the distance from the codes of true motion, in training the predictor.
+        options: those of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
+    """
+
+    # wav2vec 2.0 base as transformers had it in 2021; all but the convolutions is trained, with masks and layer drop.
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder,
+        source="facebook/wav2vec2-base-960h",
+        spec_augment=True,
+        layer_drop=0.1,
+        epsilon=1e-5,
+        edges=False,
+    )
+
+    def __init__(
+        self,
+        *,
+        stage: Stage = "predictor",
+        prior: str | None = None,
+        dim: Width | None = None,
+        num_layers: Layers | None = None,
+        prior_dim: Width = 1024,
+        prior_layers: Layers = 6,
+        prior_heads: Heads = 8,
+        prior_feed_forward_dim: Width = 1536,
+        kernel: Annotated[int, Range(1, 255)] = 5,
+        tokens: Annotated[int, Range(1, 4096)] | None = None,
+        token_dim: Width | None = None,
+        codes: Annotated[int, Range(1, 1_000_000)] = 256,
+        token_maps: bool | None = None,
+        out_bias: bool | None = None,
+        leak: Annotated[float, Range(0, 1)] = 0.2,
+        positions: PriorPositions = "constant",
+        attention_scale: PriorScale = "width",
+        first_frame: FirstFrame = "duplicated",
+        output: Output = "together",
+        commitment: Weight = 0.25,
+        quantisation_weight: Weight = 1.0,
+        feature_weight: Weight = 1.0,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        if stage == "prior":
+            options.update(audio_encoder=NoSpeech, audio_dim=1)
+        super().__init__(dim=dim or 1024, **options)
+        self.stage: Stage = stage
+        self.prior_file = prior
+        self.first_frame: FirstFrame = first_frame
+        self.output: Output = output
+        self.commitment, self.quantisation_weight = commitment, quantisation_weight
+        self.feature_weight = feature_weight
+        # The project's two data sets differ in these.
+        self.decoder_options["num_layers"] = num_layers or (12 if self.pairs else 6)
+        tokens = tokens or (8 if self.pairs else 16)
+        token_maps = self.pairs if token_maps is None else token_maps
+        check_sizes(prior_dim, prior_heads, kernel, tokens, token_dim, token_maps)
+        self.prior_options: dict[str, Any] = {
+            "dim": prior_dim,
+            "num_layers": prior_layers,
+            "num_heads": prior_heads,
+            "hidden_dim": prior_feed_forward_dim,
+            "kernel": kernel,
+            "tokens": tokens,
+            "token_dim": token_dim or prior_dim // tokens,
+            "codes": codes,
+            "token_maps": token_maps,
+            "out_bias": not self.pairs if out_bias is None else out_bias,
+            "leak": leak,
+            "scale": attention_scale,
+            "positions": positions,
+        }
+        self.prior = MotionPrior(n_vertices=self.n_vertices, **self.prior_options)
+        self._lacks_prior = False
+        if stage == "prior":
+            self.windows = type(self.windows)(above=math.inf)
+            self.unseen_identity = "style_only"  # whoever it is, the same motion is reconstructed
+            return
+        self.prior.requires_grad_(False)
+        self.network = Predictor(
+            audio_width=self.audio_width,
+            n_vertices=self.n_vertices,
+            width=self.prior.width,
+            n_identities=len(self.identities),
+            decoder=self.decoder_options,
+        )
+
+    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
+        """Save the arguments as every model does, without the prior's file: the checkpoint holds the prior itself."""
+        deaf = {"audio_encoder": NoSpeech, "audio_dim": 1} if self.stage == "prior" else {}
+        super().keep_hyperparameters({**given, **deaf, "prior": None})
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The predictor's table of speakers; a prior knows none."""
+        return [] if self.stage == "prior" else [self.network.style]
+
+    # The prior of a predictor.
+
+    def setup(self, stage: str) -> None:
+        """Take the prior's weights and its scale of motion, where a predictor is new."""
+        if stage == "fit" and self.stage == "predictor" and self._assets is None:
+            self._lacks_prior = self.prior_file is None
+            if self.prior_file is not None:
+                self.take_prior(self.prior_file)
+        super().setup(stage)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take the assets from the checkpoint; its weights hold the prior."""
+        super().on_load_checkpoint(checkpoint)
+        self._lacks_prior = False
+
+    def on_fit_start(self) -> None:
+        """Refuse to train a predictor on a prior that was never trained.
+
+        Raises:
+            FaceDiffError: with what to train first.
+        """
+        if self._lacks_prior:
+            raise FaceDiffError(
+                f"--model.prior: is missing, and CodeTalker's predictor learns to speak a trained prior's codes; train "
+                f"one with --model.stage=prior ({RECIPE}) and give its checkpoint"
+            )
+
+    def take_prior(self, path: str) -> None:
+        """Take the prior of another checkpoint of CodeTalker, with its scale of motion and its licences.
+
+        Args:
+            path: a checkpoint of either stage, a model folder, or a name of the Hugging Face hub.
+
+        Raises:
+            FaceDiffError: if it cannot be read, or its prior has other sizes or options.
+        """
+        from facediff.models.checkpoint import load_model
+        from facediff.utils.licences import merged
+
+        found = load_model(path)
+        if not isinstance(found, CodeTalker):
+            raise FaceDiffError(
+                f"--model.prior {path}: is a checkpoint of {type(found).__name__}; expected one of CodeTalker, trained "
+                f"with model.stage=prior"
+            )
+        mine, theirs = self.prior_facts(), found.prior_facts()
+        for name, value in theirs.items():
+            if mine[name] != value:
+                raise FaceDiffError(
+                    f"--model.prior {path}: its {name} is {value}, and this model has {mine[name]}; give the options "
+                    f"with which the prior was trained"
+                )
+        self.prior.load_state_dict(found.prior.state_dict())
+        self.licences = merged(self.licences, found.licences)
+        # The codes stand for motion as it was scaled when they were learnt.
+        self._assets = replace(found.assets, identities=self.identities)
+
+    def prior_facts(self) -> dict[str, object]:
+        """What two models must agree on to have the same prior, by the names of the options."""
+        renamed = {
+            "dim": "prior_dim",
+            "num_layers": "prior_layers",
+            "num_heads": "prior_heads",
+            "hidden_dim": "prior_feed_forward_dim",
+            "scale": "attention_scale",
+        }
+        options = {renamed.get(name, name): value for name, value in self.prior_options.items()}
+        own = {"n_vertices": self.n_vertices, "frame_rate": self.frame_rate, "motion_scale": self.motion_scaling}
+        return {**own, **options}
+
+    # Training.
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """The published terms of either stage."""
+        frames = batch.frame_lengths if self.stage == "prior" else self.trained_frames(batch)
+        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
+        return (
+            self.prior_losses(truth, frames) if self.stage == "prior" else self.predictor_losses(batch, truth, frames)
+        )
+
+    def prior_losses(self, truth: Tensor, frames: Int[Tensor, " batch"]) -> dict[str, Tensor]:
+        """The mean absolute error of motion, and both squared distances between tokens and codes."""
+        tokens = self.prior.encode_clips(truth, frames)
+        codes = self.prior.quantise(tokens)
+        error = masked_mean((self.prior.decode_clips(codes.values, frames) - truth).abs(), frames)
+        committed = masked_mean((codes.chosen.detach() - tokens).square(), frames)
+        moved = masked_mean((codes.chosen - tokens.detach()).square(), frames)
+        quantisation = self.commitment * committed + moved
+        used = codes.numbers[frame_mask(frames, codes.numbers.shape[1])].flatten()
+        return {
+            "reconstruction": error,
+            "quantisation": quantisation,
+            "perplexity": perplexity(used, len(self.prior.codebook)),
+            "loss": error + self.quantisation_weight * quantisation,
+        }
+
+    def predictor_losses(self, batch: Batch, truth: Tensor, frames: Int[Tensor, " batch"]) -> dict[str, Tensor]:
+        """The squared error of motion, and the distance from true motion's codes; from true frames, in one pass."""
+        self.check_length(frames, batch.names[0])
+        style, memory = self.conditions(batch, frames)
+        features = self.network.teacher_forced(style, memory, truth)
+        with torch.no_grad():
+            wanted = self.prior.quantise(self.prior.encode_clips(truth, frames)).chosen
+        made = self.prior.decode_clips(self.prior.quantise(features).values, frames)
+        error = masked_mean((made - truth).square(), frames)
+        distance = masked_mean((features - wanted).square(), frames)
+        return {"reconstruction": error, "features": distance, "loss": error + self.feature_weight * distance}
+
+    def conditions(
+        self, batch: Batch, frames: Int[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, "batch dim"], Float[Tensor, "batch steps dim"]]:
+        """The speaker's style and the speech of so many frames."""
+        memory = self.network.audio_map(self.hear(batch, frames))
+        return self.network.style(self.identity_weights(batch)), memory
+
+    # Inference.
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """Frame by frame; nothing is random."""
+        self.check_length(frames, batch.names[0])
+        style, memory = self.conditions(batch, frames)
+        generate = self.literal if self.loop == "literal" else self.cached
+        values, fed_back = generate(style, memory, int(frames.max()), progress or iter)
+        made = torch.stack(fed_back, 1) if self.output == "fed_back" else self.prior.decode_clips(values, frames)
+        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+
+    def cached(self, style: Tensor, memory: Tensor, count: int, shown: Progress) -> tuple[Tensor, list[Tensor]]:
+        """Codes (B, T, width) and the frames that were fed back, with what does not change kept.
+
+        The predictor's keys, values and codes of earlier frames stay as they are. The prior sees all frames at once and
+        normalises over them, so what it makes of earlier ones changes with every frame: it decodes all codes again,
+        but in its last layer and map the newest frame alone.
+        """
+        state, token = self.network.decoder.start(memory), style[:, None]
+        values: list[Tensor] = []
+        fed_back: list[Tensor] = []
+        for place in shown(range(count)):
+            values.append(self.prior.quantise(self.network.out(state.step(token))).values)
+            if place + 1 < count or self.output == "fed_back":
+                fed_back.append(self.prior.decode_last(torch.cat(values, 1)))
+                token = self.following(fed_back[-1], place, style)
+        return torch.cat(values, 1), fed_back
+
+    def literal(self, style: Tensor, memory: Tensor, count: int, shown: Progress) -> tuple[Tensor, list[Tensor]]:
+        """The same with everything computed again for each frame, as the published code does."""
+        tokens, values = style[:, None], memory.new_zeros(len(memory), 0, self.prior.width)
+        fed_back: list[Tensor] = []
+        for place in shown(range(count)):
+            values = self.prior.quantise(self.network.out(self.network.decoder(tokens, memory))).values
+            if place + 1 < count or self.output == "fed_back":
+                fed_back.append(self.prior.decode(values)[:, -1])
+                tokens = torch.cat([tokens, self.following(fed_back[-1], place, style)], 1)
+        return values, fed_back
+
+    def following(self, motion: Float[Tensor, "batch coordinates"], place: int, style: Tensor) -> Tensor:
+        """The token of the frame after ``place``."""
+        # The published code decodes the first frame twice over, since PyTorch's normalisation refuses a single frame.
+        # Ours takes one; the result is the same.
+        if place == 0 and self.first_frame == "still":
+            motion = torch.zeros_like(motion)
+        return (self.network.motion_in(motion) + style)[:, None]
+
+    # A prior alone.
+
+    def clip_of(
+        self,
+        audio: Float[Tensor, " samples"],
+        identity: str,
+        style: Reference | Style | None,
+        condition: str | None = None,
+        frames: int | None = None,
+    ) -> Batch:
+        """As every model.
+
+        Raises:
+            FaceDiffError: also if there is no predictor.
+        """
+        if self.stage == "prior":
+            raise FaceDiffError(
+                "this checkpoint is CodeTalker's prior alone, which reconstructs motion and hears no speech; train the "
+                "predictor with model.stage=predictor and --model.prior, and animate with its checkpoint"
+            )
+        return super().clip_of(audio, identity, style, condition, frames)
+
+    def generate_clips(self, batch: Batch, *, seed: int = 0, progress: Progress | None = None) -> BatchMotion:
+        """The motion that the speech asks for; of a prior alone, the clips' own motion as it reconstructs it."""
+        if self.stage == "predictor":
+            return super().generate_clips(batch, seed=seed, progress=progress)
+        frames = batch.frame_lengths
+        tokens = self.prior.encode_clips((batch.motion * self.scale).flatten(2), frames)
+        made = self.prior.decode_clips(self.prior.quantise(tokens).values, frames)
+        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+
+    def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> Motion:
+        """One motion for all seeds."""
+        if self.stage == "predictor":
+            return super().generate_samples(clip, seeds, progress=progress)
+        return AnimationModel.generate_samples(self, clip, seeds, progress=progress)
+
+    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
+        """As every model; a prior alone is not tried with other speech, which it would not hear."""
+        if self.stage == "prior":
+            batch = replace(batch, decoy_audio=None)
+        super().test_step(batch, batch_idx, dataloader_idx)
+
+
+class NoSpeech(AudioEncoder):
+    """In place of an audio encoder where no speech is heard.
+
+    Args:
+        dim: has no meaning.
+    """
+
+    def __init__(self, *, dim: Width) -> None:
+        super().__init__()
+
+    def forward(self, audio: Waves, audio_lengths: Lengths, frame_lengths: Lengths) -> Frames:
+        """Refuse to hear.
+
+        Raises:
+            FaceDiffError: always.
+        """
+        raise FaceDiffError("CodeTalker's prior alone hears no speech; use the checkpoint of its predictor")
+
+
+class Predictor(nn.Module):
+    """Features of speech, a speaker's row and earlier motion to features of codes.
+
+    Args:
+        audio_width: channels of the features of speech.
+        n_vertices: vertices V.
+        width: channels of all codes of a frame.
+        n_identities: rows of the table of speakers.
+        decoder: options of the decoder.
+    """
+
+    def __init__(
+        self, *, audio_width: int, n_vertices: int, width: int, n_identities: int, decoder: dict[str, Any]
+    ) -> None:
+        super().__init__()
+        dim = int(decoder["dim"])
+        self.audio_map = nn.Linear(audio_width, dim)
+        self.motion_in = nn.Linear(3 * n_vertices, dim)
+        self.decoder = MotionDecoder(**decoder)
+        self.out = nn.Linear(dim, width, bias=False)
+        self.style = SpeakerTable(n_identities, dim, "embedding")
+        nn.init.zeros_(self.out.weight)
+
+    def teacher_forced(
+        self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], motion: Tensor
+    ) -> Float[Tensor, "batch frames width"]:
+        """Features of every frame from the true motion (B, T, 3V) of the frame before it; the first one's is zero."""
+        before = F.pad(motion, (0, 0, 1, 0))[:, :-1]
+        return self.out(self.decoder(self.motion_in(before) + style[:, None], memory))
+
+
+def check_sizes(dim: int, heads: int, kernel: int, tokens: int, token_dim: int | None, token_maps: bool) -> None:  # noqa: FBT001
+    """Refuse sizes of a prior that do not go together.
+
+    Raises:
+        ArgumentError: naming them.
+    """
+    if dim % heads or dim % 2:
+        raise ArgumentError({"prior_dim": dim, "prior_heads": heads}, "prior_dim must be even, and a multiple of heads")
+    if kernel % 2 == 0:
+        raise ArgumentError({"kernel": kernel}, "expected an odd number of frames")
+    if token_dim is None and dim % tokens:
+        raise ArgumentError({"prior_dim": dim, "tokens": tokens}, "prior_dim must be a multiple of tokens")
+    if not token_maps and token_dim is not None and tokens * token_dim != dim:
+        raise ArgumentError(
+            {"tokens": tokens, "token_dim": token_dim, "prior_dim": dim},
+            "without token_maps, all tokens of a frame together must have prior_dim channels",
+        )
+
+
+# The authors' checkpoints.
+
+HALF_NAMES = (
+    ("squasher.0.0", "smooth"),
+    ("expander.0.0", "smooth"),
+    ("encoder_linear_embedding.net", "embed"),
+    ("decoder_linear_embedding.net", "embed"),
+)
+"""What the maps of a half are called by the authors, and here."""
+
+BLOCK_NAMES = (
+    {"fn.norm": "attention_norm", "fn.fn.to_qkv": "project", "fn.fn.to_out": "out"},
+    {"fn.norm": "hidden_norm", "fn.fn.l1": "first", "fn.fn.l2": "second"},
+)
+"""The same for attention and feed-forward layers, which take turns in the authors' numbering."""
+
+
+def convert_prior(weights: Weights, prefix: str = "") -> dict[str, Any]:
+    """The first stage's tensors under the names of this file, and its options."""
+    codes, token_dim = weights.shape(f"{prefix}quantize.embedding.weight")
+    dim, _ = weights.shape(f"{prefix}encoder.vertice_mapping.0.weight")
+    hidden, _ = weights.shape(f"{prefix}encoder.encoder_transformer.net.1.fn.fn.l1.weight")
+    kernel = weights.shape(f"{prefix}encoder.squasher.0.0.weight", 3)[2]
+    maps = f"{prefix}encoder.encoder_linear_embedding_post.net.weight" in weights
+    width = weights.shape(f"{prefix}encoder.encoder_linear_embedding_post.net.weight")[0] if maps else dim
+    if width % token_dim:
+        raise FaceDiffError(
+            f"{weights.source}: its frames have {width} channels and its codes {token_dim}, which does not go into "
+            f"them; it is a variant of CodeTalker"
+        )
+    for half in ("encoder", "decoder"):
+        check_positions(weights, f"{prefix}{half}.{half}_pos_embedding.pe")
+        own = f"{prefix}{half}."
+        for name in weights.names(f"{own}{half}_transformer.net."):
+            place, _, rest = name.removeprefix(f"{own}{half}_transformer.net.").partition(".")
+            part, _, kind = rest.rpartition(".")
+            number = int(place) if place.isdecimal() else -1
+            if part not in BLOCK_NAMES[number % 2] or number < 0:
+                raise FaceDiffError(
+                    f"{weights.source}: holds the tensor {name}, which CodeTalker has no place for; it is a variant of "
+                    f"the method"
+                )
+            weights.move(name, f"prior.{half}.blocks.{number // 2}.{BLOCK_NAMES[number % 2][part]}.{kind}")
+        for old, new in HALF_NAMES:
+            weights.move_all(f"{own}{old}.", f"prior.{half}.{new}.")
+    weights.move_all(f"{prefix}encoder.vertice_mapping.0.", "prior.motion_in.")
+    weights.move_all(f"{prefix}encoder.encoder_linear_embedding_post.net.", "prior.to_tokens.")
+    weights.move_all(f"{prefix}decoder.decoder_linear_embedding_pre.net.", "prior.from_tokens.")
+    weights.move_all(f"{prefix}decoder.vertice_map_reverse.", "prior.motion_out.")
+    weights.move(f"{prefix}quantize.embedding.weight", "prior.codebook")
+    blocks = [name for name in weights.made if name.startswith("prior.encoder.blocks.")]
+    return {
+        "prior_dim": dim,
+        "prior_layers": 1 + max(int(name.split(".")[3]) for name in blocks),
+        "prior_feed_forward_dim": hidden,
+        "kernel": kernel,
+        "tokens": width // token_dim,
+        "token_dim": token_dim,
+        "codes": codes,
+        "token_maps": maps,
+        "out_bias": "prior.motion_out.bias" in weights.made,
+    }
+
+
+def check_positions(weights: Weights, name: str) -> None:
+    """Leave out a table of positions, of which the published code uses the first row, once it is seen to be one.
+
+    Raises:
+        FaceDiffError: if it is anything else.
+    """
+    if name not in weights:
+        return
+    table = weights.get(name).flatten(0, -2)
+    expected = torch.zeros(table.shape[-1])
+    expected[1::2] = 1.0
+    if not len(table) or not torch.allclose(table[0], expected, rtol=0, atol=1e-5):
+        raise FaceDiffError(
+            f"{weights.source}: its table of positions {name} is not what the published formula gives; the checkpoint "
+            f"is of a variant of the method"
+        )
+    weights.ignore(name, "the table of positions is computed by its formula")
+
+
+def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+    """CodeTalker's tensors of both stages, and its options."""
+    stage_one = [name for prefix in ("encoder.", "decoder.", "quantize.") for name in weights.names(prefix)]
+    inside = bool(weights.names("autoencoder."))
+    if inside:
+        for name in stage_one:
+            weights.ignore(name, "the file of the second stage holds a prior of its own")
+    elif "quantize.embedding.weight" not in weights:
+        raise FaceDiffError(
+            f"{weights.source}: is CodeTalker's second stage without the first, whose prior it needs; give both files, "
+            f"such as vocaset_stage1.pth.tar and vocaset_stage2.pth.tar"
+        )
+    options = convert_prior(weights, "autoencoder." if inside else "")
+    dim, _ = weights.shape("audio_feature_map.weight")
+    period = read_period(weights, "PPE.pe", found)
+    encoder = weights.backbone(
+        "audio_encoder.",
+        kind="wav2vec2",
+        request=request,
+        **{name: value for name, value in CodeTalker.published_encoder.keywords.items() if name != "source"},  # type: ignore[attr-defined]
+    )
+    for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("feat_map", "out")):
+        weights.move_all(f"{old}.", f"network.{new}.")
+    weights.move("learnable_style_emb.weight", "network.style.weight")
+    weights.move_all("transformer_decoder.layers.", "network.decoder.layers.", LAYER_NAMES)
+    sizes = decoder_sizes(weights, "transformer_decoder.", dim)
+    return {**options, "audio_encoder": encoder, **sizes, "period": period}
+
+
+def convert_stage_one(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+    """A prior alone, on which a predictor can be trained."""
+    return {"stage": "prior", **convert_prior(weights)}
+
+
+LICENCE: dict[str, Any] = {
+    "licence": "unknown: no statement on the weights, whose code is under MIT and whose data is for research",
+    "licence_source": "github.com/Doubiiu/CodeTalker",
+}
+
+recogniser(
+    Recogniser(
+        method="CodeTalker",
+        marks=("learnable_style_emb.weight", "feat_map.weight", "vertice_map.weight"),
+        unless=(),
+        convert=convert,
+        vertices=lambda weights: weights.shape("vertice_map.weight")[1] // 3,
+        count=lambda weights: weights.shape("learnable_style_emb.weight")[0],
+        **LICENCE,
+    )
+)
+recogniser(
+    Recogniser(
+        method="CodeTalker",
+        marks=("quantize.embedding.weight", "encoder.vertice_mapping.0.weight", "decoder.vertice_map_reverse.weight"),
+        unless=("learnable_style_emb.", "feat_map.", "vertice_map."),
+        convert=convert_stage_one,
+        vertices=lambda weights: weights.shape("decoder.vertice_map_reverse.weight")[0] // 3,
+        count=lambda weights: 0,
+        **LICENCE,
+    )
+)

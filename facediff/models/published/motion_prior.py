@@ -1,0 +1,197 @@
+"""A discrete prior of facial motion: an autoencoder whose frames are a few entries each of a learnt table of codes.
+
+The first stage of CodeTalker. Motion goes through two halves that are built alike (:class:`Half`); between them, every
+frame's vector is cut into tokens, and each token becomes the nearest code. Both halves see all frames of a clip at once
+and normalise over them, so clips of different lengths never go through them together.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff.models.published.autoregressive import periodic_positions
+from facediff.models.speech_networks import by_lengths
+
+PriorPositions = Literal["constant", "frames"]
+"""What is added to every frame: the position of frame 0, or each frame's own."""
+
+PriorScale = Literal["width", "heads"]
+"""Whose root the attention's scores are divided by: the width of the layer, or that of one head."""
+
+
+class Block(nn.Module):
+    """Self-attention over all frames, then a feed-forward layer; each normalises its input and is added.
+
+    Args:
+        dim: channels.
+        num_heads: attention heads.
+        hidden_dim: channels of the feed-forward layer.
+        scale: see :data:`PriorScale`.
+    """
+
+    def __init__(self, dim: int, num_heads: int, hidden_dim: int, scale: PriorScale) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.scale = (dim if scale == "width" else dim // num_heads) ** -0.5
+        self.attention_norm, self.hidden_norm = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.project = nn.Linear(dim, 3 * dim, bias=False)
+        self.out = nn.Linear(dim, dim)
+        self.first, self.second = nn.Linear(dim, hidden_dim), nn.Linear(hidden_dim, dim)
+
+    def forward(
+        self, x: Float[Tensor, "batch frames dim"], wanted: int | None = None
+    ) -> Float[Tensor, "batch wanted dim"]:
+        """The frames, or only the last ``wanted`` of them, which attend to all."""
+        normed, dim = self.attention_norm(x), x.shape[-1]
+        last = slice(0 if wanted is None else x.shape[1] - wanted, None)
+        if wanted is None:
+            query, key, value = self.project(normed).chunk(3, -1)
+        else:
+            query = F.linear(normed[:, last], self.project.weight[:dim])
+            key, value = F.linear(normed, self.project.weight[dim:]).chunk(2, -1)
+        query, key, value = (x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for x in (query, key, value))
+        mixed = F.scaled_dot_product_attention(query, key, value, scale=self.scale)
+        x = x[:, last] + self.out(mixed.transpose(1, 2).flatten(2))
+        return x + self.second(F.gelu(self.first(self.hidden_norm(x)), approximate="tanh"))
+
+
+class Half(nn.Module):
+    """One half of the autoencoder: a convolution over time, and Transformer layers.
+
+    Args:
+        dim: channels.
+        num_layers: Transformer layers.
+        num_heads: their attention heads.
+        hidden_dim: channels of their feed-forward layers.
+        kernel: frames that the convolution sees; odd.
+        leak: slope below zero of the activation.
+        scale: see :data:`PriorScale`.
+        positions: see :data:`PriorPositions`.
+    """
+
+    def __init__(
+        self,
+        *,
+        dim: int,
+        num_layers: int,
+        num_heads: int,
+        hidden_dim: int,
+        kernel: int,
+        leak: float,
+        scale: PriorScale,
+        positions: PriorPositions,
+    ) -> None:
+        super().__init__()
+        self.leak, self.positions = leak, positions
+        self.smooth = nn.Conv1d(dim, dim, kernel, padding=kernel // 2, padding_mode="replicate")
+        self.embed = nn.Linear(dim, dim)
+        self.blocks = nn.ModuleList(Block(dim, num_heads, hidden_dim, scale) for _ in range(num_layers))
+
+    def forward(
+        self, x: Float[Tensor, "batch frames dim"], wanted: int | None = None
+    ) -> Float[Tensor, "batch wanted dim"]:
+        """All frames of clips of one length; or only the last ``wanted`` frames of the result."""
+        frames, dim = x.shape[1:]
+        smooth = F.leaky_relu(self.smooth(x.transpose(1, 2)), self.leak)
+        # Instance normalisation: over a clip's frames, for each channel. Written as a layer norm over time, which takes
+        # a single frame as well: zeros come of it, as they do of two equal frames.
+        x = self.embed(F.layer_norm(smooth, (frames,)).transpose(1, 2))
+        count = 1 if self.positions == "constant" else frames
+        x = x + periodic_positions(count, dim, count, device=x.device)
+        for block in self.blocks[:-1]:
+            x = block(x)
+        return self.blocks[-1](x, wanted)
+
+
+class Codes(NamedTuple):
+    """Tokens and the codes nearest to them.
+
+    Attributes:
+        values: the codes, through which gradients pass as if they were the tokens.
+        chosen: the codes themselves, without the tokens' gradients.
+        numbers: which codes they are.
+    """
+
+    values: Float[Tensor, "batch frames width"]
+    chosen: Float[Tensor, "batch frames width"]
+    numbers: Int[Tensor, "batch frames tokens"]
+
+
+class MotionPrior(nn.Module):
+    """Motion as tokens of a table of codes, and back.
+
+    Args:
+        n_vertices: vertices V.
+        dim: channels of both halves.
+        tokens: tokens of a frame.
+        token_dim: channels of a token.
+        codes: rows of the table.
+        token_maps: a linear map between the halves and the tokens, as on BIWI; without it, ``tokens`` · ``token_dim``
+            must be ``dim``.
+        out_bias: a bias of the map to vertices, as on VOCASET.
+        options: those of :class:`Half`.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_vertices: int,
+        dim: int,
+        tokens: int,
+        token_dim: int,
+        codes: int,
+        token_maps: bool,
+        out_bias: bool,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__()
+        self.tokens, self.width = tokens, tokens * token_dim
+        self.motion_in = nn.Linear(3 * n_vertices, dim)
+        self.encoder = Half(dim=dim, **options)
+        self.to_tokens = nn.Linear(dim, self.width) if token_maps else nn.Identity()
+        self.codebook = nn.Parameter(torch.empty(codes, token_dim).uniform_(-1 / codes, 1 / codes))
+        self.from_tokens = nn.Linear(self.width, dim) if token_maps else nn.Identity()
+        self.decoder = Half(dim=dim, **options)
+        self.motion_out = nn.Linear(dim, 3 * n_vertices, bias=out_bias)
+
+    def encode(self, motion: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames width"]:
+        """Tokens of clips of one length, not yet codes."""
+        return self.to_tokens(self.encoder(F.leaky_relu(self.motion_in(motion), self.encoder.leak)))
+
+    def quantise(self, tokens: Float[Tensor, "batch frames width"]) -> Codes:
+        """The code nearest to each token; the first of several that are equally near."""
+        with torch.autocast(tokens.device.type, enabled=False):  # codes that are near each other must stay apart
+            tokens = tokens.float()
+            flat = tokens.reshape(-1, self.codebook.shape[1])
+            distances = flat.square().sum(1, keepdim=True) + self.codebook.square().sum(1) - 2 * flat @ self.codebook.T
+            numbers = distances.argmin(1)
+            chosen = self.codebook[numbers].view(tokens.shape)
+            values = tokens + (chosen - tokens).detach()
+        return Codes(values, chosen, numbers.view(*tokens.shape[:2], self.tokens))
+
+    def decode(self, values: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
+        """Motion of clips of one length."""
+        return self.motion_out(self.decoder(self.from_tokens(values)))
+
+    def decode_last(self, values: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch coordinates"]:
+        """The last frame of what :meth:`decode` gives, without what only the other frames need."""
+        return self.motion_out(self.decoder(self.from_tokens(values), 1))[:, 0]
+
+    def encode_clips(self, motion: Tensor, frames: Int[Tensor, " batch"]) -> Tensor:
+        """Tokens of padded clips (B, T, 3V), each as if it were alone."""
+        return by_lengths(motion, frames, frames, lambda x, _: self.encode(x))
+
+    def decode_clips(self, values: Tensor, frames: Int[Tensor, " batch"]) -> Tensor:
+        """Motion of padded clips of codes, each as if it were alone."""
+        return by_lengths(values, frames, frames, lambda x, _: self.decode(x))
+
+
+def perplexity(numbers: Int[Tensor, " tokens"], codes: int) -> Float[Tensor, ""]:
+    """How many codes are in use: e to the entropy of their shares."""
+    shares = torch.bincount(numbers, minlength=codes) / max(1, len(numbers))
+    return torch.special.entr(shares).sum().exp()

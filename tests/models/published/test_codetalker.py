@@ -1,0 +1,384 @@
+"""CodeTalker: parity of both stages, what its stages share, its options, and its authors' files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+from torch import Tensor
+
+from facediff.data import collate
+from facediff.errors import FaceDiffError
+from facediff.models import AnimationModel, CodeTalker, import_checkpoint, load_model
+from facediff.models.published.importing import import_files
+from tests.fakes import codetalker, published
+from tests.fakes.published import COORDINATES, IDENTITIES, VERTICES, State
+from tests.fakes.tiny import Tiny
+from tests.models.conftest import no_dropout
+from tests.models.published import test_laws as laws
+from tests.models.published.author import face, speech_of, templates
+
+MakeMethod = Callable[..., AnimationModel]
+MakeTrainer = Callable[..., Trainer]
+
+
+def write(folder: Path, **states: State) -> list[Path]:
+    """The authors' files, each a container of its tensors."""
+    files = []
+    for name, state in states.items():
+        files.append(folder / f"{name}.pth.tar")
+        torch.save({"state_dict": state}, files[-1])
+    return files
+
+
+def imported(files: list[Path], dataset: str, **options: Any) -> CodeTalker:  # noqa: ANN401
+    made = import_checkpoint(
+        files,
+        dataset=dataset,
+        identities=IDENTITIES,
+        templates=templates(),
+        audio_config=published.AUDIO_CONFIG,
+        **{"num_heads": 4, "prior_heads": codetalker.PRIOR_HEADS, **options},
+    )
+    assert isinstance(made, CodeTalker)
+    return made
+
+
+@pytest.mark.parametrize("loop", ["cached", "literal"])
+@pytest.mark.parametrize(("dataset", "steps"), [("vocaset", 40), ("vocaset", 41), ("biwi", 41), ("biwi", 58)])
+def test_it_animates_as_published(dataset: str, steps: int, loop: str, tmp_path: Path) -> None:
+    one, two = codetalker.stage_one(dataset), codetalker.stage_two(dataset)
+    model = imported(write(tmp_path, one=one, two=two), dataset, loop=loop)
+    speech = speech_of(steps)
+    for number, name in enumerate(IDENTITIES if loop == "cached" else IDENTITIES[:1]):
+        expected, margin = codetalker.reference(one, two, speech, dataset, number, face("A"))
+        assert margin > 1e-4  # no code is nearly another one, so that rounding decides nothing
+        made = model.animate(speech, identity="A", condition=name).vertices.flatten(1)
+        torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
+
+
+def test_a_frame_less_where_floating_point_says_so(tmp_path: Path) -> None:
+    one, two = codetalker.stage_one("vocaset"), codetalker.stage_two("vocaset")
+    model = imported(write(tmp_path, two=two, one=one), "vocaset")
+    speech = speech_of(205)
+    expected, margin = codetalker.reference(one, two, speech, "vocaset", 1, face("B"))
+    assert margin > 1e-5
+    made = model.animate(speech, identity="B").vertices.flatten(1)
+    assert len(made) == 122
+    torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
+
+
+def test_the_frames_that_were_fed_back_may_be_given(tmp_path: Path) -> None:
+    one, two = codetalker.stage_one("biwi"), codetalker.stage_two("biwi")
+    for loop in ("cached", "literal"):
+        model = imported(write(tmp_path, one=one, two=two), "biwi", output="fed_back", loop=loop)
+        made = model.animate(speech_of(41), identity="C").vertices.flatten(1)
+        expected, _ = codetalker.reference(one, two, speech_of(41), "biwi", 2, face("C"), output="fed_back")
+        # Normalisation over the first two frames divides by how little they differ.
+        torch.testing.assert_close(made, expected, rtol=0, atol=1e-4)
+
+
+def test_the_first_frame_fed_back_is_a_constant_unless_it_is_still(tmp_path: Path) -> None:
+    one, two = codetalker.stage_one("biwi"), codetalker.stage_two("biwi")
+    files = write(tmp_path, one=one, two=two)
+    fixed = [
+        imported(files, "biwi", output="fed_back").animate(speech_of(steps), identity="A", condition=name).vertices[0]
+        for steps, name in ((40, "A"), (41, "B"))
+    ]
+    torch.testing.assert_close(fixed[0], fixed[1], rtol=0, atol=1e-6)
+    still = imported(files, "biwi", first_frame="still")
+    seen: list[Tensor] = []
+    still.network.motion_in.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    still.animate(speech_of(40), identity="A")
+    assert not seen[0].any()
+    assert all(motion.any() for motion in seen[1:])
+
+
+HOW: dict[str, dict[str, str]] = {
+    "as published": {},
+    "positions of frames": {"place": "frames"},
+    "scores of heads": {"scaled_by": "heads"},
+}
+NAMES = {"place": "positions", "scaled_by": "attention_scale"}
+
+
+@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize(("dataset", "frames"), [("vocaset", 7), ("biwi", 1), ("biwi", 24)])
+def test_the_prior_reconstructs_as_published(dataset: str, frames: int, how: str, tmp_path: Path) -> None:
+    one = codetalker.stage_one(dataset, seed=4)
+    options = {NAMES[name]: value for name, value in HOW[how].items()}
+    model = imported(write(tmp_path, one=one), dataset, leak=0.1, **options)
+    assert model.stage == "prior"
+    motion = torch.randn(frames, COORDINATES, generator=torch.Generator().manual_seed(frames))
+    tokens = codetalker.encoded(motion, one, 0.1, **HOW[how])
+    codes, margin = codetalker.quantised(tokens, one)
+    assert margin > 1e-4
+    with torch.no_grad():
+        own = model.prior.encode(motion[None])
+        torch.testing.assert_close(own[0], tokens, rtol=0, atol=1e-5)
+        made = model.prior.quantise(own)
+        torch.testing.assert_close(made.values[0], codes, rtol=0, atol=1e-6)
+        expected = codetalker.decoded_motion(codes, one, 0.1, **HOW[how])
+        torch.testing.assert_close(model.prior.decode(made.values)[0], expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(model.prior.decode_last(made.values)[0], expected[-1], rtol=0, atol=1e-5)
+
+
+# What both stages train on.
+
+
+def one_clip(model: CodeTalker, frames: int) -> Any:  # noqa: ANN401
+    sample = laws.clips(frames)[0]
+    motion = torch.randn(frames, VERTICES, 3, generator=torch.Generator().manual_seed(3))
+    return collate([replace(sample, motion=motion, template=torch.zeros(VERTICES, 3), identity=1)])
+
+
+def test_the_losses_of_both_stages_are_the_published_ones(tmp_path: Path) -> None:
+    one, two = codetalker.stage_one("vocaset"), codetalker.stage_two("vocaset")
+    files = write(tmp_path, one=one, two=two)
+    model, prior = imported(files, "vocaset").eval(), imported(files[:1], "vocaset").eval()
+    batch = one_clip(model, 24)
+    motion = batch.motion[0].flatten(1)
+    tokens = codetalker.encoded(motion, one)
+    codes, margin = codetalker.quantised(tokens, one)
+    assert margin > 1e-4
+    error = (codetalker.decoded_motion(codes, one) - motion).abs().mean()
+    # With nothing to differentiate, both terms are the same mean square.
+    quantisation = 1.25 * (codes - tokens).square().mean()
+    used = torch.stack(
+        [(codes.reshape(-1, 4) == row).all(1).float().mean() for row in one["quantize.embedding.weight"]]
+    )
+    entropy = -sum(share * share.log() for share in used if share > 0)
+    own = prior.losses(batch)
+    torch.testing.assert_close(own["reconstruction"], error)
+    torch.testing.assert_close(own["quantisation"], quantisation)
+    torch.testing.assert_close(own["perplexity"], torch.as_tensor(entropy).exp())
+    torch.testing.assert_close(own["loss"], error + quantisation)
+    # The predictor: true frames shifted by one, of which the first is a zero that goes through the map.
+    speech = batch.audio[0]
+    features = published.features_of(published.standardised(speech, 1e-5), two, "audio_encoder.")
+    features, _ = published.resampled(features, "vocaset", 24)
+    memory = published.linear(published.hidden_of(features, two, "audio_encoder."), two, "audio_feature_map")
+    shifted = torch.cat([torch.zeros(1, COORDINATES), motion[:-1]])
+    x = published.linear(shifted, two, "vertice_map") + two["learnable_style_emb.weight"][1] + two["PPE.pe"][0, :24]
+    made = published.linear(published.decoded(x, memory, two, "transformer_decoder.", "vocaset"), two, "feat_map")
+    chosen, margin = codetalker.quantised(made, one)
+    assert margin > 1e-4
+    wrong = (codetalker.decoded_motion(chosen, one) - motion).square().mean()
+    far = (made - codes).square().mean()
+    found = model.losses(batch)
+    torch.testing.assert_close(found["reconstruction"], wrong)
+    torch.testing.assert_close(found["features"], far)
+    torch.testing.assert_close(found["loss"], wrong + far)
+
+
+def test_gradients_pass_the_codes_and_move_them(make_method: MakeMethod) -> None:
+    prior = make_method("CodeTalker", stage="prior").prior
+    assert isinstance(prior, torch.nn.Module)
+    tokens = torch.randn(1, 5, 16, requires_grad=True)
+    codes = prior.quantise(tokens)  # type: ignore[operator]
+    weights = torch.randn(1, 5, 16)
+    (codes.values * weights).sum().backward()
+    torch.testing.assert_close(tokens.grad, weights)
+    assert prior.codebook.grad is None
+
+
+LAWS = [
+    laws.test_padding_and_other_clips_change_nothing,
+    laws.test_the_loss_of_a_batch_does_not_look_at_padding,
+    laws.test_gradients_reach_every_trainable_weight,
+    laws.test_mixed_precision_gives_numbers,
+    laws.test_training_lowers_the_loss_of_one_clip,
+]
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
+def test_the_prior_obeys(law: Callable[..., None], make_method: MakeMethod) -> None:
+    """The laws that the predictor obeys in test_laws.py, where they concern what a prior does."""
+    law("CodeTalker", lambda name, **options: make_method(name, stage="prior", **options))
+
+
+# Two stages, one model.
+
+
+def test_a_predictor_is_trained_on_a_trained_prior(
+    make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
+) -> None:
+    limits = {"limit_train_batches": 2, "limit_val_batches": 1, "limit_test_batches": 1}
+    prior, trainer = make_method("CodeTalker", stage="prior", motion_scale="unit"), make_trainer(**limits)
+    trainer.fit(prior, datamodule=tiny)
+    scores = trainer.test(prior, datamodule=tiny, verbose=False)
+    assert not any("shuffled" in name for split in scores for name in split)
+    trainer.save_checkpoint(tmp_path / "prior.ckpt", weights_only=True)
+    loaded = load_model(tmp_path / "prior.ckpt")
+    assert isinstance(loaded, CodeTalker)
+    assert loaded.stage == "prior"
+    with pytest.raises(FaceDiffError, match="prior"):
+        loaded.animate(torch.zeros(16_000), identity="A")
+    with pytest.raises(FaceDiffError, match="prior"):
+        loaded.stream(identity="A")
+
+    model = make_method("CodeTalker", seed=1, motion_scale="unit", prior=str(tmp_path / "prior.ckpt"))
+    trainer = make_trainer(**limits)
+    trainer.fit(model, datamodule=tiny)
+    trainer.save_checkpoint(tmp_path / "model.ckpt", weights_only=True)
+    (tmp_path / "prior.ckpt").unlink()
+    whole = load_model(tmp_path / "model.ckpt")
+    assert isinstance(whole, CodeTalker)
+    for name, value in loaded.prior.state_dict().items():
+        assert torch.equal(whole.prior.state_dict()[name], value), name
+    assert whole.assets.motion_scale == loaded.assets.motion_scale
+    assert whole.hparams["prior"] is None
+
+
+def test_without_a_prior_no_predictor_is_trained(
+    make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer
+) -> None:
+    with pytest.raises(FaceDiffError, match=r"--model\.prior"):
+        make_trainer().fit(make_method("CodeTalker", prior=None), datamodule=tiny)
+
+
+@pytest.mark.parametrize("option", ["codes", "prior_layers", "tokens", "motion_scale", "leak"])
+def test_a_prior_of_other_options_is_refused(
+    option: str, make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer
+) -> None:
+    other = {"codes": 5, "prior_layers": 2, "tokens": 4, "motion_scale": "unit", "leak": 0.3}
+    model = make_method("CodeTalker", **{option: other[option]})
+    with pytest.raises(FaceDiffError, match=f"prior.*{option}"):
+        make_trainer().fit(model, datamodule=tiny)
+
+
+def test_another_models_checkpoint_is_no_prior(
+    make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
+) -> None:
+    from facediff.models.published.importing import save_model
+
+    save_model(laws.with_assets(make_method("FaceFormer")), tmp_path / "former.ckpt")
+    for path in (tmp_path / "former.ckpt", tmp_path / "nothing.ckpt"):
+        with pytest.raises(FaceDiffError, match=path.name):
+            make_trainer().fit(make_method("CodeTalker", prior=str(path)), datamodule=tiny)
+
+
+def test_a_predictor_goes_on_without_the_priors_file(
+    make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
+) -> None:
+    trainer = make_trainer(limit_train_batches=1, limit_val_batches=0)
+    trainer.fit(make_method("CodeTalker"), datamodule=tiny)
+    trainer.save_checkpoint(tmp_path / "model.ckpt")
+    again = make_trainer(max_epochs=2, limit_train_batches=1, limit_val_batches=0)
+    again.fit(make_method("CodeTalker", prior=None), datamodule=tiny, ckpt_path=tmp_path / "model.ckpt")
+    assert again.current_epoch == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"prior_heads": 3}, "prior_heads"),
+        ({"kernel": 4}, "kernel"),
+        ({"tokens": 3}, "tokens"),
+        ({"tokens": 3, "token_dim": 2, "token_maps": False}, "token_dim"),
+        ({"codes": 0}, "codes"),
+        ({"stage": "both"}, "stage"),
+    ],
+)
+def test_sizes_that_do_not_go_together_are_named(options: dict[str, Any], named: str, make_method: MakeMethod) -> None:
+    with pytest.raises(FaceDiffError, match=named):
+        make_method("CodeTalker", **options)
+
+
+def test_a_tiny_one_learns_one_clip_by_heart(make_method: MakeMethod, tiny: Tiny) -> None:
+    """Both stages, one after the other; the predictor then generates the clip, and not from its true frames."""
+    sample = tiny_clip(tiny)
+    batch = collate([sample])
+    sizes: dict[str, Any] = {"motion_scale": "none", "codes": 32, "tokens": 2, "prior_dim": 32, "dim": 32}
+    prior = laws.with_assets(make_method("CodeTalker", stage="prior", **sizes))
+    train(prior, batch, 120)
+    model = laws.with_assets(make_method("CodeTalker", **sizes))
+    assert isinstance(prior, CodeTalker)
+    assert isinstance(model, CodeTalker)
+    model.prior.load_state_dict(prior.prior.state_dict())
+    train(model, batch, 80)
+    still = batch.motion.square().mean()
+    for each in (prior, model):
+        with torch.no_grad():
+            assert (each.generate(batch) - batch.motion).square().mean() < 0.1 * still, each.stage
+
+
+def tiny_clip(tiny: Tiny) -> Any:  # noqa: ANN401
+    sample = tiny.dataset("train")[0]
+    return replace(sample, motion=sample.motion * 100, reference=sample.reference)
+
+
+def train(model: AnimationModel, batch: Any, steps: int) -> None:  # noqa: ANN401
+    no_dropout(model)
+    optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=3e-3)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        model.losses(batch)["loss"].backward()
+        optimizer.step()
+    model.eval()
+
+
+# The authors' files.
+
+
+def test_the_stages_come_in_any_order_and_an_inner_prior_wins(tmp_path: Path) -> None:
+    one, two = codetalker.stage_one("vocaset"), codetalker.stage_two("vocaset")
+    other = codetalker.stage_one("vocaset", seed=9)
+    inner = {**two, **{f"autoencoder.{name}": value for name, value in one.items()}}
+    files = dict(zip("abcd", write(tmp_path, a=one, b=two, c=inner, d=other), strict=True))
+    states = [imported([files[name] for name in names], "vocaset").state_dict() for names in ("ab", "ba", "c", "cd")]
+    for state in states[1:]:
+        assert all(torch.equal(state[name], value) for name, value in states[0].items())
+    made = import_files(
+        [files["c"], files["d"]],
+        dataset="vocaset",
+        identities=IDENTITIES,
+        templates=templates(),
+        audio_config=published.AUDIO_CONFIG,
+        prior_heads=2,
+    )
+    assert "quantize.embedding.weight" in made.ignored
+
+
+def test_a_predictor_can_be_trained_on_an_authors_prior(tmp_path: Path) -> None:
+    from facediff.models.published.importing import save_model
+
+    one = codetalker.stage_one("biwi")
+    save_model(imported(write(tmp_path, one=one), "biwi"), tmp_path / "prior.ckpt")
+    loaded = load_model(tmp_path / "prior.ckpt")
+    assert isinstance(loaded, CodeTalker)
+    assert torch.equal(loaded.prior.codebook, one["quantize.embedding.weight"])
+    assert loaded.prior_facts()["tokens"] == 2
+
+
+def test_a_second_stage_alone_says_what_to_give(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="stage1") as caught:
+        imported(write(tmp_path, two=codetalker.stage_two("vocaset")), "vocaset")
+    assert str(caught.value).count(". ") <= 1
+
+
+WRONG: dict[str, tuple[Callable[[State, State], object], str]] = {
+    "half a first stage": (lambda one, two: one.pop("decoder.expander.0.0.weight"), "smooth.weight"),
+    "another table of positions": (lambda one, two: one["decoder.decoder_pos_embedding.pe"].add_(1), "decoder_pos"),
+    "an unknown layer": (
+        lambda one, two: one.update({"encoder.encoder_transformer.net.0.fn.gate.weight": torch.ones(2)}),
+        "gate",
+    ),
+    "codes that do not fit": (lambda one, two: one.update({"quantize.embedding.weight": torch.ones(4, 3)}), "codes"),
+    "another width": (lambda one, two: two.update({"feat_map.weight": torch.ones(12, 16)}), "out.weight"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_files_that_do_not_fit_are_refused(name: str, tmp_path: Path) -> None:
+    one, two = codetalker.stage_one("vocaset"), codetalker.stage_two("vocaset")
+    change, named = WRONG[name]
+    change(one, two)
+    with pytest.raises(FaceDiffError, match=named) as caught:
+        imported(write(tmp_path, one=one, two=two), "vocaset")
+    assert str(caught.value).count(". ") <= 1
