@@ -197,9 +197,14 @@ decoder = Kind("decoder", "facediff.models.decoders", "fused features and style 
 sampler = Kind("sampler", "facediff.models.samplers", "runs the reverse diffusion process")
 model = Kind(
     "model",
-    "facediff.models.dual_path facediff.models.style_content facediff.models.published.faceformer "
-    "facediff.models.published.facediffuser facediff.models.published.selftalk facediff.models.published.talkingstyle "
-    "facediff.models.published.codetalker",
+    "facediff.models.dual_path "
+    "facediff.models.style_content "
+    "facediff.models.published.codetalker "
+    "facediff.models.published.diffspeaker "
+    "facediff.models.published.facediffuser "
+    "facediff.models.published.faceformer "
+    "facediff.models.published.selftalk "
+    "facediff.models.published.talkingstyle",
     "a method, as a LightningModule",
     aliases=False,  # Lightning refuses to reload a module that is named by a nested alias
 )

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from facediff.models.dual_path import DualPathDiffusion as DualPathDiffusion
     from facediff.models.inference import Style as Style
     from facediff.models.published.codetalker import CodeTalker as CodeTalker
+    from facediff.models.published.diffspeaker import DiffSpeaker as DiffSpeaker
     from facediff.models.published.facediffuser import FaceDiffuser as FaceDiffuser
     from facediff.models.published.faceformer import FaceFormer as FaceFormer
     from facediff.models.published.importing import import_checkpoint as import_checkpoint
@@ -25,6 +26,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "dual_path": "DualPathDiffusion",
         "inference": "Style",
         "published.codetalker": "CodeTalker",
+        "published.diffspeaker": "DiffSpeaker",
         "published.facediffuser": "FaceDiffuser",
         "published.faceformer": "FaceFormer",
         "published.importing": "import_checkpoint",

@@ -269,27 +269,51 @@ def fold(
         last: U.
         bias: b; zero if None.
     """
-    # Not every accelerator knows float64.
-    device = torch.device("cpu") if first.device.type == "mps" else first.device
-    dim, coordinates = first.shape
-    # In float64, since products over 70 000 coordinates lose digits in float32; by chunks, since both maps in float64
-    # would double the memory of the model.
-    product = torch.zeros(dim, dim, dtype=torch.float64, device=device)
-    covariance = torch.zeros_like(product)
-    offset = torch.zeros(dim, dtype=torch.float64, device=device)
-    for begin in range(0, coordinates, CHUNK):
-        part = slice(begin, begin + CHUNK)
+    product, offset = fold_maps(first, last, bias)
+    return Fold(product, offset, fold_noise(first))
+
+
+def fold_maps(
+    first: Float[Tensor, "dim coordinates"],
+    last: Float[Tensor, "coordinates features"],
+    bias: Float[Tensor, " coordinates"] | None,
+) -> tuple[Float[Tensor, "dim features"], Float[Tensor, " dim"]]:
+    """E U and E b, in float64; the arguments are those of :func:`fold`."""
+    device = fold_device(first)
+    product = torch.zeros(first.shape[0], last.shape[1], dtype=torch.float64, device=device)
+    offset = product.new_zeros(len(first))
+    for part in fold_parts(first):
         e = first[:, part].to(device, torch.float64)
         product.addmm_(e, last[part].to(device, torch.float64))
-        covariance.addmm_(e, e.T)
         if bias is not None:
             offset.addmv_(e, bias[part].to(device, torch.float64))
+    return product.to(first), offset.to(first)
+
+
+def fold_noise(first: Float[Tensor, "dim coordinates"]) -> Float[Tensor, "dim dim"]:
+    """The symmetric square root of E Eᵀ, in float64."""
+    device = fold_device(first)
+    covariance = torch.zeros(len(first), len(first), dtype=torch.float64, device=device)
+    for part in fold_parts(first):
+        e = first[:, part].to(device, torch.float64)
+        covariance.addmm_(e, e.T)
     # By eigenvectors, so that E may have any rank. The symmetric root is unique: it does not depend on the signs and
     # the order of eigenvectors, which libraries choose as they like, so that equal seeds give comparable motion.
     values, vectors = torch.linalg.eigh(covariance)
     # A covariance has no negative eigenvalues; those that appear are rounding.
-    root = (vectors * values.clamp_min(0).sqrt()) @ vectors.T
-    return Fold(product.to(first), offset.to(first), root.to(first))
+    return ((vectors * values.clamp_min(0).sqrt()) @ vectors.T).to(first)
+
+
+def fold_parts(first: Tensor) -> list[slice]:
+    """The coordinates by chunks."""
+    # In float64, since products over 70 000 coordinates lose digits in float32; by chunks, since both maps in float64
+    # would double the memory of the model.
+    return [slice(begin, begin + CHUNK) for begin in range(0, first.shape[1], CHUNK)]
+
+
+def fold_device(first: Tensor) -> torch.device:
+    """Where float64 is known; not every accelerator knows it."""
+    return torch.device("cpu") if first.device.type == "mps" else first.device
 
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ own for each frame, so the keys and values of earlier frames never change, and m
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -19,18 +19,12 @@ from facediff.data import Batch
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import StepRule
 from facediff.models.layers import Heads, Layers, Share, Width
-from facediff.models.published.base import PublishedModel
+from facediff.models.published.base import LongSpeech, PublishedModel
 from facediff.models.published.importing import Found, Weights
 from facediff.utils.ranges import Range
 
 Loop = Literal["cached", "literal"]
 """How frames are made: with the keys and values of earlier frames kept, or from all earlier frames again each time."""
-
-LongSpeech = Literal["refuse", "windows", "extend"]
-"""What is done with speech beyond the tables of the published code."""
-
-TABLE_FRAMES = 600
-"""Frames of the published tables of the attention's bias."""
 
 Period = Annotated[int, Range(1, 100_000)]
 
@@ -52,6 +46,8 @@ class AutoregressiveModel(PublishedModel):
             them, as published; animate ``windows`` of them; or ``extend`` the tables by their formula.
         options: those of :class:`PublishedModel`.
     """
+
+    table_frames: ClassVar[int | None] = 600
 
     def __init__(
         self,
@@ -81,25 +77,7 @@ class AutoregressiveModel(PublishedModel):
             "steps": 2 if self.pairs else 1,
         }
         self.loop: Loop = loop
-        self.long_speech: LongSpeech = long_speech
-        if long_speech != "windows":
-            self.windows = type(self.windows)(above=math.inf)
-        else:
-            self.windows = type(self.windows)(above=TABLE_FRAMES / self.frame_rate)
-
-    def check_length(self, frames: Int[Tensor, " batch"], source: str) -> None:
-        """Refuse more frames than the published tables have.
-
-        Raises:
-            FaceDiffError: with what to do instead.
-        """
-        most = int(frames.max())
-        if most > TABLE_FRAMES and self.long_speech != "extend":
-            raise FaceDiffError(
-                f"{source}: {most / self.frame_rate:.1f} s are {most} frames, and {type(self).__name__}'s published "
-                f"tables have {TABLE_FRAMES} ({TABLE_FRAMES / self.frame_rate:g} s); animate it in windows "
-                f"(--window 4), or make the model with long_speech=extend or long_speech=windows"
-            )
+        self.plan_long_speech(long_speech)
 
     def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch steps width"]:
         """Speech features: as many as frames, or two for each where speech comes in pairs."""

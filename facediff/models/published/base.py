@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.errors import ArgumentError
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay, MotionScale
 from facediff.models.evaluation import IdentityPolicy
@@ -29,6 +29,9 @@ from facediff.utils.plain_options import fits, parameters
 Alignment = Literal["auto", "pairs", "interpolated"]
 """How speech at 50 steps a second meets motion: as ``pairs`` of steps for each frame, as the projects do on BIWI at 25
 frames a second, or ``interpolated`` to the frames, as they do on VOCASET at 30; ``auto`` chooses by the frame rate."""
+
+LongSpeech = Literal["refuse", "windows", "extend"]
+"""What is done with speech beyond the tables of the published code."""
 
 NO_STYLE = Style("none", torch.zeros(0))
 """The style of a model that takes none."""
@@ -42,6 +45,7 @@ class PublishedModel(AnimationModel):
 
     Class attributes:
         published_encoder: the audio encoder as the method's authors use it.
+        table_frames: frames for which the published tables of attention have rows; None where there are none.
 
     Args:
         audio_encoder: speech to features; the method's own pretrained network with its settings if None.
@@ -56,6 +60,8 @@ class PublishedModel(AnimationModel):
 
     hears_all: ClassVar[bool] = True
     published_encoder: ClassVar[AudioEncoderFactory]
+    table_frames: ClassVar[int | None] = None
+    long_speech: LongSpeech = "extend"
 
     def __init__(
         self,
@@ -108,6 +114,27 @@ class PublishedModel(AnimationModel):
         steps = self.steps_of(samples)
         # In this very order and in floating point, as the projects compute it: 205 steps give 122 frames, not 123.
         return steps // 2 if self.pairs else int((steps / 50.0) * self.frame_rate)
+
+    def plan_long_speech(self, long_speech: LongSpeech) -> None:
+        """Choose what is done with speech beyond the published tables: by windows only where that is chosen."""
+        self.long_speech = long_speech
+        by_windows = long_speech == "windows" and self.table_frames is not None
+        above = (self.table_frames or 0) / self.frame_rate if by_windows else math.inf
+        self.windows = type(self.windows)(above=above)
+
+    def check_length(self, frames: Int[Tensor, " batch"], source: str) -> None:
+        """Refuse more frames than the published tables have.
+
+        Raises:
+            FaceDiffError: with what to do instead.
+        """
+        most, rows = int(frames.max()), self.table_frames
+        if rows is not None and most > rows and self.long_speech != "extend":
+            raise FaceDiffError(
+                f"{source}: {most / self.frame_rate:.1f} s are {most} frames, and {type(self).__name__}'s published "
+                f"tables have {rows} ({rows / self.frame_rate:g} s); animate it in windows (--window 4), or make the "
+                f"model with long_speech=extend or long_speech=windows"
+            )
 
     def tested_frames(self, batch: Batch) -> list[int]:
         """Frames that the method gives for each clip of a corpus."""

@@ -8,7 +8,6 @@ of the published code is an option here.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -21,20 +20,20 @@ from facediff import registry
 from facediff.data import Batch
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
+from facediff.models.folding import WeightCache
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width
-from facediff.models.published.base import PublishedModel, SpeakerTable, masked_mean
+from facediff.models.published.base import SpeakerTable, masked_mean
+from facediff.models.published.diffusion import DiffusionModel, FoldedSpace, NoiseSource, SamplingSpace, VertexSpace
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
 from facediff.models.samplers import cosine_betas
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
-SamplingSpace = Literal["vertices", "folded"]
-
 
 @registry.model.register("FaceDiffuser")
-class FaceDiffuser(PublishedModel):
+class FaceDiffuser(DiffusionModel):
     """FaceDiffuser: diffusion over vertices with HuBERT and recurrent layers.
 
     Args:
@@ -50,10 +49,9 @@ class FaceDiffuser(PublishedModel):
         sampling_space: where sampling runs: on the ``vertices``, whose noise is that of the published code for a seed,
             or ``folded`` into the first map's width, with the same distribution of motion at a cost per step that does
             not depend on the vertices.
-        options: those of :class:`PublishedModel`, and of every model.
+        options: those of :class:`DiffusionModel`, and of every model.
     """
 
-    samples: ClassVar[bool] = True
     # HuBERT base as the project's copy of transformers has it; the two lowest layers are frozen.
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder,
@@ -99,15 +97,6 @@ class FaceDiffuser(PublishedModel):
     def personal_modules(self) -> list[nn.Module]:
         """The table of speakers."""
         return [self.network.style]
-
-    def choose_expressivity(self, expressivity: object) -> None:
-        """Samples as they are (1); the method knows no mean around which they lie.
-
-        Raises:
-            FaceDiffError: if it is anything else.
-        """
-        if isinstance(expressivity, Tensor) or expressivity != 1:
-            raise FaceDiffError("expressivity: FaceDiffuser predicts no mean of its samples; omit the option")
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """There is one way to sample, over all steps.
@@ -173,27 +162,10 @@ class FaceDiffuser(PublishedModel):
 
     # Sampling.
 
-    def generate_frames(
-        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
-    ) -> BatchMotion:
-        """The reverse process over all steps; a clip's noise depends on its seed alone."""
-        return self.sample(batch, frames, SeededNoise(frames.tolist(), seeds, self.device), progress)
-
     def sample(
-        self,
-        batch: Batch,
-        frames: Int[Tensor, " batch"],
-        noise: Callable[[Tensor], Tensor],
-        progress: Progress | None = None,
+        self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
     ) -> BatchMotion:
-        """The reverse process with a given source of noise.
-
-        Args:
-            batch: clips.
-            frames: how many each gets.
-            noise: new noise of the shape of a tensor: the first noisy motion, then one for each step.
-            progress: wraps the iteration over steps.
-        """
+        """The reverse process over all steps: the first noisy motion, then new noise in each step."""
         network, posterior, rest = self.network, self.posterior, self.rest(batch)
         style = network.style(self.identity_weights(batch))
         space = VertexSpace(network, rest) if self.sampling_space == "vertices" else FoldedSpace(network, rest)
@@ -252,27 +224,6 @@ class Posterior:
         return signal.sqrt().to(clean) * clean + (1.0 - signal).sqrt().to(clean) * noise
 
 
-class SeededNoise:
-    """Unit Gaussian noise as a generator with a clip's seed gives it, zero on the clip's padding.
-
-    Args:
-        frames: of each clip.
-        seeds: one for each clip.
-        device: where the noise is drawn.
-    """
-
-    def __init__(self, frames: Sequence[int], seeds: Sequence[int], device: torch.device) -> None:
-        self.frames = list(frames)
-        self.streams = [torch.Generator(device).manual_seed(seed) for seed in seeds]
-
-    def __call__(self, like: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
-        """The next noise of the shape of ``like``."""
-        noise = torch.zeros_like(like)
-        for row, stream, frames in zip(noise, self.streams, self.frames, strict=True):
-            row[:frames] = torch.randn((frames, like.shape[2]), device=like.device, dtype=like.dtype, generator=stream)
-        return noise
-
-
 class FaceDiffuserNetwork(nn.Module):
     """Predicts clean motion from noisy motion, speech, the speaker and the step.
 
@@ -308,6 +259,7 @@ class FaceDiffuserNetwork(nn.Module):
         self.motion_out = nn.Linear(dim, 3 * n_vertices)
         nn.init.zeros_(self.motion_out.weight)
         nn.init.zeros_(self.motion_out.bias)
+        self.of_weights: WeightCache[tuple[Tensor, ...]] = WeightCache()
 
     def forward(
         self,
@@ -325,68 +277,6 @@ class FaceDiffuserNetwork(nn.Module):
         embedded = F.mish(self.step.weight.T[step] + self.step.bias)[:, None].expand(-1, frames, -1)
         joined = self.norm(torch.cat([audio, motion, embedded.to(motion.dtype)], -1))
         return self.gru(joined)[0] * style[:, None]
-
-
-class VertexSpace:
-    """The reverse process on the vertices.
-
-    Args:
-        network: the network.
-        rest: what is added to every prediction.
-    """
-
-    def __init__(self, network: FaceDiffuserNetwork, rest: Tensor) -> None:
-        self.network, self.rest = network, rest
-        self.width = network.motion_in.in_features
-
-    def mapped(self, state: Tensor) -> Tensor:
-        """The state after the network's first map."""
-        return self.network.motion_in(state)
-
-    def clean(self, made: Tensor) -> Tensor:
-        """Clean motion as a state."""
-        return self.network.motion_out(made) + self.rest
-
-    def noise(self, source: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
-        """Noise as a state."""
-        return source(like)
-
-
-class FoldedSpace:
-    """The reverse process in the width of the network's first map.
-
-    Noisy motion enters the network through that map alone, and the reverse process is linear in noisy motion, clean
-    motion and noise. So all of it may be mapped: clean motion by the product of the last and the first map, and unit
-    noise to noise whose covariance is that of the map, W Wᵀ.
-
-    Args:
-        network: the network.
-        rest: what is added to every prediction.
-    """
-
-    def __init__(self, network: FaceDiffuserNetwork, rest: Tensor) -> None:
-        first, last = network.motion_in, network.motion_out
-        self.width = first.out_features
-        with torch.autocast(rest.device.type, enabled=False):
-            # Products over all vertices, in double precision, since they are used in every step.
-            weight = first.weight.double()
-            self._turn = (weight @ last.weight.double()).to(first.weight)
-            self._rest = F.linear(rest.double() + last.bias.double(), weight).to(first.weight)
-            values, vectors = torch.linalg.eigh(weight @ weight.T)
-            self._root = (vectors * values.clamp_min(0).sqrt() @ vectors.T).to(first.weight)
-        self._bias = first.bias
-
-    def mapped(self, state: Tensor) -> Tensor:
-        """The state with the map's bias, which the reverse process must not repeat."""
-        return state + self._bias
-
-    def clean(self, made: Tensor) -> Tensor:
-        """Clean motion as a state."""
-        return F.linear(made, self._turn) + self._rest
-
-    def noise(self, source: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
-        """Noise as a state."""
-        return source(like) @ self._root
 
 
 # The authors' checkpoints.

@@ -51,6 +51,7 @@ METHODS: dict[str, dict[str, Any]] = {
         "ctc_weight": 1.0,
     },
     "TalkingStyle": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 2},
+    "DiffSpeaker": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "sampling_steps": 8, "smooth": True},
 }
 """Options by which each published method is small."""
 

@@ -1,0 +1,498 @@
+"""DiffSpeaker (Ma et al.: "DiffSpeaker: Speech-Driven 3D Facial Animation with Diffusion Transformer", 2024).
+
+Diffusion over offsets from the template, with one Transformer layer in which the speaker and the denoising step are
+tokens that every frame attends to. From top to bottom: the model, its network, the sampler's steps, the authors'
+checkpoints. docs/methods/diffspeaker.md says what of the published code is an option here.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch
+from facediff.errors import ArgumentError, FaceDiffError, choices
+from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.base import Decay
+from facediff.models.folding import WeightCache
+from facediff.models.inference import BatchMotion, Progress
+from facediff.models.layers import Heads, Layers, Share, Width, frame_mask
+from facediff.models.published.autoregressive import (
+    KeysValues,
+    Period,
+    ProjectedAttention,
+    decoder_sizes,
+    periodic_positions,
+    read_period,
+)
+from facediff.models.published.base import LongSpeech, SpeakerTable, masked_mean
+from facediff.models.published.diffusion import DiffusionModel, FoldedSpace, NoiseSource, SamplingSpace, VertexSpace
+from facediff.models.published.faceformer import LAYER_NAMES
+from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
+from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.utils.ranges import Range
+
+Scheduler = Literal["published", "ddim"]
+"""The published scheduler's update of DDIM, or that of the paper."""
+
+TRAINING_STEPS = 1000
+"""Noising steps of the process that the sampler's steps are taken from."""
+
+
+@registry.model.register("DiffSpeaker")
+class DiffSpeaker(DiffusionModel):
+    """DiffSpeaker: a diffusion Transformer with the speaker and the step as tokens, and biased attention.
+
+    Args:
+        dim: channels of the Transformer; 1024 at 25 frames a second (BIWI) and 512 otherwise if None.
+        num_layers: its layers.
+        num_heads: its attention heads.
+        feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
+        time_dim: sinusoids of the step; as many as the channels of speech if None.
+        dropout: in the Transformer and on its positions, in training.
+        period: frames after which positions and the attention's bias repeat; those of a second if None.
+        scheduler: ``published`` is DDIM as diffusers 0.11 had it, which takes the predicted clean motion for the
+            predicted noise where it goes to the next step; ``ddim`` computes that noise, as the paper of DDIM does.
+        sampling_steps: denoising steps, at most 1000.
+        sampling_space: where sampling runs: ``folded`` into the first map's width, or on the ``vertices``, as
+            published; nothing but rounding differs.
+        smooth: take the mean of each frame, the one before and the one after it; at 30 frames a second (VOCASET) if
+            None, as published.
+        loss_mean: over which numbers the loss is a mean: all of a ``padded`` batch, as published, so that a clip weighs
+            less the longer the others are; or those of ``frames`` alone.
+        unknown_speaker: whose row an unknown speaker gets: that of the ``first`` identity, as published, or the
+            ``mean`` of all.
+        long_speech: what is done with more than 3000 frames, for which the published tables have no rows: ``refuse``
+            them, as published; animate ``windows`` of them; or ``extend`` the tables by their formula.
+        alignment: speech is interpolated at every frame rate.
+        weight_decay: AdamW's, as PyTorch has it.
+        options: those of :class:`PublishedModel`, and of every model.
+    """
+
+    chosen: ClassVar[tuple[str, ...]] = (*DiffusionModel.chosen, "scheduler", "sampling_steps")
+    table_frames: ClassVar[int | None] = 3000
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder,
+        source="facebook/hubert-base-ls960",
+        spec_augment=True,
+        layer_drop=0.1,
+        epsilon=1e-7,
+        edges=False,
+    )
+
+    def __init__(
+        self,
+        *,
+        dim: Width | None = None,
+        num_layers: Layers = 1,
+        num_heads: Heads = 4,
+        feed_forward_dim: Width | None = None,
+        time_dim: Width | None = None,
+        dropout: Share = 0.1,
+        period: Period | None = None,
+        scheduler: Scheduler = "published",
+        sampling_steps: Annotated[int, Range(1, TRAINING_STEPS)] = 50,
+        sampling_space: SamplingSpace = "folded",
+        smooth: bool | None = None,
+        loss_mean: Literal["padded", "frames"] = "padded",
+        unknown_speaker: Literal["first", "mean"] = "first",
+        long_speech: LongSpeech = "refuse",
+        alignment: Literal["interpolated"] = "interpolated",
+        weight_decay: Decay = 0.01,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(alignment=alignment, weight_decay=weight_decay, **options)
+        self.dim = dim or (1024 if self.frame_rate == 25.0 else 512)
+        if self.dim % num_heads or self.dim % 2:
+            raise ArgumentError({"dim": self.dim, "num_heads": num_heads}, "dim must be even, and a multiple of heads")
+        time_dim = time_dim or self.audio_width
+        if time_dim % 2:
+            raise ArgumentError({"time_dim": time_dim}, "it must be even, half sines and half cosines")
+        self.scheduler: Scheduler = scheduler
+        self.sampling_steps = sampling_steps
+        self.sampling_space: SamplingSpace = sampling_space
+        self.smooth = self.frame_rate == 30.0 if smooth is None else smooth
+        self.loss_mean, self.unknown_speaker = loss_mean, unknown_speaker
+        self.plan_long_speech(long_speech)
+        # The share of the clean motion's variance that is left after each step, in single precision as published.
+        self.signal = torch.cumprod(1 - torch.linspace(0.00085**0.5, 0.012**0.5, TRAINING_STEPS) ** 2, 0)
+        self.network = DiffSpeakerNetwork(
+            audio_width=self.audio_width,
+            n_vertices=self.n_vertices,
+            dim=self.dim,
+            num_layers=num_layers,
+            num_heads=num_heads,
+            hidden_dim=feed_forward_dim or 2 * self.dim,
+            time_dim=time_dim,
+            dropout=dropout,
+            period=period or max(1, round(self.frame_rate)),
+            n_identities=len(self.identities),
+        )
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The table of speakers."""
+        return [self.network.style]
+
+    def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
+        """Change the number of denoising steps, or correct the published scheduler.
+
+        Args:
+            name: ``ddim`` for DDIM as its paper has it; the present scheduler if None.
+            steps: denoising steps; the present number if None.
+
+        Raises:
+            FaceDiffError: if there is no such sampler, or so many steps are impossible.
+        """
+        if name not in (None, "ddim"):
+            raise FaceDiffError(f"--sampler {name}: DiffSpeaker has no such sampler: {choices(name, ['ddim'])}")
+        if steps is not None and not 1 <= steps <= TRAINING_STEPS:
+            raise FaceDiffError(f"--steps {steps}: expected a number from 1 to {TRAINING_STEPS}")
+        self.scheduler = "ddim" if name == "ddim" else self.scheduler
+        self.sampling_steps = steps or self.sampling_steps
+
+    # Frames, speech and the speaker.
+
+    def frames_of(self, samples: int) -> int:
+        """Frames that the method gives for speech of so many samples, at any frame rate in floating point."""
+        return int((self.steps_of(samples) / 50.0) * self.frame_rate)
+
+    def tested_frames(self, batch: Batch) -> list[int]:
+        """As many as the truth has, as in the published test."""
+        return [int(frames) for frames in batch.frame_lengths]
+
+    def identity_weights(self, batch: Batch) -> Float[Tensor, "batch identities"]:
+        """One-hot rows of the clips' identities; an unknown speaker's as ``unknown_speaker`` says."""
+        if self.unknown_speaker == "mean":
+            return super().identity_weights(batch)
+        return F.one_hot(batch.identity.clamp_min(0), len(self.identities)).to(batch.template)
+
+    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+        """Hidden states, interpolated to the frames."""
+        cached = batch.cached_features or ()
+        return self.audio_encoder.at_steps(batch.audio, batch.audio_lengths, frames, "hidden", *cached)
+
+    def conditions(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Conditions:
+        """What the network is conditioned on in every step."""
+        valid = frame_mask(frames, int(frames.max())) if bool((frames != frames.max()).any()) else None
+        return self.network.conditions(self.hear(batch, frames), self.identity_weights(batch), valid)
+
+    # Training.
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """The mean squared error of the predicted clean motion at a random step, and that of its first differences."""
+        step = torch.randint(0, TRAINING_STEPS, (len(batch),), device=self.device, generator=generator)
+        noise = torch.randn(batch.motion.flatten(2).shape, device=self.device, generator=generator)
+        return self.losses_at(batch, step, noise)
+
+    def losses_at(
+        self, batch: Batch, step: Int[Tensor, " batch"], noise: Float[Tensor, "batch frames coordinates"]
+    ) -> dict[str, Tensor]:
+        """The losses with given random numbers."""
+        frames = batch.frame_lengths
+        self.check_length(frames, batch.names[0])
+        mask = frame_mask(frames, batch.motion.shape[1])[..., None]
+        clean = (batch.motion * self.scale).flatten(2) * mask
+        signal = self.signal.to(clean)[step].view(-1, 1, 1)
+        noisy = signal.sqrt() * clean + (1 - signal).sqrt() * noise * mask
+        made = self.network.motion_out(
+            self.network(self.network.motion_in(noisy), step, self.conditions(batch, frames))
+        )
+        error = (made - clean) * mask
+        change = error[:, 1:] - error[:, :-1]
+        if self.loss_mean == "frames":
+            position, velocity = masked_mean(error.square(), frames), masked_mean(change.square(), frames - 1)
+        else:
+            position, velocity = error.square().mean(), change.square().sum() / max(1, change.numel())
+        return {"reconstruction": position, "velocity": velocity, "loss": position + velocity}
+
+    # Sampling.
+
+    def sample(
+        self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
+    ) -> BatchMotion:
+        """The reverse process from noise that is drawn once."""
+        self.check_length(frames, batch.names[0])
+        network, conditions = self.network, self.conditions(batch, frames)
+        start = noise(batch.template.new_empty(len(batch), int(frames.max()), 3 * self.n_vertices))
+        rest = start.new_zeros(1, 1, 3 * self.n_vertices)
+        space = (
+            VertexSpace(network, rest)
+            if self.sampling_space == "vertices"
+            else FoldedSpace(network, rest, fresh_noise=False)
+        )
+        state = space.of(start)
+        # Noisy motion is always U h + weight · b + left · start, of which h, a sum of features, has the network's
+        # width; so the vertices are not needed before the end.
+        features, weight, left = torch.zeros((), device=state.device), 0.0, 1.0
+        steps = step_shares(self.signal, self.sampling_steps, self.scheduler)
+        for number in progress(range(len(steps))) if progress is not None else range(len(steps)):
+            step, of_clean, of_noisy = steps[number]
+            made = network(space.mapped(state), torch.full((len(batch),), step, device=state.device), conditions)
+            state = of_clean * space.clean(made) + of_noisy * state
+            features, weight, left = (
+                of_clean * made + of_noisy * features,
+                of_clean + of_noisy * weight,
+                of_noisy * left,
+            )
+        if self.sampling_space == "folded":
+            weights = network.motion_out
+            state = F.linear(features, weights.weight) + weight * weights.bias + left * start
+        motion = state.view(*state.shape[:2], self.n_vertices, 3) / self.scale
+        return smoothed(motion, frames) if self.smooth else motion
+
+
+def step_shares(signal: Float[Tensor, " steps"], count: int, scheduler: Scheduler) -> list[tuple[int, float, float]]:
+    """The steps of the sampler, and what predicted clean and noisy motion contribute to the motion of the next one.
+
+    DDIM (Song et al. 2021, eq. 12, with η = 0) goes from noisy motion x to √ᾱ' x̂₀ + √(1 − ᾱ') ε̂, where the predicted
+    noise is ε̂ = (x − √ᾱ x̂₀)/√(1 − ᾱ). diffusers 0.11 took x̂₀ for ε̂ where a network predicts x̂₀, and so the authors'
+    networks were tested; x then contributes nothing.
+
+    Args:
+        signal: ᾱ of every step of the process, in single precision as published.
+        count: steps of the sampler.
+        scheduler: see :class:`DiffSpeaker`.
+    """
+    stride = len(signal) // count
+    found = []
+    for place in reversed(range(count)):
+        step = min(place * stride + 1, len(signal) - 1)  # the published offset of 1
+        now, after = float(signal[step]), float(signal[max(step - stride, 0)])
+        noise = math.sqrt(1 - after)
+        if scheduler == "published":
+            found.append((step, math.sqrt(after) + noise, 0.0))
+        else:
+            found.append((step, math.sqrt(after) - noise * math.sqrt(now / (1 - now)), noise / math.sqrt(1 - now)))
+    return found
+
+
+def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"]) -> BatchMotion:
+    """The mean of each frame and its two neighbours; a clip's first and last frame stay as they are."""
+    if motion.shape[1] < 3:
+        return motion
+    mean = (motion[:, :-2] + motion[:, 1:-1] + motion[:, 2:]) / 3
+    inner = frame_mask(frames - 2, motion.shape[1] - 2)[..., None, None]
+    return torch.cat([motion[:, :1], torch.where(inner, mean, motion[:, 1:-1]), motion[:, -1:]], 1)
+
+
+class Conditions:
+    """What a clip's motion is conditioned on, and what is constant over the denoising steps.
+
+    Args:
+        style: the speaker's tokens of all layers, side by side.
+        speech: keys and values of the speech for each layer.
+        positions: of the frames.
+        bias: of the attention between frames, with two columns of zeros for the tokens; −∞ where there is padding.
+    """
+
+    def __init__(
+        self, style: Tensor, speech: list[KeysValues], positions: Tensor, bias: Float[Tensor, "... frames keys"]
+    ) -> None:
+        self.style, self.speech, self.positions, self.bias = style, speech, positions, bias
+
+
+class AdaptedLayer(nn.Module):
+    """Self-attention, attention to the speech, feed-forward, each of the normalised frames and added to them.
+
+    Frames attend to two further tokens in both, that of the speaker and that of the step.
+
+    Args:
+        dim: channels.
+        num_heads: attention heads.
+        hidden_dim: channels of the feed-forward layer.
+        dropout: everywhere.
+    """
+
+    def __init__(self, dim: int, num_heads: int, hidden_dim: int, dropout: float) -> None:
+        super().__init__()
+        self.self_attention = ProjectedAttention(dim, num_heads, dropout)
+        self.cross_attention = ProjectedAttention(dim, num_heads, dropout)
+        self.first, self.second = nn.Linear(dim, hidden_dim), nn.Linear(hidden_dim, dim)
+        self.norms = nn.ModuleList(nn.LayerNorm(dim) for _ in range(3))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch frames dim"],
+        tokens: Float[Tensor, "batch 2 dim"],
+        speech: KeysValues,
+        bias: Tensor,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Frames after the layer.
+
+        Args:
+            x: the frames.
+            tokens: the speaker and the step, which are not normalised.
+            speech: keys and values of the frames' own moments of the speech.
+            bias: added to the scores of the tokens and the frames.
+        """
+        normed, own = self.norms[0](x), self.self_attention
+        frames = KeysValues(*map(joined, own.keys_values(tokens), own.keys_values(normed)))
+        x = x + self.dropout(own.attend(own.queries(normed), frames, bias))
+        heard, count = self.cross_attention, x.shape[1]
+        # Each frame has the two tokens and one moment of speech to attend to, side by side.
+        moments = KeysValues(
+            *(
+                torch.cat([token[:, :, None].expand(-1, -1, count, -1, -1), part[:, :, :, None]], 3).flatten(2, 3)
+                for token, part in zip(heard.keys_values(tokens), speech, strict=True)
+            )
+        )
+        x = x + self.dropout(heard.attend_own(heard.queries(self.norms[1](x)), moments))
+        return x + self.dropout(self.second(self.dropout(F.gelu(self.first(self.norms[2](x))))))
+
+
+def joined(first: Tensor, second: Tensor) -> Tensor:
+    """Positions of two tensors (batch, heads, positions, head_dim), one after the other."""
+    return torch.cat([first, second.to(first.dtype)], 2)
+
+
+class DiffSpeakerNetwork(nn.Module):
+    """Predicts clean motion from noisy motion, speech, the speaker and the step.
+
+    Args:
+        audio_width: channels of a frame's speech.
+        n_vertices: vertices V.
+        dim: channels.
+        num_layers: layers.
+        num_heads: attention heads.
+        hidden_dim: channels of the feed-forward layers.
+        time_dim: sinusoids of the step; even.
+        dropout: everywhere, and on the positions.
+        period: frames after which positions and bias repeat.
+        n_identities: rows of the table of speakers.
+    """
+
+    def __init__(
+        self,
+        *,
+        audio_width: int,
+        n_vertices: int,
+        dim: int,
+        num_layers: int,
+        num_heads: int,
+        hidden_dim: int,
+        time_dim: int,
+        dropout: float,
+        period: int,
+        n_identities: int,
+    ) -> None:
+        super().__init__()
+        self.dim, self.num_heads, self.time_dim, self.period = dim, num_heads, time_dim, period
+        self.audio_map = nn.Linear(audio_width, dim)
+        self.motion_in = nn.Linear(3 * n_vertices, dim)
+        # Each layer has tokens of its own.
+        self.style = SpeakerTable(n_identities, num_layers * dim, "embedding")
+        self.time = nn.Sequential(
+            nn.Linear(time_dim, num_layers * dim), nn.SiLU(), nn.Linear(num_layers * dim, num_layers * dim)
+        )
+        self.layers = nn.ModuleList(AdaptedLayer(dim, num_heads, hidden_dim, dropout) for _ in range(num_layers))
+        self.motion_out = nn.Linear(dim, 3 * n_vertices)
+        nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
+        nn.init.zeros_(self.motion_out.bias)
+        self.dropout = nn.Dropout(dropout)
+        self.of_weights: WeightCache[tuple[Tensor, ...]] = WeightCache()
+
+    def conditions(
+        self,
+        hidden: Float[Tensor, "batch frames width"],
+        identities: Float[Tensor, "batch identities"],
+        valid: Bool[Tensor, "batch frames"] | None,
+    ) -> Conditions:
+        """What is constant over the denoising steps; without ``valid``, all frames are."""
+        memory, frames = self.audio_map(hidden), hidden.shape[1]
+        speech = [layer.cross_attention.keys_values(memory) for layer in self.layers]  # type: ignore[union-attr, operator]
+        positions = periodic_positions(frames, self.dim, self.period, device=hidden.device)
+        bias = F.pad(mutual_bias(frames, self.num_heads, self.period, device=hidden.device), (2, 0))
+        if valid is not None:
+            bias = bias.masked_fill(~F.pad(valid, (2, 0), value=True)[:, None, None], -torch.inf)
+        return Conditions(self.style(identities), speech, positions, bias)
+
+    def forward(
+        self, mapped: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions
+    ) -> Float[Tensor, "batch frames dim"]:
+        """From noisy motion after ``motion_in`` to what ``motion_out`` makes clean motion of."""
+        x = self.dropout(mapped + conditions.positions)
+        time = self.time(step_sinusoids(step, self.time_dim))
+        tokens = torch.stack([part.unflatten(1, (-1, self.dim)) for part in (conditions.style.to(time), time)], 2)
+        for number, layer in enumerate(self.layers):
+            x = layer(x, tokens[:, number], conditions.speech[number], conditions.bias)
+        return x
+
+
+def step_sinusoids(step: Int[Tensor, " batch"], dim: int) -> Float[Tensor, "batch dim"]:
+    """cos(n·w_k), then sin(n·w_k), w_k = 10000^(−k/(dim/2)), of the step n."""
+    exponents = -math.log(10_000.0) * torch.arange(dim // 2, device=step.device).float() / (dim // 2)
+    angle = step[:, None].float() * exponents.exp()
+    return torch.cat([angle.cos(), angle.sin()], 1)
+
+
+def mutual_bias(
+    frames: int, heads: int, period: int, *, device: torch.device | None = None
+) -> Float[Tensor, "heads frames frames"]:
+    """−2^(−8(h+1)/heads)·⌊(i − j)/period⌋ for head h, frame i and j ≤ i, and of ⌊(j − i − 1)/period⌋ for j > i.
+
+    The published table is that of later frames turned about, so that both sides differ by one frame.
+    """
+    places = torch.arange(frames, device=device)
+    distance = places[:, None] - places
+    distance = torch.where(distance < 0, -distance - 1, distance)
+    slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
+    return -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")
+
+
+# The authors' checkpoints.
+
+
+def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+    """DiffSpeaker's tensors under the names of this file, and its options."""
+    dim, _ = weights.shape("denoiser.audio_feature_map.weight")
+    _, time_dim = weights.shape("denoiser.time_embedding.linear_1.weight")
+    period = round(found.frame_rate)
+    if "denoiser.PPE.pe" in weights:
+        period = read_period(weights, "denoiser.PPE.pe", found)
+    encoder = weights.backbone(
+        "audio_encoder.",
+        kind="wav2vec2",  # the published code makes this network of HuBERT's weights too
+        request=request,
+        **{name: value for name, value in DiffSpeaker.published_encoder.keywords.items() if name != "source"},  # type: ignore[attr-defined]
+    )
+    for old, new in (
+        ("audio_feature_map", "audio_map"),
+        ("vertice_map", "motion_in"),
+        ("motion_decoder", "motion_out"),
+        ("obj_vector", "style"),
+        ("time_embedding.linear_1", "time.0"),
+        ("time_embedding.linear_2", "time.2"),
+    ):
+        weights.move_all(f"denoiser.{old}.", f"network.{new}.")
+    decoder = "denoiser.transformer_decoder."
+    weights.move_all(f"{decoder}layers.", "network.layers.", LAYER_NAMES)
+    weights.ignore("_losses.", "sums of the training's losses")
+    return {
+        "audio_encoder": encoder,
+        **decoder_sizes(weights, decoder, dim),
+        "time_dim": time_dim,
+        "period": period,
+        "smooth": found.dataset == "vocaset",
+    }
+
+
+recogniser(
+    Recogniser(
+        method="DiffSpeaker",
+        marks=("denoiser.motion_decoder.weight", "denoiser.vertice_map.weight", "denoiser.obj_vector.weight"),
+        unless=(),
+        convert=convert,
+        vertices=lambda weights: weights.shape("denoiser.motion_decoder.weight")[0] // 3,
+        count=lambda weights: weights.shape("denoiser.obj_vector.weight")[0],
+        licence="unknown: no statement on code or weights, whose data is for research",
+        licence_source="github.com/theEricMa/DiffSpeaker",
+    )
+)

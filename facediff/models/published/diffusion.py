@@ -1,0 +1,178 @@
+"""What the published diffusion methods share: their noise, and where their reverse process runs.
+
+FaceDiffuser and DiffSpeaker take noisy vertices in by one linear map and give clean ones by another, so that the
+reverse process may run on the vertices, as published, or in the width of the first map; see
+:mod:`facediff.models.folding` for why.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import ClassVar, Literal, Protocol
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff.data import Batch
+from facediff.errors import FaceDiffError
+from facediff.models.folding import WeightCache, fold_maps, fold_noise
+from facediff.models.inference import BatchMotion, Progress
+from facediff.models.published.base import PublishedModel
+
+SamplingSpace = Literal["vertices", "folded"]
+"""Where the reverse process runs."""
+
+NoiseSource = Callable[[Tensor], Tensor]
+"""New unit Gaussian noise like a tensor, zero on padding."""
+
+
+class DiffusionModel(PublishedModel):
+    """Base of the published methods that sample by diffusion.
+
+    Args:
+        options: those of :class:`PublishedModel`.
+    """
+
+    samples: ClassVar[bool] = True
+
+    def choose_expressivity(self, expressivity: object) -> None:
+        """Samples as they are (1); the method knows no mean around which they lie.
+
+        Raises:
+            FaceDiffError: if it is anything else.
+        """
+        if isinstance(expressivity, Tensor) or expressivity != 1:
+            raise FaceDiffError(f"expressivity: {type(self).__name__} predicts no mean of its samples; omit the option")
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """The reverse process; a clip's noise depends on its seed alone."""
+        return self.sample(batch, frames, SeededNoise(frames.tolist(), seeds, self.device), progress)
+
+    @abstractmethod
+    def sample(
+        self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
+    ) -> BatchMotion:
+        """The reverse process with a given source of noise.
+
+        Args:
+            batch: clips.
+            frames: how many each gets.
+            noise: its random numbers, in the order in which the published code draws them.
+            progress: wraps the iteration over steps.
+        """
+
+
+class SeededNoise:
+    """Unit Gaussian noise as a generator with a clip's seed gives it, zero on the clip's padding.
+
+    Unlike that of the other models, it does not depend on the clip's name: so a seed gives the published code's noise.
+
+    Args:
+        frames: of each clip.
+        seeds: one for each clip.
+        device: where the noise is drawn.
+    """
+
+    def __init__(self, frames: Sequence[int], seeds: Sequence[int], device: torch.device) -> None:
+        self.frames = list(frames)
+        self.streams = [torch.Generator(device).manual_seed(seed) for seed in seeds]
+
+    def __call__(self, like: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
+        """The next noise of the shape of ``like``."""
+        noise = torch.zeros_like(like)
+        for row, stream, frames in zip(noise, self.streams, self.frames, strict=True):
+            row[:frames] = torch.randn((frames, like.shape[2]), device=like.device, dtype=like.dtype, generator=stream)
+        return noise
+
+
+class Maps(Protocol):
+    """A network between two linear maps.
+
+    Attributes:
+        motion_in: E x + e, from noisy motion x (3V) to the network's width.
+        motion_out: U h + b, from features h to clean motion.
+        of_weights: what was computed of both.
+    """
+
+    motion_in: nn.Linear
+    motion_out: nn.Linear
+    of_weights: WeightCache[tuple[Tensor, ...]]
+
+
+class VertexSpace:
+    """The reverse process on the vertices.
+
+    Args:
+        network: the network.
+        rest: what is added to every prediction.
+    """
+
+    def __init__(self, network: Maps, rest: Tensor) -> None:
+        self.network, self.rest = network, rest
+        self.width = network.motion_in.in_features
+
+    def of(self, motion: Tensor) -> Tensor:
+        """Motion as a state."""
+        return motion
+
+    def mapped(self, state: Tensor) -> Tensor:
+        """The state after the network's first map."""
+        return self.network.motion_in(state)
+
+    def clean(self, made: Tensor) -> Tensor:
+        """Clean motion as a state."""
+        return self.network.motion_out(made) + self.rest
+
+    def noise(self, source: NoiseSource, like: Tensor) -> Tensor:
+        """Noise as a state."""
+        return source(like)
+
+
+class FoldedSpace:
+    """The reverse process in the width of the network's first map.
+
+    Noisy motion enters the network through that map alone, and the reverse process is linear in noisy motion, clean
+    motion and noise. So all of it may be mapped: clean motion by the product of the last and the first map, and unit
+    noise to noise whose covariance is that of the map, E Eᵀ.
+
+    Args:
+        network: the network.
+        rest: what is added to every prediction.
+        fresh_noise: whether noise is drawn by :meth:`noise`, and not on the vertices.
+    """
+
+    def __init__(self, network: Maps, rest: Tensor, *, fresh_noise: bool = True) -> None:
+        first, last = network.motion_in, network.motion_out
+        self.network, self.width = network, first.out_features
+
+        def computed() -> tuple[Tensor, ...]:
+            maps = fold_maps(first.weight, last.weight, last.bias)
+            return (*maps, fold_noise(first.weight)) if fresh_noise else maps
+
+        weights = [first.weight, last.weight, last.bias]
+        self._product, offset, *self._root = network.of_weights.get(weights, fresh_noise, computed)
+        self._offset = offset + self.of(rest)
+
+    def of(self, motion: Tensor) -> Tensor:
+        """Motion as a state: the first map without its bias, which the reverse process must not repeat."""
+        with torch.autocast(motion.device.type, enabled=False):
+            return nn.functional.linear(motion.to(self.network.motion_in.weight), self.network.motion_in.weight)
+
+    def mapped(self, state: Tensor) -> Tensor:
+        """The state with the map's bias."""
+        return state + self.network.motion_in.bias
+
+    def clean(self, made: Tensor) -> Tensor:
+        """Clean motion as a state."""
+        # In the weights' own precision: errors of the state add up over the steps.
+        with torch.autocast(made.device.type, enabled=False):
+            return nn.functional.linear(made.to(self._product), self._product) + self._offset
+
+    def noise(self, source: NoiseSource, like: Tensor) -> Tensor:
+        """Noise as a state."""
+        with torch.autocast(like.device.type, enabled=False):
+            return source(like) @ self._root[0]
