@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +10,9 @@ from facediff.cli.options import File, Folder, Output
 from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
+
+MOST_NAMED = 4
+"""Tensors of one part of a model that are named one by one where they are not needed."""
 
 
 def import_checkpoint(
@@ -75,13 +78,28 @@ def import_checkpoint(
         f"{output}: {type(model).__name__} of {made.dataset}, {model.n_vertices} vertices, {model.frame_rate:g} frames "
         f"a second, identities {', '.join(model.identities)}, {count / 1e6:.1f} M parameters from {made.used} tensors"
     )
-    for name, why in made.ignored.items():
-        tell(f"not needed: {name} ({why})")
+    for names, why in gathered(made.ignored):
+        tell(f"not needed: {names} ({why})")
     for licence in model.licences:
         tell(f"licence: {licence}")
     for note in made.notes:
         tell(f"note: {note}")
     tell(f"next: facediff animate speech.wav --checkpoint {output} -o speech.npy")
+
+
+def gathered(ignored: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Tensors by the reason why they are not needed; many of one part of a model as their count.
+
+    >>> gathered({"PPE.pe": "a table", **{f"head.{i}.weight": "of no use" for i in range(9)}})
+    [('PPE.pe', 'a table'), ('head.… of 9 tensors', 'of no use')]
+    """
+    parts: dict[tuple[str, str], list[str]] = {}
+    for name, why in ignored.items():
+        parts.setdefault((name.split(".")[0], why), []).append(name)
+    found: dict[str, list[str]] = {}
+    for (part, why), names in parts.items():
+        found.setdefault(why, []).extend(names if len(names) <= MOST_NAMED else [f"{part}.… of {len(names)} tensors"])
+    return [(", ".join(names), why) for why, names in found.items()]
 
 
 def as_list(value: object) -> list[object]:

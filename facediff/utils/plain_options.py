@@ -238,9 +238,14 @@ def is_name(text: object) -> bool:
 
 def in_words(hint: Any) -> str:  # noqa: ANN401 - a type hint
     """A type hint for a message."""
-    if get_origin(hint) is Annotated:
-        return in_words(get_args(hint)[0])
-    if isinstance(hint, type) and not get_args(hint):
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return in_words(inner[0])
+    if origin in (Union, types.UnionType):
+        return " or ".join(in_words(part) for part in inner if part is not type(None))
+    if origin is list:
+        return f"a list, each {in_words(inner[0])}"
+    if isinstance(hint, type) and not inner:
         return {int: "a whole number", float: "a number", bool: "true or false", str: "plain text"}.get(
             hint, hint.__name__
         )
