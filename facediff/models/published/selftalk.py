@@ -415,7 +415,14 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         if name != "source"
     }
     encoder = weights.backbone("audio_encoder.", kind="wav2vec2", request=request, **settings)
-    dim, _ = weights.shape("audio_feature_map.weight")
+    dim, width = weights.shape("audio_feature_map.weight")
+    channels, _ = weights.shape("audio_encoder.feature_projection.projection.weight")
+    if "alignment" not in request.options and (width == 2 * channels) != (found.frame_rate == 25.0):
+        heard = "pairs of steps of speech, as at 25" if width == 2 * channels else "single steps of speech, as at 30"
+        raise FaceDiffError(
+            f"--dataset {found.dataset}: {weights.source} takes {heard} frames a second, and {found.dataset} has "
+            f"{found.frame_rate:g}; give the data set that it was trained on"
+        )
     hidden, _ = weights.shape("transformer_decoder.layers.0.linear1.weight")
     weights.move_all("audio_feature_map.", "network.audio_map.")
     weights.move_all("transformer_decoder.", "network.decoder.")

@@ -12,12 +12,13 @@ import torch
 from lightning.pytorch import Trainer
 
 from facediff.callbacks.averaging import EmaWithWarmup
+from facediff.cli.app import main
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, SelfTalk, load_model
 from facediff.models.published.importing import import_files, save_model
 from tests.fakes import published
-from tests.fakes.published import COORDINATES, IDENTITIES, LIPS, VERTICES
+from tests.fakes.published import COORDINATES, IDENTITIES, LIPS, VERTICES, write_author_files
 from tests.fakes.tiny import Tiny
 from tests.models.published.author import face, imported, sample_of, speech_of, templates
 
@@ -136,6 +137,37 @@ def test_the_lip_reader_is_left_out_of_an_import_and_reported(tmp_path: Path) ->
         each.animate(speech, identity="A").vertices for each in (made.model, load_model(tmp_path / "model.ckpt"))
     )
     assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(("of", "given"), [("biwi", "vocaset"), ("vocaset", "biwi")])
+def test_another_data_set_than_it_was_trained_on_is_named(of: str, given: str, tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match=f"--dataset {given}"):
+        imported(published.selftalk_state(of), tmp_path, given)
+
+
+def test_the_command_line_keeps_the_lip_reader_and_gathers_what_is_not_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_author_files(tmp_path)
+    torch.save(published.selftalk_state("vocaset"), "author.pth")
+    words = [
+        "import-checkpoint",
+        "author.pth",
+        "--dataset=vocaset",
+        "--templates=faces.pkl",
+        "--audio-config=audio.json",
+    ]
+    assert main([*words, "-o", "model.ckpt"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("not needed")]
+    assert len(lines) == 1
+    assert all(part in lines[0] for part in ("text_encoder.", "lip_map.weight", "transformer.", "lm_head.bias"))
+    assert main([*words, "-o", "whole.ckpt", "--option=lip_reader=text", f"--option=lip_vertices={LIPS}"]) == 0
+    assert "not needed" not in capsys.readouterr().out
+    assert isinstance(load_model("whole.ckpt"), SelfTalk)
+    assert main([*words, "-o", "none.ckpt", "--option=lip_reader=text", "--option=lip_vertices=lips.txt"]) == 2
+    assert "--option lip_vertices" in capsys.readouterr().err
+    assert not Path("none.ckpt").exists()
 
 
 @pytest.mark.parametrize(
