@@ -1,0 +1,510 @@
+"""Files of TensorFlow from elsewhere, read without TensorFlow: tensors of a checkpoint, and constants of a graph.
+
+A checkpoint of TensorFlow 1 and 2 is a *bundle*: ``NAME.index`` says where the bytes of every tensor lie in
+``NAME.data-00000-of-00001``. The index is a sorted table as LevelDB writes one, whose values are messages of Protocol
+Buffers. A frozen graph (``output_graph.pb``) is one such message, whose nodes of the type ``Const`` hold the weights.
+From top to bottom: messages, the checksum, the table, the bundle, the graph. Both formats are public; nothing of a file
+is run, and every size and place that it states is compared with the file before it is believed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import LIMITS, quoted
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+BUNDLE = "expected the files NAME.index and NAME.data-00000-of-00001 of a TensorFlow checkpoint, whole and of one run"
+GRAPH = "expected a frozen graph of TensorFlow such as output_graph.pb, as it was unpacked"
+
+INDEX_BYTES = 64 * 2**20
+"""Most bytes of an index, and of one of its blocks: names and places of tensors, not their values."""
+
+FILLED = 1 << 20
+"""Most numbers of a tensor that a file states by fewer numbers than it has."""
+
+NAME_BYTES = 4096
+"""Most bytes of a tensor's name."""
+
+RANK = 32
+"""Most dimensions of a tensor."""
+
+TYPES = {1: "<f4", 2: "<f8", 3: "<i4", 4: "u1", 5: "<i2", 6: "i1", 9: "<i8", 10: "?", 19: "<f2"}
+"""Types of numbers by TensorFlow's codes, as NumPy writes them; others (texts, resources) are no weights."""
+
+FLOATS = {1: "<f4", 2: "<f8", 19: "<f2"}
+"""Those of them that weights have."""
+
+
+class DamagedError(ValueError):
+    """What is wrong with a file, for the sentence that names it."""
+
+
+# Messages of Protocol Buffers.
+
+Message = dict[int, list["int | memoryview"]]
+"""The values of a message by the number of their field, in their order: whole numbers, or bytes."""
+
+
+def varint(view: memoryview, at: int) -> tuple[int, int]:
+    """A whole number of variable length, 7 bits a byte from the lowest on, and where it ends.
+
+    >>> varint(memoryview(bytes([0xAC, 0x02])), 0)
+    (300, 2)
+
+    Raises:
+        DamagedError: if it has no end within the bytes, or takes more than 64 bits.
+    """
+    value = 0
+    for number in range(10):
+        if at >= len(view):
+            raise DamagedError("a number in it is cut short")
+        byte = view[at]
+        value |= (byte & 127) << (7 * number)
+        at += 1
+        if byte < 128:
+            if value >> 64:
+                break
+            return value, at
+    raise DamagedError("a number in it takes more than 64 bits")
+
+
+def message(view: memoryview) -> Message:
+    """The fields of a message, which may have been written by any version of its definition.
+
+    Raises:
+        DamagedError: if it is cut short, or is no message.
+        FaceDiffError: if it has more fields than the budget allows.
+    """
+    found: Message = {}
+    at = count = 0
+    while at < len(view):
+        key, at = varint(view, at)
+        field, wire = key >> 3, key & 7
+        value: int | memoryview
+        if not field or wire not in (0, 1, 2, 5):
+            raise DamagedError("it holds something else than messages")
+        if wire == 0:
+            value, at = varint(view, at)
+        else:
+            size = {1: 8, 5: 4}.get(wire, 0)
+            if wire == 2:
+                size, at = varint(view, at)
+            if size > len(view) - at:
+                raise DamagedError("a message in it is cut short")
+            value = view[at : at + size]
+            at += size
+        found.setdefault(field, []).append(value)
+        count += 1
+        if count > LIMITS.entries:
+            raise DamagedError("a message in it has more fields than the budget allows")
+    return found
+
+
+def whole(fields: Message, number: int, default: int = 0) -> int:
+    """The whole number of a field; the last one counts if there are several, as the format says.
+
+    Raises:
+        DamagedError: if it is of another type.
+    """
+    value = fields.get(number, [default])[-1]
+    if isinstance(value, memoryview):
+        raise DamagedError("a number in it has another type than expected")
+    return value - (1 << 64) if value >> 63 else value
+
+
+def part(fields: Message, number: int) -> memoryview:
+    """The bytes of a field, of which the last counts; none if it is absent.
+
+    Raises:
+        DamagedError: if it is of another type.
+    """
+    value = fields.get(number, [memoryview(b"")])[-1]
+    if not isinstance(value, memoryview):
+        raise DamagedError("a message in it has another type than expected")
+    return value
+
+
+def text(view: memoryview) -> str:
+    """The text of a field.
+
+    Raises:
+        DamagedError: if it is no UTF-8.
+    """
+    try:
+        return bytes(view).decode()
+    except UnicodeDecodeError as error:
+        raise DamagedError("a name in it is no text") from error
+
+
+def shape_of(view: memoryview) -> tuple[int, ...]:
+    """A tensor's shape.
+
+    Raises:
+        DamagedError: if it has an unknown size, or too many dimensions.
+    """
+    fields = message(view)
+    dims = fields.get(2, [])
+    if len(dims) > RANK or whole(fields, 3):
+        raise DamagedError("a tensor in it has no shape")
+    sizes = [whole(message(dim), 1) if isinstance(dim, memoryview) else -1 for dim in dims]
+    if any(size < 0 for size in sizes):
+        raise DamagedError("a tensor in it has no shape")
+    return tuple(sizes)
+
+
+# The checksum of both files: CRC-32C (Castagnoli).
+
+LANES = 1024
+"""Pieces of a long text whose checksums are computed side by side."""
+
+
+@cache
+def crc_table() -> npt.NDArray[np.uint32]:
+    """What each byte makes of a checksum."""
+    table: npt.NDArray[np.uint32] = np.arange(256, dtype=np.uint32)
+    for _ in range(8):
+        table = (table >> np.uint32(1)) ^ (table & np.uint32(1)) * np.uint32(0x82F63B78)
+    return table
+
+
+def crc32c(data: bytes | memoryview) -> int:
+    """The CRC-32C of some bytes.
+
+    >>> hex(crc32c(b"123456789"))
+    '0xe3069283'
+    """
+    table, numbers = crc_table(), np.frombuffer(data, np.uint8)
+    rows = len(numbers) // LANES if len(numbers) >= 64 * LANES else 0
+    state = 0xFFFFFFFF
+    if rows:
+        # A loop over single bytes in Python would take seconds for the weights of a model. The checksum is linear, so
+        # that of a text follows from those of its pieces: one piece's, advanced over the zeros that the next one's
+        # place would hold, differs from that of both together by that of the next one alone.
+        lanes = np.zeros(LANES, np.uint32)
+        lanes[0] = state
+        for column in np.ascontiguousarray(numbers[: rows * LANES].reshape(LANES, rows).T):
+            lanes = table[(lanes ^ column) & 255] ^ (lanes >> 8)
+        shift = zeros_operator(rows)
+        while len(lanes) > 1:
+            lanes = applied(shift, lanes[0::2]) ^ lanes[1::2]
+            shift = applied(shift, shift)
+        state = int(lanes[0])
+    small = [int(value) for value in table]
+    for byte in numbers[rows * LANES :].tolist():
+        state = small[(state ^ byte) & 255] ^ (state >> 8)
+    return state ^ 0xFFFFFFFF
+
+
+def zeros_operator(count: int) -> npt.NDArray[np.uint32]:
+    """What so many zero bytes make of each of a checksum's bits."""
+    bits = np.uint32(1) << np.arange(32, dtype=np.uint32)
+    once, made = crc_table()[bits & 255] ^ (bits >> 8), bits
+    while count:
+        made = applied(once, made) if count & 1 else made
+        once, count = applied(once, once), count >> 1
+    return made
+
+
+def applied(operator: npt.NDArray[np.uint32], values: npt.NDArray[np.uint32]) -> npt.NDArray[np.uint32]:
+    """A linear operator, given by what becomes of each bit, on some checksums."""
+    made = np.zeros_like(values)
+    for bit, image in enumerate(operator):
+        made ^= np.where((values >> np.uint32(bit)) & 1, image, np.uint32(0))
+    return made
+
+
+def masked(checksum: int) -> int:
+    """A checksum as the files store it, turned and shifted, so that a text with its own checksum has no special one."""
+    return ((checksum >> 15 | checksum << 17) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+# The table.
+
+FOOTER, MAGIC = 48, bytes.fromhex("57fb808b247547db")
+"""Bytes at the end of a table, and the last of them."""
+
+
+def table_entries(content: memoryview) -> Iterator[tuple[bytes, memoryview]]:
+    """Keys and values of a sorted table, in their order.
+
+    Raises:
+        DamagedError: if it is damaged.
+    """
+    if len(content) < FOOTER or bytes(content[-8:]) != MAGIC:
+        raise DamagedError("it is no index, or cut short")
+    footer = content[-FOOTER:]
+    _, at = handle(footer, 0)
+    (offset, size), _ = handle(footer, at)
+    last: bytes | None = None
+    count = 0
+    for _, place in block_entries(block(content, offset, size)):
+        (offset, size), _ = handle(place, 0)
+        for key, value in block_entries(block(content, offset, size)):
+            # This also ends an index that names the same block again and again.
+            if last is not None and key <= last:
+                raise DamagedError("its names are not sorted")
+            last, count = key, count + 1
+            if count > LIMITS.entries:
+                raise DamagedError("it has more entries than the budget allows")
+            yield key, value
+
+
+def handle(view: memoryview, at: int) -> tuple[tuple[int, int], int]:
+    """Offset and size of a block, and where the two numbers end."""
+    offset, at = varint(view, at)
+    size, at = varint(view, at)
+    return (offset, size), at
+
+
+def block(content: memoryview, offset: int, size: int) -> memoryview:
+    """A block's content, whose checksum is right.
+
+    Raises:
+        DamagedError: if it lies outside of the table, or is damaged.
+    """
+    if offset + size + 5 > len(content) - FOOTER:
+        raise DamagedError("a block of it lies outside of it")
+    body = content[offset : offset + size + 1]
+    if masked(crc32c(body)) != int.from_bytes(content[offset + size + 1 : offset + size + 5], "little"):
+        raise DamagedError("a block of it has another checksum than it states")
+    if body[size] == 0:
+        return body[:size]
+    if body[size] == 1:
+        return memoryview(unsnapped(body[:size]))
+    raise DamagedError("it is compressed in an unknown way")
+
+
+def block_entries(view: memoryview) -> Iterator[tuple[bytes, memoryview]]:
+    """Keys and values of a block, where a key omits what it shares with the key before.
+
+    Raises:
+        DamagedError: if it is damaged.
+    """
+    restarts = int.from_bytes(view[-4:], "little")
+    end = len(view) - 4 * (restarts + 1)
+    if len(view) < 4 or end < 0:
+        raise DamagedError("a block of it is cut short")
+    at, key = 0, b""
+    while at < end:
+        shared, at = varint(view[:end], at)
+        own, at = varint(view[:end], at)
+        size, at = varint(view[:end], at)
+        if shared > len(key) or shared + own > NAME_BYTES or own + size > end - at:
+            raise DamagedError("an entry of it is cut short")
+        key = key[:shared] + bytes(view[at : at + own])
+        yield key, view[at + own : at + own + size]
+        at += own + size
+
+
+def unsnapped(view: memoryview) -> bytes:
+    """What Snappy compressed: stretches of bytes, and copies of what came before.
+
+    >>> unsnapped(memoryview(bytes([6, 0b100]) + b"ab" + bytes([0b000_000_01, 2])))
+    b'ababab'
+
+    Raises:
+        DamagedError: if it is damaged, or longer than a block may be.
+    """
+    size, at = varint(view, 0)
+    if size > INDEX_BYTES:
+        raise DamagedError("a block of it is too long")
+    made = bytearray()
+    while at < len(view):
+        tag = view[at]
+        at += 1
+        kind, count = tag & 3, tag >> 2
+        extra = (max(0, count - 59) if count >= 60 else 0) if kind == 0 else (0, 1, 2, 4)[kind]
+        if extra > len(view) - at:
+            raise DamagedError("a block of it is cut short")
+        further = int.from_bytes(view[at : at + extra], "little")
+        at += extra
+        if kind == 0:
+            length = (further if count >= 60 else count) + 1
+            if length > len(view) - at:
+                raise DamagedError("a block of it is cut short")
+            made += view[at : at + length]
+            at += length
+        else:
+            length = (count & 7) + 4 if kind == 1 else count + 1
+            back = further | (count >> 3) << 8 if kind == 1 else further
+            if not 0 < back <= len(made):
+                raise DamagedError("a block of it is damaged")
+            # What is copied may reach into the copy itself.
+            pattern = made[-back:]
+            made += (pattern * (length // back + 1))[:length]
+        if len(made) > size:
+            break
+    if len(made) != size:
+        raise DamagedError("a block of it is damaged")
+    return bytes(made)
+
+
+# The bundle.
+
+
+def read_bundle(index: Path, shards: Sequence[Path] = ()) -> dict[str, Tensor]:
+    """All tensors of a TensorFlow checkpoint by name; what are no numbers, such as texts, is left out.
+
+    Args:
+        index: the file ``NAME.index``.
+        shards: files with the tensors' bytes, by their names; those that are not among them lie next to the index.
+
+    Raises:
+        FaceDiffError: if a file is missing or damaged, or needs more than the budget.
+    """
+    import torch
+
+    with reading(index, BUNDLE):
+        if index.stat().st_size > INDEX_BYTES:
+            raise DamagedError("it is too long for an index")
+        entries = dict(table_entries(memoryview(index.read_bytes())))
+        header = message(entries.pop(b"", memoryview(b"")))
+        count = whole(header, 1)
+        if not 0 < count < 100_000 or whole(header, 2):
+            raise DamagedError("it has no header of a checkpoint" if count <= 0 else "its byte order is unusual")
+        tensors = [(text(memoryview(key)), message(value)) for key, value in entries.items()]
+        LIMITS.check("bytes", sum(max(0, whole(entry, 5)) for _, entry in tensors), index)
+    files: dict[int, Shard] = {}
+    made: dict[str, Tensor] = {}
+    for name, entry in tensors:
+        with reading(index, BUNDLE):
+            kind, number, shape = TYPES.get(whole(entry, 1)), whole(entry, 3), shape_of(part(entry, 2))
+            offset, size, checksum = whole(entry, 4), whole(entry, 5), part(entry, 6)
+            if kind is None:
+                continue
+            if 7 in entry:
+                raise DamagedError(f"its tensor {quoted(name)} is stored in slices")
+            if math.prod(shape) * np.dtype(kind).itemsize != size:
+                raise DamagedError(f"its tensor {quoted(name)} has another size than its shape")
+            if not 0 <= number < count:
+                raise DamagedError(f"its tensor {quoted(name)} lies in no file of it")
+        if number not in files:
+            wanted = f"{index.name.removesuffix('.index')}.data-{number:05d}-of-{count:05d}"
+            files[number] = Shard(next((each for each in shards if each.name == wanted), index.with_name(wanted)))
+        content = files[number].piece(name, offset, size, int.from_bytes(checksum, "little"))
+        made[name] = torch.from_numpy(np.frombuffer(bytearray(content), kind).reshape(shape))
+    return made
+
+
+class Shard:
+    """A file with the bytes of tensors.
+
+    Args:
+        path: the file.
+
+    Raises:
+        FaceDiffError: if there is no such file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise FaceDiffError(f"{path}: no such file; {BUNDLE}")
+        self.path, self.size = path, path.stat().st_size
+
+    def piece(self, name: str, offset: int, size: int, checksum: int) -> bytes:
+        """The bytes of a tensor.
+
+        Raises:
+            FaceDiffError: if they lie outside of the file, or are damaged.
+        """
+        with reading(self.path, BUNDLE):
+            if not 0 <= offset <= self.size - size:
+                raise DamagedError(f"the tensor {quoted(name)} lies outside of it")
+            with self.path.open("rb") as stream:
+                stream.seek(offset)
+                content = stream.read(size)
+            if masked(crc32c(content)) != checksum:
+                raise DamagedError(f"the tensor {quoted(name)} has another checksum than the index states")
+            return content
+
+
+# The graph.
+
+
+def read_graph(path: Path) -> dict[str, Tensor]:
+    """The weights of a frozen graph: its constants of one dimension or more that are floating-point numbers, by name.
+
+    Raises:
+        FaceDiffError: if the file is missing or damaged, or needs more than the budget.
+    """
+    import torch
+
+    if not path.is_file():
+        raise FaceDiffError(f"{path}: no such file; {GRAPH}")
+    made: dict[str, Tensor] = {}
+    with reading(path, GRAPH):
+        LIMITS.check("bytes", path.stat().st_size, path)
+        content = memoryview(np.memmap(path, np.uint8, "r").data) if path.stat().st_size else memoryview(b"")
+        used = 0
+        for node in message(content.cast("B")).get(1, []):
+            if not isinstance(node, memoryview):
+                raise DamagedError("it holds no nodes")
+            fields = message(node)
+            if bytes(part(fields, 2)) != b"Const":
+                continue
+            value = constant(fields)
+            if value is None:
+                continue
+            name = text(part(fields, 1))
+            if name in made:
+                raise DamagedError(f"two of its nodes are called {quoted(name)}")
+            used += value.nbytes
+            LIMITS.check("bytes", used, path)
+            made[name] = torch.from_numpy(value)
+        if not made:
+            raise DamagedError("it holds no weights")
+    return made
+
+
+def constant(node: Message) -> npt.NDArray[np.floating] | None:
+    """The value of a constant; None if it is a single number, or none of floating point.
+
+    Raises:
+        DamagedError: if it is damaged.
+    """
+    for entry in node.get(5, []):
+        attribute = message(entry) if isinstance(entry, memoryview) else {}
+        if bytes(part(attribute, 1)) == b"value":
+            tensor = message(part(message(part(attribute, 2)), 8))
+            break
+    else:
+        return None
+    kind, shape = FLOATS.get(whole(tensor, 1)), shape_of(part(tensor, 2))
+    if kind is None or not shape:
+        return None
+    count, content = math.prod(shape), part(tensor, 4)
+    if not len(content):
+        # Few numbers stand in a list of their own, where the last one is repeated as often as the shape needs.
+        field, item = {"<f4": (5, 4), "<f8": (6, 8), "<f2": (13, 0)}[kind]
+        pieces = [each for each in tensor.get(field, []) if isinstance(each, memoryview)]
+        stated = np.frombuffer(b"".join(pieces), kind) if item else np.zeros(0, kind)
+        if not 0 < len(stated) <= count <= max(FILLED, len(stated)):
+            raise DamagedError("a constant of it has another size than its shape")
+        return np.concatenate([stated, np.repeat(stated[-1:], count - len(stated))]).reshape(shape)
+    if len(content) != count * np.dtype(kind).itemsize:
+        raise DamagedError("a constant of it has another size than its shape")
+    return np.frombuffer(bytearray(content), kind).reshape(shape)
+
+
+@contextmanager
+def reading(path: Path, remedy: str) -> Iterator[None]:
+    """A context in which whatever a damaged file makes its readers raise becomes one sentence that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); {remedy}") from error
+    except (ValueError, IndexError, OverflowError, MemoryError) as error:
+        reason = str(error) if isinstance(error, DamagedError) else "it is damaged"
+        raise FaceDiffError(f"{path}: {reason}; {remedy}") from error
