@@ -185,7 +185,7 @@ class Kind:
 
 audio_encoder = Kind(
     "audio_encoder",
-    "facediff.models.audio_encoders facediff.models.speech_networks",
+    "facediff.models.audio_encoders facediff.models.speech_networks facediff.models.deepspeech",
     "speech to one feature per frame",
 )
 identity_encoder = Kind("identity_encoder", "facediff.models.speaker_encoders", "a speaker's label to a vector")
@@ -204,7 +204,8 @@ model = Kind(
     "facediff.models.published.facediffuser "
     "facediff.models.published.faceformer "
     "facediff.models.published.selftalk "
-    "facediff.models.published.talkingstyle",
+    "facediff.models.published.talkingstyle "
+    "facediff.models.published.voca",
     "a method, as a LightningModule",
     aliases=False,  # Lightning refuses to reload a module that is named by a nested alias
 )

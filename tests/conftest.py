@@ -6,7 +6,7 @@ import os
 from jaxtyping import install_import_hook
 
 SHAPED = "audio_encoders speaker_encoders mesh_encoders fusions decoders layers losses samplers folding"
-SHAPED += " losses_fused motion_space"
+SHAPED += " losses_fused motion_space deepspeech"
 install_import_hook([f"facediff.models.{module}" for module in SHAPED.split()], "beartype.beartype")
 
 os.environ["HF_HUB_OFFLINE"] = "1"
@@ -122,6 +122,15 @@ def hubert_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
         num_conv_pos_embedding_groups=4,
     )
     return saved(HubertModel, config, tmp_path_factory.mktemp("hubert"))
+
+
+@pytest.fixture(scope="session")
+def deepspeech_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """DeepSpeech's frozen graph in miniature, with random weights."""
+    from tests.fakes.tensorflow import write_graph
+    from tests.fakes.voca import deepspeech_state
+
+    return write_graph(tmp_path_factory.mktemp("deepspeech") / "output_graph.pb", deepspeech_state())
 
 
 @pytest.fixture(scope="session")

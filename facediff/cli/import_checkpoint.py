@@ -37,7 +37,7 @@ def import_checkpoint(
       facediff animate speech.wav --checkpoint faceformer.ckpt --condition FaceTalk_170725_00137_TA -o speech.npy
 
     Args:
-        files: the checkpoint; both of a method with two stages
+        files: the checkpoint; both of a method with two stages; of VOCA the checkpoint and DeepSpeech's graph
         output: checkpoint to write (.ckpt)
         dataset: what it was trained on, where the number of vertices does not say it
         identities: training identities in the order of the training command; by default the data set's usual ones
@@ -50,7 +50,8 @@ def import_checkpoint(
     if output.suffix != ".ckpt":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
     for path in files:
-        if not path.is_file():
+        # A checkpoint of TensorFlow is named by what its files' names begin with, too.
+        if not path.is_file() and not path.with_name(f"{path.name}.index").is_file():
             raise FaceDiffError(f"{path}: no such file; expected the checkpoint of a published method")
     options: dict[str, object] = {}
     for words in option or []:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from facediff.models.published.importing import import_checkpoint as import_checkpoint
     from facediff.models.published.selftalk import SelfTalk as SelfTalk
     from facediff.models.published.talkingstyle import TalkingStyle as TalkingStyle
+    from facediff.models.published.voca import Voca as Voca
     from facediff.models.style_content import StyleContentDisentanglement as StyleContentDisentanglement
 
 __getattr__, __dir__, __all__ = lazy_names(
@@ -32,6 +33,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "published.importing": "import_checkpoint",
         "published.selftalk": "SelfTalk",
         "published.talkingstyle": "TalkingStyle",
+        "published.voca": "Voca",
         "style_content": "StyleContentDisentanglement",
     },
 )

@@ -113,6 +113,26 @@ class AudioEncoder(nn.Module, ABC):
         encoded: Tensor = self(audio, audio_lengths, steps, *cached)
         return encoded
 
+    def at_rate(
+        self, audio: Waves, audio_lengths: Lengths, steps: Lengths, rate: float, *cached: Tensor
+    ) -> Float[Tensor, "batch most_steps width"]:
+        """Encode as VOCA does: at so many steps a second, the first of them where speech begins.
+
+        Here for encoders whose own steps have no such times: as many steps, spread over the clip evenly.
+
+        Args:
+            audio: as :meth:`forward` takes it.
+            audio_lengths: likewise.
+            steps: how many are wanted of each clip.
+            rate: steps a second.
+            cached: features of the frozen part with their lengths, if they are at hand.
+
+        Returns:
+            features, ``most_steps = steps.max()``; zero beyond a clip's own steps.
+        """
+        encoded: Tensor = self(audio, audio_lengths, steps, *cached)
+        return encoded
+
     @abstractmethod
     def forward(self, audio: Waves, audio_lengths: Lengths, frame_lengths: Lengths) -> Frames:
         """Encode.

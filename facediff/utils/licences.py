@@ -26,7 +26,9 @@ MOST = 1000
 """Labels that a file may hold."""
 
 KNOWN: dict[str, Commercial] = {
-    **dict.fromkeys(("apache-2.0", "mit", "bsd-2-clause", "bsd-3-clause", "cc0-1.0", "unlicense", "isc"), "allowed"),
+    **dict.fromkeys(
+        ("apache-2.0", "mpl-2.0", "mit", "bsd-2-clause", "bsd-3-clause", "cc0-1.0", "unlicense", "isc"), "allowed"
+    ),
     **dict.fromkeys(("cc-by-4.0", "cc-by-3.0", "cc-by-sa-4.0", "cc-by-sa-3.0", "cdla-permissive-2.0"), "allowed"),
     **dict.fromkeys(("cc-by-nc-4.0", "cc-by-nc-3.0", "cc-by-nc-sa-4.0", "cc-by-nc-nd-4.0"), "forbidden"),
 }
@@ -38,8 +40,9 @@ SPEECH_NETWORKS = {
         "Apache-2.0",
     ),
     **dict.fromkeys(("facebook/wav2vec2-base-960h", "facebook/wav2vec2-base"), "Apache-2.0"),
+    "mozilla/DeepSpeech": "MPL-2.0",
 }
-"""Licences of pretrained audio encoders, as their model cards on the hub state them."""
+"""Licences of pretrained audio encoders, as their model cards on the hub or their projects state them."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +175,7 @@ def network_licences(options: Any) -> tuple[Licence, ...]:  # noqa: ANN401 - pla
             f"audio encoder {shown}",
             name or "unknown",
             known_licence(name or ""),
-            f"model card huggingface.co/{own}" if name else "",
+            "" if not name else f"github.com/{own}" if name == "MPL-2.0" else f"model card huggingface.co/{own}",
         )
         return merged([label], inner)
     if isinstance(options, list | tuple):

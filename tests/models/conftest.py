@@ -45,9 +45,14 @@ def batch(tiny: Tiny) -> Batch:
 
 
 @pytest.fixture
-def make(hubert_source: Path, ctc_source: Path) -> Make:
+def make(hubert_source: Path, ctc_source: Path, deepspeech_source: Path) -> Make:
     """A small component by kind and name, with reproducible weights."""
-    sources = {"hubert": hubert_source, "wav2vec2": hubert_source, "ctc": ctc_source}
+    sources = {
+        "hubert": hubert_source,
+        "wav2vec2": hubert_source,
+        "ctc": ctc_source,
+        "deepspeech": deepspeech_source,
+    }
 
     def build(kind: str, name: str, seed: int = 0, **options: Any) -> nn.Module:  # noqa: ANN401
         if name in sources:

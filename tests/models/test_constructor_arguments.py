@@ -170,10 +170,14 @@ def test_wild_arguments_of_a_model(name: str, use_model: Callable[[AnimationMode
 
 @pytest.mark.parametrize("entry", COMPONENTS, ids=lambda entry: f"{entry.alias.__qualname__}")
 def test_wild_arguments_of_a_component(
-    entry: registry.Entry, use_model: Callable[[AnimationModel], None], hubert_source: object
+    entry: registry.Entry,
+    use_model: Callable[[AnimationModel], None],
+    hubert_source: object,
+    deepspeech_source: object,
 ) -> None:
     kind = entry.alias.__qualname__.partition(".")[0]
-    base: dict[str, Any] = {"source": str(hubert_source)} if entry.name in ("hubert", "wav2vec2") else {}
+    sources = {"hubert": hubert_source, "wav2vec2": hubert_source, "deepspeech": deepspeech_source}
+    base: dict[str, Any] = {"source": str(sources[entry.name])} if entry.name in sources else {}
     if entry.name == "spiral":
         base = {"channels": (4,), "spiral_length": 4}
     if kind == "sampler":

@@ -596,6 +596,30 @@ def authors(name: str) -> tuple[Callable[[Path], object], Callable[[Path], objec
     return one_of(author_folder, name, read)
 
 
+@functools.cache
+def voca_folder() -> Path:
+    """A checkpoint of VOCA as its authors write it, in TensorFlow's files, with DeepSpeech's graph and faces."""
+    from tests.fakes.voca import write_voca
+
+    folder = new_folder()
+    write_voca(folder)
+    (folder / "faces.pkl").write_bytes(pickle.dumps({"A": np.zeros((12, 3))}))
+    return folder
+
+
+def voca(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """Writes one file of VOCA, and imports the method with it."""
+
+    def read(folder: Path) -> object:
+        from facediff.models import import_checkpoint
+
+        files = [folder / "gstep_52280.model.index", folder / "output_graph.pb"]
+        options = {"dataset": "vocaset", "identities": ["A", "B", "C"], "templates": folder / "faces.pkl"}
+        return import_checkpoint(files, **options)
+
+    return one_of(voca_folder, name, read)
+
+
 def curves(path: Path) -> None:
     path.write_text("epoch,step,train/loss\n0,0,1.0\n0,1,0.5\n1,2,0.25\n")
 
@@ -716,6 +740,10 @@ READERS = {
     **{
         f"published method, {name}": Reader(Path(name).suffix, *authors(name), 0.2)
         for name in ("author.pth", "faces.pkl", "audio.json")
+    },
+    **{
+        f"voca, {name}": Reader(Path(name).suffix, *voca(name), 0.2)
+        for name in ("gstep_52280.model.index", "gstep_52280.model.data-00000-of-00001", "output_graph.pb")
     },
     "curves": Reader(".csv", curves, read_the_curves),
     "hubert, config": Reader(".json", *hubert("config.json"), 0.2),

@@ -9,6 +9,7 @@ or reported as not needed. Nothing of a file is run.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -28,9 +29,10 @@ from facediff.metrics import Region
 from facediff.models.checkpoint import check_weights
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.licences import Commercial, Licence, merged, network_licences
-from facediff.utils.limits import quoted
+from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import load_json
 from facediff.utils.plain_options import as_hinted, fits, in_words, is_name, parameters
+from facediff.utils.tensorflow_files import read_bundle
 from facediff.utils.torch_files import read_state_dict
 
 if TYPE_CHECKING:
@@ -70,12 +72,13 @@ def dataset_facts() -> dict[str, DatasetFacts]:
 
 @dataclass(frozen=True)
 class Request:
-    """What the user says besides the files; see :func:`import_checkpoint`."""
+    """What the user says besides the checkpoint; see :func:`import_checkpoint`."""
 
     dataset: str | None = None
     identities: Sequence[str] | None = None
     audio_config: Mapping[str, Any] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    graph: Path | None = None
 
 
 class Weights:
@@ -259,6 +262,9 @@ class Recogniser:
         convert: makes the model's options, but for those that every model has, and uses or ignores the tensors.
         vertices: the number of vertices by the tensors' shapes.
         count: the number of training identities by the tensors' shapes; 0 where the method knows no identities.
+        frame_rate: frames a second that its checkpoints animate, where they are not those of the data set; the option
+            ``frame_rate`` then says otherwise.
+        graph: the option that names the frozen graph that the method needs as well; empty if it needs none.
         licence: of the authors' weights.
         commercial: whether that licence allows commercial use.
         licence_source: where it stands.
@@ -270,6 +276,8 @@ class Recogniser:
     convert: Callable[[Weights, Request, Found], dict[str, Any]]
     vertices: Callable[[Weights], int]
     count: Callable[[Weights], int]
+    frame_rate: float | None = None
+    graph: str = ""
     licence: str = "unknown"
     commercial: Commercial = "unknown"
     licence_source: str = ""
@@ -339,7 +347,8 @@ def import_checkpoint(
     """An author's checkpoint of one of the published methods as a model.
 
     Args:
-        paths: the file, or the files of a method with several stages.
+        paths: the file, or the files of a method with several stages; of TensorFlow's checkpoints the ``.index``, the
+            ``.data-…`` or what both names begin with, and the frozen graph (``.pb``) that the method needs.
         dataset: ``vocaset``, ``biwi`` or ``multiface``; by the number of vertices if None.
         identities: training identities in the order of the training command; the data set's usual ones if None.
         templates: neutral faces by speaker: the project's ``templates.pkl``, or arrays (V, 3) or (3V,) by name.
@@ -381,11 +390,11 @@ def import_files(
 ) -> Imported:
     """As :func:`import_checkpoint`, with a report of what became of the files."""
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
-    request = Request(
-        dataset, identities, read_config(audio_config), {k: v for k, v in options.items() if k != "ignore"}
-    )
-    weights = read_weights(files)
+    weights = read_weights([path for path in files if path.suffix != GRAPH])
     method = recognise(weights)
+    own = {name: value for name, value in options.items() if name not in ("ignore", method.graph)}
+    graph = the_graph([path for path in files if path.suffix == GRAPH], options.get(method.graph), method)
+    request = Request(dataset, identities, read_config(audio_config), own, graph)
     found = facts_of(weights, method, request)
     made = method.convert(weights, request, found)
     ignore = options.get("ignore", ())
@@ -397,10 +406,59 @@ def import_files(
             f"of the method? If they may be left out, give --option ignore={left[0]}"
         )
     assets, notes = read_assets(found, templates, regions, mesh)
+    if found.frame_rate != (usual := dataset_facts()[found.dataset].frame_rate):
+        notes.append(
+            f"it animates at {found.frame_rate:g} frames a second, as {method.method} was published, and the corpus "
+            f"{found.dataset} has {usual:g}; to test it there, import it with --option frame_rate={usual:g}"
+        )
     model = build(weights, method, found, with_options(method.method, made, request.options))
     model.adopt(assets)
     label(model, method, found.dataset)
     return Imported(model.eval(), found.dataset, len(weights.made), weights.ignored, [*weights.notes, *notes])
+
+
+GRAPH, META = ".pb", ".meta"
+"""Suffixes of TensorFlow's graphs: of a frozen one with its weights, and of one without."""
+
+SHARD = re.compile(r"(.+)\.data-\d{5}-of-\d{5}")
+"""Names of files with the bytes of a TensorFlow checkpoint's tensors."""
+
+
+def the_graph(given: Sequence[Path], option: object, method: Recogniser) -> Path | None:
+    """The frozen graph that a method needs, which is a further file, or that of an option.
+
+    Raises:
+        FaceDiffError: if there are several, or the method needs none.
+    """
+    graphs = [*given, *([] if option is None else [Path(str(option))])]
+    if graphs and not method.graph:
+        raise FaceDiffError(f"{graphs[0]}: is a graph of TensorFlow, which {method.method} does not need; omit it")
+    if len(set(graphs)) > 1:
+        raise FaceDiffError(f"{graphs[1]}: is the second graph that is given; expected one")
+    return graphs[0] if graphs else None
+
+
+def bundles(files: Sequence[Path]) -> dict[Path, list[Path]]:
+    """The files of checkpoints, in their order, each with those that were given of its tensors' bytes.
+
+    A checkpoint of TensorFlow has several files, any of which stands for it, as does what their names begin with.
+    """
+    found: dict[Path, list[Path]] = {}
+    shards = [path for path in files if SHARD.fullmatch(path.name)]
+    for path in files:
+        named = SHARD.fullmatch(path.name)
+        if path.suffix == ".index":
+            index = path
+        elif named is not None or path.suffix == META:
+            name = f"{path.stem if named is None else named[1]}.index"
+            index = next((each for each in files if each.name == name), path.with_name(name))
+        elif not path.exists() and path.with_name(f"{path.name}.index").is_file():
+            index = path.with_name(f"{path.name}.index")
+        else:
+            found[path] = []
+            continue
+        found[index] = shards
+    return found
 
 
 def read_weights(files: Sequence[Path]) -> Weights:
@@ -410,10 +468,10 @@ def read_weights(files: Sequence[Path]) -> Weights:
         FaceDiffError: if a file cannot be read, or two of them hold the same tensor.
     """
     if not files:
-        raise FaceDiffError("import-checkpoint: no file was given; expected the checkpoint of a published method")
+        raise FaceDiffError("import-checkpoint: no checkpoint was given; expected that of a published method")
     together: dict[str, Tensor] = {}
-    for path in files:
-        state = read_state_dict(path)
+    for path, shards in bundles(files).items():
+        state = read_bundle(path, shards) if path.suffix == ".index" else read_state_dict(path)
         if "facediff_format" in state:
             raise FaceDiffError(f"{path}: is a checkpoint of facediff already; use it as it is")
         if twice := sorted(together.keys() & state.keys()):
@@ -475,7 +533,23 @@ def facts_of(weights: Weights, method: Recogniser, request: Request) -> Found:
         )
     if not all(map(is_name, names)) or len(set(names)) < len(names):
         raise FaceDiffError(f"--identities: {quoted(names)}; expected different names without path separators")
-    return Found(name, facts.frame_rate, names, vertices)
+    return Found(name, rate_of(facts, method, request), names, vertices)
+
+
+def rate_of(facts: DatasetFacts, method: Recogniser, request: Request) -> float:
+    """Frames a second: those of the data set or of the method, or as the user says where the method lets choose.
+
+    Raises:
+        FaceDiffError: if they are no positive number.
+    """
+    given = read_value(request.options.get("frame_rate")) if method.frame_rate is not None else None
+    if given is None:
+        return method.frame_rate or facts.frame_rate
+    if isinstance(given, bool) or not isinstance(given, int | float) or not 0 < given <= FRAME_RATES[1]:
+        raise FaceDiffError(
+            f"--option frame_rate={quoted(given)}: expected frames a second, such as {method.frame_rate or 0:g}"
+        )
+    return float(given)
 
 
 def read_config(given: str | Path | Mapping[str, Any] | None) -> Mapping[str, Any] | None:
@@ -505,6 +579,8 @@ def with_options(method: str, made: dict[str, Any], given: Mapping[str, Any]) ->
     for name in ("dim", "config", "source"):
         encoders.pop(name, None)
     for name, text in given.items():
+        if name == "frame_rate" and chooses_rate(method):
+            continue
         hints = own if name in own else encoders
         if name not in hints or (name not in own and "audio_encoder" not in made):
             raise FaceDiffError(f"--option {name}: {method} has no such option: {choices(name, [*own, *encoders])}")
@@ -517,6 +593,11 @@ def with_options(method: str, made: dict[str, Any], given: Mapping[str, Any]) ->
         else:
             made = {**made, "audio_encoder": partial(made["audio_encoder"], **{name: value})}
     return made
+
+
+def chooses_rate(method: str) -> bool:
+    """Whether the option ``frame_rate`` belongs to a method; :func:`rate_of` reads it."""
+    return any(entry.method == method and entry.frame_rate is not None for entry in RECOGNISERS)
 
 
 def read_value(text: object) -> object:

@@ -52,6 +52,7 @@ METHODS: dict[str, dict[str, Any]] = {
     },
     "TalkingStyle": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 2},
     "DiffSpeaker": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "sampling_steps": 8, "smooth": True},
+    "Voca": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "components": 8, "channels": (8, 8)},
 }
 """Options by which each published method is small."""
 

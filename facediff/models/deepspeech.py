@@ -1,0 +1,328 @@
+"""DeepSpeech 0.1.0 (Mozilla's form of Hannun et al., "Deep Speech", 2014), as VOCA hears speech through it.
+
+From top to bottom: cepstra of speech, the acoustic network, the frozen graph that its weights come in, the encoder. The
+cepstra are those of the library python_speech_features with its defaults, from the formulas, in float64 as there.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor, nn
+
+from facediff.errors import ArgumentError, FaceDiffError
+from facediff.models.audio_encoders import AudioEncoder, Features, Lengths, Waves, by_length, fingerprint
+from facediff.models.layers import Frames, Width, frame_mask, interpolate_frames
+from facediff.registry import audio_encoder
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.limits import quoted
+from facediff.utils.tensorflow_files import read_graph
+
+FRAME, HOP, SPECTRUM = 400, 160, 512
+"""Samples of a frame (25 ms) and from one to the next (10 ms); those that the Fourier transform takes."""
+
+CEPSTRA = 26
+"""Mel bands, and as many cepstra."""
+
+RATE = 50
+"""Steps a second: every second frame of 10 ms."""
+
+LOUDEST = 20.0
+"""Where the network's rectifiers are clipped."""
+
+PROJECT = "mozilla/DeepSpeech"
+
+RELEASE = f"github.com/{PROJECT}/releases/tag/v0.1.0, deepspeech-0.1.0-models.tar.gz"
+
+SIZES = ("inputs", "first", "second", "third", "cell", "fifth", "logits")
+"""The network's sizes: a step's cepstra with their context, the layers in their order, what it gives."""
+
+
+# Cepstra.
+
+
+@cache
+def tables() -> tuple[Tensor, Tensor]:
+    """The mel filters (26, 257), and the cosine transform with the lifter, (26, 26), float64."""
+
+    def hertz(mel: np.ndarray) -> np.ndarray:
+        return 700.0 * (10.0 ** (mel / 2595.0) - 1.0)
+
+    mels = np.linspace(0.0, 2595.0 * np.log10(1.0 + SAMPLE_RATE / 2 / 700.0), CEPSTRA + 2)
+    # The edges are whole bins, rounded down.
+    edges = np.floor((SPECTRUM + 1) * hertz(mels) / SAMPLE_RATE)[:, None]
+    bins = np.arange(SPECTRUM // 2 + 1)[None]
+    low, middle, high = edges[:-2], edges[1:-1], edges[2:]
+    rise, fall = (bins - low) / (middle - low), (high - bins) / (high - middle)
+    filters = np.where((bins >= low) & (bins < middle), rise, 0.0) + np.where(
+        (bins >= middle) & (bins < high), fall, 0.0
+    )
+    order = np.arange(CEPSTRA)
+    cosine = np.cos(np.pi * order[:, None] * (2 * order[None] + 1) / (2 * CEPSTRA)) * math.sqrt(2 / CEPSTRA)
+    cosine[0] /= math.sqrt(2)
+    lifter = 1.0 + 11.0 * np.sin(np.pi * order / 22)
+    return torch.from_numpy(filters), torch.from_numpy(cosine * lifter[:, None])
+
+
+def cepstra(samples: Float64[Tensor, "batch samples"]) -> Float64[Tensor, "batch steps 26"]:
+    """Mel-frequency cepstra, 100 a second, whose first is the logarithm of the frame's energy.
+
+    Args:
+        samples: whole numbers of 16 bits, at 16 kHz.
+    """
+    emphasised = torch.cat([samples[:, :1], samples[:, 1:] - 0.97 * samples[:, :-1]], 1)
+    steps = 1 + max(0, math.ceil((samples.shape[1] - FRAME) / HOP))
+    padded = nn.functional.pad(emphasised, (0, (steps - 1) * HOP + FRAME - samples.shape[1]))
+    power = torch.fft.rfft(padded.unfold(1, FRAME, HOP), SPECTRUM).abs().square() / SPECTRUM
+    filters, transform = tables()
+    tiny = torch.finfo(torch.float64).eps
+
+    def logarithm(x: Tensor) -> Tensor:
+        return torch.where(x == 0, tiny, x).log()
+
+    made = logarithm(power @ filters.T) @ transform.T
+    made[..., 0] = logarithm(power.sum(-1))
+    return made
+
+
+def network_input(audio: Waves, context: int) -> Float[Tensor, "batch steps inputs"]:
+    """What the network takes: 50 steps a second with the cepstra around each, standardised over the clip.
+
+    Args:
+        audio: clips of one length, full scale 1.
+        context: steps on either side.
+    """
+    # The library takes whole numbers, cut off towards zero. Not every accelerator knows float64.
+    samples = (audio.cpu().double() * 32768.0).trunc().clamp(-32768, 32767)
+    found = nn.functional.pad(cepstra(samples)[:, ::2], (0, 0, context, context))
+    # (batch, steps, cepstra, steps around): a step's row holds one step after the other.
+    rows = found.unfold(1, 2 * context + 1, 1).transpose(2, 3).flatten(2)
+    mean = rows.mean((1, 2), keepdim=True)
+    deviation = rows.std((1, 2), correction=0, keepdim=True)
+    return ((rows - mean) / deviation).to(audio)
+
+
+# The network.
+
+
+class DeepSpeech(nn.Module):
+    """Three dense layers, one recurrent layer in both directions, two dense layers.
+
+    Args:
+        sizes: of :data:`SIZES`.
+    """
+
+    def __init__(self, sizes: Mapping[str, int]) -> None:
+        super().__init__()
+        inputs, first, second, third, cell, fifth, logits = (sizes[name] for name in SIZES)
+        self.first = nn.Linear(inputs, first)
+        self.second = nn.Linear(first, second)
+        self.third = nn.Linear(second, third)
+        self.recurrent = nn.LSTM(third, cell, batch_first=True, bidirectional=True)
+        self.fifth = nn.Linear(2 * cell, fifth)
+        self.logits = nn.Linear(fifth, logits)
+
+    def forward(self, x: Float[Tensor, "batch steps inputs"]) -> Float[Tensor, "batch steps logits"]:
+        """Logits over letters, space, apostrophe and blank, of clips of one length."""
+        for layer in (self.first, self.second, self.third):
+            x = layer(x).clamp(0.0, LOUDEST)
+        x = self.fifth(self.recurrent(x)[0]).clamp(0.0, LOUDEST)
+        logits: Tensor = self.logits(x)
+        return logits
+
+
+# The frozen graph.
+
+DENSE = {"1": "first", "2": "second", "3": "third", "5": "fifth", "6": "logits"}
+"""The dense layers by the number in the graph's names: ``h1`` is a matrix, ``b1`` its bias."""
+
+CELL = re.compile(r"(?:^|/)(fw|bw)/\w*lstm_cell/(kernel|weights|bias|biases)$")
+
+
+def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tensor], dict[str, int], list[str]]:
+    """The network's weights, its sizes, and the constants that it has no use for.
+
+    Args:
+        graph: a frozen graph's constants by name.
+        source: the file, for messages.
+
+    Raises:
+        FaceDiffError: if it is another network's.
+    """
+    found: dict[str, Tensor] = {}
+    left = []
+    for name, value in graph.items():
+        part = name.rpartition("/")[2]
+        cell = CELL.search(name)
+        if cell is not None:
+            part = f"{cell[1]}.{cell[2][0]}"  # k(ernel) or w(eights), b(ias)
+            part = part.replace(".w", ".k")
+        elif part[:1] not in ("h", "b") or part[1:] not in DENSE:
+            left.append(name)
+            continue
+        if part in found:
+            raise FaceDiffError(f"{source}: holds several networks ({name}); expected DeepSpeech 0.1.0, {RELEASE}")
+        found[part] = value
+    expected = {f"{kind}{number}" for number in DENSE for kind in "hb"} | {"fw.k", "fw.b", "bw.k", "bw.b"}
+    if missing := sorted(expected - found.keys()):
+        raise FaceDiffError(
+            f"{source}: lacks {', '.join(missing[:3])}, so it is not DeepSpeech's network; expected output_graph.pb of "
+            f"{RELEASE}"
+        )
+    misshapen = [
+        name
+        for name, value in found.items()
+        if value.ndim != (1 if name[-1] == "b" or name[0] == "b" and name[:2] != "bw" else 2)
+    ]
+    if misshapen or len(found["bw.k"]) != len(found["fw.k"]) or found["fw.k"].shape[1] % 4:
+        raise FaceDiffError(f"{source}: its network has another form than DeepSpeech 0.1.0; expected {RELEASE}")
+    cells = found["fw.k"].shape[1] // 4
+    sizes = dict(
+        zip(
+            SIZES,
+            [*found["h1"].shape, found["h2"].shape[1], found["h3"].shape[1], cells, *found["h6"].shape],
+            strict=True,
+        )
+    )
+    made: dict[str, Tensor] = {}
+    for number, layer in DENSE.items():
+        made[f"{layer}.weight"] = found[f"h{number}"].T
+        made[f"{layer}.bias"] = found[f"b{number}"]
+    for direction, end in (("fw", ""), ("bw", "_reverse")):
+        kernel = gates_as_torch(found[f"{direction}.k"].T, cells)
+        bias = gates_as_torch(found[f"{direction}.b"], cells).clone()
+        # TensorFlow's cell adds 1 to the forget gate when it runs.
+        bias[cells : 2 * cells] += 1.0
+        made[f"recurrent.weight_ih_l0{end}"] = kernel[:, : sizes["third"]]
+        made[f"recurrent.weight_hh_l0{end}"] = kernel[:, sizes["third"] :]
+        made[f"recurrent.bias_ih_l0{end}"] = bias
+        made[f"recurrent.bias_hh_l0{end}"] = torch.zeros_like(bias)
+    with torch.device("meta"):
+        own = DeepSpeech(checked_sizes(sizes)).state_dict()
+    for name, value in made.items():
+        if value.shape != own[name].shape:
+            raise FaceDiffError(
+                f"{source}: its {name} has the shape {tuple(value.shape)}, expected {tuple(own[name].shape)}; the "
+                f"file is of another network, expected {RELEASE}"
+            )
+        if not bool(value.isfinite().all()):
+            raise FaceDiffError(f"{source}: its {name} holds NaN or infinity; the file is damaged")
+    return {name: value.float().contiguous() for name, value in made.items()}, sizes, left
+
+
+def gates_as_torch(rows: Tensor, cells: int) -> Tensor:
+    """Rows of gates in PyTorch's order, where those of the new state come third; TensorFlow has them second."""
+    entry, new, forget, output = rows.reshape(4, cells, *rows.shape[1:])
+    return torch.cat([entry, forget, new, output])
+
+
+def checked_sizes(sizes: Mapping[str, Any]) -> dict[str, int]:
+    """The network's sizes, if it can be made of them.
+
+    Raises:
+        ArgumentError: if they are others than expected.
+    """
+    known = {name: sizes.get(name) for name in SIZES}
+    sizes = {name: size for name, size in sizes.items() if name != "_name_or_path"}
+    fits = all(isinstance(size, int) and not isinstance(size, bool) and 0 < size <= 1 << 16 for size in known.values())
+    if not fits or set(sizes) != set(SIZES) or known["inputs"] % CEPSTRA or known["inputs"] // CEPSTRA % 2 == 0:  # type: ignore[operator]
+        raise ArgumentError(
+            {"config": quoted(dict(sizes))},
+            f"expected the sizes {', '.join(SIZES)}, of which inputs is an odd multiple of {CEPSTRA}",
+        )
+    return {name: int(size) for name, size in known.items() if size is not None}
+
+
+# The encoder.
+
+
+@audio_encoder.register("deepspeech")
+class DeepSpeechEncoder(AudioEncoder):
+    """Logits of the frozen DeepSpeech 0.1.0, as VOCA hears speech.
+
+    Its steps are 50 a second. Models that take frames get them interpolated to the motion's frames; VOCA itself takes
+    them at the times of its own rate.
+
+    Args:
+        dim: channels of the result, by a linear map of the logits; the 29 logits as they are if None. Given by the
+            model.
+        source: the frozen graph ``output_graph.pb`` of the release 0.1.0, which TensorFlow is not needed for.
+        config: the network's sizes; if given, the weights are not read from ``source`` but left for a checkpoint to
+            fill in. Checkpoints use it, so that they need no access to ``source``.
+
+    Raises:
+        FaceDiffError: if ``source`` cannot be read, or is no such graph.
+    """
+
+    checkpoint_options = ("config",)  # without it, a file could have another one read
+
+    def __init__(
+        self, *, dim: Width | None, source: str = "output_graph.pb", config: dict[str, Any] | None = None
+    ) -> None:
+        super().__init__()
+        state: dict[str, Tensor] = {}
+        if config is None:
+            path = Path(source).expanduser()
+            if not path.is_file():
+                raise FaceDiffError(
+                    f"audio_encoder.source: no file {source}; expected the graph output_graph.pb of DeepSpeech 0.1.0, "
+                    f"unpack it from {RELEASE}"
+                )
+            state, config, _ = network_of(read_graph(path), source)
+        self.sizes = checked_sizes(config)
+        self.context = self.sizes["inputs"] // CEPSTRA // 2
+        self.network = DeepSpeech(self.sizes)
+        if state:
+            self.network.load_state_dict(state)
+        self.network.requires_grad_(False)
+        self.out = None if dim is None else nn.Linear(self.sizes["logits"], dim)
+        self.width: int = self.sizes["logits"] if dim is None else dim
+
+    def checkpoint_init_args(self) -> dict[str, Any]:
+        """What a checkpoint stores in place of ``source``: the sizes, and whose network it is, for its licence."""
+        return {"config": {**self.sizes, "_name_or_path": PROJECT}}
+
+    def frozen_key(self) -> str | None:
+        """A hash of the network's weights."""
+        return fingerprint(-1, dict(self.sizes), {"network": self.network})
+
+    @torch.no_grad()
+    def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
+        """The logits, at 50 steps a second."""
+        return by_length(audio, audio_lengths, lambda wave: self.network(network_input(wave, self.context)))
+
+    def forward(
+        self,
+        audio: Waves,
+        audio_lengths: Lengths,
+        frame_lengths: Lengths,
+        features: Features | None = None,
+        feature_lengths: Lengths | None = None,
+    ) -> Frames:
+        """Encode; see :class:`AudioEncoder`."""
+        if features is None or feature_lengths is None:
+            features, feature_lengths = self.frozen_features(audio, audio_lengths)
+        return interpolate_frames(features if self.out is None else self.out(features), feature_lengths, frame_lengths)
+
+    def at_rate(
+        self, audio: Waves, audio_lengths: Lengths, steps: Lengths, rate: float, *cached: Tensor
+    ) -> Float[Tensor, "batch most_steps width"]:
+        """Encode at the times of another rate; the last logits are held. See :meth:`AudioEncoder.at_rate`."""
+        features, lengths = cached or self.frozen_features(audio, audio_lengths)
+        times = torch.arange(int(steps.max()), dtype=torch.float64) * (RATE / rate)
+        places = torch.minimum(times[None], lengths.cpu().double()[:, None] - 1)
+        low = places.floor().long()
+        high = torch.minimum(low + 1, lengths.cpu()[:, None] - 1).to(features.device)
+        share = (places - low)[..., None].to(features)
+        rows = torch.arange(len(features), device=features.device)[:, None]
+        made = torch.lerp(features[rows, low.to(features.device)], features[rows, high], share)
+        made = made if self.out is None else self.out(made)
+        return made * frame_mask(steps, made.shape[1])[..., None]

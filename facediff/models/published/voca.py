@@ -1,0 +1,379 @@
+"""VOCA (Cudeiro, Bolkart, Laidlaw, Ranjan, Black: "Capture, Learning, and Synthesis of 3D Speaking Styles", 2019).
+
+Convolutions over a window of DeepSpeech's logits around each frame, joined with the speaker as a one-hot vector, give
+the coefficients of linear shapes. From top to bottom: the model, its network, the authors' checkpoint.
+docs/methods/voca.md says what of the published code is an option here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch, SpeechMotionDataModule
+from facediff.errors import FaceDiffError
+from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.deepspeech import DeepSpeechEncoder, network_of
+from facediff.models.inference import BatchMotion, Progress
+from facediff.models.layers import Width, frame_mask
+from facediff.models.published.base import PublishedModel, SpeakerTable, masked_mean
+from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Range
+from facediff.utils.tensorflow_files import read_graph
+
+PUBLISHED_RATE = 60.0
+"""Frames a second of VOCA's motion and of its windows' rows."""
+
+CHANNELS = (32, 32, 64, 64)
+"""Channels of the published convolutions."""
+
+
+@registry.model.register("Voca")
+class Voca(PublishedModel):
+    """VOCA: a window of speech around each frame, convolved to the coefficients of linear shapes.
+
+    Args:
+        dim: channels of the dense layer after the convolutions.
+        components: linear shapes.
+        channels: of the convolutions, each of which halves the window.
+        speech_window: rows of speech that a frame hears, half of them before it.
+        rows_per_frame: rows of speech from one frame to the next; as many as bring the rows closest to the published
+            60 a second if None: 1 at 60 frames a second, 2 at 30 and 25.
+        velocity_weight: of the error of differences between frames, next to that of the frames.
+        shapes: how the linear shapes start: as ``principal`` components of the training motion as published, or
+            ``random``.
+        options: those of :class:`PublishedModel`, and of every model.
+    """
+
+    published_encoder: ClassVar[AudioEncoderFactory] = DeepSpeechEncoder
+
+    def __init__(
+        self,
+        *,
+        dim: Width = 128,
+        components: Width = 50,
+        channels: Annotated[Sequence[Width], Range(items=(1, 16))] = CHANNELS,
+        speech_window: Annotated[int, Range(1, 1024)] = 16,
+        rows_per_frame: Annotated[int, Range(1, 1000)] | None = None,
+        velocity_weight: Annotated[float, Range(0, 1e9)] = 10.0,
+        shapes: Literal["principal", "random"] = "principal",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(**options)
+        self.windows = type(self.windows)(above=math.inf)  # a frame hears its own window alone
+        self.speech_window, self.velocity_weight, self.shapes = speech_window, velocity_weight, shapes
+        self.rows_per_frame = rows_per_frame or max(1, round(PUBLISHED_RATE / self.frame_rate))
+        self.network = VocaNetwork(
+            audio_width=self.audio_width,
+            n_vertices=self.n_vertices,
+            n_identities=len(self.identities),
+            window=speech_window,
+            channels=channels,
+            dim=dim,
+            components=components,
+        )
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The two tables of speakers."""
+        return [self.network.early_style, self.network.late_style]
+
+    def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
+        """The linear shapes start as principal components of the training motion, without an offset."""
+        wanted = self.network.expression.in_features if self.shapes == "principal" else 0
+        found = super().measure(data, max(at_least, wanted))
+        if found is not None and wanted:
+            with torch.no_grad():
+                weight, count = self.network.expression.weight, min(wanted, len(found))
+                weight[:, :count] = found[:count].T.to(weight)
+                self.network.expression.bias.zero_()
+        return found
+
+    # Frames.
+
+    def rows_of(self, samples: int) -> int:
+        """Rows of speech, of which a frame takes one, or every so many."""
+        # In this very order, as published; half a row is rounded to an even number.
+        return round(samples / SAMPLE_RATE * (self.frame_rate * self.rows_per_frame))
+
+    def frames_of(self, samples: int) -> int:
+        """At the published 60 frames a second, as many as rows; else every so many of them, from the first on."""
+        return -(-self.rows_of(samples) // self.rows_per_frame)
+
+    def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
+        """Frames of each clip for which there is speech."""
+        heard = torch.tensor([self.frames_of(int(n)) for n in batch.audio_lengths], device=batch.frame_lengths.device)
+        return torch.minimum(batch.frame_lengths, heard.clamp_min(1))
+
+    def hear(self, batch: Batch, most: int) -> Float[Tensor, "batch frames channels rows"]:
+        """The window of speech around each of so many frames; what lies before or after the speech is zero."""
+        rows = torch.tensor([max(1, self.rows_of(int(n))) for n in batch.audio_lengths], device=batch.audio.device)
+        cached = batch.cached_features or ()
+        rate = self.frame_rate * self.rows_per_frame
+        heard = self.audio_encoder.at_rate(batch.audio, batch.audio_lengths, rows, rate, *cached)
+        before, last = self.speech_window // 2, (most - 1) * self.rows_per_frame
+        after = max(0, last + self.speech_window - before - heard.shape[1])
+        windows = F.pad(heard, (0, 0, before, after)).unfold(1, self.speech_window, 1)
+        return windows[:, : last + 1 : self.rows_per_frame]
+
+    def coefficients(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames components"]:
+        """Coefficients of the linear shapes for each frame; zero on padding."""
+        windows, weights = self.hear(batch, int(frames.max())), self.identity_weights(batch)
+        # The batch norm must not see padding, so frames stand in one row without it.
+        mask = frame_mask(frames, windows.shape[1])
+        clips = mask.nonzero()[:, 0]
+        valid = self.mixed(windows[mask], weights[clips])
+        made = valid.new_zeros(*mask.shape, valid.shape[-1])
+        made[mask] = valid
+        return made
+
+    def mixed(
+        self, windows: Float[Tensor, "frames channels rows"], weights: Float[Tensor, "frames identities"]
+    ) -> Float[Tensor, "frames components"]:
+        """Coefficients, mixed by the speakers' weights.
+
+        The published code mixes vertices. They are linear in the coefficients and the weights sum to 1, so a mixture of
+        coefficients is the same.
+        """
+        if bool((weights.amax(1) == 1).all()):
+            coefficients: Tensor = self.network(windows, weights)
+            return coefficients
+        speakers = torch.eye(weights.shape[1], device=weights.device, dtype=weights.dtype)
+        used = weights.any(0).nonzero().flatten().tolist()
+        parts = [weights[:, k, None] * self.network(windows, speakers[k].expand(len(windows), -1)) for k in used]
+        return torch.stack(parts).sum(0)
+
+    # Training and inference.
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Squared distances of vertices, and of their differences between frames."""
+        frames = self.trained_frames(batch)
+        coefficients = self.coefficients(batch, frames)
+        truth = (batch.motion * self.scale).flatten(2)[:, : coefficients.shape[1]]
+        error = self.network.expression(coefficients) - truth
+        # Distances are sums over the three coordinates; the first frame is its own frame before.
+        reconstruction = 3.0 * masked_mean(error.square(), frames)
+        change = F.pad(error.diff(dim=1), (0, 0, 1, 0))
+        velocity = 3.0 * masked_mean(change.square(), frames)
+        loss = reconstruction + self.velocity_weight * velocity
+        return {"reconstruction": reconstruction, "velocity": velocity, "loss": loss}
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """Each frame from its own window; nothing is random."""
+        made = self.network.expression(self.coefficients(batch, frames))
+        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+
+
+class VocaNetwork(nn.Module):
+    """From a window of speech and a speaker to coefficients of linear shapes.
+
+    In the published network, the speaker's one-hot vector is a constant stretch of channels next to the speech, and is
+    joined to the result of the convolutions once more. Both times it picks columns of a matrix, which are the rows of
+    two tables here.
+
+    Args:
+        audio_width: channels of speech.
+        n_vertices: vertices V.
+        n_identities: rows of the tables of speakers.
+        window: rows of speech.
+        channels: of the convolutions.
+        dim: channels of the dense layer after them.
+        components: linear shapes.
+    """
+
+    TAPS = 3
+
+    def __init__(
+        self,
+        *,
+        audio_width: int,
+        n_vertices: int,
+        n_identities: int,
+        window: int,
+        channels: Sequence[int],
+        dim: int,
+        components: int,
+    ) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(1, eps=1e-5, momentum=0.1)
+        widths = [audio_width, *channels]
+        self.convolutions = nn.ModuleList(
+            nn.Conv1d(into, out, self.TAPS, stride=2) for into, out in zip(widths[:-1], widths[1:], strict=True)
+        )
+        self.early_style = SpeakerTable(n_identities, self.TAPS * widths[1])
+        left = window
+        for _ in channels:
+            left = -(-left // 2)
+        self.dense = nn.Linear(left * widths[-1], dim)
+        self.late_style = SpeakerTable(n_identities, dim)
+        self.coefficients = nn.Linear(dim, components)
+        self.expression = nn.Linear(components, 3 * n_vertices)
+
+    def forward(
+        self, windows: Float[Tensor, "frames channels rows"], speaker: Float[Tensor, "frames identities"]
+    ) -> Float[Tensor, "frames components"]:
+        """The coefficients, which ``expression`` makes offsets of."""
+        count, channels, rows = windows.shape
+        x = self.norm(windows.reshape(count, 1, channels * rows)).view(count, channels, rows)
+        for number, convolution in enumerate(self.convolutions):
+            inside = padded_same(x.new_ones(x.shape[2]), self.TAPS).unfold(0, self.TAPS, 2)
+            x = convolution(padded_same(x, self.TAPS))
+            if number == 0:
+                # The speaker's channels are padded with zeros as well: at the ends not all taps meet them.
+                taps = self.early_style(speaker).view(count, self.TAPS, -1)
+                x = x + torch.einsum("pt,ntc->ncp", inside, taps.to(inside)).to(x)
+            x = torch.relu(x)
+        # Row by row, as TensorFlow lays it out.
+        flat = x.transpose(1, 2).flatten(1)
+        made: Tensor = self.coefficients(torch.tanh(self.dense(flat) + self.late_style(speaker)))
+        return made
+
+
+def padded_same(x: Float[Tensor, "*channels rows"], taps: int) -> Float[Tensor, "*channels padded"]:
+    """Zeros for a convolution of stride 2 that halves the rows, rather after than before, as TensorFlow's ``SAME``.
+
+    >>> padded_same(torch.ones(4), 3)
+    tensor([1., 1., 1., 1., 0.])
+    """
+    rows = x.shape[-1]
+    missing = max(0, (-(-rows // 2) - 1) * 2 + taps - rows)
+    return F.pad(x, (missing // 2, missing - missing // 2))
+
+
+# The authors' checkpoint.
+
+SCOPES = ("VOCA/", "")
+"""How the names of the variables may begin."""
+
+ENCODER, SHAPES = "SpeechEncoder/", "ExpressionLayer/expression_offset/"
+"""How they go on."""
+
+OPTIMISER = ("/Adam", "/Adam_1", "/Momentum", "/RMSProp", "/ExponentialMovingAverage")
+"""How names of what the optimiser keeps end."""
+
+
+def convert(weights: Weights, request: Request, found: Found, *, scope: str) -> dict[str, Any]:
+    """VOCA's variables under the names of this file, and its options."""
+    encoder, shapes = f"{scope}{ENCODER}", f"{scope}{SHAPES}"
+    for name in list(weights.tensors):
+        last = name.rpartition("/")[2]
+        if name.endswith(OPTIMISER) or last in ("global_step", "beta1_power", "beta2_power"):
+            weights.ignore(name, "of the optimiser")
+    rate = found.frame_rate
+    if PUBLISHED_RATE % rate:
+        raise FaceDiffError(
+            f"--option frame_rate={rate:g}: VOCA gives {PUBLISHED_RATE:g} frames a second; expected a rate that "
+            f"divides it, such as 30, which takes every second frame"
+        )
+    if request.graph is None:
+        raise FaceDiffError(
+            f"{weights.source}: holds VOCA without DeepSpeech, through whose logits it hears; give the graph "
+            f"output_graph.pb of DeepSpeech 0.1.0 as a further file, or as --option deepspeech=output_graph.pb"
+        )
+    state, sizes, left = network_of(read_graph(request.graph), str(request.graph))
+    weights.made.update({f"audio_encoder.network.{name}": value for name, value in state.items()})
+    weights.ignored.update({f"{request.graph.name}: {name}": "a constant of the graph" for name in left})
+    count, heard = len(found.identities), sizes["logits"]
+    channels = convert_convolutions(weights, encoder, heard, count)
+    for old, new in (
+        ("gamma", "weight"),
+        ("beta", "bias"),
+        ("moving_mean", "running_mean"),
+        ("moving_variance", "running_var"),
+    ):
+        weights.move(f"{encoder}batch_norm/{old}", f"network.norm.{new}")
+    weights.made["network.norm.num_batches_tracked"] = torch.tensor(0)
+    dense = weights.get(f"{encoder}fc1/weights")
+    weights.made["network.dense.weight"] = dense[:-count].T
+    weights.made["network.late_style.weight"] = dense[-count:]
+    weights.move(f"{encoder}fc1/biases", "network.dense.bias")
+    for old, new in ((f"{encoder}fc2/", "coefficients"), (shapes, "expression")):
+        weights.shape(f"{old}weights")
+        weights.made[f"network.{new}.weight"] = weights.get(f"{old}weights").T
+        weights.move(f"{old}biases", f"network.{new}.bias")
+    return {
+        "audio_encoder": partial(DeepSpeechEncoder, config=sizes),
+        "dim": weights.shape(f"{encoder}fc1/weights")[1],
+        "components": weights.shape(f"{shapes}weights")[0],
+        "channels": channels,
+        "rows_per_frame": round(PUBLISHED_RATE / rate),
+    }
+
+
+def convert_convolutions(weights: Weights, encoder: str, heard: int, count: int) -> list[int]:
+    """The convolutions, of which the first sees the speaker too, and their channels.
+
+    Raises:
+        FaceDiffError: if their shapes are others than expected.
+    """
+    channels: list[int] = []
+    into = heard + count
+    while (name := f"{encoder}conv{len(channels) + 1}/weights") in weights or not channels:
+        shape = weights.shape(name, 4)
+        if shape[:3] != (3, 1, into):
+            raise FaceDiffError(
+                f"{weights.source}: its tensor {name} has the shape {shape}, expected (3, 1, {into}, …); it does not "
+                f"fit the other tensors, or {heard} logits and {count} identities"
+            )
+        number, into = len(channels), shape[3]
+        kernel = weights.get(name)[:, 0]
+        if number == 0:
+            # (taps, identities, channels) as one row for each identity.
+            weights.made["network.early_style.weight"] = kernel[:, heard:].transpose(0, 1).flatten(1)
+            kernel = kernel[:, :heard]
+        weights.made[f"network.convolutions.{number}.weight"] = kernel.permute(2, 1, 0)
+        weights.move(f"{encoder}conv{number + 1}/biases", f"network.convolutions.{number}.bias")
+        channels.append(into)
+    return channels
+
+
+def count_identities(weights: Weights, *, scope: str) -> int:
+    """Rows of the first dense layer beyond those of the last convolution, whose window is one row by then.
+
+    Raises:
+        FaceDiffError: if there are none.
+    """
+    last, dense = 1, f"{scope}{ENCODER}fc1/weights"
+    while f"{scope}{ENCODER}conv{last + 1}/weights" in weights:
+        last += 1
+    rows, _ = weights.shape(dense)
+    count = rows - weights.shape(f"{scope}{ENCODER}conv{last}/weights", 4)[3]
+    if count < 1:
+        raise FaceDiffError(
+            f"{weights.source}: its tensor {dense} has {rows} rows, which leave none for the speakers; it does not fit "
+            f"the other tensors"
+        )
+    return count
+
+
+def count_vertices(weights: Weights, *, scope: str) -> int:
+    """Vertices by the linear shapes."""
+    return weights.shape(f"{scope}{SHAPES}weights")[1] // 3
+
+
+for each in SCOPES:
+    recogniser(
+        Recogniser(
+            method="Voca",
+            marks=(f"{each}{ENCODER}conv1/weights", f"{each}{ENCODER}fc1/weights", f"{each}{SHAPES}weights"),
+            unless=(),
+            convert=partial(convert, scope=each),
+            vertices=partial(count_vertices, scope=each),
+            count=partial(count_identities, scope=each),
+            frame_rate=PUBLISHED_RATE,
+            graph="deepspeech",
+            licence="Max Planck licence for non-commercial scientific research",
+            commercial="forbidden",
+            licence_source="voca.is.tue.mpg.de",
+        )
+    )
