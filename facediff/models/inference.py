@@ -334,6 +334,10 @@ class Inference(ABC):
             raise FaceDiffError(f"style: the checkpoint holds no reference motion of {identity}; give one with --style")
         return self.assets.references[identity]
 
+    def own_styles(self) -> dict[str, Style]:
+        """Styles that the model has by name, in addition to those of reference motion, for ``--style``; here none."""
+        return {}
+
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """Change the sampler for all that follows; a model that does not sample has none.
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, choices
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,12 +59,13 @@ def read_styles(
 
     from facediff.models import Style
 
-    if not style_width(model):
+    own = model.own_styles()
+    if not own and not style_width(model):
         raise FaceDiffError(
             f"--style {words}: this checkpoint was trained without a dynamic style, so a style would change nothing; "
             f"omit --style"
         )
-    parts = split_styles(words, [reference.clip for reference in model.assets.references.values()])
+    parts = split_styles(words, [*own, *(reference.clip for reference in model.assets.references.values())])
     if len(parts) == 1:
         if parts[0].weight not in (None, 1.0):
             raise FaceDiffError(
@@ -244,10 +245,10 @@ def read_style(
     A file holds a style vector that ``facediff style extract`` wrote, or a motion in absolute vertices: an animation
     (``.npz``), which has its own template, or a bare array (``.npy``). An array's speaker follows from its name
     (``F1_e03.npy``), else it is ``identity``, unless a template is given. A file in the ``vertices_npy`` of a corpus
-    folder comes with that folder's templates and frame rate.
+    folder comes with that folder's templates and frame rate. A model that has styles by name takes only those.
 
     Args:
-        style: the file, or the name of a clip.
+        style: the file, or the name of a clip, or of a style that the model has.
         identity: whose face is animated.
         model: the trained model.
         template: neutral face of the speaker whose motion an array holds, or ``median``.
@@ -255,6 +256,15 @@ def read_style(
     Raises:
         FaceDiffError: if there is no such file or clip, or it is no style for this checkpoint.
     """
+    own = model.own_styles()
+    if own:
+        # Such a model has no style encoder: there is nothing to make a style of motion with.
+        if style not in own:
+            raise FaceDiffError(
+                f"--style {style}: {type(model).__name__} takes no motion as a style, but a training identity or a "
+                f"mixture of several (A:0.3,B:0.7): {choices(style, own)}"
+            )
+        return own[style]
     is_file = style.endswith(FILES)
     if not is_file:
         for reference in model.assets.references.values():

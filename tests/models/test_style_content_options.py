@@ -34,6 +34,14 @@ def test_the_rate_falls_by_a_tenth_in_every_epoch_from_the_thirtieth() -> None:
     assert lr_factor(0, **{**options, "warmup_steps": 10}) == pytest.approx(0.1)  # type: ignore[arg-type]
 
 
+def test_the_rate_may_fall_once_in_some_epochs() -> None:
+    options = {"total": 200 * 7, "warmup_steps": 0, "schedule": "step", "epoch_steps": 7, "decay": 0.5}
+    for epoch, expected in ((0, 1.0), (19, 1.0), (20, 0.5), (39, 0.5), (40, 0.25), (199, 0.5**9)):
+        for step in (0, 6):
+            found = lr_factor(7 * epoch + step, decay_epoch=20, **options)  # type: ignore[arg-type]
+            assert found == pytest.approx(expected), epoch
+
+
 def test_training_follows_the_rate(tiny_root: Path, make_trainer: MakeTrainer) -> None:
     model, rates = make(lr_schedule="exponential", lr_decay=0.5, lr_decay_epoch=1, learning_rate=1e-3), []
     step = model.on_train_batch_start = lambda *_: rates.append(model.optimizers().param_groups[0]["lr"])  # type: ignore[method-assign, assignment]

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from facediff.data import Assets
-from facediff.models import AnimationModel, FaceDiffuser, FaceFormer, SelfTalk, TalkingStyle
+from facediff.models import AnimationModel, CodeTalker, FaceDiffuser, FaceFormer, SelfTalk, TalkingStyle
 from facediff.models.published.autoregressive import AutoregressiveModel, Loop
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.tables import print_table
@@ -77,7 +77,11 @@ def main() -> None:
             rows.append((method, name, way, f"{parameters:.1f} M", f"{taken:.2f}", f"{taken / asked.seconds:.2f}"))
             print(*rows[-1], flush=True)
 
-        kinds: list[tuple[type[AutoregressiveModel], dict[str, Any]]] = [(FaceFormer, BASE), (TalkingStyle, LARGE)]
+        kinds: list[tuple[type[AutoregressiveModel], dict[str, Any]]] = [
+            (FaceFormer, BASE),
+            (TalkingStyle, LARGE),
+            (CodeTalker, BASE),
+        ]
         for kind, network in kinds:
             former = made(kind, vertices, rate, count, network)
             assert isinstance(former, AutoregressiveModel)

@@ -151,14 +151,26 @@ class PublishedModel(AnimationModel):
     # The speaker.
 
     def identity_weights(self, batch: Batch) -> Float[Tensor, "batch identities"]:
-        """One-hot rows of the clips' identities; of an unknown speaker, equal weights of all training identities."""
+        """One-hot rows of the clips' identities; of an unknown speaker, equal weights of all training identities.
+
+        A clip that has a style of :meth:`own_styles`, or a mixture of them, has its weights.
+        """
         count = len(self.identities)
+        if batch.style is not None and batch.style.shape[1] == count:
+            return batch.style.to(batch.template)
         known = nn.functional.one_hot(batch.identity.clamp_min(0), count).to(batch.template)
         return torch.where(batch.identity[:, None] >= 0, known, known.new_full((count,), 1.0 / count))
 
     def styled_identities(self) -> list[str]:
         """Every training identity: the table is the style."""
         return list(self.identities)
+
+    def own_styles(self) -> dict[str, Style]:
+        """Each training identity as weights that choose its row of the table, so that rows may be mixed."""
+        if not self.personal_modules():
+            return {}
+        rows = torch.eye(len(self.identities))
+        return {name: Style(name, row) for name, row in zip(self.identities, rows, strict=True)}
 
     def default_style(self, identity: str) -> Style:
         """A style vector of no numbers, since the method takes no reference motion."""

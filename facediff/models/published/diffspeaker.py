@@ -8,6 +8,7 @@ checkpoints. docs/methods/diffspeaker.md says what of the published code is an o
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -169,9 +170,9 @@ class DiffSpeaker(DiffusionModel):
 
     def identity_weights(self, batch: Batch) -> Float[Tensor, "batch identities"]:
         """One-hot rows of the clips' identities; an unknown speaker's as ``unknown_speaker`` says."""
-        if self.unknown_speaker == "mean":
-            return super().identity_weights(batch)
-        return F.one_hot(batch.identity.clamp_min(0), len(self.identities)).to(batch.template)
+        if self.unknown_speaker == "first":
+            batch = replace(batch, identity=batch.identity.clamp_min(0))
+        return super().identity_weights(batch)
 
     def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states, interpolated to the frames."""

@@ -14,6 +14,7 @@ from facediff.data import Assets, Sample, collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, load_model
 from facediff.models.adaptation import with_extra_identities
+from facediff.models.styles import style_from
 from tests.fakes.tiny import RATE, SEEN, UNSEEN, VERTICES, Tiny
 from tests.models.conftest import no_dropout
 
@@ -141,6 +142,25 @@ def test_a_trained_model_is_tested_saved_and_loaded(
     speech = 0.1 * torch.randn(16_000, generator=torch.Generator().manual_seed(2))
     expected, got = (each.eval().animate(speech, identity=UNSEEN, condition="A") for each in (model, loaded))
     assert torch.equal(got.vertices, expected.vertices)
+
+
+def test_rows_of_training_identities_may_be_mixed(method: str, make_method: MakeMethod) -> None:
+    model = with_assets(make_method(method, **({"noised": "offsets"} if method == "FaceDiffuser" else {})))
+    if not model.personal_modules():
+        with pytest.raises(FaceDiffError, match="--style"):
+            style_from("A:0.3,B:0.7", "A", model)
+        return
+    speech = 0.1 * torch.randn(16_000, generator=torch.Generator().manual_seed(2))
+    alone = model.animate(speech, identity="A", style=style_from("B", "A", model))
+    assert torch.equal(alone.vertices, model.animate(speech, identity="A", condition="B").vertices)
+    own = model.animate(speech, identity="A").vertices
+    whole = model.animate(speech, identity="A", style=style_from({"A": 1.0, "B": 0.0}, "A", model)).vertices
+    torch.testing.assert_close(whole, own, rtol=0, atol=1e-5)
+    mixed = model.animate(speech, identity="A", style=style_from("A,B", "A", model)).vertices
+    assert all((mixed - other).abs().max() > 1e-4 for other in (own, alone.vertices))
+    for wrong in ("A:0.3,D:0.7", "reference.npy"):
+        with pytest.raises(FaceDiffError, match="--style"):
+            style_from(wrong, "A", model)
 
 
 def test_a_further_identity_leaves_the_others_as_they_are(method: str, make_method: MakeMethod) -> None:
