@@ -23,10 +23,13 @@ def blendshapes(
     carry: bool = False,
     smoothness: Annotated[ranges.Strength, Option(metavar="S")] = 0.02,
     symmetry: Annotated[ranges.Strength, Option(metavar="S")] = 0.0,
+    sparsity: Annotated[ranges.Strength, Option(metavar="S")] = 0.02,
     bounds: Annotated[tuple[ranges.Bound, ranges.Bound], Option(metavar=("LO", "HI"))] = (0.0, 1.0),
     region: Annotated[str | None, Option(metavar="NAME")] = None,
     only_arkit: bool = False,
     plain: bool = False,
+    residual_limit: Annotated[ranges.Strength, Option(metavar="SHARE")] = 0.8,
+    key_tolerance: Annotated[ranges.KeyTolerance, Option(metavar="W")] = 0.0,
     csv_rate: Annotated[ranges.FrameRate | None, Option(metavar="F")] = None,
     show: Picture = None,
     write_puppet_shapes: Annotated[Path | None, Option(metavar="DIR", writes="folder")] = None,
@@ -40,14 +43,17 @@ def blendshapes(
         animation: motion: .npz of `facediff animate`, or .npy
         output: table to write
         shapes: folder of .obj or .ply files named jawOpen, mouthFunnel … with the face at rest as neutral, or a .glb
-            with named targets
+            with named targets, or "puppet" for those of the built-in face
         carry: the shapes are of another topology: transfer them to the animation's mesh
         smoothness: cost of change over time; 0 is off
         symmetry: cost of a difference between left and right; 0 is off
+        sparsity: cost of weights, which keeps shapes at 0 that would cancel one another; 0 is off
         bounds: limits of weights (default: 0 1)
         region: look at a region of the face only, such as lips
         only_arkit: leave out shapes whose names are not ARKit's
         plain: columns time, the set's own names, residuals in mm
+        residual_limit: share of the motion that weights may leave before they are refused
+        key_tolerance: the .json gets the keys of each curve that a straight line does not replace to within so much
         csv_rate: rows a second, interpolated between the frames (default: a row for each frame)
         show: picture of the frame that the shapes fit worst
         write_puppet_shapes: write shapes of the built-in puppet's face (of the speaker --identity) and do nothing else
@@ -87,12 +93,21 @@ def blendshapes(
     check_writable(output.with_suffix(".json"))
     check_free(output.with_suffix(".json"))
     lower, upper = bounds
-    options = SolveOptions(smoothness=smoothness, symmetry=symmetry, lower=lower, upper=upper, region=region)
+    options = SolveOptions(
+        smoothness=smoothness,
+        symmetry=symmetry,
+        sparsity=sparsity,
+        lower=lower,
+        upper=upper,
+        region=region,
+        residual_limit=residual_limit,
+    )
     own = source.read(animation)
     if show is not None:
         _ = own.triangles  # refuses an animation without triangles before anything is written
     found, weights = solve_weights(own, shapes, options, carry=carry, only_arkit=only_arkit)
-    (weights if csv_rate is None else weights.at_rate(csv_rate)).save(output, plain=plain)
+    table = weights if csv_rate is None else weights.at_rate(csv_rate)
+    table.save(output, plain=plain, key_tolerance=key_tolerance)
     if show is not None:
         from facediff.export.pictures import draw_worst_frame
 

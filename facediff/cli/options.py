@@ -124,7 +124,8 @@ class OutputOptions:
         output_unit: unit of length of the file: m, cm, mm, in, or a number of metres (default: the motion's own)
         up: axis that points up in the file (default: y)
         no_speech: omit the sound
-        shapes: for .csv: folder of meshes, or .glb with targets
+        shapes: for .csv and .glb: folder of meshes, .glb with targets, or "puppet" (built in)
+        key_tolerance: for weights: leave out keys that a straight line replaces to within so much
         tolerance: for .glb: largest error in mm
         view: for .mp4: camera
         size: for .mp4: height and width in pixels
@@ -134,6 +135,7 @@ class OutputOptions:
     up: Literal["y", "z"] | None = None
     no_speech: bool = False
     shapes: Annotated[Path | None, Option(metavar="SHAPES", reads=True)] = None
+    key_tolerance: Annotated[ranges.KeyTolerance, Option(metavar="W")] = 0.0
     tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.05
     view: View = "front"
     size: Size = 512
@@ -155,6 +157,7 @@ class OutputOptions:
             view=self.view,
             size=self.size,
             shapes=self.shapes,
+            key_tolerance=self.key_tolerance,
             tolerance_mm=self.tolerance,
             footer=footer,
             quiet=quiet,

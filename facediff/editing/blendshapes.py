@@ -22,6 +22,9 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 CHUNK_BYTES = 32 * 2**20
+AROUND = 1 / 15  # Seconds before and after a shape's work in which it is free to fade
+VISIBLE_MM = 0.2  # A residual that nobody sees is none, however small the motion
+ACTIVE = 1e-3  # Share of the cost of a weight above which a shape is at work
 STATED_RATE = 30.0  # Frames a second for which the smoothness is stated
 
 
@@ -33,12 +36,16 @@ class SolveOptions:
         smoothness: how much a weight's change from frame to frame costs; at 0.02, a movement to and fro five times a
             second keeps 98 % of its size. Stated for 30 frames a second and converted to the animation's frame rate.
         symmetry: how much a difference between the weights of a left shape and its right one costs.
-        ridge: how much weights cost by themselves, which chooses the smallest among equally good ones.
+        sparsity: how much of a weight a shape must gain by its work to be used in a frame: shapes that would cancel one
+            another stay at 0. With 0, all shapes are used; see :func:`minimise_sparse`.
+        ridge: how much the squares of weights cost, which chooses the smallest among equally good ones.
         lower: least weight.
         upper: greatest weight.
         region: name of the animation's region that is looked at; None for the whole face.
         area_weighted: count vertices by the area around them, so that finely meshed places do not count for more;
             without triangles, all count alike.
+        residual_limit: share of the motion, as a root mean square over all frames, above which what the shapes leave of
+            it means that they are not those of this face; 1 or more allows everything.
         tolerance: what may be left of the optimality conditions, in weights.
         max_iterations: of Newton's method.
 
@@ -48,11 +55,13 @@ class SolveOptions:
 
     smoothness: ranges.Strength = 0.02
     symmetry: ranges.Strength = 0.0
+    sparsity: ranges.Strength = 0.02
     ridge: ranges.Strength = 1e-6
     lower: ranges.Bound = 0.0
     upper: ranges.Bound = 1.0
     region: str | None = None
     area_weighted: bool = True
+    residual_limit: ranges.Strength = 0.8
     tolerance: ranges.Tolerance = 1e-8
     max_iterations: ranges.Steps = 200
 
@@ -135,12 +144,24 @@ class Weights:
             frame_rate=frame_rate,
         )
 
-    def save(self, path: str | Path, *, plain: bool = False) -> Path:
+    def curves(self, tolerance: float) -> dict[str, tuple[list[float], list[float]]]:
+        """Times in seconds and weights of the keys that are enough for each curve by itself, see :func:`key_frames`."""
+        found = {}
+        for name, curve in zip(self.names, self.values.T, strict=True):
+            keys = key_frames(curve[:, None], tolerance)
+            times, weights = keys / self.frame_rate, curve[keys]
+            found[name] = ([round(float(time), 6) for time in times], [round(float(one), 6) for one in weights])
+        return found
+
+    @ranges.checked
+    def save(self, path: str | Path, *, plain: bool = False, key_tolerance: ranges.KeyTolerance = 0.0) -> Path:
         """Write the table, and what it cannot say in a .json next to it.
 
         Args:
             path: the .csv file.
             plain: columns time, the set's own names and residuals in mm, instead of those of Live Link Face.
+            key_tolerance: above 0, the .json gets the keys of each curve that a straight line does not replace to
+                within so much of a weight. The table has a row for each frame.
 
         Raises:
             FaceDiffError: if a file cannot be written.
@@ -148,7 +169,7 @@ class Weights:
         path = Path(path)
         if path.suffix.lower() != ".csv":
             raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a table .csv')
-        (write_weights if plain else write_live_link)(path, self)
+        (write_weights if plain else write_live_link)(path, self, key_tolerance)
         return path
 
     def __repr__(self) -> str:
@@ -165,7 +186,8 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     Minimises Σ_t ½‖Σ_k w_tk d_k − (x_t − template)‖² + ½λ Σ_t Σ_k e_k (w_tk − w_{t−1,k})² + ½σ Σ_t Σ_(l,r) ½(e_l + e_r)
     (w_tl − w_tr)² + ½ρ Σ_t Σ_k e_k w_tk² with lower ≤ w ≤ upper, where d_k are the displacements of shape k, norms are
     means over vertices weighted by area, and e_k = ‖d_k‖² makes the strengths λ (smoothness), σ (symmetry) and ρ
-    (ridge) the same for shapes that move much and little. All frames are solved for together.
+    (ridge) the same for shapes that move much and little. All frames are solved for together. Sparsity τ first adds
+    τ Σ_t Σ_k e_k |w_tk|, and holds at 0 what that sets to 0.
 
     Args:
         animation: with V vertices and T frames.
@@ -173,8 +195,8 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         options: the usual ones if None.
 
     Raises:
-        FaceDiffError: if the topologies differ, a frame is not finite, the region is unknown, or no shape moves
-            anything.
+        FaceDiffError: if the topologies differ, a frame is not finite, the region is unknown, no shape moves anything,
+            or the weights leave more of the motion than the limit.
 
     Example:
         >>> from facediff.animation import Animation
@@ -210,15 +232,28 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     # A movement that takes as many seconds takes more steps at a higher frame rate, each the smaller.
     coupling = options.smoothness * (animation.frame_rate / STATED_RATE) ** 2
     problem = Problem(0.5 * (matrix + matrix.T), right, coupling, options.lower * scale, options.upper * scale)
-    found, converged = minimise(problem, options.tolerance * scale, options.max_iterations)
+    tolerance = options.tolerance * scale
+    if options.sparsity > 0:
+        around = Sparse(options.max_iterations, max(1, round(AROUND * animation.frame_rate)))
+        found, converged = minimise_sparse(problem, options.sparsity * scale, tolerance, around)
+    else:
+        found, converged = minimise(problem, tolerance, options.max_iterations)
     values = np.full((len(right), len(shapes.names)), np.clip(0.0, options.lower, options.upper))
     # Division may lead past a bound by a rounding error.
     values[:, moving.places] = np.clip(found / scale, options.lower, options.upper)
     rms, most = _residuals(animation, moving, values[:, moving.places])
     millimetres = 1000.0 * metres_per_unit(animation.unit)
+    remaining = float(np.sqrt(np.square(rms).mean()))
+    if remaining > options.residual_limit * amplitude and millimetres * remaining > VISIBLE_MM:
+        raise FaceDiffError(
+            f"{animation.name}: the weights leave {remaining / amplitude:.0%} of the motion "
+            f"({millimetres * remaining:.2g} of {millimetres * amplitude:.2g} mm), as shapes of another face or "
+            f"in another unit do; look at them, or raise --residual-limit from {options.residual_limit:g}"
+        )
     about = {
         "smoothness": f"{options.smoothness:g}",
         "symmetry": f"{options.symmetry:g}",
+        "sparsity": f"{options.sparsity:g}",
         "ridge": f"{options.ridge:g}",
         "bounds": f"{options.lower:g} {options.upper:g}",
         "region": options.region or "whole face",
@@ -234,6 +269,38 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         still=tuple(name for k, name in enumerate(shapes.names) if k not in moving.places),
         metadata={**animation.metadata, **{f"solve {key}": value for key, value in about.items()}},
     )
+
+
+def key_frames(values: Array, tolerance: float) -> npt.NDArray[np.int64]:
+    """Frames (N,) that are enough: between them, no curve is further than a tolerance from the straight line.
+
+    The first and the last frame are among them. Douglas & Peucker, "Algorithms for the reduction of the number of
+    points required to represent a digitized line", Cartographica 1973, with distances taken at equal times, as
+    players interpolate.
+
+    Args:
+        values: (T, K) curves that share their keys.
+        tolerance: largest change of a value.
+
+    Example:
+        >>> key_frames(np.array([[0.0], [0.5], [1.0], [0.0]]), 0.001).tolist()
+        [0, 2, 3]
+    """
+    last = len(values) - 1
+    kept, spans = {0, last}, [(0, last)]
+    while spans:
+        first, end = spans.pop()
+        if end - first < 2:
+            continue
+        share = (np.arange(first + 1, end) - first)[:, None] / (end - first)
+        line = values[first] + share * (values[end] - values[first])
+        apart = np.abs(values[first + 1 : end] - line).max(axis=1)
+        worst = int(apart.argmax())
+        if apart[worst] > tolerance:
+            middle = first + 1 + worst
+            kept.add(middle)
+            spans += [(first, middle), (middle, end)]
+    return np.array(sorted(kept), np.int64)
 
 
 @dataclass(frozen=True)
@@ -319,8 +386,8 @@ class Problem:
     matrix: Array  # M (K, K), symmetric, positive semi-definite, with a diagonal of about one
     right: Array  # r (T, K)
     coupling: float  # c, not negative
-    lower: Array  # (K,)
-    upper: Array  # (K,)
+    lower: Array  # (K,) or (T, K)
+    upper: Array  # (K,) or (T, K)
 
     def clip(self, x: Array) -> Array:
         """The nearest point of the box."""
@@ -344,6 +411,51 @@ class Problem:
         return np.abs(x - self.clip(x - self.gradient(x)))
 
 
+def minimise_sparse(problem: Problem, cost: Array, tolerance: Array, options: Sparse) -> tuple[Array, bool]:
+    """The box's point of least value with few shapes at work in each frame.
+
+    The sum Σ_t Σ_k cost_k |x_tk| is added to the objective, which keeps shapes at 0 that gain less than they cost. It
+    also takes something from all others. The second problem, without the sum and with those shapes held at 0, gives it
+    back (Meinshausen, "Relaxed Lasso", Computational Statistics & Data Analysis 2007).
+
+    Returns:
+        x (T, K), and whether the residual of the second problem meets the tolerance (K,).
+    """
+    chosen = _least_sum(problem, cost, tolerance, options)
+    # A shape that is at work in a frame is free in those around it, or its curve would begin and end with a jump.
+    window = np.lib.stride_tricks.sliding_window_view
+    reach = np.pad(np.abs(chosen) > ACTIVE * cost, ((options.frames_around, options.frames_around), (0, 0)))
+    active = window(reach, 2 * options.frames_around + 1, axis=0).any(axis=-1)
+    lower = np.where(active, problem.lower, np.clip(0.0, problem.lower, problem.upper))
+    upper = np.where(active, problem.upper, np.clip(0.0, problem.lower, problem.upper))
+    return minimise(replace(problem, lower=lower, upper=upper), tolerance, options.max_iterations)
+
+
+@dataclass(frozen=True)
+class Sparse:
+    """Options of :func:`minimise_sparse`."""
+
+    max_iterations: int
+    frames_around: int  # before and after a frame in which a shape is at work
+
+
+def _least_sum(problem: Problem, cost: Array, tolerance: Array, options: Sparse) -> Array:
+    """The solution with Σ_t Σ_k cost_k |x_tk| added to the objective, (T, K)."""
+    if (problem.lower >= 0).all():
+        return minimise(replace(problem, right=problem.right - cost), tolerance, options.max_iterations)[0]
+    # Where weights have both signs, each is a positive part less a negative one, whose sum is its size.
+    parts = Problem(
+        np.block([[problem.matrix, -problem.matrix], [-problem.matrix, problem.matrix]]),
+        np.concatenate([problem.right - cost, -problem.right - cost], axis=1),
+        problem.coupling,
+        np.maximum(np.concatenate([problem.lower, -problem.upper]), 0.0),
+        np.maximum(np.concatenate([problem.upper, -problem.lower]), 0.0),
+    )
+    found, _ = minimise(parts, np.concatenate([tolerance, tolerance]), options.max_iterations)
+    positive, negative = np.split(found, 2, axis=1)
+    return positive - negative
+
+
 def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[Array, bool]:
     """The box's point of least value.
 
@@ -356,7 +468,8 @@ def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[A
         x (T, K), and whether its :meth:`Problem.residual` meets the tolerance (K,).
     """
     x = problem.clip(_newton(problem, problem.right, np.ones(problem.right.shape, bool)))
-    width = float((problem.upper - problem.lower).min())
+    widths = problem.upper - problem.lower
+    width = float(widths[widths > 0].min(initial=1.0))
     for _ in range(max_iterations):
         left = problem.residual(x)
         if (left <= tolerance).all():
@@ -417,7 +530,7 @@ DAY = 24 * 3600
 SURELY_SIXTIETHS = 31 / 60  # A table with a row at this time is read as one of sixtieths
 
 
-def write_live_link(path: Path, weights: Weights) -> None:
+def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) -> None:
     """Write a table as Epic's app Live Link Face records it, and ``<name>.json`` next to it.
 
     A row for each frame: timecode, number of values (61), ARKit's 52 names in order, rotations of head and eyes. Names
@@ -426,6 +539,11 @@ def write_live_link(path: Path, weights: Weights) -> None:
 
     A table that ends before frame number 31 of a second gets one more row there, which holds the last frame: Unreal
     Engine's importer takes a table for one of 30 frames a second unless it finds a greater number than 30.
+
+    Args:
+        path: the table.
+        weights: what is written.
+        key_tolerance: as :meth:`Weights.save` takes it.
 
     Raises:
         FaceDiffError: if a file cannot be written.
@@ -448,11 +566,16 @@ def write_live_link(path: Path, weights: Weights) -> None:
         "timecode": "frames are sixtieths of a second with a fraction, whatever the frame rate",
         "rows_held": len(held) - len(times),
     }
-    _write_both(path, header, rows, _about(weights, in_table=ARKIT, more=more))
+    _write_both(path, header, rows, _about(weights, in_table=ARKIT, more=more, key_tolerance=key_tolerance))
 
 
-def write_weights(path: Path, weights: Weights) -> None:
+def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> None:
     """Write a plain table and ``<name>.json`` next to it: time in seconds, every weight, residuals in millimetres.
+
+    Args:
+        path: the table.
+        weights: what is written.
+        key_tolerance: as :meth:`Weights.save` takes it.
 
     Raises:
         FaceDiffError: if a file cannot be written.
@@ -467,7 +590,7 @@ def write_weights(path: Path, weights: Weights) -> None:
         ]
         for frame, values in enumerate(weights.values)
     )
-    _write_both(path, header, rows, _about(weights, in_table=weights.names, more={}))
+    _write_both(path, header, rows, _about(weights, in_table=weights.names, more={}, key_tolerance=key_tolerance))
 
 
 def timecode(seconds: float) -> str:
@@ -481,8 +604,13 @@ def timecode(seconds: float) -> str:
     return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{fraction // 1000:02d}.{fraction % 1000:03d}"
 
 
-def _about(weights: Weights, *, in_table: Sequence[str], more: Mapping[str, object]) -> dict[str, object]:
+def _about(
+    weights: Weights, *, in_table: Sequence[str], more: Mapping[str, object], key_tolerance: float
+) -> dict[str, object]:
     """What a table does not say."""
+    if key_tolerance > 0:
+        curves = {name: {"times": t, "values": v} for name, (t, v) in weights.curves(key_tolerance).items()}
+        more = {**more, "key_tolerance": key_tolerance, "curves": curves}
     return {
         "format": FORMAT,
         "frame_rate": weights.frame_rate,

@@ -147,12 +147,34 @@ class ShapeSet:
         return replace(self, names=tuple(self.names[index] for index in kept), deltas=self.deltas[kept])
 
 
+BUILT_IN = "puppet"
+"""What users give in place of a folder or file for the shapes of the built-in face."""
+
+
+def is_built_in(path: Path) -> bool:
+    """Whether a path stands for the shapes of the built-in face; a file or folder of that name goes first."""
+    return str(path) == BUILT_IN and not path.exists()
+
+
+def check_shapes(path: Path) -> None:
+    """Refuse a path that is neither there nor stands for the built-in shapes.
+
+    Raises:
+        FaceDiffError: naming the path.
+    """
+    if not path.exists() and not is_built_in(path):
+        raise FaceDiffError(
+            f"--shapes {path}: no such folder or file; expected a folder of meshes, a .glb with targets, or puppet"
+        )
+
+
 def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m") -> ShapeSet:
     """Read a set of shapes for a face of the same topology.
 
     Args:
         path: a folder of ``.obj`` or ``.ply`` files named as their shapes are, the face at rest among them as
-            ``neutral`` or ``Basis`` (without one, the template is the face at rest), or a ``.glb`` with named targets.
+            ``neutral`` or ``Basis`` (without one, the template is the face at rest), a ``.glb`` with named targets, or
+            ``puppet`` for those of the built-in face, whose speaker with the nearest face they are taken from.
         template: (V, 3) the animation's neutral face.
         unit: the template's unit of length.
 
@@ -160,7 +182,8 @@ def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m")
         FaceDiffError: if a file is missing or damaged, has another topology or vertices in another order, or a name
             occurs twice.
     """
-    return fitted(read_shape_files(path), template, unit)
+    files = _built_in(np.asarray(template, np.float64) * metres_per_unit(unit)) if is_built_in(path) else None
+    return fitted(files or read_shape_files(path), template, unit)
 
 
 def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m") -> ShapeSet:
@@ -259,6 +282,8 @@ def read_shape_files(path: Path) -> ShapeFiles:
     Raises:
         FaceDiffError: if it is missing or damaged, holds no shapes, or its meshes differ in topology or vertex order.
     """
+    if is_built_in(path):
+        return _built_in(None)
     if path.suffix.lower() == ".glb":
         return _read_glb(path)
     if not path.is_dir():
@@ -296,6 +321,22 @@ def read_shape_files(path: Path) -> ShapeFiles:
         faces if len(faces) else None,
         rest=rest[0].name if rest else "",
     )
+
+
+def _built_in(template: Array | None) -> ShapeFiles:
+    """The built-in shapes: of the speaker with the face nearest to a template (V, 3) in metres, or the common ones."""
+    from facediff.synthetic.arkit import puppet_shapes
+    from facediff.synthetic.speakers import SPEAKERS
+
+    neutral, faces, shapes = puppet_shapes()
+    if template is not None and template.shape == neutral.shape:
+        speakers: list[str | None] = [None, *SPEAKERS]
+        faces_at_rest = [puppet_shapes(speaker)[0] for speaker in speakers]
+        apart = [np.square((face - face.mean(0)) - (template - template.mean(0))).sum() for face in faces_at_rest]
+        neutral, faces, shapes = puppet_shapes(speakers[int(np.argmin(apart))])
+    points = np.stack(list(shapes.values()))
+    path = Path(BUILT_IN)
+    return ShapeFiles(path, path, tuple(shapes), points, neutral, faces, metric=True, rest=BUILT_IN)
 
 
 # Morph targets of binary glTF 2.0 files: section 3.7.2.2 of the specification. Names of targets are in

@@ -59,6 +59,7 @@ class BlendshapeWeights(Format):
     speech = "next to it"
     needs_mesh = False
     needs_shapes = True
+    uses = ("shapes", "key_tolerance")
     units = "none"
     up_axes = ()
 
@@ -68,13 +69,13 @@ class BlendshapeWeights(Format):
         Raises:
             FaceDiffError: if the blendshapes do not fit the animation.
         """
-        from facediff.editing.blendshapes import SolveOptions, solve, write_live_link
+        from facediff.editing.blendshapes import SolveOptions, solve
         from facediff.editing.shapes import read_shapes
 
         (animation,) = animations
         assert options.shapes is not None  # noqa: S101 - checked by check_export
         shapes = read_shapes(options.shapes, animation.template, animation.unit)
-        write_live_link(path, solve(animation, shapes, SolveOptions()))
+        solve(animation, shapes, SolveOptions()).save(path, key_tolerance=options.key_tolerance)
 
     def companions(self, path: Path, animation: Animation) -> list[Path]:
         """The .json file."""

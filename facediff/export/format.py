@@ -34,7 +34,9 @@ class ExportOptions:
         speech: whether the speech is written, into the file or next to it.
         view: camera of a video: ``front``, ``three_quarter`` or ``side``.
         size: height and width of a video's panels in pixels.
-        shapes: blendshapes that weights are solved for: a folder of meshes, or a .glb with named targets.
+        shapes: blendshapes that weights are solved for: a folder of meshes, a .glb with named targets, or ``puppet``
+            for those of the built-in face.
+        key_tolerance: keys of weights are left out where a straight line is no further from them than this.
         tolerance_mm: largest distance between a compressed vertex and the original one, in millimetres.
         footer: text below a video, such as "synthetic corpus".
         quiet: whether progress bars are hidden.
@@ -48,6 +50,7 @@ class ExportOptions:
     view: str = "front"
     size: ranges.Pixels = 512
     shapes: Path | None = None
+    key_tolerance: ranges.KeyTolerance = 0.0
     tolerance_mm: ranges.Millimetres = 0.05
     footer: str = ""
     quiet: bool = True
@@ -99,7 +102,8 @@ class Format(ABC):
     up_axes: ClassVar[tuple[Up, ...]] = ("y", "z")
     """Axes that may point up."""
     uses: ClassVar[tuple[str, ...]] = ()
-    """Which of the options ``view``, ``size`` and ``tolerance_mm`` the format uses; the command line refuses others."""
+    """Which of the options ``view``, ``size``, ``tolerance_mm``, ``shapes`` and ``key_tolerance`` the format uses; the
+    command line refuses others."""
     requires: ClassVar[tuple[str, str] | None] = None
     """An optional package that writing needs: its import name, and the extra of facediff that installs it."""
 

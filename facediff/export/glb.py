@@ -33,24 +33,32 @@ LIMIT = 2**32 - 1  # The most bytes that the header of a .glb can count
 
 @export_format.register("glb")
 class Glb(Format):
-    """glTF 2.0 with morph targets: Blender, Unity, three.js, Unreal."""
+    """glTF 2.0 with morph targets, exact or under the names of --shapes: Blender, Unity, three.js, Unreal."""
 
     next_step = "Blender: File > Import > glTF 2.0, then play; other programs: docs/export.md"
     speech = "next to it"
     units = "m"
     up_axes = ("y",)
-    uses = ("tolerance_mm",)
+    uses = ("tolerance_mm", "shapes", "key_tolerance")
     requires = ("pygltflib", "train")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Write one animation."""
+        """Write one animation: all of it, or what the given shapes can show of it.
+
+        Raises:
+            FaceDiffError: if the shapes do not fit the animation.
+        """
         (animation,) = animations
         space = Space.of(animation, options, "m")
         rest = space.place(animation.template)
-        offsets = np.stack([frame - rest for frame in space.frames(animation)])
-        morphs = compress(offsets, options.tolerance_mm / 1000)
         extras = facts(animation, space)
-        extras["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance_mm
+        if options.shapes is not None:
+            morphs, fit = named_shapes(animation, space, options.shapes, options.key_tolerance)
+            extras |= fit
+        else:
+            offsets = np.stack([frame - rest for frame in space.frames(animation)])
+            morphs = compress(offsets, options.tolerance_mm / 1000)
+            extras["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance_mm
         if options.speech_file is not None:
             extras["speech"] = options.speech_file
         binary = Binary()
@@ -62,8 +70,36 @@ class Morphs:
     """A motion as shapes and their weights: frame t is ``rest + Σ weights[t, m] · shapes[m]``."""
 
     shapes: Array  # (M, V, 3) offsets from the rest face
-    weights: Array  # (T, M) from 0 to 1
+    weights: Array  # (K, M) from 0 to 1, at the keys
     components: int | None  # number of principal components that were kept; None where there is a shape for every frame
+    names: tuple[str, ...] = ()  # M names; numbers if there are none
+    keys: npt.NDArray[np.int64] | None = None  # (K,) frames that have a key; all T if None
+
+
+def named_shapes(
+    animation: Animation, space: Space, shapes: Path, key_tolerance: float
+) -> tuple[Morphs, dict[str, object]]:
+    """The motion as weights of blendshapes under their own names, and facts on how well they fit.
+
+    Raises:
+        FaceDiffError: if the shapes do not fit the animation.
+    """
+    from facediff.editing.blendshapes import SolveOptions, key_frames, solve
+    from facediff.editing.shapes import read_shapes
+
+    found = read_shapes(shapes, animation.template, animation.unit)
+    weights = solve(animation, found, SolveOptions())
+    # All curves of a mesh share their keys in glTF.
+    keys = key_frames(weights.values, key_tolerance)
+    offsets = np.asarray(found.deltas * space.factor, np.float32)
+    morphs = Morphs(offsets, weights.values[keys].astype(np.float32), None, found.names, keys)
+    return morphs, {
+        "shapes": shapes.name,
+        "residual_rms_mm": round(float(np.sqrt(np.square(weights.residual_rms_mm).mean())), 6),
+        "residual_max_mm": round(float(weights.residual_max_mm.max()), 6),
+        "key_tolerance": key_tolerance,
+        "keys": len(keys),
+    }
 
 
 def compress(offsets: Array, tolerance: float) -> Morphs:
@@ -219,11 +255,16 @@ def make_document(
     # The largest number of a type is reserved: it restarts a strip of triangles.
     index_type = np.uint16 if len(rest) < 65_535 else np.uint32
     indices = binary.add(faces.astype(index_type).ravel(), target=ELEMENT_ARRAY_BUFFER)
-    true_normals = (normals_of(points, faces) for points in space.frames(animation))
-    turned = normal_shapes(morphs.weights, rest_normals, true_normals)
+    if morphs.names:
+        # Named shapes are used for other motions too, so that each has the normals of its own pose.
+        turned = np.stack([normals_of(rest + shape, faces) - rest_normals for shape in morphs.shapes])
+    else:
+        true_normals = (normals_of(points, faces) for points in space.frames(animation))
+        turned = normal_shapes(morphs.weights, rest_normals, true_normals)
     targets = [add_vertices(shape, normals) for shape, normals in zip(morphs.shapes, turned, strict=True)]
     prefix = "frame" if morphs.components is None else "shape"
-    times = (np.arange(len(animation.vertices)) / animation.frame_rate).astype(np.float32)
+    frames = np.arange(len(animation.vertices)) if morphs.keys is None else morphs.keys
+    times = (frames / animation.frame_rate).astype(np.float32)
     sampler = gltf.AnimationSampler(
         input=binary.add(times, bounds=True), output=binary.add(morphs.weights.ravel()), interpolation="LINEAR"
     )
@@ -234,7 +275,7 @@ def make_document(
             gltf.Primitive(attributes=gltf.Attributes(**attributes), indices=indices, material=0, targets=targets)
         ],
         weights=[0.0] * len(targets),
-        extras={"targetNames": [f"{prefix}_{index:04d}" for index in range(len(targets))]},
+        extras={"targetNames": list(morphs.names) or [f"{prefix}_{index:04d}" for index in range(len(targets))]},
     )
     return gltf.GLTF2(
         asset=gltf.Asset(generator="facediff", copyright=animation.metadata.get("licence")),

@@ -14,6 +14,15 @@ from facediff.export.format import MARK, ExportOptions, Format, check_animation,
 from facediff.export.sequences import RECORD
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
+OPTIONS = {
+    "view": "view",
+    "size": "size",
+    "tolerance": "tolerance_mm",
+    "shapes": "shapes",
+    "key_tolerance": "key_tolerance",
+}
+"""Options that some formats use, as the command line and as formats call them."""
+
 
 class _Formats(Mapping[str, Format]):
     """All registered formats by suffix; they are loaded when the first one is looked up."""
@@ -123,10 +132,12 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
         raise FaceDiffError(f"{path}: {suffix} {reason}; omit the axis")
     if form.needs_shapes and options.shapes is None:
         raise FaceDiffError(
-            f"{path}: {suffix} needs blendshapes; give --shapes with a folder of meshes or a .glb with named targets"
+            f"{path}: {suffix} needs blendshapes; give --shapes with a folder of meshes, a .glb with targets, or puppet"
         )
-    if form.needs_shapes and options.shapes is not None and not options.shapes.exists():
-        raise FaceDiffError(f"{options.shapes}: no such folder or file; expected the blendshapes for {path}")
+    if options.shapes is not None and (form.needs_shapes or "shapes" in form.uses):
+        from facediff.editing.shapes import check_shapes
+
+        check_shapes(options.shapes)
     if form.requires is not None and importlib.util.find_spec(form.requires[0]) is None:
         raise MissingExtraError(*form.requires, f"writing {suffix}")
     for target in _targets(path, form, n_animations):
@@ -148,12 +159,16 @@ def check_used(suffix: str, given: Collection[str]) -> None:
     if suffix not in FORMATS:
         return
     form = FORMATS[suffix]
-    for name, field in (("view", "view"), ("size", "size"), ("tolerance", "tolerance_mm")):
+    for name, field in OPTIONS.items():
         if name in given and field not in form.uses:
             users = [other for other, each in FORMATS.items() if field in each.uses]
-            raise FaceDiffError(f"--{name}: has no effect on {suffix}, but on {', '.join(users)}; omit it")
-    if "shapes" in given and not form.needs_shapes:
-        raise FaceDiffError(f"--shapes: is for weights, and {suffix} holds none; write .csv; omit it")
+            raise FaceDiffError(
+                f"--{name.replace('_', '-')}: has no effect on {suffix}, but on {', '.join(users)}; omit it"
+            )
+    if "shapes" in given and "tolerance" in given:
+        raise FaceDiffError("--tolerance: has no effect with --shapes, which fixes the targets; omit one")
+    if "key_tolerance" in given and "shapes" not in given:
+        raise FaceDiffError("--key-tolerance: has no effect without --shapes, whose weights have keys; omit it")
 
 
 def _targets(path: Path, form: Format, count: int) -> list[Path]:

@@ -106,7 +106,7 @@ def _deciding_files(options: AnimationOptions) -> list[Path]:
     optional = (options.target_mesh, options.controls.eyes, options.correspondence, template)
     files += [path for path in optional if path is not None and path.is_file()]
     shapes = options.export.shapes
-    if shapes is not None:
+    if shapes is not None and shapes.exists():
         inside = sorted(shapes.iterdir()) if shapes.is_dir() else [shapes]
         files += [path for path in inside if path.is_file()]
     return files

@@ -65,6 +65,7 @@ class Animation(finished.Animation):
         up: Literal["y", "z"] | None = None,
         no_speech: bool = False,
         shapes: str | Path | None = None,
+        key_tolerance: float | None = None,
         tolerance: float | None = None,
         view: str | None = None,
         size: int | None = None,
@@ -76,7 +77,8 @@ class Animation(finished.Animation):
             output_unit: unit of length of the file: m, cm, mm, in, or a number of metres; the motion's own if None.
             up: axis that points up in the file, y or z; the format's own if None.
             no_speech: omit the sound.
-            shapes: for .csv: folder of meshes, or .glb with targets.
+            shapes: for .csv and .glb: folder of meshes, .glb with targets, or ``puppet`` for the built-in ones.
+            key_tolerance: for weights: leave out keys that a straight line replaces to within so much; 0 if None.
             tolerance: for .glb: largest error in mm; 0.05 if None.
             view: for .mp4: camera, ``front``, ``three_quarter`` or ``side``; the front if None.
             size: for .mp4: height and width in pixels; 512 if None.
@@ -168,19 +170,24 @@ class Animation(finished.Animation):
         carry: bool = False,
         smoothness: float = 0.02,
         symmetry: float = 0.0,
+        sparsity: float = 0.02,
         bounds: tuple[float, float] = (0.0, 1.0),
         region: str | None = None,
+        residual_limit: float = 0.8,
         only_arkit: bool = False,
     ) -> Weights:
         """Weights of blendshapes that come nearest to the motion; their ``save`` writes a table.
 
         Args:
-            shapes: folder of .obj or .ply files named jawOpen, mouthFunnel …, or a .glb with named targets.
+            shapes: folder of .obj or .ply files named jawOpen, mouthFunnel …, a .glb with named targets, or ``puppet``
+                for those of the built-in face.
             carry: the shapes are of another topology: transfer them to this mesh.
             smoothness: cost of change over time; 0 is off.
             symmetry: cost of a difference between left and right; 0 is off.
+            sparsity: cost of weights, which keeps shapes at 0 that would cancel one another; 0 is off.
             bounds: least and greatest weight.
             region: look at a region of the face only, such as ``lips``.
+            residual_limit: share of the motion that weights may leave before they are refused.
             only_arkit: leave out shapes whose names are not ARKit's.
 
         Raises:
@@ -189,7 +196,13 @@ class Animation(finished.Animation):
         from facediff.editing.blendshapes import SolveOptions
 
         options = SolveOptions(
-            smoothness=smoothness, symmetry=symmetry, lower=bounds[0], upper=bounds[1], region=region
+            smoothness=smoothness,
+            symmetry=symmetry,
+            sparsity=sparsity,
+            lower=bounds[0],
+            upper=bounds[1],
+            region=region,
+            residual_limit=residual_limit,
         )
         return solve_weights(self, Path(shapes), options, carry=carry, only_arkit=only_arkit)[1]
 
@@ -219,6 +232,7 @@ class Samples(list[Animation]):
         up: Literal["y", "z"] | None = None,
         no_speech: bool = False,
         shapes: str | Path | None = None,
+        key_tolerance: float | None = None,
         tolerance: float | None = None,
         view: str | None = None,
         size: int | None = None,
@@ -234,6 +248,7 @@ class Samples(list[Animation]):
             up: likewise.
             no_speech: likewise.
             shapes: likewise.
+            key_tolerance: likewise.
             tolerance: likewise.
             view: likewise.
             size: likewise.
@@ -526,10 +541,9 @@ def solve_weights(
     """Shapes from a folder or a file as they fit an animation, and their weights: :meth:`Animation.blendshapes`."""
     from facediff.editing.blendshapes import solve
     from facediff.editing.retargeting import retarget_shapes
-    from facediff.editing.shapes import ARKIT, read_shapes
+    from facediff.editing.shapes import ARKIT, check_shapes, read_shapes
 
-    if not shapes.exists():
-        raise FaceDiffError(f"--shapes {shapes}: no such folder or file")
+    check_shapes(shapes)
     found = retarget_shapes(shapes, animation) if carry else read_shapes(shapes, animation.template, animation.unit)
     if only_arkit:
         found = found.only(ARKIT)

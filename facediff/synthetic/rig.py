@@ -123,18 +123,24 @@ def lip_side(mesh: Mesh, canonical: Array) -> Array:
     return below
 
 
-def _fields(mesh: Mesh, canonical: Array) -> dict[str, Array]:
-    """Displacements of the neutral head in mm, each of shape (V, 3)."""
-    x, y, z = np.abs(canonical[:, 0]), canonical[:, 1], canonical[:, 2]
-    sign = np.sign(canonical[:, 0])
-    below = lip_side(mesh, canonical)
-    skin = np.ones(len(x))
+def soft_parts(mesh: Mesh, canonical: Array) -> tuple[Array, Array]:
+    """How far each vertex is skin at the front of the face, and how far it follows inside the mouth; both (V,)."""
+    skin = np.ones(len(canonical))
     rigid = ["pupil", *(n for n in mesh.groups if n.startswith(("eyeball", "teeth", "ear")))]
     skin[mesh.both(*rigid)] = 0.0
-    skin *= rise(z, -10.0, 35.0)
-    inside = np.ones(len(x))
+    skin *= rise(canonical[:, 2], -10.0, 35.0)
+    inside = np.ones(len(canonical))
     for name, share in (("lip_roll", 0.9), ("mouth_bag", 0.45), ("mouth_back", 0.15)):
         inside[mesh.both(name)] = share
+    return skin, inside
+
+
+def _fields(mesh: Mesh, canonical: Array) -> dict[str, Array]:
+    """Displacements of the neutral head in mm, each of shape (V, 3)."""
+    x, y = np.abs(canonical[:, 0]), canonical[:, 1]
+    sign = np.sign(canonical[:, 0])
+    below = lip_side(mesh, canonical)
+    skin, inside = soft_parts(mesh, canonical)
 
     def move(dx: Array | float = 0.0, dy: Array | float = 0.0, dz: Array | float = 0.0) -> Array:
         return np.stack(np.broadcast_arrays(sign * dx, dy, dz, np.zeros_like(x))[:3], axis=-1)
@@ -180,8 +186,8 @@ def _fields(mesh: Mesh, canonical: Array) -> dict[str, Array]:
     }
 
 
-def _jaw(mesh: Mesh, canonical: Array, below: Array) -> Array:
-    """Turn of the lower jaw about an axis through the ears."""
+def jaw_share(mesh: Mesh, canonical: Array, below: Array) -> Array:
+    """How far each vertex follows the lower jaw, (V,)."""
     y, z = canonical[:, 1], canonical[:, 2]
     weight = below * rise(z, -12.0, 30.0) * rise(y, -128.0, -96.0) * rise(y, 8.0, -22.0)
     for name, share in (("mouth_back", 0.55), ("mouth_bag", 0.9)):
@@ -189,6 +195,13 @@ def _jaw(mesh: Mesh, canonical: Array, below: Array) -> Array:
     rigid = [name for name in mesh.groups if name.startswith(("eyeball", "ear", "teeth"))]
     weight[mesh.both("pupil", *rigid)] = 0.0
     weight[mesh.both(*(name for name in mesh.groups if name.startswith("teeth_lower")))] = 1.0
+    return np.asarray(weight)
+
+
+def _jaw(mesh: Mesh, canonical: Array, below: Array) -> Array:
+    """Turn of the lower jaw about an axis through the ears."""
+    y, z = canonical[:, 1], canonical[:, 2]
+    weight = jaw_share(mesh, canonical, below)
     turn = np.deg2rad(_JAW_DEGREES)
     down, forward = y - _HINGE[0], z - _HINGE[1]
     dy = np.cos(turn) * down - np.sin(turn) * forward - down

@@ -58,7 +58,13 @@ def test_animations_of_one_recording_are_named_after_their_files(animation: Anim
     [
         (["a.npz", "-o", "a.fbx"], 'there is no format ".fbx"'),
         (["a.npz", "-o", "a.csv"], "give --shapes"),
-        (["a.npz", "-o", "a.glb", "--shapes", "."], "--shapes"),
+        (["a.npz", "-o", "a.usdc", "--shapes", "."], "--shapes: has no effect on .usdc"),
+        (["a.npz", "-o", "a.glb", "--shapes", "none"], "--shapes none: no such"),
+        (
+            ["a.npz", "-o", "a.glb", "--shapes", "puppet", "--tolerance", "1"],
+            "--tolerance: has no effect with --shapes",
+        ),
+        (["a.npz", "-o", "a.glb", "--key-tolerance", "0.1"], "--key-tolerance: has no effect without --shapes"),
         (["missing.npz", "-o", "a.npy"], "missing.npz: no such file"),
         (["a.npz", "-o", "a.mp4", "--up", "z"], ".mp4 holds no axes"),
     ],

@@ -19,7 +19,9 @@ from hypothesis import strategies as st
 from facediff.animation import Animation
 from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, write_animations
+from facediff.export.format import normals_of, outward
 from facediff.export.glb import compress
+from facediff.synthetic.arkit import puppet_shapes
 
 COMPONENTS = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
@@ -248,3 +250,33 @@ def test_glb_of_the_same_animation_has_the_same_bytes(animation: Animation, tmp_
     for folder in ("one", "two"):
         write_animations(tmp_path / folder / "a.glb", [animation])
     assert (tmp_path / "one" / "a.glb").read_bytes() == (tmp_path / "two" / "a.glb").read_bytes()
+
+
+@pytest.mark.parametrize("key_tolerance", [0.0, 0.05])
+def test_named_shapes_give_named_targets_and_curves(tmp_path: Path, key_tolerance: float) -> None:
+    """Targets, their normals, and weights at the keys are those of the shapes' own face."""
+    neutral, faces, shapes = puppet_shapes("M1")
+    time = np.arange(40) / 25
+    goal = {"jawOpen": 0.4 + 0.4 * np.sin(3 * time), "eyeBlinkLeft": np.clip(1 - 8 * np.abs(time - 0.8), 0, 1)}
+    moved = neutral + sum(curve[:, None, None] * (shapes[name] - neutral) for name, curve in goal.items())
+    made = Animation("a", np.float32(moved), np.float32(neutral), 25.0, faces=faces)
+    options = ExportOptions(shapes=Path("puppet"), key_tolerance=key_tolerance)
+    write_animations(tmp_path / "a.glb", [made], options)
+    read = Reader(tmp_path / "a.glb")
+    names = read.gltf.meshes[0].extras["targetNames"]
+    assert sorted(names) == sorted(shapes)
+    extras = read.gltf.nodes[0].extras
+    assert extras["keys"] == len(read.times)
+    assert extras["residual_rms_mm"] < 0.2
+    assert (len(read.times) < 40) == (key_tolerance > 0)
+    for name, curve in goal.items():
+        found = np.interp(time, read.times, read.weights[:, names.index(name)])
+        assert found == pytest.approx(curve, abs=0.05 + key_tolerance)
+        target = read.primitive.targets[names.index(name)]
+        assert read.values(target["POSITION"]) == pytest.approx(shapes[name] - neutral, abs=1e-6)
+        posed = np.float32(
+            normals_of(np.float32(shapes[name]), outward(made)) - normals_of(np.float32(neutral), outward(made))
+        )
+        assert read.values(target["NORMAL"]) == pytest.approx(posed, abs=1e-4)
+    others = [index for index, name in enumerate(names) if name not in goal]
+    assert np.abs(read.weights[:, others]).mean() < 0.01

@@ -162,9 +162,9 @@ def test_other_meshes_and_weights_are_those_of_the_commands(model: facediff.Anim
     np.testing.assert_array_equal(made.vertices, facediff.read("command.npz").vertices)
     carried = model.animate("speech.wav", identity="F1", target_mesh="face.ply", correspondence="map.npz")
     np.testing.assert_array_equal(made.vertices, carried.vertices)
-    words = ["--shapes", "shapes", "--only-arkit", "--smoothness", 0.1]
+    words = ["--shapes", "shapes", "--only-arkit", "--smoothness", 0.1, "--residual-limit", 1]
     command("blendshapes", "a.npz", "-o", "command.csv", *words)
-    weights = anim.blendshapes("shapes", only_arkit=True, smoothness=0.1)
+    weights = anim.blendshapes("shapes", only_arkit=True, smoothness=0.1, residual_limit=1)
     assert weights.save("python.csv") == Path("python.csv")
     assert Path("python.csv").read_bytes() == Path("command.csv").read_bytes()
     write_live_link(Path("same.csv"), weights)

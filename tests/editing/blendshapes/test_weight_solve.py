@@ -16,7 +16,7 @@ from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError
 
 NAMES = ("jawOpen", "mouthSmileLeft", "mouthSmileRight", "mouthFunnel", "mine")
-PLAIN = SolveOptions(smoothness=0, ridge=0)
+PLAIN = SolveOptions(smoothness=0, ridge=0, sparsity=0, residual_limit=9)
 
 
 def shapes(seed: int = 0, vertices: int = 40, names: tuple[str, ...] = NAMES) -> ShapeSet:
@@ -87,9 +87,9 @@ def test_known_weights_come_back_from_a_motion_as_stored() -> None:
     "options",
     [
         PLAIN,
-        SolveOptions(),
-        SolveOptions(smoothness=0.3, symmetry=0.7),
-        SolveOptions(symmetry=5, lower=-0.2, upper=0.7),
+        SolveOptions(sparsity=0, residual_limit=9),
+        SolveOptions(smoothness=0.3, symmetry=0.7, sparsity=0, residual_limit=9),
+        SolveOptions(symmetry=5, lower=-0.2, upper=0.7, sparsity=0, residual_limit=9),
     ],
 )
 @pytest.mark.parametrize("rate", [25.0, 60.0])
@@ -133,7 +133,7 @@ def test_no_choice_of_bounds_is_better() -> None:
 def test_any_motion_stays_in_bounds_and_settles(seed: int, size: float, smooth: float) -> None:
     made = shapes()
     animation = animation_of(made, np.zeros((7, 5)), off=size, seed=seed)
-    found = solve(animation, made, SolveOptions(smoothness=smooth))
+    found = solve(animation, made, SolveOptions(smoothness=smooth, sparsity=0, residual_limit=9))
     assert found.values.min() >= 0
     assert found.values.max() <= 1
     assert np.isfinite(found.residual_rms_mm).all()
@@ -160,7 +160,7 @@ def test_smoothness_is_over_the_whole_animation_and_shifts_nothing() -> None:
     """Inside the bounds the answer is one linear model's; read backwards, it is the same."""
     made = shapes()
     known = 0.5 + 0.3 * np.sin(np.arange(20)[:, None] / 3 + np.arange(5))
-    options = SolveOptions(smoothness=0.5, lower=-9, upper=9)
+    options = SolveOptions(smoothness=0.5, lower=-9, upper=9, sparsity=0, residual_limit=9)
     animation = animation_of(made, known, off=0.001)
     found = solve(animation, made, options).values
     hessian, right = dense(made, animation, options)
@@ -175,7 +175,13 @@ def test_symmetry_draws_left_and_right_together() -> None:
     made = shapes()
     known = np.tile([0.5, 0.9, 0.1, 0.2, 0.3], (4, 1))
     gaps = [
-        np.abs(np.subtract(*solve(animation_of(made, known), made, SolveOptions(symmetry=s)).values[:, 1:3].T)).max()
+        np.abs(
+            np.subtract(
+                *solve(animation_of(made, known), made, SolveOptions(symmetry=s, sparsity=0, residual_limit=9))
+                .values[:, 1:3]
+                .T
+            )
+        ).max()
         for s in (0.0, 0.5, 1e4)
     ]
     assert gaps[0] > 0.79
@@ -188,7 +194,7 @@ def test_weights_do_not_depend_on_the_unit() -> None:
     animation = animation_of(made, wild(), off=0.003)
     mm = ShapeSet(made.names, 1000 * made.neutral, 1000 * made.deltas)
     big = replace(animation, vertices=1000 * animation.vertices, template=1000 * animation.template, unit="mm")
-    options = SolveOptions(smoothness=0.2, symmetry=0.1)
+    options = SolveOptions(smoothness=0.2, symmetry=0.1, sparsity=0, residual_limit=9)
     one, two = solve(animation, made, options), solve(big, mm, options)
     assert one.values == pytest.approx(two.values, abs=1e-6)
     assert one.residual_rms_mm == pytest.approx(two.residual_rms_mm, rel=1e-6)
@@ -233,12 +239,14 @@ def test_dependent_and_still_shapes_do_no_harm() -> None:
     deltas = np.concatenate([made.deltas, made.deltas[:1], np.zeros((1, 40, 3))])
     more = ShapeSet((*made.names, "twin", "tongueOut"), made.neutral, deltas)
     known = np.random.default_rng(2).uniform(0, 1, (6, 5))
-    found = solve(animation_of(made, known), more, SolveOptions(smoothness=0))
+    found = solve(animation_of(made, known), more, SolveOptions(smoothness=0, sparsity=0, residual_limit=9))
     assert found.metadata["solve converged"] == "yes"
     assert found.residual_share.max() < 1e-4
     assert found.still == ("tongueOut",)
     assert not found.values[:, -1].any()
-    without = solve(animation_of(made, known), more, SolveOptions(smoothness=1e-3, ridge=0))
+    without = solve(
+        animation_of(made, known), more, SolveOptions(smoothness=1e-3, ridge=0, sparsity=0, residual_limit=9)
+    )
     assert without.metadata["solve converged"] == "yes"
     # The ridge chooses the smallest weights: the twins share.
     assert found.values[:, 0] == pytest.approx(found.values[:, 5], abs=1e-3)
