@@ -64,7 +64,7 @@ class SamplingPreview(Callback):
         clips: how many clips: the first of each of so many speakers.
         names: validation clips to draw instead, by name.
         seconds: longest piece of a clip that is drawn, from its beginning.
-        sampler: registered name of the sampler; the model's own if None.
+        sampler: registered name of the sampler; the model's own if None, or if it has no such sampler.
         steps: its denoising steps; its own default if None.
         seed: seed of the noise, the same in every epoch.
         size: height of a panel in pixels; it is three quarters as wide.
@@ -272,16 +272,16 @@ def copy_weights(source: dict[str, Tensor], target: dict[str, Tensor]) -> None:
 
 @contextmanager
 def borrowed(model: AnimationModel, sampler: str | None, steps: int | None) -> Iterator[None]:
-    """A model in evaluation mode with another sampler, if it samples; both are put back afterwards."""
+    """A model in evaluation mode with another sampler, if it has that one; both are put back afterwards."""
     modes = [(module, module.training) for module in model.modules()]
-    kept = {name: value for name, value in vars(model).items() if name == "sampler"}
     model.eval()
     try:
-        if model.samples and (sampler is not None or steps is not None):
-            model.choose_sampler(sampler, steps)
-        yield
+        with model.choosing():
+            # Of a method that samples in its own way, previews show that.
+            if (sampler is not None or steps is not None) and model.has_sampler(sampler):
+                model.choose_sampler(sampler, steps)
+            yield
     finally:
-        vars(model).update(kept)
         for module, training in modes:
             module.training = training
 

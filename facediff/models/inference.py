@@ -350,6 +350,10 @@ class Inference(ABC):
         """
         raise FaceDiffError(f"{type(self).__name__} does not sample: omit --sampler and --steps")
 
+    def has_sampler(self, name: str | None) -> bool:
+        """Whether :meth:`choose_sampler` takes this name; a model that samples is asked for registered ones."""
+        return self.samples
+
     def choose_expressivity(self, expressivity: Expressivity) -> None:
         """Go from the mean prediction (0) to a full sample (1) or beyond, for all that follows.
 

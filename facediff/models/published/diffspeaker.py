@@ -78,6 +78,7 @@ class DiffSpeaker(DiffusionModel):
     """
 
     chosen: ClassVar[tuple[str, ...]] = (*DiffusionModel.chosen, "scheduler", "sampling_steps")
+    samplers: ClassVar[tuple[str, ...]] = ("ddim",)
     table_frames: ClassVar[int | None] = 3000
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder,
@@ -151,8 +152,8 @@ class DiffSpeaker(DiffusionModel):
         Raises:
             FaceDiffError: if there is no such sampler, or so many steps are impossible.
         """
-        if name not in (None, "ddim"):
-            raise FaceDiffError(f"--sampler {name}: DiffSpeaker has no such sampler: {choices(name, ['ddim'])}")
+        if name is not None and name not in self.samplers:
+            raise FaceDiffError(f"--sampler {name}: DiffSpeaker has no such sampler: {choices(name, self.samplers)}")
         if steps is not None and not 1 <= steps <= TRAINING_STEPS:
             raise FaceDiffError(f"--steps {steps}: expected a number from 1 to {TRAINING_STEPS}")
         self.scheduler = "ddim" if name == "ddim" else self.scheduler

@@ -31,11 +31,19 @@ NoiseSource = Callable[[Tensor], Tensor]
 class DiffusionModel(PublishedModel):
     """Base of the published methods that sample by diffusion.
 
+    Class attributes:
+        samplers: names that :meth:`choose_sampler` takes; the methods have samplers of their own.
+
     Args:
         options: those of :class:`PublishedModel`.
     """
 
     samples: ClassVar[bool] = True
+    samplers: ClassVar[tuple[str, ...]] = ()
+
+    def has_sampler(self, name: str | None) -> bool:
+        """Whether it is one of the method's own."""
+        return name in self.samplers
 
     def choose_expressivity(self, expressivity: object) -> None:
         """Samples as they are (1); the method knows no mean around which they lie.
