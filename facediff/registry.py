@@ -168,6 +168,38 @@ class Kind:
             raise UnknownComponentError(self.unknown(name))
         return self._entries[name].alias
 
+    def read(self, text: str, hidden: Set[str] = frozenset()) -> tuple[str, dict[str, Any]]:
+        """The name and the options of ``NAME:option=value,option=value``; a value is of the kind of its default.
+
+        Args:
+            text: as typed.
+            hidden: options that cannot be chosen this way.
+
+        Raises:
+            UnknownComponentError: if nothing has the name; the message names the nearest.
+            FaceDiffError: if there is no such option, or its value is of another kind.
+        """
+        text = text.replace(" ", "")
+        name, _, rest = text.partition(":")
+        known = {
+            option: parameter.default
+            for option, parameter in inspect.signature(self.get(name)).parameters.items()
+            if parameter.default is not inspect.Parameter.empty and option not in hidden
+        }
+        options = {}
+        for word in filter(None, rest.split(",")):
+            option, equals, value = word.partition("=")
+            if option not in known:
+                offered = choices(option, known) if known else "it has none"
+                raise FaceDiffError(f"{self.kind} {text}: {name} has no option {option!r}: {offered}")
+            if not equals or not value:
+                raise FaceDiffError(f"{self.kind} {text}: option {option} has no value; write {option}=VALUE")
+            try:
+                options[option] = _value(value, known[option])
+            except ValueError as error:
+                raise FaceDiffError(f"{self.kind} {text}: option {option} is {value!r}; expected {error}") from error
+        return name, options
+
     def unknown(self, name: str) -> str:
         """The sentence for a name that does not exist: the nearest one, then all."""
         return f'there is no {self.kind} "{name}": {choices(name, self.names())}'
@@ -181,6 +213,26 @@ class Kind:
     def __iter__(self) -> Iterator[Entry]:
         """Iterate over the components, sorted by name."""
         return iter(self.entries())
+
+
+def _value(text: str, default: object) -> object:
+    """A word as a value of the kind of the option's default; a ValueError says what kind was expected."""
+    if isinstance(default, bool):
+        if text.lower() not in ("true", "false"):
+            raise ValueError("true or false")
+        return text.lower() == "true"
+    if isinstance(default, str):
+        return text
+    kind = int if isinstance(default, int) else float
+    try:
+        value = kind(text)
+        if not -1e12 < value < 1e12:  # not NaN either
+            raise ValueError
+        return value
+    except ValueError:
+        if default is None:
+            return None if text.lower() == "none" else text
+        raise ValueError("a whole number" if kind is int else "a number") from None
 
 
 audio_encoder = Kind(
@@ -216,6 +268,8 @@ corpus = Kind(
     aliases=False,
 )
 metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class", aliases=False)
+augmentation = Kind("augmentation", "facediff.data.augmentation", "a change of training speech", aliases=False)
+voice_gate = Kind("voice_gate", "facediff.data.voice_activity", "finds the pauses of speech", aliases=False)
 export_format = Kind(
     "export_format",
     "facediff.export.arrays facediff.export.glb facediff.export.sequences facediff.export.usd facediff.export.video "
@@ -239,7 +293,10 @@ COMPONENTS: dict[str, Kind] = {
 }
 """The kinds of which models are made; a model's option of the kind's name chooses one."""
 
-KINDS: dict[str, Kind] = {**COMPONENTS, **{kind.kind: kind for kind in (model, corpus, metric, export_format)}}
+KINDS: dict[str, Kind] = {
+    **COMPONENTS,
+    **{kind.kind: kind for kind in (model, corpus, metric, augmentation, voice_gate, export_format)},
+}
 """Everything that can be chosen by name."""
 
 

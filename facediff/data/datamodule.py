@@ -13,11 +13,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from facediff.data.augmentation import Augmenter, read_augmentations
 from facediff.data.batch import Assets, Batch, Reference, Sample, collate
 from facediff.data.corpus import EYELID_PAIRS, LIP_PAIRS, Clip, Corpus, find_region, parse_name, read_manifest
 from facediff.data.dataset import (
@@ -100,6 +103,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             possible with the same attributes (such as the mood), or the target itself.
         reference_frames: longest style reference, in frames.
         predict_split: the split that ``predict`` runs over; the first test split if None.
+        augmentations: changes of training speech by name with their options, such as ``[voice:semitones=4, room,
+            noise]``, in this order; see docs/voices.md.
+        augmented_share: share of the training clips to which they are applied; the others stay as recorded.
         people: folders of further speakers to train on, as ``facediff data import-person`` writes them; they come first
             in the order of the identity index.
         extra_identities: further identities of the corpus to train on, with those of their clips that belong to no
@@ -149,6 +155,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         reference: ReferenceChoice = "same_subject",
         reference_frames: Count = 100,
         predict_split: Split | None = None,
+        augmentations: list[str] | None = None,
+        augmented_share: Annotated[float, Range(0, 1)] = 1.0,
         people: list[str] | None = None,
         extra_identities: list[str] | None = None,
         train_identities: Annotated[list[str], Range(items=(1, 1_000_000))] | None = None,
@@ -169,6 +177,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.reference: ReferenceChoice = reference
         self.reference_frames = reference_frames
         self.predict_split = predict_split
+        self.augmenter: Augmenter | None = None
+        if augmentations:
+            self.augmenter = Augmenter(read_augmentations(augmentations), augmented_share)
         self.people = [Path(folder).expanduser() for folder in people or []]
         self.regions = {
             name: self.region_sources[name] if chosen is None else (chosen,)
@@ -377,7 +388,31 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             words=[self.words_of(clip) for clip in clips],
             context=self.window_context if training and self.window is not None else (0, 0),
             aligner=self.aligner if training and self.pair_sentences else None,
+            augmenter=self.augmenter if training else None,
+            mouth=self._mouth() if training and self.augmenter is not None else None,
         )
+
+    def _mouth(self) -> npt.NDArray[np.float32]:
+        """Which vertices speech moves (V,): 1 for all but the upper face.
+
+        Raises:
+            FaceDiffError: if training is such that speech cannot be augmented.
+        """
+        if self.features.reader is not None:
+            raise FaceDiffError(
+                "data.augmentations: speech features that were computed before training are those of the recordings "
+                "as they are; omit the callback that caches them, or the augmentations"
+            )
+        moving = [each for each in (self.augmenter.augmentations if self.augmenter else []) if each.moves]
+        if moving and (self.window is not None or self.pair_sentences):
+            raise FaceDiffError(
+                "data.augmentations: speed changes the number of frames, which windows and pairs of clips rely on; "
+                "omit it, or train on whole clips"
+            )
+        mouth = np.ones(self.n_vertices, np.float32)
+        sources = self.regions["upper_face"]
+        mouth[find_region(self.root, sources, "upper_face", self.n_vertices, self.region_help).tensor().numpy()] = 0
+        return mouth
 
     def assets(self) -> Assets:
         """What a checkpoint keeps of this corpus; the motion scale is measured by :meth:`motion_scale`."""

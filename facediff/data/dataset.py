@@ -10,11 +10,13 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from facediff.data.audio import samples_for
+from facediff.data.augmentation import Augmenter, Example
 from facediff.data.batch import UNKNOWN_IDENTITY, Sample
 from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
@@ -337,6 +339,8 @@ class MotionDataset(Dataset[Sample]):
         words: what each clip says, where that is not its sentence; clips that say the same can be aligned.
         context: frames before and after a training window that are read with it.
         aligner: lets the windows of two clips that say the same begin at the same sound; None leaves them to chance.
+        augmenter: changes training speech; None leaves it as it was recorded.
+        mouth: which vertices speech moves (V,), 0 to 1; needed with an augmenter.
     """
 
     corpus: Corpus
@@ -351,6 +355,8 @@ class MotionDataset(Dataset[Sample]):
     words: list[str] | None = None
     context: tuple[int, int] = (0, 0)
     aligner: Aligner | None = None
+    augmenter: Augmenter | None = None
+    mouth: npt.NDArray[np.float32] | None = None
     _alignments: dict[tuple[int, int], Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -378,9 +384,12 @@ class MotionDataset(Dataset[Sample]):
         first, last = max(0, start - self.context[0]), min(frames, stop + self.context[1])
         source = self._reference(clip, random)
         earliest, latest = self._window(self.corpus.frames(source), self.policy.max_frames, random)
+        audio, motion = self.corpus.read_audio(clip, first, last), self.corpus.read_motion(clip, first, last)
+        if self.augmenter is not None:
+            audio, motion = self._augmented(self.augmenter, clip, audio, motion, pick.seed)
         return Sample(
-            audio=self.corpus.read_audio(clip, first, last),
-            motion=self.corpus.read_motion(clip, first, last),
+            audio=audio,
+            motion=motion,
             template=self.corpus.template(clip),
             identity=self.identities.index(clip.identity) if clip.identity in self.identities else UNKNOWN_IDENTITY,
             reference=self.corpus.read_motion(source, earliest, latest),
@@ -393,6 +402,19 @@ class MotionDataset(Dataset[Sample]):
             repeated=pick.repeated,
             window=(start - first, stop - first) if any(self.context) else None,
         )
+
+    def _augmented(
+        self, augmenter: Augmenter, clip: Clip, audio: Tensor, motion: Tensor, seed: int
+    ) -> tuple[Tensor, Tensor]:
+        """Speech (samples,) and motion (frames, V, 3) as the augmenter changes them."""
+        frames = self.corpus.frames(clip)
+        # A recording begins and ends without speech: of its two ends, the one nearer to the neutral face.
+        mouth = np.ones(len(motion[0]), np.float32) if self.mouth is None else self.mouth
+        ends = [self.corpus.read_motion(clip, place, place + 1)[0].numpy() for place in (0, frames - 1)]
+        rest = min(ends, key=lambda each: float(np.square(each[mouth > 0]).sum()))
+        example = Example(audio.numpy(), motion.numpy(), self.corpus.frame_rate, rest, mouth)
+        changed = augmenter(example, seed)
+        return torch.from_numpy(changed.speech), torch.from_numpy(changed.motion)
 
     def says(self, index: int) -> str:
         """What a clip says: clips of which it is equal have the same words."""

@@ -112,51 +112,12 @@ def parse(text: str) -> Request:
     >>> parse("temporal_misalignment:at=path,smoothing=1.5").options
     {'at': 'path', 'smoothing': 1.5}
     """
-    text = text.replace(" ", "")
-    name, _, rest = text.partition(":")
     try:
-        implementation = metrics.get(name)
+        name, options = metrics.read(text, _NOT_CHOSEN)
     except UnknownComponentError as error:
         # It is an AttributeError too, which a torch module that parses in a property would report as one of its own.
         raise FaceDiffError(str(error)) from error
-    known = {
-        option: parameter.default
-        for option, parameter in inspect.signature(implementation).parameters.items()
-        if parameter.default is not inspect.Parameter.empty and option not in _NOT_CHOSEN
-    }
-    options = {}
-    for word in filter(None, rest.split(",")):
-        option, equals, value = word.partition("=")
-        if option not in known:
-            offered = choices(option, known) if known else "it has none"
-            raise FaceDiffError(f"metric {text}: {name} has no option {option!r}: {offered}")
-        if not equals or not value:
-            raise FaceDiffError(f"metric {text}: option {option} has no value; write {option}=VALUE")
-        try:
-            options[option] = _value(value, known[option])
-        except ValueError as error:
-            raise FaceDiffError(f"metric {text}: option {option} is {value!r}; expected {error}") from error
-    return Request(text, name, options)
-
-
-def _value(text: str, default: object) -> object:
-    """A word as a value of the kind of the option's default; a ValueError says what kind was expected."""
-    if isinstance(default, bool):
-        if text.lower() not in ("true", "false"):
-            raise ValueError("true or false")
-        return text.lower() == "true"
-    if isinstance(default, str):
-        return text
-    kind = int if isinstance(default, int) else float
-    try:
-        value = kind(text)
-        if not -1e12 < value < 1e12:  # not NaN either
-            raise ValueError
-        return value
-    except ValueError:
-        if default is None:
-            return None if text.lower() == "none" else text
-        raise ValueError("a whole number" if kind is int else "a number") from None
+    return Request(text.replace(" ", ""), name, options)
 
 
 def feed(metric: Metric, inputs: Mapping[str, Any]) -> None:

@@ -1,0 +1,570 @@
+"""Speech of training clips as other voices, rooms and microphones would have it, while the motion stays the truth.
+
+A model that has only heard a speech synthesiser takes the synthesiser's voice for speech itself. What is changed here
+is what a face does not depend on: pitch and formants, loudness, the spectrum of a microphone or a telephone, the room,
+noise and hum. Two entries change the motion as well: :class:`Speed`, and :class:`Pauses`, which teaches that no speech
+means a mouth at rest, however loud the noise.
+
+They are registered under the kind ``augmentation`` and chosen by name with their options::
+
+    --data.augmentations="[voice:semitones=5, room, noise:least=0, pauses]" --data.augmented_share=0.5
+
+Everything is NumPy and SciPy on whole clips; docs/voices.md has what each costs.
+"""
+
+from __future__ import annotations
+
+import io
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.audio import fit_length
+from facediff.errors import FaceDiffError
+from facediff.registry import UnknownComponentError, augmentation, checks_arguments
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Range
+
+Wave = npt.NDArray[np.float32]
+"""Speech (S,) at 16 kHz."""
+
+Share = Annotated[float, Range(0, 1)]
+Decibels = Annotated[float, Range(0, 60)]
+Ratio = Annotated[float, Range(0, 150)]
+"""A ratio of speech to noise in decibels."""
+
+SIZE, HOP = 512, 128
+"""Samples of a spectrum, and from one to the next: 32 ms and 8 ms, in which a voice hardly changes."""
+
+LIFTER = 30
+"""Coefficients of the cepstrum that make the spectral envelope. Harmonics of voices below 530 Hz lie above."""
+
+CLOSING, OPENING = 0.2, 0.16
+"""Seconds that a mouth takes to come to rest after speech, and to open before it."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """A training clip, or a window of one.
+
+    Attributes:
+        speech: (S,) at 16 kHz.
+        motion: (T, V, 3) offsets from the template, over the same time.
+        frame_rate: of the motion.
+        rest: (V, 3) the speaker's face when nothing is said.
+        mouth: (V,) which vertices speech moves, 0 to 1; the others keep their motion in a pause.
+    """
+
+    speech: Wave
+    motion: npt.NDArray[np.float32]
+    frame_rate: float
+    rest: npt.NDArray[np.float32]
+    mouth: npt.NDArray[np.float32]
+
+
+class Augmentation(ABC):
+    """One change that is made to a share of the clips.
+
+    Args:
+        share: of the clips that are augmented at all.
+    """
+
+    moves: bool = False
+    """Whether it changes the number of frames, so that speech and motion are no longer those of the corpus's frames."""
+
+    def __init__(self, *, share: Share = 0.5) -> None:
+        self.share = share
+
+    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+        """Let every constructor refuse options that are out of range."""
+        super().__init_subclass__(**words)
+        if "__init__" in vars(cls):
+            cls.__init__ = checks_arguments(cls.__init__, "data.augmentations")  # type: ignore[method-assign]
+
+    @abstractmethod
+    def __call__(self, example: Example, random: np.random.Generator) -> Example:
+        """The changed clip; its speech has as many samples as its frames last."""
+
+
+class OfSpeech(Augmentation):
+    """A change of the speech alone."""
+
+    def __call__(self, example: Example, random: np.random.Generator) -> Example:
+        """The clip with other speech of the same length."""
+        if not example.speech.any():
+            return example
+        changed = fit_length(np.asarray(self.change(example.speech, random), np.float32), len(example.speech))
+        return replace(example, speech=changed)
+
+    @abstractmethod
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Other speech (S',), whose samples go with those of the speech; cut or filled up where it is not as long."""
+
+
+class Augmenter:
+    """Applies a list of augmentations to a share of the clips.
+
+    Args:
+        augmentations: in the order in which they are applied.
+        share: of the clips that are augmented; the others stay as they are, so that clean speech is learnt too.
+    """
+
+    def __init__(self, augmentations: Sequence[Augmentation], share: float = 1.0) -> None:
+        self.augmentations = list(augmentations)
+        self.share = share
+
+    def __call__(self, example: Example, seed: int) -> Example:
+        """The clip as these augmentations change it; the same seed changes it in the same way."""
+        random = np.random.default_rng(seed)
+        if random.random() >= self.share:
+            return example
+        for each in self.augmentations:
+            if random.random() < each.share:
+                example = each(example, random)
+        peak = float(np.abs(example.speech).max(initial=0))
+        return replace(example, speech=example.speech / peak) if peak > 1 else example
+
+
+def read_augmentations(texts: Sequence[str]) -> list[Augmentation]:
+    """Augmentations from ``NAME:option=value,option=value``.
+
+    Raises:
+        FaceDiffError: if there is no such augmentation or option, or a value is out of range.
+
+    Example:
+        >>> [type(each).__name__ for each in read_augmentations(["voice:semitones=3", "room"])]
+        ['Voice', 'Room']
+    """
+    made = []
+    for text in texts:
+        try:
+            name, options = augmentation.read(text)
+        except UnknownComponentError as error:
+            raise FaceDiffError(f"data.augmentations: {error}") from error
+        made.append(cast(Augmentation, augmentation.get(name)(**options)))
+    return made
+
+
+# Voices.
+
+
+@augmentation.register("voice")
+class Voice(OfSpeech):
+    """Another speaker's pitch and formants, each by a random amount.
+
+    The pitch is shifted by a phase vocoder and resampling, the spectral envelope is warped along frequency (vocal-tract
+    length), so that the two do not depend on one another; the times of sounds stay.
+
+    Args:
+        share: of the augmented clips.
+        semitones: the pitch goes up or down by up to so many.
+        formants: the formants go up or down by up to this share of their frequency.
+    """
+
+    def __init__(
+        self,
+        *,
+        share: Share = 0.7,
+        semitones: Annotated[float, Range(0, 24)] = 5.0,
+        formants: Annotated[float, Range(0, 0.6)] = 0.2,
+    ) -> None:
+        super().__init__(share=share)
+        self.semitones, self.formants = semitones, formants
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Shift pitch and formants."""
+        pitch = 2.0 ** (random.uniform(-self.semitones, self.semitones) / 12)
+        warp = (1 + self.formants) ** random.uniform(-1, 1)
+        if abs(pitch - 1) > 0.02:
+            speech = shifted(speech, pitch)
+        else:
+            pitch = 1.0
+        # The shift has moved the formants with the pitch.
+        return warped(speech, warp / pitch)
+
+
+@augmentation.register("speed")
+class Speed(Augmentation):
+    """Quicker or slower speech of the same pitch, and the motion with it.
+
+    Args:
+        share: of the augmented clips.
+        ratio: speech is quicker or slower by up to this share.
+    """
+
+    moves = True
+
+    def __init__(self, *, share: Share = 0.3, ratio: Annotated[float, Range(0, 0.5)] = 0.15) -> None:
+        super().__init__(share=share)
+        self.ratio = ratio
+
+    def __call__(self, example: Example, random: np.random.Generator) -> Example:
+        """The clip with another number of frames."""
+        before = len(example.motion)
+        after = max(2, round(before / (1 + self.ratio) ** random.uniform(-1, 1)))
+        if before < 2 or after == before:
+            return example
+        places = (np.arange(after) + 0.5) * (before / after) - 0.5
+        low = np.clip(np.floor(places).astype(int), 0, before - 2)
+        share = np.clip(places - low, 0.0, 1.0).astype(np.float32)[:, None, None]
+        motion = (1 - share) * example.motion[low] + share * example.motion[low + 1]
+        length = round(after * SAMPLE_RATE / example.frame_rate)
+        speech = stretched(example.speech, length / max(1, len(example.speech)))
+        return replace(example, motion=motion, speech=fit_length(speech.astype(np.float32), length))
+
+
+# Level and spectrum.
+
+
+@augmentation.register("loudness")
+class Loudness(OfSpeech):
+    """Loudness that drifts, as of a speaker who turns away from the microphone.
+
+    Args:
+        share: of the augmented clips.
+        decibels: most by which it differs from the mean, in either direction.
+    """
+
+    def __init__(self, *, share: Share = 0.5, decibels: Decibels = 6.0) -> None:
+        super().__init__(share=share)
+        self.decibels = decibels
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Multiply by a smooth gain."""
+        knots = max(2, 2 + round(1.5 * len(speech) / SAMPLE_RATE))
+        gains = random.uniform(-self.decibels, self.decibels, knots)
+        over = np.interp(np.arange(len(speech)), np.linspace(0, len(speech), knots), gains)
+        return cast(Wave, speech * 10 ** (over / 20))
+
+
+@augmentation.register("tilt")
+class Tilt(OfSpeech):
+    """Another balance of low and high: a straight tilt, and a smooth curve over it.
+
+    Args:
+        share: of the augmented clips.
+        decibels: most by which an octave differs from the one below it.
+        curve: most by which the curve adds or takes, anywhere.
+    """
+
+    def __init__(self, *, share: Share = 0.5, decibels: Decibels = 4.0, curve: Decibels = 6.0) -> None:
+        super().__init__(share=share)
+        self.decibels, self.curve = decibels, curve
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Filter without delay."""
+        octaves = np.linspace(-3.0, 3.0, 7)  # from 125 Hz to 8 kHz
+        gains = random.uniform(-self.decibels, self.decibels) * octaves + random.uniform(-1, 1, 7) * self.curve
+        return filtered(
+            speech, lambda hertz: 10 ** (np.interp(np.log2(np.maximum(hertz, 1) / 1000), octaves, gains) / 20)
+        )
+
+
+@augmentation.register("band")
+class Band(OfSpeech):
+    """A band of the spectrum, as small microphones and telephones leave of it.
+
+    Args:
+        share: of the augmented clips.
+        low: everything below a random frequency is lost; the highest it may be, in Hz.
+        high: everything above a random frequency is lost; the lowest it may be, in Hz.
+    """
+
+    def __init__(
+        self,
+        *,
+        share: Share = 0.3,
+        low: Annotated[float, Range(0, 2000)] = 300.0,
+        high: Annotated[float, Range(500, 8000)] = 3000.0,
+    ) -> None:
+        super().__init__(share=share)
+        self.low, self.high = low, high
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Filter by edges that fall by 24 dB an octave."""
+        low = random.uniform(0, self.low)
+        high = random.uniform(min(self.high, 7900), 7900)
+
+        def gain(hertz: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+            rise = 1 / np.sqrt(1 + (low / np.maximum(hertz, 1)) ** 8)
+            return cast(npt.NDArray[np.floating], rise / np.sqrt(1 + (hertz / high) ** 8))
+
+        return filtered(speech, gain)
+
+
+@augmentation.register("codec")
+class Codec(OfSpeech):
+    """What a codec leaves of speech: a telephone's 8 bits at 8 kHz, or Vorbis at a low rate.
+
+    Args:
+        share: of the augmented clips.
+        kind: ``telephone`` (mu-law, ITU-T G.711), ``vorbis``, or ``any`` of them.
+    """
+
+    def __init__(self, *, share: Share = 0.15, kind: Literal["any", "telephone", "vorbis"] = "any") -> None:
+        super().__init__(share=share)
+        self.kind = kind
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Encode and decode."""
+        chosen = ("telephone", "vorbis")[int(random.integers(2))] if self.kind == "any" else self.kind
+        return telephone(speech) if chosen == "telephone" else vorbis(speech, float(random.uniform(0.5, 1.0)))
+
+
+# Rooms and noise.
+
+
+@augmentation.register("room")
+class Room(OfSpeech):
+    """A room: the direct sound, and noise that decays exponentially after it (Moorer 1979).
+
+    Args:
+        share: of the augmented clips.
+        seconds: longest time in which the room's sound falls by 60 dB.
+        direct: least ratio of direct to reverberant sound, in decibels.
+    """
+
+    def __init__(
+        self,
+        *,
+        share: Share = 0.4,
+        seconds: Annotated[float, Range(0.05, 5)] = 0.6,
+        direct: Annotated[float, Range(-20, 60)] = 0.0,
+    ) -> None:
+        super().__init__(share=share)
+        self.seconds, self.direct = seconds, direct
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Convolve with a random impulse response, whose direct sound comes without delay."""
+        from scipy.signal import fftconvolve
+
+        decay = random.uniform(0.08, max(0.08, self.seconds))
+        times = np.arange(round(decay * SAMPLE_RATE)) / SAMPLE_RATE
+        tail = random.standard_normal(len(times)) * 10 ** (-3 * times / decay)
+        tail[: round(random.uniform(0.001, 0.02) * SAMPLE_RATE)] = 0
+        # Walls swallow high frequencies first.
+        smooth = random.uniform(0, 0.7)
+        tail = (1 - smooth) * tail + smooth * np.convolve(tail, [0.5, 0.5], "same")
+        ratio = random.uniform(self.direct, self.direct + 15)
+        tail *= 10 ** (-ratio / 20) / max(float(np.sqrt((tail**2).sum())), 1e-9)
+        tail[0] = 1
+        return cast(Wave, fftconvolve(speech, tail.astype(np.float32))[: len(speech)])
+
+
+@augmentation.register("noise")
+class Noise(OfSpeech):
+    """Noise of a random colour, from white to brown, and of a level that may change slowly.
+
+    Args:
+        share: of the augmented clips.
+        least: least ratio of speech to noise, in decibels.
+        most: largest ratio.
+    """
+
+    def __init__(self, *, share: Share = 0.6, least: Ratio = 5.0, most: Ratio = 50.0) -> None:
+        super().__init__(share=share)
+        self.least, self.most = least, max(least, most)
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Add noise."""
+        exponent = random.uniform(-1.0, 0.2)
+        noise = filtered(random.standard_normal(len(speech)), lambda hertz: np.maximum(hertz / 500, 0.08) ** exponent)
+        return speech + noise * gain_for(speech, noise, random.uniform(self.least, self.most))
+
+
+@augmentation.register("hum")
+class Hum(OfSpeech):
+    """Mains hum: 50 or 60 Hz with its harmonics.
+
+    Args:
+        share: of the augmented clips.
+        least: least ratio of speech to hum, in decibels.
+        most: largest ratio.
+    """
+
+    def __init__(self, *, share: Share = 0.2, least: Ratio = 10.0, most: Ratio = 50.0) -> None:
+        super().__init__(share=share)
+        self.least, self.most = least, max(least, most)
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Add hum."""
+        base = (50.0, 60.0)[int(random.integers(2))] * random.uniform(0.995, 1.005)
+        orders = np.arange(1, 13)
+        sizes = random.uniform(0.2, 1.0, 12) * orders ** -random.uniform(0.5, 2.0)
+        phase = 2 * np.pi * (base / SAMPLE_RATE) * np.arange(len(speech))
+        hum = sum(
+            size * np.sin(order * phase + shift)
+            for order, size, shift in zip(orders, sizes, random.uniform(0, 2 * np.pi, 12), strict=True)
+        )
+        hum = np.asarray(hum)
+        return speech + hum * gain_for(speech, hum, random.uniform(self.least, self.most))
+
+
+@augmentation.register("pauses")
+class Pauses(Augmentation):
+    """Nothing is said for a while, or in the whole clip, and the mouth comes to rest.
+
+    Put it before rooms, noise and hum, so that these go on in the pause. The rest of the face keeps its motion.
+
+    Args:
+        share: of the augmented clips.
+        seconds: longest pause.
+        silent: share of the changed clips in which nothing is said at all, but for noise where ``noise`` follows.
+    """
+
+    def __init__(
+        self, *, share: Share = 0.4, seconds: Annotated[float, Range(0.3, 60)] = 1.2, silent: Share = 0.15
+    ) -> None:
+        super().__init__(share=share)
+        self.seconds, self.silent = seconds, silent
+
+    def __call__(self, example: Example, random: np.random.Generator) -> Example:
+        """The clip with a pause."""
+        frames, rate = len(example.motion), example.frame_rate
+        whole = random.random() < self.silent
+        length = min(random.uniform(0.3, self.seconds), 0.7 * frames / rate)
+        # Often at either end of the clip: where speech begins out of silence is where onsets are learnt.
+        start = float(np.clip(random.uniform(-0.3, 1.3), 0, 1)) * (frames / rate - length)
+        first, last = (-1e9, 1e9) if whole else (start, start + length)
+        if start <= 0:
+            first = -1e9
+        elif start >= frames / rate - length:
+            last = 1e9
+        middles = (np.arange(frames) + 0.5) / rate
+        at_rest = np.minimum(_step((middles - first) / CLOSING), _step((last - middles) / OPENING)).astype(np.float32)
+        weight = at_rest[:, None, None] * example.mouth[None, :, None]
+        motion = example.motion + weight * (example.rest - example.motion)
+        times = np.arange(len(example.speech)) / SAMPLE_RATE
+        said = 1 - np.clip(np.minimum((times - first) / 0.02, (last - times) / 0.02), 0, 1)
+        # Faint and not zero, so that a ratio of speech to noise has something to stand on.
+        faint = 10 ** (-random.uniform(50, 90) / 20) * random.standard_normal(len(times))
+        speech = example.speech * said + faint * float(np.abs(example.speech).max(initial=0))
+        return replace(example, motion=motion, speech=speech.astype(np.float32))
+
+
+def _step(values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """From 0 at 0 to 1 at 1, smoothly."""
+    inside = np.clip(values, 0, 1)
+    return cast(npt.NDArray[np.floating], inside * inside * (3 - 2 * inside))
+
+
+# What they are made of.
+
+
+def gain_for(speech: npt.NDArray[np.floating], noise: npt.NDArray[np.floating], ratio: float) -> float:
+    """The factor on noise for a ratio of speech to noise in decibels."""
+    power = float(np.mean(np.square(noise, dtype=np.float64)))
+    return float(np.sqrt(np.mean(np.square(speech, dtype=np.float64)) / max(power, 1e-20))) * 10 ** (-ratio / 20)
+
+
+def filtered(speech: npt.NDArray[np.floating], gain: Any) -> npt.NDArray[np.floating]:  # noqa: ANN401
+    """Speech (S,) multiplied by a gain, a function of the frequencies (F,) in Hz, without delay."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    size = next_fast_len(len(speech) + SIZE, real=True)
+    spectrum = rfft(speech, size) * gain(np.arange(size // 2 + 1) * (SAMPLE_RATE / size))
+    return cast(npt.NDArray[np.floating], irfft(spectrum, size)[: len(speech)])
+
+
+def spectra(speech: npt.NDArray[np.floating], hop: int = HOP) -> npt.NDArray[np.complexfloating]:
+    """Short-time spectra (frames, SIZE/2 + 1), Hann window, the first centred on the first sample."""
+    from scipy.fft import rfft
+
+    padded = np.pad(np.asarray(speech, np.float32), (SIZE // 2, SIZE // 2 + hop))
+    frames = np.lib.stride_tricks.sliding_window_view(padded, SIZE)[::hop]
+    return cast(npt.NDArray[np.complexfloating], rfft(frames * _WINDOW, axis=1))
+
+
+def signal(spectrum: npt.NDArray[np.complexfloating], length: int) -> npt.NDArray[np.floating]:
+    """Speech (length,) of short-time spectra HOP apart, by overlap and add of windowed frames."""
+    from scipy.fft import irfft
+
+    frames = irfft(spectrum, SIZE, axis=1) * _WINDOW
+    count, parts = len(frames), SIZE // HOP
+    # Every fourth frame lies behind the other without overlap: four rows, added with shifts.
+    out = np.zeros((count + parts) * HOP, np.float32)
+    for part in range(parts):
+        some = frames[part::parts].reshape(-1)
+        out[part * HOP : part * HOP + len(some)] += some
+    out = out[SIZE // 2 : SIZE // 2 + length] / 1.5  # the sum of squared Hann windows a quarter apart
+    return out if len(out) == length else np.pad(out, (0, length - len(out)))
+
+
+_WINDOW = np.hanning(SIZE + 1)[:-1].astype(np.float32)
+
+
+def stretched(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
+    """Speech that lasts ``ratio`` times as long and has the same pitch: a phase vocoder (Flanagan and Golden 1966)."""
+    given = spectra(speech)
+    length = round(len(speech) * ratio)
+    places = np.arange(int(np.ceil(length / HOP)) + 1) / ratio
+    low = np.clip(np.floor(places).astype(int), 0, len(given) - 2)
+    share = np.clip(places - low, 0, 1)[:, None].astype(np.float32)
+    size, angle = np.abs(given), np.angle(given)
+    sizes = (1 - share) * size[low] + share * size[low + 1]
+    # The phase advances as it does from one spectrum to the next where the frame comes from.
+    advance = (2 * np.pi * HOP / SIZE * np.arange(SIZE // 2 + 1)).astype(np.float32)
+    turn = np.diff(angle, axis=0) - advance
+    turn += advance - 2 * np.pi * np.round(turn / (2 * np.pi))
+    phase = np.cumsum(np.concatenate([angle[:1], turn[low[:-1]]]), axis=0, dtype=np.float64) % (2 * np.pi)
+    phase = phase.astype(np.float32)
+    turned = np.empty(phase.shape, np.complex64)
+    np.multiply(sizes, np.cos(phase), out=turned.real)
+    np.multiply(sizes, np.sin(phase), out=turned.imag)
+    return signal(turned, length)
+
+
+def shifted(speech: Wave, ratio: float) -> Wave:
+    """Speech (S,) of the same length with every frequency times ``ratio``."""
+    import soxr
+
+    longer = stretched(speech, ratio)
+    made: Wave = soxr.resample(longer.astype(np.float32), 1000 * ratio, 1000, quality="LQ")
+    return fit_length(made, len(speech))
+
+
+def warped(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
+    """Speech (S,) whose spectral envelope has every frequency times ``ratio`` while its pitch stays."""
+    from scipy.fft import irfft, rfft
+
+    if abs(ratio - 1) < 0.01:
+        return speech
+    spectrum = spectra(speech)
+    logs = np.log(np.abs(spectrum) + 1e-5)
+    cepstrum = irfft(logs, SIZE, axis=1)
+    cepstrum[:, LIFTER : SIZE - LIFTER + 1] = 0
+    envelope = rfft(cepstrum, axis=1).real
+    places = np.minimum(np.arange(SIZE // 2 + 1) / ratio, SIZE // 2 - 1e-6)
+    low = places.astype(int)
+    share = (places - low).astype(np.float32)
+    moved = (1 - share) * envelope[:, low] + share * envelope[:, low + 1]
+    return signal(spectrum * np.exp(np.clip(moved - envelope, -4, 4)), len(speech))
+
+
+def telephone(speech: Wave) -> npt.NDArray[np.floating]:
+    """Speech through 8 bits of mu-law at 8 kHz (ITU-T G.711)."""
+    import soxr
+
+    narrow = soxr.resample(speech, SAMPLE_RATE, 8000, quality="LQ")
+    scale = max(float(np.abs(narrow).max(initial=0)), 1e-6)
+    compressed = np.sign(narrow) * np.log1p(255 * np.abs(narrow) / scale) / np.log(256)
+    rounded = np.round(compressed * 127) / 127
+    decoded = np.sign(rounded) * (np.exp(np.abs(rounded) * np.log(256)) - 1) / 255 * scale
+    return cast(Wave, soxr.resample(decoded.astype(np.float32), 8000, SAMPLE_RATE, quality="LQ"))
+
+
+def vorbis(speech: Wave, compression: float) -> npt.NDArray[np.floating]:
+    """Speech through Vorbis; compression 0 is best, 1 is smallest."""
+    import soundfile
+
+    scale = max(1.0, float(np.abs(speech).max(initial=0)))
+    with io.BytesIO() as file:
+        soundfile.write(
+            file, speech / scale, SAMPLE_RATE, format="OGG", subtype="VORBIS", compression_level=compression
+        )
+        file.seek(0)
+        return cast(Wave, soundfile.read(file, dtype="float32")[0] * scale)

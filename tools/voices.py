@@ -1,0 +1,400 @@
+"""What a model does with voices, rooms and noise that it was not trained on, and in pauses, as tables.
+
+The test sentences of the built-in corpus are changed by means that training does not use (facediff/data/augmentation.py
+has those): pitch by overlapping pieces of the waveform, formants by linear prediction, a room by mirrored sources,
+noise and hum by filters in time. The truth stays what it was, so that scores can be taken.
+
+- *closures*: of the p, b and m at which the truth's lips close, the share at which the model's lips close too. A mouth
+  is closed up to the truth's smallest opening of the clip and a fifth of its range. *Chance* is the mean of the same
+  share with the closures moved to every other time of the clip.
+- *pauses*: two sentences with 1 s of silence before, between and after them. How far the lips are open in the pauses,
+  from 0.3 s after speech to 0.2 s before it, how far a lip vertex moves from a frame to the next, and the lip vertex
+  error of the first 0.2 s of speech, which a gate that opens late would raise.
+- *LVE* as in `facediff test`, in mm².
+
+    $ python tools/voices.py demo/puppet.ckpt
+    $ python tools/voices.py demo/puppet.ckpt --options voice_gate=off
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import soxr
+from scipy.linalg import solve_toeplitz
+from scipy.signal import butter, fftconvolve, lfilter, sosfilt
+
+import facediff
+from facediff.data import Puppet, Sample
+from facediff.data.audio import fit_length
+from facediff.data.phonemes import closures, phonemes_file, read_phonemes
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.files import atomic
+from facediff.utils.tables import print_table
+
+Array = npt.NDArray[np.floating]
+Change = Callable[[Array], Array]
+
+THRESHOLD = 0.2
+"""Share of the truth's range of opening up to which a mouth is closed, as in `BilabialClosureRate`."""
+PAUSE = 1.0
+AFTER, BEFORE, ONSET = 0.3, 0.2, 0.2
+"""Seconds after speech and before it that do not count as a pause, and those that count as an onset."""
+
+
+# Other voices, by means that training does not use.
+
+
+def pasted(speech: Array, ratio: float) -> Array:
+    """Speech that lasts ``ratio`` times as long at the same pitch, by waveform similarity (WSOLA, Verhelst 1993)."""
+    size, reach = 480, 160
+    hop = size // 2
+    window = np.hanning(size + 1)[:-1]
+    padded = np.pad(speech, (reach + size, 2 * size + reach))
+    count = int(len(speech) * ratio / hop) + 1
+    out = np.zeros((count + 2) * hop)
+    place = reach + size
+    for index in range(count):
+        out[index * hop : index * hop + size] += window * padded[place : place + size]
+        wanted = padded[place + hop : place + hop + size]
+        middle = min(reach + size + round((index + 1) * hop / ratio), len(padded) - size - reach)
+        around = padded[middle - reach : middle + reach + size]
+        place = middle - reach + int(np.argmax(np.correlate(around, wanted, "valid")))
+        place = min(place, len(padded) - 2 * size)
+    return out[: round(len(speech) * ratio)]
+
+
+def pitched(speech: Array, semitones: float) -> Array:
+    """Every frequency higher by so many semitones, formants too, at the same speed."""
+    ratio = 2 ** (semitones / 12)
+    return fit_length(soxr.resample(pasted(speech, ratio), ratio * 1000, 1000, quality="HQ"), len(speech))
+
+
+def formants(speech: Array, ratio: float) -> Array:
+    """Formants times ``ratio`` at the same pitch: the poles of linear prediction are turned."""
+    order, size, hop = 18, 480, 240
+    window = np.hanning(size + 1)[:-1]
+    padded = np.pad(speech, (size, 2 * size))
+    out = np.zeros(len(padded))
+    for start in range(0, len(padded) - size, hop):
+        frame = padded[start : start + size] * window
+        power = np.correlate(frame, frame, "full")[size - 1 : size + order]
+        if power[0] < 1e-8:
+            continue
+        power[0] *= 1.0001
+        predictor = np.concatenate([[1.0], -solve_toeplitz(power[:-1], power[1:])])
+        rest = lfilter(predictor, [1.0], frame)
+        poles = np.roots(predictor)
+        angles = np.angle(poles)
+        kept = np.where(np.abs(angles) * ratio < 0.98 * np.pi, np.abs(angles) * ratio, 0.98 * np.pi)
+        real = np.abs(poles.imag) < 1e-9
+        turned = np.where(real, poles, np.minimum(np.abs(poles), 0.985) * np.exp(1j * np.sign(angles) * kept))
+        made = lfilter([1.0], np.real(np.poly(turned)), rest)
+        level = np.sqrt((frame**2).sum() / max((made**2).sum(), 1e-12))
+        out[start : start + size] += made * level
+    return np.asarray(out[size : size + len(speech)])
+
+
+def voice(semitones: float, ratio: float) -> Change:
+    """Another speaker: pitch by so many semitones, formants times ``ratio``."""
+    return lambda speech: formants(pitched(speech, semitones), ratio / 2 ** (semitones / 12))
+
+
+def room(seconds: float, size: tuple[float, float, float] = (4.2, 3.4, 2.6), apart: float = 1.2) -> Change:
+    """A box-shaped room by mirrored sources (Allen and Berkley 1979), heard so many metres away, without delay."""
+    volume, (x, y, z) = float(np.prod(size)), size
+    surface = 2 * (x * y + y * z + x * z)
+    kept = np.sqrt(max(0.0, 1 - 0.161 * volume / (surface * seconds)))
+    source = np.array([0.31 * x, 0.42 * y, 0.58 * z])
+    ear = source + apart * np.array([0.8, 0.55, 0.24])
+    most = int(np.ceil(343 * seconds / min(size) / 2)) + 1
+    response = np.zeros(round(seconds * SAMPLE_RATE) + SAMPLE_RATE // 10)
+    order = np.arange(-most, most + 1)
+    for flips in np.ndindex(2, 2, 2):
+        places = [(1 - 2 * flip) * source[axis] + 2 * order * size[axis] - ear[axis] for axis, flip in enumerate(flips)]
+        bounces = [np.abs(order - flip) + np.abs(order) for flip in flips]
+        distance = np.sqrt(
+            places[0][:, None, None] ** 2 + places[1][None, :, None] ** 2 + places[2][None, None, :] ** 2
+        ).ravel()
+        walls = (bounces[0][:, None, None] + bounces[1][None, :, None] + bounces[2][None, None, :]).ravel()
+        arrival = np.round((distance - apart) / 343 * SAMPLE_RATE).astype(int)
+        near = (arrival < len(response)) & (arrival >= 0)
+        np.add.at(response, arrival[near], kept ** walls[near] * apart / distance[near])
+    return lambda speech: fftconvolve(speech, response)[: len(speech)]
+
+
+def telephone(speech: Array) -> Array:
+    """300 to 3400 Hz."""
+    return np.asarray(sosfilt(butter(4, (300, 3400), "bandpass", fs=SAMPLE_RATE, output="sos"), speech))
+
+
+def tone(count: int, seed: int) -> Array:
+    """Room tone of unit power: noise that falls by 6 dB an octave above 200 Hz, as of air conditioning."""
+    made = lfilter([1.0], [1.0, -0.92], np.random.default_rng(seed).standard_normal(count + 1000))[1000:]
+    return np.asarray(made / np.sqrt((made**2).mean()))
+
+
+def hiss(count: int, seed: int) -> Array:
+    """White noise of unit power."""
+    return np.random.default_rng(seed).standard_normal(count)
+
+
+def hum(count: int, seed: int) -> Array:
+    """Mains hum of unit power: a clipped sine of 50 Hz."""
+    made = np.clip(np.sin(2 * np.pi * 50 * np.arange(count) / SAMPLE_RATE + seed), -0.3, 0.6)
+    made -= made.mean()
+    return np.asarray(made / np.sqrt((made**2).mean()))
+
+
+def level(speech: Array) -> float:
+    """Root mean square of what is said: of the louder half of stretches of 20 ms."""
+    parts = speech[: len(speech) // 320 * 320].reshape(-1, 320)
+    power = np.sort((parts**2).mean(1))
+    return float(np.sqrt(power[len(power) // 2 :].mean()))
+
+
+def noisy(decibels: float, kind: Callable[[int, int], Array] = tone) -> Change:
+    """Noise so many decibels below the speech."""
+    return lambda speech: speech + kind(len(speech), 1) * level(speech) * 10 ** (-decibels / 20)
+
+
+def both(first: Change, second: Change) -> Change:
+    """One after the other."""
+    return lambda speech: second(first(speech))
+
+
+VOICES: dict[str, Change] = {
+    "clean": lambda speech: speech,
+    "pitch +4 semitones": voice(4, 1.0),
+    "pitch -4 semitones": voice(-4, 1.0),
+    "formants +15 %": voice(0, 1.15),
+    "formants -13 %": voice(0, 0.87),
+    "higher voice (+3, +12 %)": voice(3, 1.12),
+    "lower voice (-3, -10 %)": voice(-3, 0.9),
+    "room, 0.4 s": room(0.4),
+    "room tone -20 dB": noisy(20),
+    "telephone": telephone,
+    "higher voice in a room": both(voice(3, 1.12), room(0.3)),
+    "lower voice in a room": both(voice(-3, 0.9), room(0.3)),
+    "lower voice, room, tone -25 dB": both(both(voice(-3, 0.9), room(0.3)), noisy(25)),
+}
+"""Changes of the test sentences, by name."""
+
+TRAINED = 1
+"""How many of them, from the first, are no strange voice."""
+
+PAUSES: dict[str, Change] = {
+    "digital silence": lambda speech: speech,
+    "room tone -50 dB": noisy(50),
+    "room tone -40 dB": noisy(40),
+    "room tone -30 dB": noisy(30),
+    "room tone -20 dB": noisy(20),
+    "hiss -30 dB": noisy(30, hiss),
+    "hum -30 dB": noisy(30, hum),
+    "lower voice, room tone -30 dB": both(voice(-3, 0.9), noisy(30)),
+}
+"""Changes of sentences with pauses, by name."""
+
+NOTHING: dict[str, Callable[[int], Array]] = {
+    "digital silence": np.zeros,
+    "room tone at -50 dB of full scale": lambda count: tone(count, 3) * 10**-2.5,
+    "hiss at -20 dB of full scale": lambda count: hiss(count, 3) * 0.1,
+    "hum at -20 dB of full scale": lambda count: hum(count, 3) * 0.1,
+}
+"""Recordings in which nobody speaks, by name."""
+
+
+class Bench:
+    """A model and the test clips.
+
+    Args:
+        checkpoint: the model.
+        options: further keywords of `Animator.animate`.
+        clips: most clips of a split.
+    """
+
+    def __init__(self, checkpoint: Path, options: dict[str, Any], clips: int | None = None) -> None:
+        self.model = facediff.load(checkpoint)
+        self.options = options
+        self.data = Puppet()
+        self.data.prepare_data()
+        assets = self.data.assets()
+        assert assets.inner_lip_pairs is not None
+        self.pairs = assets.inner_lip_pairs.numpy()
+        self.lips = assets.regions["lips"].numpy()
+        self.samples = {
+            split: [self.data.dataset(split)[i] for i in range(len(self.data.clips(split)))][:clips]
+            for split in ("test_a", "test_b")
+        }
+
+    def animate(self, speech: Array, sample: Sample) -> Array:
+        """Vertices (T, V, 3) in mm."""
+        style = (sample.reference + sample.template).numpy()
+        made = self.model.animate(
+            speech.astype(np.float32), SAMPLE_RATE, identity=sample.identity_name, style=style, **self.options
+        )
+        return made.vertices.astype(np.float64) * 1000
+
+    def truth(self, sample: Sample) -> Array:
+        """Vertices (T, V, 3) in mm."""
+        return (sample.motion + sample.template).double().numpy() * 1000
+
+    def opening(self, vertices: Array) -> Array:
+        """Opening of the mouth (T,)."""
+        return np.asarray(
+            np.linalg.norm(vertices[:, self.pairs[:, 0]] - vertices[:, self.pairs[:, 1]], axis=-1).mean(1)
+        )
+
+    def squared_error(self, made: Array, true: Array) -> Array:
+        """Largest squared error of a lip vertex in each frame (T,)."""
+        return np.asarray(((made - true)[:, self.lips] ** 2).sum(-1).max(1))
+
+    def said(self, sample: Sample) -> tuple[list[tuple[int, int]], tuple[float, float]]:
+        """A clip's closures in frames, and when its first phoneme starts and its last one ends."""
+        file = phonemes_file(self.data.root, sample.name)
+        assert file is not None
+        phonemes = read_phonemes(file)
+        spoken = [each for each in phonemes if each.ipa]
+        return closures(phonemes, self.model.frame_rate), (spoken[0].start, spoken[-1].end)
+
+    def voice(self, change: Change) -> dict[str, float]:
+        """Closures, chance and LVE over both splits, of speech that is changed."""
+        hits, chances, errors, frames = [], [], {"test_a": 0.0, "test_b": 0.0}, {"test_a": 0, "test_b": 0}
+        for split, samples in self.samples.items():
+            for sample in samples:
+                true = self.truth(sample)
+                made = self.animate(change(sample.audio.double().numpy()), sample)[: len(true)]
+                wide = self.opening(true)
+                limit = wide.min() + THRESHOLD * np.ptp(wide)
+                shut, closed = self.opening(made) <= limit, wide <= limit
+                count = len(shut)
+                for start, end in self.said(sample)[0]:
+                    if not closed[start:end].any():
+                        continue
+                    hits.append(float(shut[start:end].any()))
+                    starts = range(0, count - (end - start))
+                    chances.append(float(np.mean([shut[i : i + end - start].any() for i in starts])))
+                error = self.squared_error(made, true[: len(made)])
+                errors[split] += float(error.sum())
+                frames[split] += count
+        return {
+            "closures": float(np.mean(hits)),
+            "chance": float(np.mean(chances)),
+            "LVE A": errors["test_a"] / frames["test_a"],
+            "LVE B": errors["test_b"] / frames["test_b"],
+        }
+
+    def pause(self, change: Change) -> dict[str, float]:
+        """Opening and tremble in pauses, and the error of onsets, of changed sentences with pauses."""
+        rate, quiet = self.model.frame_rate, np.zeros(round(PAUSE * SAMPLE_RATE))
+        opened, trembled, onsets, ends = [], [], [], []
+        samples = self.samples["test_a"]
+        for one, two in zip(samples[::5], samples[1::5], strict=False):
+            speech = np.concatenate([quiet, one.audio.numpy(), quiet, two.audio.numpy(), quiet])
+            made = self.animate(change(speech), one)
+            starts = [PAUSE, 2 * PAUSE + len(one.audio) / SAMPLE_RATE]
+            spoken = [
+                tuple(start + time for time in self.said(sample)[1])
+                for start, sample in zip(starts, (one, two), strict=True)
+            ]
+            pauses = [
+                (0.0, spoken[0][0] - BEFORE),
+                (spoken[0][1] + AFTER, spoken[1][0] - BEFORE),
+                (spoken[1][1] + AFTER, len(speech) / SAMPLE_RATE),
+            ]
+            opening = self.opening(made)
+            for start, end in pauses:
+                first, last = round(start * rate), round(end * rate)
+                opened.append(opening[first:last])
+                steps = np.linalg.norm(np.diff(made[first:last][:, self.lips], axis=0), axis=-1)
+                trembled.append(steps.mean(1))
+            for start, sample, (begin, _) in zip(starts, (one, two), spoken, strict=True):
+                true = self.truth(sample)
+                first = round(begin * rate)
+                count = round(ONSET * rate)
+                own = first - round(start * rate)
+                onsets.append(self.squared_error(made[first : first + count], true[own : own + count]))
+                middle = made[round(start * rate) : round(start * rate) + len(true)]
+                ends.append(self.squared_error(middle, true[: len(middle)]))
+        return {
+            "opening": float(np.concatenate(opened).mean()),
+            "widest": float(np.concatenate(opened).max()),
+            "tremble": float(np.concatenate(trembled).mean()),
+            "LVE onset": float(np.concatenate(onsets).mean()),
+            "LVE speech": float(np.concatenate(ends).mean()),
+        }
+
+    def nothing(self, make: Callable[[int], Array]) -> dict[str, float]:
+        """Opening and tremble of recordings in which nobody speaks."""
+        opened, trembled = [], []
+        for sample in self.samples["test_a"][::5]:
+            made = self.animate(make(4 * SAMPLE_RATE), sample)
+            opened.append(self.opening(made))
+            trembled.append(np.linalg.norm(np.diff(made[:, self.lips], axis=0), axis=-1).mean(1))
+        return {
+            "opening": float(np.concatenate(opened).mean()),
+            "widest": float(np.concatenate(opened).max()),
+            "tremble": float(np.concatenate(trembled).mean()),
+        }
+
+
+def show(title: str, scores: dict[str, dict[str, float]]) -> None:
+    """Print a table of scores by name."""
+    columns = list(next(iter(scores.values())))
+    print_table([title, *columns], [[name, *(f"{row[key]:.3f}" for key in columns)] for name, row in scores.items()])
+    print()
+
+
+def measured(checkpoint: Path, options: dict[str, Any], clips: int | None = None, only: str = "") -> dict[str, Any]:
+    """All tables, which are printed as they are ready.
+
+    Args:
+        checkpoint: the model.
+        options: further keywords of `Animator.animate`.
+        clips: most clips of a split.
+        only: measure rows whose name contains this.
+    """
+    bench = Bench(checkpoint, options, clips)
+    found: dict[str, Any] = {}
+    for title, rows, measure in (
+        ("voice", VOICES, bench.voice),
+        ("pauses, mm", PAUSES, bench.pause),
+        ("nobody speaks, mm", NOTHING, bench.nothing),
+    ):
+        scores = {name: measure(change) for name, change in rows.items() if only in name}  # type: ignore[operator]
+        if not scores:
+            continue
+        if title == "voice" and not only:
+            strange = list(scores.values())[TRAINED:]
+            scores["mean of strange voices"] = {
+                key: float(np.mean([row[key] for row in strange])) for key in strange[0]
+            }
+        found[title] = scores
+        show(title, scores)
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run as a program."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("--options", nargs="*", default=[], metavar="NAME=VALUE", help="keywords of Animator.animate")
+    parser.add_argument("--clips", type=int, help="most clips of a split")
+    parser.add_argument("--only", default="", metavar="WORDS", help="rows whose name contains this")
+    parser.add_argument("--json", type=Path, help="write the scores here too")
+    given = parser.parse_args(arguments)
+    options = dict(word.split("=", 1) for word in given.options)
+    scores = measured(given.checkpoint, options, given.clips, given.only)
+    if given.json:
+        with atomic(given.json) as temporary:
+            temporary.write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
