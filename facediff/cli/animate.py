@@ -44,6 +44,20 @@ class WindowOptions:
 
 
 @dataclass(frozen=True)
+class SpeechOptions:
+    """Speech (what is done about pauses and noise).
+
+    Attributes:
+        voice_gate: what finds the pauses, in which the mouth comes to rest: energy or webrtc, with options
+            (energy:release=0.3); off for the model's own motion there
+        denoise: take steady noise out of the recording before the model hears it (the file keeps the recording)
+    """
+
+    voice_gate: Annotated[str, Option(metavar="GATE")] = "energy"
+    denoise: bool = False
+
+
+@dataclass(frozen=True)
 class BatchOptions:
     """Batch (several recordings or a folder; can be resumed).
 
@@ -81,6 +95,7 @@ def animate(
     quiet: bool = False,
     yes: bool = False,
     files: OutputOptions,
+    sound: SpeechOptions,
     windows: WindowOptions,
     batch: BatchOptions,
     controls: ControlOptions,
@@ -120,6 +135,7 @@ def animate(
         quiet: no progress bars
         yes: start without a question, however much time or memory it takes
         files: how the files are written.
+        sound: what is done about pauses and noise.
         windows: how long speech is cut.
         batch: how several recordings are animated.
         controls: what is changed after inference.
@@ -143,6 +159,7 @@ def animate(
     if not streamed and len(speech) == 1 and not speech[0].exists():
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
     check_model_source(checkpoint)
+    from facediff.data.voice_activity import speech_problems
     from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, read_recording
 
     several = len(speech) > 1 or speech[0].is_dir()
@@ -163,6 +180,8 @@ def animate(
         precision=precision,
         window=windows.window,
         overlap=windows.overlap,
+        voice_gate=sound.voice_gate,
+        denoise=sound.denoise,
         controls=controls.controls(),
         target_mesh=target_mesh,
         correspondence=correspondence,
@@ -189,6 +208,8 @@ def animate(
         )
     options.check(output)
     samples_of_speech = read_recording(speech[0], windows.max_seconds)  # before the model, which takes longer to load
+    for problem in speech_problems(samples_of_speech):
+        tell(f"note: {speech[0]}: {problem}")
     pipeline = AnimationPipeline(options, seed=seed)
     seconds, size = pipeline.cost(samples_of_speech, output)
     confirm_cost(yes, "--samples, --steps or --size", seconds=seconds, size=size)

@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
     from facediff.animation import Animation
     from facediff.data import Assets, Reference
+    from facediff.data.voice_activity import VoiceGate
     from facediff.editing.correspondence import Correspondence
     from facediff.models import AnimationModel, Style
     from facediff.models.styles import StyleLike
+    from facediff.pipelines.rest import MouthAtRest
 
 MIN_SECONDS = 0.2
 STEP_SECONDS = 0.01  # What a denoising step of a second of speech takes on two cores (tools/benchmarks/RESULTS.md)
 PIXEL_SECONDS = 4e-8  # What drawing and encoding a pixel of a video takes
-SILENCE = 1e-4
-"""Speech whose largest sample is smaller than this is silence."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class AnimationOptions:
     window: ranges.Window | None = None
     overlap: ranges.Window | None = None
     controls: AnimationControls = field(default_factory=AnimationControls)
+    voice_gate: str = "energy"
+    denoise: bool = False
     target_mesh: Path | None = None
     correspondence: Path | None = None
     export: ExportOptions = field(default_factory=ExportOptions)
@@ -64,7 +66,7 @@ class AnimationOptions:
 
     def __post_init__(self) -> None:
         ranges.check_fields(self)
-        _ = self.expressivity_factors, self.guidance_scales
+        _ = self.expressivity_factors, self.guidance_scales, self.gate
 
     @property
     def expressivity_factors(self) -> dict[str, float]:
@@ -74,6 +76,13 @@ class AnimationOptions:
         from facediff.editing.expressiveness import read_factors
 
         return read_factors(self.expressivity, "--expressivity", ranges.EXPRESSIVITY.most)
+
+    @property
+    def gate(self) -> VoiceGate | None:
+        """What finds the pauses in which the mouth comes to rest; None if nothing does."""
+        from facediff.data.voice_activity import read_gate
+
+        return read_gate(self.voice_gate)
 
     @property
     def guidance_scales(self) -> dict[str, float]:
@@ -164,6 +173,12 @@ class AnimationPipeline:
         controls.check(facts["template"], facts["faces"], facts["regions"], name)
         if options.expressivity is not None:
             self._choose_expressivity(facts["template"], facts["regions"], name)
+        gate = options.gate
+        self.rest: MouthAtRest | None = None
+        if gate is not None:
+            from facediff.pipelines.rest import MouthAtRest
+
+            self.rest = MouthAtRest(gate, facts["template"], facts["regions"], self.model.frame_rate)
         self._correspondence: Correspondence | None = None
         self.style: Reference | Style | None = None
         wanted = style if style is not None else options.style or None
@@ -238,9 +253,14 @@ class AnimationPipeline:
         import torch
 
         seeds, name = [seed + i for i in range(self.options.samples)], valid_text(name)
+        heard = speech
+        if self.options.denoise:
+            from facediff.data.denoising import denoised
+
+            heard = denoised(speech)
         # Counted in whole frames, as the model counts them: otherwise speech of just about the limit would be animated
         # by windows here and in one pass there.
-        short = self.model.windows.in_one_pass(self.model.frames_of(len(speech)), self.model.frame_rate)
+        short = self.model.windows.in_one_pass(self.model.frames_of(len(heard)), self.model.frame_rate)
         spool: AbstractContextManager[Path | None] = (
             nullcontext() if short or output is None else scratch_folder(output)
         )
@@ -248,7 +268,7 @@ class AnimationPipeline:
             with self.precision():
                 if folder is None:
                     made = self.model.animate_samples(
-                        torch.from_numpy(speech).to(self.model.device),
+                        torch.from_numpy(heard).to(self.model.device),
                         identity=self.identity,
                         condition=self.options.condition,
                         style=self.style,
@@ -258,8 +278,10 @@ class AnimationPipeline:
                         else partial(track, description="sampling" if short else "seconds of speech"),
                     )
                     motions, style = [sample.vertices.numpy() for sample in made], made[0].reference_name
+                    opened = self.openness(heard, len(motions[0]))
+                    motions = [self.at_rest(motion, opened) for motion in motions]
                 else:
-                    motions, style = self._by_windows(speech, seeds, folder)
+                    motions, style = self._by_windows(heard, seeds, folder)
             yield [
                 self._animation(motion, speech, name if len(seeds) == 1 else f"{name}, sample {i + 1}", each, style)
                 for i, (motion, each) in enumerate(zip(motions, seeds, strict=True))
@@ -286,6 +308,20 @@ class AnimationPipeline:
 
         return torch.autocast(self.model.device.type, torch.bfloat16, enabled=self.options.precision == "bf16")
 
+    def openness(self, speech: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32] | None:
+        """How far the mouth may be open in each frame (frames,) of some speech (S,); None without a gate."""
+        if self.rest is None:
+            return None
+        from facediff.data.voice_activity import openness
+
+        return openness(speech, frames, self.model.frame_rate, self.rest.gate)
+
+    def at_rest(
+        self, vertices: npt.NDArray[np.float32], openness: npt.NDArray[np.float32] | None
+    ) -> npt.NDArray[np.float32]:
+        """Vertices (T, V, 3) with the mouth as far at rest as the openness (T,) of their frames says."""
+        return vertices if self.rest is None or openness is None else self.rest.apply(vertices, openness)
+
     def _by_windows(
         self, speech: npt.NDArray[np.float32], seeds: Sequence[int], folder: Path
     ) -> tuple[list[npt.NDArray[np.float32]], str]:
@@ -301,9 +337,12 @@ class AnimationPipeline:
         progress = None if self.options.quiet else partial(track, description="seconds of speech")
         template = self.model.assets.template(self.identity)
         writers = [MotionWriter(folder / f"{seed}.npy", tuple(template.shape)) for seed in seeds]
+        opened, done = self.openness(speech, self.model.frames_of(len(speech))), 0
         for part in stream.parts(torch.from_numpy(speech).to(self.model.device), progress=progress):
+            now = None if opened is None else opened[done : done + part.shape[1]]
+            done += part.shape[1]
             for writer, motion in zip(writers, part, strict=True):
-                writer.write((motion.cpu() + template).numpy())
+                writer.write(self.at_rest((motion.cpu() + template).numpy(), now))
         for writer in writers:
             writer.close()
         return [open_array(writer.path) for writer in writers], stream.clip.reference_names[0]
@@ -331,6 +370,10 @@ class AnimationPipeline:
             metadata["condition"] = self.options.condition
         if sampler is not None:
             metadata["sampler"] = f"{type(sampler).__name__}, {sampler.steps} steps"
+        if self.rest is not None:
+            metadata["voice gate"] = self.options.voice_gate
+        if self.options.denoise:
+            metadata["denoised"] = "yes"
         for option in ("expressivity", "guidance"):
             if (chosen := getattr(self.options, option)) is not None:
                 metadata[option] = chosen
@@ -368,7 +411,7 @@ def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[
         max_seconds: longest speech allowed.
 
     Raises:
-        FaceDiffError: if the file cannot be read, holds only silence, or lasts too short or too long.
+        FaceDiffError: if the file cannot be read, or lasts too short or too long.
     """
     from facediff.data.audio import read_speech
 
@@ -378,20 +421,16 @@ def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[
 
 
 def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
-    """Refuse speech (S,) at 16 kHz that animates nothing.
+    """Refuse speech (S,) at 16 kHz that animates nothing; silence animates a face at rest.
 
     Raises:
-        FaceDiffError: naming ``name``, if it holds only silence or lasts too short.
+        FaceDiffError: naming ``name``, if it lasts too short.
     """
-    import numpy as np
-
     from facediff.data.audio import SAMPLE_RATE
 
     seconds = len(speech) / SAMPLE_RATE
     if seconds < MIN_SECONDS:
         raise FaceDiffError(f"{name}: lasts {seconds:.2f} s; expected speech of at least {MIN_SECONDS} s")
-    if float(np.abs(speech).max()) < SILENCE:
-        raise FaceDiffError(f"{name}: holds only silence; expected a recording of speech")
 
 
 def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:

@@ -223,6 +223,8 @@ class Animator:
         window: float | None = None,
         overlap: float | None = None,
         max_seconds: float | None = None,
+        voice_gate: str = "energy",
+        denoise: bool = False,
         expressiveness: Scales | None = None,
         blinks: float | bool | None = None,
         gaze: float | bool | None = None,
@@ -258,6 +260,9 @@ class Animator:
             window: seconds of a window of long speech.
             overlap: seconds that neighbouring windows share.
             max_seconds: refuse speech that lasts longer.
+            voice_gate: what finds the pauses, in which the mouth comes to rest, with its options
+                (``"energy:release=0.3"``); ``"off"`` for the model's own motion there.
+            denoise: take steady noise out of the speech before the model hears it.
             expressiveness: as :meth:`Animation.control` takes it.
             blinks: likewise.
             gaze: likewise.
@@ -287,6 +292,8 @@ class Animator:
             precision=precision,
             window=window,
             overlap=overlap,
+            voice_gate=voice_gate,
+            denoise=denoise,
             controls=controls_of(
                 **_given(
                     {
@@ -332,6 +339,7 @@ class Animator:
         precision: Precision = "32",
         window: float | None = None,
         overlap: float | None = None,
+        voice_gate: str = "energy",
     ) -> Iterator[npt.NDArray[np.float32]]:
         """Animate speech of any length while it arrives, as ``facediff animate --stream`` does.
 
@@ -352,6 +360,7 @@ class Animator:
             precision: likewise.
             window: likewise; shorter windows give frames sooner.
             overlap: likewise.
+            voice_gate: likewise.
 
         Yields:
             absolute vertices (m, V, 3) of the next frames, as soon as these are certain.
@@ -378,6 +387,7 @@ class Animator:
             precision=precision,
             window=window,
             overlap=overlap,
+            voice_gate=voice_gate,
         )
         options.check_inputs(styled=style is not None)
         with self.module.choosing():
@@ -466,8 +476,7 @@ def speech_of(
     """Speech (S,) at 16 kHz and its name, from whatever speech may be given as; see :meth:`Animator.animate`.
 
     Raises:
-        FaceDiffError: naming the file or the argument, if it is nothing of that kind, holds only silence, or lasts too
-            short or too long.
+        FaceDiffError: naming the file or the argument, if it is nothing of that kind, or lasts too short or too long.
     """
     if isinstance(speech, str | Path):
         if rate is not None:

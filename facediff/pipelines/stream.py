@@ -82,6 +82,8 @@ class LiveAnimation:
     """
 
     def __init__(self, pipeline: AnimationPipeline, *, rate: int = SAMPLE_RATE, seed: int = 0) -> None:
+        import numpy as np
+
         from facediff.data.audio import resampler
 
         self._pipeline, model = pipeline, pipeline.model
@@ -93,13 +95,37 @@ class LiveAnimation:
                 identity=pipeline.identity, condition=pipeline.options.condition, style=pipeline.style, seeds=[seed]
             )
 
+        self._rest = pipeline.rest
+        self._openness = None if self._rest is None else self._rest.openness()
+        # Frames of the model, and how far their mouths may be open, whichever is certain first.
+        self._held = np.zeros((0, *self._template.shape), np.float32)
+        self._opened = np.zeros(0, np.float32)
+
     def feed(self, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Hear samples (n,), and give the frames (m, V, 3) that are certain now; m may be 0."""
+        speech = samples if self._convert is None else self._convert(samples, False)
+        return self._hear(speech)
+
+    def _hear(self, speech: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """The frames that are certain after more speech (n,) at 16 kHz."""
+        import numpy as np
         import torch
 
-        speech = samples if self._convert is None else self._convert(samples, False)
         with self._pipeline.model.choosing(self._chosen), self._pipeline.precision():
-            return self._absolute(self._stream.feed(torch.from_numpy(speech)))
+            made = self._absolute(self._stream.feed(torch.from_numpy(speech)))
+        if self._openness is None:
+            return made
+        self._opened = np.concatenate([self._opened, self._openness.feed(speech)])
+        return self._at_rest(made)
+
+    def _at_rest(self, made: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """With more frames of the model, those whose pauses are known, with the mouth at rest in them."""
+        import numpy as np
+
+        held = np.concatenate([self._held, made]) if len(self._held) else made
+        count = min(len(held), len(self._opened))
+        opened, self._opened, self._held = self._opened[:count], self._opened[count:], held[count:]
+        return self._pipeline.at_rest(held[:count], opened)
 
     def finish(self) -> npt.NDArray[np.float32]:
         """The frames (m, V, 3) that are left.
@@ -108,15 +134,17 @@ class LiveAnimation:
             FaceDiffError: if the speech was shorter than a frame.
         """
         import numpy as np
-        import torch
 
         with self._pipeline.model.choosing(self._chosen), self._pipeline.precision():
             last = []
             if self._convert is not None:
                 rest = self._convert(np.zeros(0, np.float32), True)
-                last.append(self._absolute(self._stream.feed(torch.from_numpy(rest))))
-            last.append(self._absolute(self._stream.finish()))
-        return np.concatenate(last)
+                last.append(self._hear(rest))
+            made = self._absolute(self._stream.finish())
+        if self._openness is None:
+            return np.concatenate([*last, made])
+        self._opened = np.concatenate([self._opened, self._openness.finish(self._stream.frames)])
+        return np.concatenate([*last, self._at_rest(made)])
 
     def _absolute(self, motion: Tensor) -> npt.NDArray[np.float32]:
         """Vertices of the first sample's offsets."""
@@ -141,6 +169,7 @@ def check_stream(options: AnimationOptions, output: Path) -> None:
         "output-unit": export.unit,
         "up": export.up,
         "samples": None if options.samples == 1 else options.samples,
+        "denoise": options.denoise or None,
     }
     for option, value in whole.items():
         if value is not None:

@@ -35,6 +35,7 @@ NO_PATHS = {
         "expressiveness",
         "expressivity",
         "font",
+        "voice_gate",
         "guidance",
     ),
     *("identities", "option"),

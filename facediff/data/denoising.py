@@ -1,0 +1,26 @@
+"""Steady noise taken out of a recording, by the library noisereduce."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.audio import fit_length
+from facediff.errors import MissingExtraError
+from facediff.utils import SAMPLE_RATE
+
+
+def denoised(speech: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Speech (S,) at 16 kHz without its steady noise, by spectral gating; silence stays silence.
+
+    Raises:
+        MissingExtraError: if noisereduce is not installed.
+    """
+    try:
+        import noisereduce
+    except ImportError as error:
+        raise MissingExtraError("noisereduce", "voice", "--denoise") from error
+    if not speech.any():
+        return speech
+    made = noisereduce.reduce_noise(y=speech, sr=SAMPLE_RATE, stationary=True)
+    return fit_length(np.nan_to_num(np.asarray(made, np.float32)), len(speech))

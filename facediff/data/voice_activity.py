@@ -1,0 +1,416 @@
+"""When somebody speaks in a recording, and how far a mouth may therefore be open in each frame.
+
+From top to bottom: the detectors, which are registered under the kind ``voice_gate`` and say for every 10 ms whether
+there is speech; :class:`Openness`, which makes of that a smooth number for every motion frame, in whole recordings and
+in streams alike; and what is wrong with a recording (:func:`speech_problems`).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from typing import Annotated, Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.registry import UnknownComponentError, checks_arguments, voice_gate
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Range
+
+Wave = npt.NDArray[np.floating]
+"""Speech (S,) at 16 kHz."""
+
+HOP = SAMPLE_RATE // 100
+"""Samples of a step of 10 ms."""
+
+OFF = "off"
+"""In place of a detector's name: the mouth does what the model says, in pauses too."""
+
+QUIETEST = -65.0
+"""Decibels of full scale below which nothing is speech."""
+
+SILENT = -120.0
+"""Decibels of a step without any sound."""
+
+LOUDEST_ABOVE = 40.0
+"""Decibels below the loudest speech so far at which nothing is speech any more."""
+
+FADING = 3.0
+"""Decibels by which the loudest speech is forgotten in a second."""
+
+SMOOTH = 5
+"""Steps over which levels are averaged."""
+
+FLAT = 7.0
+"""Decibels within which the level of steady noise stays. Speech changes by more, but for drawn out vowels."""
+
+SHORT, LONG = 25, 60
+"""Steps for which the level must stay so: 0.25 s if the noise is far below the speech, 0.6 s if it is as loud."""
+
+CLEARLY = 10.0
+"""Decibels that make noise clearly softer than speech."""
+
+MEMORY = 500
+"""Steps for which the level of noise is remembered."""
+
+HYSTERESIS = 3.0
+"""Decibels by which speech must fall below the limit that it has risen above."""
+
+Seconds = Annotated[float, Range(0, 2)]
+
+
+class VoiceGate(ABC):
+    """Says when somebody speaks, and how quickly a mouth comes to rest and leaves it.
+
+    Args:
+        attack: seconds in which the gate opens.
+        lead: seconds before speech at which it is open, since a mouth moves before it is heard.
+        hold: seconds after speech for which it stays open.
+        release: seconds in which it closes.
+    """
+
+    look_ahead: int = 0
+    """Steps after one that the detector hears before it decides."""
+
+    def __init__(
+        self, *, attack: Seconds = 0.1, lead: Seconds = 0.12, hold: Seconds = 0.1, release: Seconds = 0.15
+    ) -> None:
+        self.attack, self.lead, self.hold, self.release = attack, lead, hold, release
+        if attack + lead > 0.5:
+            raise FaceDiffError(
+                f"voice gate: attack and lead are {attack:g} and {lead:g} s; expected at most 0.5 s together"
+            )
+
+    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+        """Let every constructor refuse options that are out of range."""
+        super().__init_subclass__(**words)
+        if "__init__" in vars(cls):
+            cls.__init__ = checks_arguments(cls.__init__, "voice gate")  # type: ignore[method-assign]
+
+    @abstractmethod
+    def listener(self) -> Listener:
+        """A detector at the beginning of a recording."""
+
+
+class Listener(ABC):
+    """A detector that hears one recording, step by step."""
+
+    @abstractmethod
+    def hear(self, steps: npt.NDArray[np.float64]) -> list[bool]:
+        """Whether there is speech in the steps that are certain after hearing more, (n, HOP) samples."""
+
+    @abstractmethod
+    def finish(self) -> list[bool]:
+        """The same for the steps that are left."""
+
+
+def read_gate(text: str) -> VoiceGate | None:
+    """A gate from ``NAME:option=value,option=value``; None for ``off``.
+
+    Raises:
+        FaceDiffError: if there is no such gate or option, or a value is out of range.
+
+    Example:
+        >>> read_gate("energy:release=0.2").release
+        0.2
+        >>> read_gate("off") is None
+        True
+    """
+    if text.strip() == OFF:
+        return None
+    try:
+        name, options = voice_gate.read(text)
+    except UnknownComponentError as error:
+        raise FaceDiffError(f"--voice-gate {text}: {error}; or {OFF}") from error
+    return cast(VoiceGate, voice_gate.get(name)(**options))
+
+
+@voice_gate.register("energy")
+class EnergyGate(VoiceGate):
+    """Speech is what rises above the noise, whose level is followed.
+
+    The level between 150 Hz and 5 kHz is compared with that of the noise: the softest stretch of the last 5 s, and the
+    next 0.7 s, in which it was steady. Where nothing was steady yet, only what is far below the loudest is a pause.
+
+    Args:
+        margin: decibels above the noise at which speech begins.
+        attack: seconds in which the gate opens.
+        lead: seconds before speech at which it is open, since a mouth moves before it is heard.
+        hold: seconds after speech for which it stays open.
+        release: seconds in which it closes.
+    """
+
+    look_ahead = 70
+
+    def __init__(
+        self,
+        *,
+        margin: Annotated[float, Range(1, 40)] = 8.0,
+        attack: Seconds = 0.1,
+        lead: Seconds = 0.12,
+        hold: Seconds = 0.1,
+        release: Seconds = 0.15,
+    ) -> None:
+        super().__init__(attack=attack, lead=lead, hold=hold, release=release)
+        self.margin = margin
+
+    def listener(self) -> Listener:
+        """A detector at the beginning of a recording."""
+        return _EnergyListener(self)
+
+
+class _EnergyListener(Listener):
+    """Follows level, noise and loudest speech; what it decides for a step depends on steps up to look-ahead only."""
+
+    def __init__(self, gate: EnergyGate) -> None:
+        from scipy.signal import butter
+
+        self.gate = gate
+        self._band = butter(2, (150.0, 5000.0), "bandpass", fs=SAMPLE_RATE, output="sos")
+        self._state = np.zeros((len(self._band), 2))
+        self._recent: deque[float] = deque(maxlen=SMOOTH)  # powers of the latest steps
+        self._levels: deque[float] = deque(maxlen=LONG)  # smoothed levels of the latest steps
+        self._waiting: deque[float] = deque()  # levels that are not decided yet
+        self._short: deque[tuple[int, float]] = deque()  # steady stretches (last step, level), softer ones later
+        self._long: deque[tuple[int, float]] = deque()
+        self._loudest = QUIETEST
+        self._step = -1  # the latest one that was heard
+        self._speaking = False
+
+    def hear(self, steps: npt.NDArray[np.float64]) -> list[bool]:
+        """Decide on steps that lie look-ahead before the latest."""
+        from scipy.signal import sosfilt
+
+        if not len(steps):
+            return []
+        band, self._state = sosfilt(self._band, steps.reshape(-1), zi=self._state)
+        found = []
+        for power in np.square(band.reshape(steps.shape)).mean(axis=1).tolist():
+            self._follow(power)
+            if len(self._waiting) > self.gate.look_ahead:
+                found.append(self._decide())
+        return found
+
+    def finish(self) -> list[bool]:
+        """Decide on all that is left."""
+        return [self._decide() for _ in range(len(self._waiting))]
+
+    def _follow(self, power: float) -> None:
+        """Take in the power of one more step."""
+        self._step += 1
+        self._recent.append(power)
+        mean = sum(self._recent) / len(self._recent)
+        level = 10 * math.log10(mean) if mean > 1e-12 else SILENT
+        # A gate must not wait for an average: a step that is loud by itself is loud.
+        self._waiting.append(max(level, 10 * math.log10(power) if power > 1e-12 else SILENT))
+        self._levels.append(level)
+        self._loudest = max(level, self._loudest - FADING / 100, QUIETEST)
+        latest = list(self._levels)
+        for length, stretches in ((SHORT, self._short), (LONG, self._long)):
+            some = [max(each, QUIETEST - 20) for each in latest[-length:]]
+            if len(some) == length and max(some) - min(some) < FLAT:
+                steady = sum(some) / length
+                while stretches and stretches[-1][1] >= steady:
+                    stretches.pop()
+                stretches.append((self._step, steady))
+            while stretches and stretches[0][0] < self._step - MEMORY:
+                stretches.popleft()
+
+    def _decide(self) -> bool:
+        """Whether the first step that waits is speech."""
+        level = self._waiting.popleft()
+        limit = max(QUIETEST, self._loudest - LOUDEST_ABOVE)
+        noise = [self._long[0][1]] if self._long else []
+        if self._short and self._short[0][1] < self._loudest - CLEARLY:
+            noise.append(self._short[0][1])
+        if noise:
+            limit = max(limit, min(noise) + self.gate.margin)
+        self._speaking = level > (limit - HYSTERESIS if self._speaking else limit)
+        return self._speaking
+
+
+@voice_gate.register("webrtc")
+class WebRtcGate(VoiceGate):
+    """The voice activity detector of WebRTC, which knows the spectra of speech and of noise.
+
+    Args:
+        strictness: 0 takes most for speech, 3 least.
+        attack: seconds in which the gate opens.
+        lead: seconds before speech at which it is open, since a mouth moves before it is heard.
+        hold: seconds after speech for which it stays open.
+        release: seconds in which it closes.
+
+    Raises:
+        MissingExtraError: if webrtcvad is not installed.
+    """
+
+    def __init__(
+        self,
+        *,
+        strictness: Annotated[int, Range(0, 3)] = 2,
+        attack: Seconds = 0.1,
+        lead: Seconds = 0.12,
+        hold: Seconds = 0.1,
+        release: Seconds = 0.15,
+    ) -> None:
+        super().__init__(attack=attack, lead=lead, hold=hold, release=release)
+        try:
+            import webrtcvad
+        except ImportError as error:
+            raise MissingExtraError("webrtcvad", "voice", "the voice gate webrtc") from error
+        self.strictness = strictness
+        self._make = webrtcvad.Vad
+
+    def listener(self) -> Listener:
+        """A detector at the beginning of a recording."""
+        return _WebRtcListener(self._make(self.strictness))
+
+
+class _WebRtcListener(Listener):
+    """Asks WebRTC's detector about every 10 ms."""
+
+    def __init__(self, detector: Any) -> None:  # noqa: ANN401 - a class of C
+        self._detector = detector
+
+    def hear(self, steps: npt.NDArray[np.float64]) -> list[bool]:
+        """Decide on each step."""
+        whole = np.clip(np.round(steps * 32767), -32768, 32767).astype("<i2")
+        # Its detector takes the faintest noise for speech where nothing else was heard before.
+        return [
+            bool(np.abs(step).max() > 10) and self._detector.is_speech(step.tobytes(), SAMPLE_RATE) for step in whole
+        ]
+
+    def finish(self) -> list[bool]:
+        """Nothing waits."""
+        return []
+
+
+class Openness:
+    """How far a mouth may be open in each frame, from 0 (at rest) to 1 (as the model moves it).
+
+    It is 1 from ``lead`` before speech until ``hold`` after it, and rises and falls smoothly. A frame depends on speech
+    up to :attr:`look_ahead` after it, and not on how the speech was cut into pieces.
+
+    Args:
+        gate: finds speech.
+        frame_rate: of the motion.
+
+    Example:
+        >>> import numpy as np
+        >>> found = Openness(read_gate("energy"), 25.0)
+        >>> np.concatenate([found.feed(np.zeros(16000)), found.finish(25)]).max()
+        0.0
+    """
+
+    def __init__(self, gate: VoiceGate, frame_rate: float) -> None:
+        self.gate, self.frame_rate = gate, frame_rate
+        self._listener = gate.listener()
+        self._rest = np.zeros(0)  # samples that fill no step yet
+        self._active: list[bool] = []
+        self._first = 0  # the step of the first of these
+        self._frames = 0  # frames that were given
+        self._ahead = math.ceil((gate.attack + gate.lead) * 100)
+        self._behind = math.ceil((gate.hold + gate.release) * 100)
+
+    @property
+    def look_ahead(self) -> float:
+        """Seconds of speech after a frame that decide on it."""
+        return (self.gate.look_ahead + self._ahead + 2) / 100
+
+    def feed(self, samples: Wave) -> npt.NDArray[np.float32]:
+        """Hear more (n,) at 16 kHz; the openness (m,) of the frames that are certain now."""
+        speech = np.concatenate([self._rest, np.asarray(samples, np.float64)])
+        whole = len(speech) // HOP
+        self._rest = speech[whole * HOP :]
+        self._active += self._listener.hear(speech[: whole * HOP].reshape(-1, HOP))
+        last = self._first + len(self._active) - self._ahead - 1
+        return self._up_to(max(self._frames, math.floor(last / 100 * self.frame_rate)))
+
+    def finish(self, frames: int) -> npt.NDArray[np.float32]:
+        """The openness (m,) of the frames that are left.
+
+        Args:
+            frames: in all.
+        """
+        self._active += self._listener.finish()
+        return self._up_to(max(frames, self._frames))
+
+    def _up_to(self, frames: int) -> npt.NDArray[np.float32]:
+        """The openness of frames up to a number, and forget what no later frame depends on."""
+        found = np.array([self._of(frame) for frame in range(self._frames, frames)], np.float32)
+        self._frames = frames
+        needed = math.floor((frames + 0.5) / self.frame_rate * 100) - self._behind - 2
+        drop = max(0, needed - self._first)
+        self._active, self._first = self._active[drop:], self._first + min(drop, len(self._active))
+        return found
+
+    def _of(self, frame: int) -> float:
+        """The openness of a frame, by the nearest speech before and after it."""
+        middle = (frame + 0.5) / self.frame_rate * 100  # in steps
+        low = max(0, math.floor(middle) - self._behind - 1 - self._first)
+        high = max(0, math.ceil(middle) + self._ahead + 1 - self._first)
+        found = 0.0
+        for place, active in enumerate(self._active[low:high], start=low + self._first):
+            if active:
+                away = (place + 0.5 - middle) / 100  # seconds until that step; negative after it
+                free, ramp = (self.gate.lead, self.gate.attack) if away > 0 else (self.gate.hold, self.gate.release)
+                beyond = abs(away) - free
+                share = 0.0 if beyond <= 0 else min(1.0, beyond / ramp) if ramp > 0 else 1.0
+                found = max(found, 1 - share * share * (3 - 2 * share))
+        return found
+
+
+def openness(speech: Wave, frames: int, frame_rate: float, gate: VoiceGate) -> npt.NDArray[np.float32]:
+    """How far a mouth may be open in each frame (frames,) of a whole recording (S,); see :class:`Openness`."""
+    found = Openness(gate, frame_rate)
+    parts = [found.feed(speech), found.finish(frames)]
+    return np.concatenate(parts)[:frames]
+
+
+# What is wrong with a recording.
+
+CLIPPED = 1e-3
+"""Share of samples in runs at the largest value above which a recording counts as clipped."""
+
+NOISY = 25.0
+"""Decibels between speech and what goes on in its pauses below which a recording counts as noisy."""
+
+TONAL = 0.1
+"""Spectral flatness of what goes on in pauses below which it is music or hum, and above which it is hiss."""
+
+
+def speech_problems(speech: Wave) -> list[str]:
+    """What is wrong with a recording (S,) at 16 kHz, each in a few words; empty where nothing is.
+
+    Example:
+        >>> import numpy as np
+        >>> speech_problems(np.zeros(16000))
+        ['is silent']
+    """
+    peak = float(np.abs(speech).max(initial=0))
+    if peak < 1e-4:
+        return ["is silent"]
+    found = []
+    top = np.abs(speech) >= 0.998 * peak
+    runs = top[2:] & top[1:-1] & top[:-2]
+    if len(runs) and float(runs.mean()) > CLIPPED:
+        found.append("is clipped: its loudest samples are cut off; record it at a lower level")
+    size = SAMPLE_RATE // 20
+    parts = np.asarray(speech[: len(speech) // size * size], np.float64).reshape(-1, size)
+    if len(parts) < 10:
+        return found
+    levels = 10 * np.log10(np.square(parts - parts.mean(1, keepdims=True)).mean(1) + 1e-12)
+    soft = np.argsort(levels)[: max(4, len(parts) // 20)]
+    apart = float(np.percentile(levels, 80) - levels[soft].mean())
+    if apart < NOISY:
+        power = np.square(np.abs(np.fft.rfft(parts[soft] * np.hanning(size), axis=1)))[:, 4:-8].mean(0) + 1e-12
+        flatness = float(np.exp(np.log(power).mean()) / power.mean())
+        what = "hiss or other noise" if flatness > TONAL else "music, hum or another steady sound"
+        if apart < 6:
+            found.append(f"holds {what} from beginning to end and perhaps no speech")
+        else:
+            found.append(f"has {what} {apart:.0f} dB below the speech; a cleaner recording moves the lips better")
+    return found

@@ -1,0 +1,144 @@
+"""Gates find pauses at every level of noise, keep onsets, and depend on nothing but the speech."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from facediff.data.voice_activity import EnergyGate, Openness, VoiceGate, openness, read_gate, speech_problems
+from facediff.errors import FaceDiffError
+from facediff.registry import voice_gate
+
+RATE = 16_000
+FRAMES = 25.0
+
+
+def talk(seconds: float, seed: int = 0) -> np.ndarray:
+    """A buzz whose level goes up and down four times a second, by 20 dB, as that of syllables; its mean power is 1."""
+    count = round(seconds * RATE)
+    time = np.arange(count) / RATE
+    pitch = 140 + 20 * np.sin(2 * np.pi * 0.7 * time + seed)
+    phase = 2 * np.pi * np.cumsum(pitch) / RATE
+    buzz = sum(np.sin(order * phase) / order for order in range(1, 20))
+    made = buzz * 10 ** (-0.5 - 0.5 * np.cos(2 * np.pi * 4 * time))
+    return made / np.sqrt((made**2).mean())
+
+
+def sentence_with_pauses(decibels: float, seed: int = 0) -> np.ndarray:
+    """1 s of noise, 2 s of speech with it, 1 s of noise, 2 s of speech, 1 s of noise; the ratio is in decibels."""
+    quiet = np.zeros(RATE)
+    speech = np.concatenate([quiet, talk(2, 1), quiet, talk(2, 2), quiet])
+    noise = np.random.default_rng(seed).standard_normal(len(speech))
+    return 0.1 * (speech + noise * 10 ** (-decibels / 20))
+
+
+SPOKEN = np.zeros(175, bool)
+SPOKEN[25:75] = SPOKEN[100:150] = True
+
+
+@pytest.mark.parametrize("decibels", [12, 20, 30, 50, 200])
+def test_mouth_rests_in_pauses_and_no_onset_is_cut(decibels: float) -> None:
+    found = openness(sentence_with_pauses(decibels), 175, FRAMES, EnergyGate())
+    # A frame and a half on either side: what is said begins and ends softly here.
+    assert found[[*range(27, 73), *range(102, 148)]].min() > 0.99
+    assert found[[*range(18), *range(84, 94), *range(159, 175)]].max() < 0.01
+
+
+def test_gate_opens_before_speech_by_lead_and_closes_after_hold_within_release() -> None:
+    speech = np.concatenate([np.zeros(RATE), talk(1), np.zeros(RATE)])
+    times = (np.arange(300) + 0.5) / 100
+    found = openness(speech, 300, 100.0, EnergyGate(attack=0.1, lead=0.2, hold=0.3, release=0.2))
+    assert found[(times > 0.82) & (times < 2.28)].min() > 0.99
+    assert found[(times < 0.68) | (times > 2.54)].max() == 0
+    assert np.diff(found).max() < 0.2  # in no hurry
+    assert (np.diff(found[times < 1.5]) >= 0).all()
+
+
+def test_louder_recording_is_gated_alike() -> None:
+    soft, loud = (openness(level * sentence_with_pauses(30), 175, FRAMES, EnergyGate()) for level in (0.1, 2))
+    np.testing.assert_array_equal(soft, loud)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_noise_silence_and_hum_alone_are_no_speech(seed: int) -> None:
+    noise = np.random.default_rng(seed).standard_normal(4 * RATE)
+    hum = np.sin(2 * np.pi * 50 * np.arange(4 * RATE) / RATE) + 0.5 * np.sin(
+        2 * np.pi * 150 * np.arange(4 * RATE) / RATE
+    )
+    for level in (0, 1e-3, 0.3):
+        for sound in (noise, hum):
+            assert openness(level * sound, 100, FRAMES, EnergyGate()).max() == 0
+
+
+def test_drawn_out_vowel_after_a_pause_is_speech() -> None:
+    time = np.arange(2 * RATE) / RATE
+    vowel = sum(np.sin(2 * np.pi * 150 * order * time) / order for order in range(1, 15))
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(3 * RATE)
+    found = openness(0.1 * np.concatenate([np.zeros(RATE), vowel]) + noise, 75, FRAMES, EnergyGate())
+    assert found[26:].min() == 1
+    assert found[:18].max() == 0
+
+
+def gates() -> list[VoiceGate]:
+    pytest.importorskip("webrtcvad")
+    return [read_gate(name) for name in voice_gate.names()]  # type: ignore[misc]
+
+
+@given(cuts=st.lists(st.integers(1, 30_000), max_size=8), which=st.integers(0, 1))
+@settings(max_examples=15, deadline=None)
+def test_openness_does_not_depend_on_how_speech_is_cut(cuts: list[int], which: int) -> None:
+    gate = gates()[which]
+    speech = sentence_with_pauses(25)[: 5 * RATE]
+    whole = openness(speech, 125, FRAMES, gate)
+    stream, parts, start = Openness(gate, FRAMES), [], 0
+    for cut in [*cuts, len(speech)]:
+        piece = speech[start : start + cut]
+        parts.append(stream.feed(piece))
+        start += len(piece)
+        # What is certain is given, and not held back until the end.
+        assert sum(map(len, parts)) >= int((start / RATE - stream.look_ahead) * FRAMES) - 1
+    parts.append(stream.finish(125))
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+def test_what_comes_after_the_look_ahead_does_not_matter() -> None:
+    first, second = sentence_with_pauses(25), sentence_with_pauses(25)
+    second[4 * RATE :] = 0.9
+    known = int((4 - Openness(EnergyGate(), FRAMES).look_ahead) * FRAMES)
+    made = [openness(speech, 175, FRAMES, EnergyGate())[:known] for speech in (first, second)]
+    np.testing.assert_array_equal(*made)
+
+
+def test_webrtc_gate_rests_in_silence() -> None:
+    found = openness(sentence_with_pauses(200), 175, FRAMES, gates()[1])
+    assert found[84:94].max() == 0
+    assert found[SPOKEN].mean() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("energie", "energie"),
+        ("energy:margins=3", "margins"),
+        ("energy:margin=x", "margin"),
+        ("energy:margin=90", "margin"),
+        ("energy:attack=0.4,lead=0.4", "lead"),
+        ("webrtc:strictness=4", "strictness"),
+    ],
+)
+def test_impossible_gate_is_named(text: str, named: str) -> None:
+    with pytest.raises(FaceDiffError, match=named):
+        read_gate(text)
+
+
+def test_recordings_are_told_what_is_wrong_with_them() -> None:
+    clean, random = sentence_with_pauses(60), np.random.default_rng(0)
+    assert speech_problems(clean) == []
+    assert "clipped" in " ".join(speech_problems(np.clip(6 * clean, -1, 1)))
+    assert "hiss" in " ".join(speech_problems(sentence_with_pauses(15)))
+    time = np.arange(len(clean)) / RATE
+    chord = sum(np.sin(2 * np.pi * hertz * time) for hertz in (220, 277, 330))
+    assert "music" in " ".join(speech_problems(clean + 0.02 * chord))
+    assert "no speech" in " ".join(speech_problems(0.1 * random.standard_normal(RATE)))
