@@ -25,6 +25,7 @@ from facediff.models import AnimationModel
 from facediff.registry import checks_arguments
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import sha256
+from facediff.utils.provenance import Provenance, recipe_of
 from facediff.version import __version__
 
 PICTURE_SIZE = 320  # Pixels of a picture's sides
@@ -79,6 +80,28 @@ def describe_run(model: AnimationModel, data: SpeechMotionDataModule) -> dict[st
         "version/torch": str(torch.__version__),
         "version/lightning": lightning.__version__,
     }
+
+
+def provenance_of(trainer: Trainer, model: AnimationModel, data: SpeechMotionDataModule) -> Provenance:
+    """Which training run is being scored, or predicts: seed, checkpoint, components and options."""
+    facts = describe_run(model, data)
+    path = Path(trainer.ckpt_path) if isinstance(trainer.ckpt_path, str | Path) else None
+    seed, steps = (model.provenance.get(name, "") for name in ("seed", "steps"))
+    scored = {"protocol", "metrics", "unseen_identity", "score_by"}  # decide what is measured, not what is trained
+    options = {name: value for name, value in model.hparams.items() if name not in scored}
+    trained = {name: value for name, value in model.data_options.items() if name not in ("root", "num_workers")}
+    return Provenance(
+        model=facts["model"],
+        components={key.partition("/")[2]: name for key, name in facts.items() if key.startswith("component/")},
+        recipe=recipe_of({"model": options, "data": trained}),
+        seed=int(seed) if seed.isdecimal() else None,
+        steps=int(steps) if steps.isdecimal() else None,
+        checkpoint=sha256(path) if path is not None and path.is_file() else "",
+        corpus=facts["data/corpus"],
+        manifest=facts["data/manifest"],
+        parameters=facts["parameters/trainable"] + facts["parameters/frozen"],
+        versions={key.partition("/")[2]: name for key, name in facts.items() if key.startswith("version/")},
+    )
 
 
 def manifest_hash(folder: Path) -> str:

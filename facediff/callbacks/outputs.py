@@ -12,12 +12,12 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 from lightning.pytorch.loggers import WandbLogger
 
-from facediff.callbacks.dashboard import measure_clips, wandb_media, worst_clips
+from facediff.callbacks.dashboard import measure_clips, provenance_of, wandb_media, worst_clips
 from facediff.models import AnimationModel
 from facediff.models.inference import Prediction
 from facediff.registry import checks_arguments
 from facediff.utils.files import atomic
-from facediff.utils.plain_files import write_rows
+from facediff.utils.plain_files import write_json, write_rows
 from facediff.utils.ranges import Range
 from facediff.utils.tables import format_table
 
@@ -35,7 +35,8 @@ class ScoreTable(Callback):
     Next to the model are scored a face that never moves, the mean face of each speaker's training clips, which does not
     move either, and the model given another sentence's speech. Weights & Biases gets the table of sequences as
     ``test/sequences``, with sound and a picture of the errors for the worst clips, and the protocol's definition in the
-    run's config.
+    run's config. Which training run is scored (its seed, the checkpoint's SHA-256, the components) stands in every row
+    of the scores, and in ``provenance.json``.
 
     Args:
         file: name of the CSV file in the run's folder; None writes none.
@@ -43,6 +44,8 @@ class ScoreTable(Callback):
         sequences_file: name of the CSV file with one row per clip and method; None writes none.
         media_clips: how many clips get sound and picture, the worst by LVE of all processes. They are predicted once
             more, by the first process alone, one at a time; nothing is kept in memory during the test.
+        report_file: name of the JSON file with all of it for programs, such as ``facediff benchmark``: scores,
+            sequences, what each column means, and the training run; None writes none.
     """
 
     @checks_arguments
@@ -52,8 +55,10 @@ class ScoreTable(Callback):
         sequences_file: str | None = "test_sequences.csv",
         media_clips: Annotated[int, Range(0, 10_000)] = 8,
         groups_file: str | None = "test_scores_by.csv",
+        report_file: str | None = "test_report.json",
     ) -> None:
         self.file = file
+        self.report_file = report_file
         self.sequences_file = sequences_file
         self.media_clips = media_clips
         self.groups_file = groups_file
@@ -78,19 +83,34 @@ class ScoreTable(Callback):
         if groups and self.groups_file and folder:
             write_rows(Path(folder) / self.groups_file, groups)
             print(f"written: {Path(folder) / self.groups_file}")
-        if self.file and folder:
+        provenance = None
+        if folder and (self.file or self.report_file):
+            provenance = provenance_of(trainer, pl_module, trainer.datamodule)  # type: ignore[attr-defined]
+            provenance.write(Path(folder))
+        if self.file and folder and provenance is not None:
             # Regions become the columns <region>_vertices and <region>_hash.
             flat = []
             for row in rows:
                 line = {key: value for key, value in row.items() if key != "regions"}
                 for part, region in row["regions"].items():
                     line |= {f"{part}_vertices": region["count"], f"{part}_hash": region["hash"]}
-                flat.append(line)
+                flat.append(line | provenance.columns())
             write_rows(Path(folder) / self.file, flat)
             print(f"written: {Path(folder) / self.file}")
         if self.sequences_file and folder:
             write_rows(Path(folder) / self.sequences_file, sequences)
             print(f"written: {Path(folder) / self.sequences_file}")
+        if self.report_file and folder and provenance is not None:
+            everything = {
+                "format": 1,
+                "provenance": provenance.as_dict(),
+                "synthetic": assets.synthetic,
+                "definition": evaluation.describe(),
+                "columns": evaluation.columns(),
+                "scores": rows,
+                "sequences": sequences,
+            }
+            write_json(Path(folder) / self.report_file, everything)
         sys.stdout.flush()
         loggers = [logger for logger in trainer.loggers if isinstance(logger, WandbLogger)]
         if loggers:
@@ -197,6 +217,8 @@ class PredictionWriter(BasePredictionWriter):
                 np.save(temporary, clip.vertices.flatten(1).numpy())
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Print where the files are."""
+        """Say which training run the files are of, and print where they are."""
         if trainer.is_global_zero:
+            if isinstance(pl_module, AnimationModel):
+                provenance_of(trainer, pl_module, trainer.datamodule).write_next_to(self.folder)  # type: ignore[attr-defined]
             print(f"written: {self.folder}")

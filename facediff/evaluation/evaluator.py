@@ -27,7 +27,7 @@ from facediff.evaluation.files import (
     read_pairs,
 )
 from facediff.evaluation.groups import attributes_of
-from facediff.evaluation.report import Bootstrap, MethodTable, Report
+from facediff.evaluation.report import Bootstrap, MethodTable, Report, runs_of
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
 from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, protocol
 from facediff.metrics.by_name import parse_all
@@ -146,6 +146,7 @@ def evaluate(
     if chosen:
         words = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in chosen.items()]
         definitions[METRICS] = "\n".join(["further metrics", *words])
+    results = [table.result(sampling, attributes) for table in tables]
     return Report(
         truth=str(truth),
         lips=lips,
@@ -157,7 +158,8 @@ def evaluate(
         resamples=bootstrap,
         level=level,
         seed=seed,
-        methods=[table.result(sampling, attributes) for table in tables],
+        methods=results,
+        runs=runs_of(results),
         groups=[group for table in tables for group in table.groups(attributes)],
         comparisons=[row for table in tables[1:] for row in table.compare(tables[0], sampling)],
         unnamed_truths=unnamed_truths,

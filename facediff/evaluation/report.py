@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from facediff.evaluation.files import Missing, Pair
 from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
 from facediff.utils import ranges
+from facediff.utils.provenance import Provenance, read_provenance
 from facediff.utils.tables import format_table
 
 
@@ -38,6 +40,8 @@ class Score:
     frames: int
     sequences: int
     region: dict[str, Any] | str  # name, count and hash of the vertices that it was taken over, or "all vertices"
+    pooling: str | None = None  # ``frames`` or ``sequences``; None if it is no mean of the scores of sequences
+    better: str | None = None  # ``lower``, ``higher``, ``zero``, or None if no direction is the better one
 
     @property
     def name(self) -> str:
@@ -78,11 +82,16 @@ class MethodResult:
     scores: list[Score]  # protocol by protocol
     sequences: list[SequenceScores]  # sorted by clip
     missing: Missing
+    provenance: Provenance | None = None  # the training run that the files say they are of
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A method against the first, over the sequences that both have."""
+    """A method against the first, over the sequences that both have.
+
+    The interval says how the difference depends on the sentences. It says nothing of what another training run of
+    either method would give; where both are runs of one method, all of the difference is that.
+    """
 
     method: str
     baseline: str  # the first method
@@ -91,6 +100,24 @@ class Comparison:
     difference: float  # the method's score minus the baseline's
     interval: Interval | None  # of the difference, over the same resamples; None as in :class:`Score`
     sequences: int  # that both have
+    same_method: bool = False  # whether both are training runs of one method that differ in the seed alone
+
+    @property
+    def starred(self) -> bool:
+        """Whether the interval does not contain 0, and the difference is one between methods."""
+        return not self.same_method and self.interval is not None and (self.interval.low > 0 or self.interval.high < 0)
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The scores of several training runs of one method: the other source of chance."""
+
+    methods: tuple[str, ...]  # the names under which the runs were given
+    seeds: tuple[int | None, ...]
+    protocol: str
+    metric: str
+    mean: float
+    deviation: float  # standard deviation between the runs (n − 1)
 
 
 @dataclass(frozen=True)
@@ -123,6 +150,7 @@ class Report:
     groups: list[Group]  # scores by the attributes asked for, method by method
     unnamed_truths: list[str]  # files among the truths whose names do not fit the pattern
     remarks: list[str]  # whether the regions are those in use on the topology, if one was named
+    runs: list[Runs] = field(default_factory=list)  # of methods of which several training runs were given
 
     def regions(self) -> dict[str, dict[str, Any]]:
         """Name, vertex count, hash and repeated indices of each region."""
@@ -142,6 +170,8 @@ class Report:
             "bootstrap": {"resamples": self.resamples, "level": self.level, "seed": self.seed},
             "methods": [asdict(method) for method in self.methods],
             "comparisons": [asdict(comparison) for comparison in self.comparisons],
+            "chance": {"sequences": "intervals and stars", "training_runs": "runs" if self.runs else "not known"},
+            "runs": [asdict(runs) for runs in self.runs],
             "groups": [asdict(group) for group in self.groups],
             "unnamed_truths": self.unnamed_truths,
         }
@@ -248,6 +278,7 @@ class MethodTable:
         self.columns = columns
         unusable = {clip: reason for clip, reason in sorted(found.items()) if isinstance(reason, str)}
         self.missing = replace(missing, unusable=unusable)
+        self.provenance = read_provenance(Path(folder))
         self.rows = [(pair, scores) for pair in pairs if isinstance(scores := found[pair.clip], ClipScores)]
         if not self.rows:
             raise FaceDiffError(f"{folder}: {_why_nothing(self.missing)}")
@@ -295,6 +326,8 @@ class MethodTable:
                     frames,
                     len(self.rows) if column.metric in self.rows[0][1].states else int(np.count_nonzero(weights)),
                     column.region,
+                    None if column.metric in self.rows[0][1].states else column.pooling,
+                    column.better,
                 )
                 for column, total, interval, weights in zip(
                     self.columns, totals, intervals, self.weights.T, strict=True
@@ -305,6 +338,7 @@ class MethodTable:
                 for pair, scores in self.rows
             ],
             self.missing,
+            self.provenance,
         )
 
     def _totals(self) -> list[float]:
@@ -362,13 +396,48 @@ class MethodTable:
         spread = None if mine is None or other is None else mine - other
         return [
             Comparison(
-                self.name, baseline.name, column.protocol, column.metric, float(difference), interval, len(common)
+                self.name,
+                baseline.name,
+                column.protocol,
+                column.metric,
+                float(difference),
+                interval,
+                len(common),
+                same_method(self.provenance, baseline.provenance),
             )
             for column, difference, interval in zip(
                 self.columns, pooled(*a) - pooled(*b), bootstrap.intervals(spread, len(self.columns)), strict=True
             )
             if not math.isnan(difference)
         ]
+
+
+def same_method(one: Provenance | None, other: Provenance | None) -> bool:
+    """Whether two folders are known to be of two training runs of one method."""
+    return one is not None and other is not None and one.checkpoint != other.checkpoint and one.same_method(other)
+
+
+def runs_of(methods: Sequence[MethodResult]) -> list[Runs]:
+    """Mean and deviation over the training runs of each method of which several were given."""
+    kinds: list[list[MethodResult]] = []
+    for method in methods:
+        kind = next((kind for kind in kinds if same_method(kind[0].provenance, method.provenance)), None)
+        if kind is None:
+            kinds.append([method])
+        else:
+            kind.append(method)
+    found = []
+    for kind in [kind for kind in kinds if len(kind) > 1]:
+        names = tuple(method.name for method in kind)
+        seeds = tuple(method.provenance.seed for method in kind if method.provenance is not None)
+        for scores in zip(*(method.scores for method in kind), strict=True):
+            values = np.array([score.value for score in scores])
+            found.append(
+                Runs(
+                    names, seeds, scores[0].protocol, scores[0].metric, float(values.mean()), float(values.std(ddof=1))
+                )
+            )
+    return found
 
 
 def _why_nothing(missing: Missing) -> str:
@@ -406,12 +475,16 @@ def text(report: Report) -> str:
     lines += report.remarks
     for name in report.protocols:
         title = "further metrics" if name == METRICS else f"protocol {name}"
-        lines += ["", title, *_scores(report, name), *_comparisons(report, name), *_groups(report, name)]
+        lines += ["", title, *_scores(report, name), *_runs(report, name), *_comparisons(report, name)]
+        lines += _groups(report, name)
     if any(score.interval for method in report.methods for score in method.scores):
         lines += [
             "",
             f"[…]: {report.level:.0%} intervals, {report.resamples} bootstrap resamples of the sequences, "
             f"seed {report.seed}",
+            "they say how much depends on the sentences; the spread over training runs is given apart"
+            if report.runs
+            else "they say how much depends on the sentences, and nothing of the chance between training runs",
         ]
     lines += ["", *(_left_out(report) or ["everything there was scored; nothing was cut, skipped or missing"])]
     lines = [printable(line) for line in lines]
@@ -463,13 +536,27 @@ def _comparisons(report: Report, protocol: str) -> list[str]:
     rows: dict[str, list[str]] = {}
     for each in found:
         row = f"{each.method} − {each.baseline}" + (f": {each.metric}" if protocol == METRICS else "")
-        sure = each.interval is not None and (each.interval.low > 0 or each.interval.high < 0)
-        rows.setdefault(row, []).append(_cell(each.difference, each.interval, "+") + ("*" if sure else ""))
+        rows.setdefault(row, []).append(_cell(each.difference, each.interval, "+") + ("*" if each.starred else ""))
     metrics = ["difference"] if protocol == METRICS else list(dict.fromkeys(each.metric for each in found))
     counts = {each.method: str(each.sequences) for each in found}
     body = [[row, *cells, counts[row.partition(" − ")[0]]] for row, cells in rows.items()]
-    head = "difference, over the sequences that both have (*: the interval does not contain 0)"
-    return [head, *format_table(["", *metrics, "sequences"], body).splitlines()]
+    head = "difference, over the sequences that both have (*: the interval over sentences does not contain 0)"
+    same = list(dict.fromkeys(f"{each.method} and {each.baseline}" for each in found if each.same_method))
+    notes = [f"{pair} are training runs of one method: their difference is chance, and has no star" for pair in same]
+    return [head, *format_table(["", *metrics, "sequences"], body).splitlines(), *notes]
+
+
+def _runs(report: Report, protocol: str) -> list[str]:
+    """Mean ± standard deviation over the training runs of a method."""
+    found = [each for each in report.runs if each.protocol == protocol]
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for each in found:
+        rows.setdefault(each.methods, []).append(f"{each.mean:.4e} ± {each.deviation:.1e}")
+    if not rows:
+        return []
+    metrics = list(dict.fromkeys(each.metric for each in found))
+    body = [[", ".join(names), *cells, str(len(names))] for names, cells in rows.items()]
+    return ["over training runs (mean ± standard deviation)", *format_table(["", *metrics, "runs"], body).splitlines()]
 
 
 def _cell(value: float, interval: Interval | None, sign: str = "") -> str:

@@ -16,7 +16,15 @@ from torchmetrics import Metric
 
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import Pair
-from facediff.metrics import FaceDynamicsDeviation, Protocol, Region, SequenceMetric, VertexError, feed
+from facediff.metrics import (
+    FaceDynamicsDeviation,
+    Protocol,
+    Region,
+    SequenceMetric,
+    VertexError,
+    describe_column,
+    feed,
+)
 from facediff.metrics.base import Clips, LengthRule, Pooling, align
 from facediff.metrics.one_pass import one_pass
 from facediff.utils.arrays import in_range, open_vertices
@@ -38,6 +46,7 @@ class Column:
     source: str  # which of the scorer's metrics gives the value of a sequence
     absolute: bool = False  # whether its sign is dropped
     region: dict[str, Any] | str = "all vertices"  # name, count and hash of what the score was taken over
+    better: str | None = None  # ``lower``, ``higher``, ``zero``, or None; see :func:`facediff.metrics.describe_column`
 
     @property
     def name(self) -> str:
@@ -120,11 +129,13 @@ class Scorer:
                     raise FaceDiffError(f"metric {name}: {error}") from error
             pooling: Pooling = getattr(chosen, "pooling", "sequences")
             where = "all vertices" if over is None else over.as_dict()
-            self.columns.append(Column(METRICS, name, pooling, "min", name, region=where))
+            better = describe_column(chosen)["better"]
+            self.columns.append(Column(METRICS, name, pooling, "min", name, region=where, better=better))
         self.needs_template |= any("template" in getattr(chosen, "needs", ()) for chosen in self.chosen.values())
 
     def _add(self, protocol: Protocol, name: str, metric: SequenceMetric) -> None:
         absolute = False
+        better = describe_column(metric)["better"]
         if isinstance(metric, FaceDynamicsDeviation):
             absolute = metric.sign == "absolute"
             source = f"fdd {metric.region}"
@@ -137,7 +148,9 @@ class Scorer:
         self.metrics.setdefault(source, metric)
         pooling: Pooling = "sequences" if source.startswith("fdd") else protocol.pooling
         region = "all vertices" if metric.region is None else metric.region.as_dict()
-        self.columns.append(Column(protocol.name, name, pooling, protocol.length_rule, source, absolute, region))
+        self.columns.append(
+            Column(protocol.name, name, pooling, protocol.length_rule, source, absolute, region, better)
+        )
 
     def score(self, pair: Pair) -> ClipScores | str:
         """The scores of a clip, or in words why it has none: a file of it cannot be used.

@@ -41,6 +41,7 @@ from facediff.metrics.base import ExactMetric as ExactMetric
 from facediff.metrics.base import LipMetric as LipMetric
 from facediff.metrics.base import SequenceMetric as SequenceMetric
 from facediff.metrics.base import align as align
+from facediff.metrics.base import describe_column as describe_column
 from facediff.metrics.base import functional as functional
 from facediff.metrics.by_name import NEEDS as NEEDS
 from facediff.metrics.by_name import Context as Context

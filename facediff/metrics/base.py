@@ -636,3 +636,21 @@ def _arguments(documented: object) -> dict[str, str]:
     section = re.search(r"^Args:\n((?:    .*\n?|\n)+)", inspect.getdoc(documented) or "", re.MULTILINE)
     entries = re.findall(r"^    (\w+): ((?:.*\n?)(?:        .*\n?)*)", section[1] if section else "", re.MULTILINE)
     return {name: text.rstrip() for name, text in entries}
+
+
+def describe_column(metric: Metric) -> dict[str, str | None]:
+    """What a table needs to know of a score to pool it again and to compare it.
+
+    Returns:
+        ``pooling``: ``frames`` or ``sequences``; None if the score is no mean of those of sequences. ``better``:
+        ``lower``, ``higher`` or ``zero``, which is the best value of a signed one; None if no direction is better.
+
+    >>> from facediff.metrics import FaceDynamicsDeviation
+    >>> describe_column(FaceDynamicsDeviation([0], sign="signed"))
+    {'pooling': 'sequences', 'better': 'zero'}
+    """
+    pools = isinstance(metric, SequenceMetric) and type(metric).clip_weight is SequenceMetric.clip_weight
+    signs = {"signed": "zero", "absolute": "lower"}
+    directions = {False: "lower", True: "higher"}
+    better = signs.get(getattr(metric, "sign", "")) or directions.get(metric.higher_is_better)  # type: ignore[arg-type]
+    return {"pooling": str(getattr(metric, "pooling", "sequences")) if pools else None, "better": better}

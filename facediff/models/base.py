@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -469,6 +470,8 @@ class AnimationModel(LightningModule, Inference, ABC):
         if stage != "predict":
             _ = self.evaluation  # an unknown protocol or metric is reported before the corpus is read
         if stage == "fit":
+            # The seed that Lightning was given; scores name it, so that runs of one method can be told apart.
+            self.provenance |= {"seed": seed} if (seed := os.environ.get("PL_GLOBAL_SEED")) else {}
             # Those of a checkpoint that is adapted or resumed stay: a model inherits from all that it has learnt from.
             self.licences = merged(self.licences, data.licences(), network_licences(dict(self.hparams)))
         self.data_source = {

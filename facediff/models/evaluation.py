@@ -27,6 +27,7 @@ from facediff.metrics import (
     ProtocolMetrics,
     Region,
     SequenceMetric,
+    describe_column,
     device_name,
     feed,
     protocol,
@@ -485,6 +486,15 @@ class Evaluation:
             facts = {"split": split, "method": method, "unseen_identity": self.unseen_identity}
             table.append({**facts, **scores, **summary.as_dict()})
         return table
+
+    def columns(self) -> dict[str, dict[str, str | None]]:
+        """How each score is pooled over sequences, and which way it is better.
+
+        By the name of the score; see :func:`facediff.metrics.describe_column`.
+        """
+        of_model = next(iter(self.metrics.values()))["model"].scores()
+        chosen = next(iter(self.chosen.values()), {}).get("model", {})
+        return {name: describe_column(metric) for name, metric in {**of_model, **chosen}.items()}
 
     def describe(self) -> str:
         """The definitions of all numbers, in words."""

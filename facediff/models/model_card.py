@@ -32,7 +32,10 @@ METHODS = {
     "mean_face": "speaker's mean face",
     "shuffled": "this model, shuffled speech",
 }
-ABOUT = {"split", "method", "unseen_identity", "protocol", "frames", "sequences", "cut_prediction", "cut_truth"}
+ABOUT = {
+    *("split", "method", "unseen_identity", "protocol", "frames", "sequences", "cut_prediction", "cut_truth"),
+    *("seed", "checkpoint", "components"),
+}
 """Columns of a table of scores that are no scores; those of regions end in ``_vertices`` and ``_hash``."""
 
 LONGEST_NAME = 96
@@ -262,6 +265,7 @@ def training_section(model: AnimationModel) -> str:
         ("adapted from", text(known.get("parent") or "nothing; trained from its first step")),
         ("epochs", known.get("epochs", "not known")),
         ("optimiser steps", known.get("steps", "not known")),
+        ("seed", known.get("seed", "not known")),
         ("learning rate", f"{options.get('learning_rate', 'not known')}, {options.get('lr_schedule', '')}"),
         ("weight decay", str(options.get("weight_decay", "not known"))),
         ("clips a batch", str(data.get("batch_size", "not known"))),

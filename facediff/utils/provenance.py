@@ -1,0 +1,132 @@
+"""What made a folder of scores or of predictions: ``provenance.json`` next to them.
+
+Scores mean little without the training run that they are of. Whoever compares two folders reads here whether they are
+of two methods, or of one method that was trained twice: then their difference is chance between training runs, about
+which the spread over sentences says nothing.
+
+A folder of predictions holds nothing but predictions, as other projects' scripts expect; its file lies next to it,
+``<folder>.provenance.json``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import check_format, quoted
+from facediff.utils.plain_files import load_json, write_json
+
+FILE = "provenance.json"
+FORMAT = 1
+"""Goes up when a field changes its meaning; new fields do not count."""
+
+REMEDY = "expected what `facediff test` or `facediff predict` writes; remove the file, or run the command again"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """One training run, and what was scored or predicted with it.
+
+    Attributes:
+        model: the method's class.
+        components: name of each of its components, by kind.
+        recipe: SHA-256 of all options of model and data; runs that differ in the seed alone have the same one.
+        seed: of the training run; None where the checkpoint does not know it, as an imported one.
+        steps: optimiser steps of the training.
+        checkpoint: SHA-256 of the checkpoint; empty if the model came from none.
+        corpus: what it was scored on.
+        manifest: SHA-256 of that corpus's manifest, or ``none``.
+        parameters: weights of the network, trained and frozen.
+        versions: of facediff, torch and lightning.
+    """
+
+    model: str
+    components: Mapping[str, str] = field(default_factory=dict)
+    recipe: str = ""
+    seed: int | None = None
+    steps: int | None = None
+    checkpoint: str = ""
+    corpus: str = ""
+    manifest: str = ""
+    parameters: int | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def same_method(self, other: Provenance) -> bool:
+        """Whether two runs are of one method, with equal options and equally many steps: they differ by chance."""
+        return bool(self.recipe) and (self.recipe, self.steps) == (other.recipe, other.steps)
+
+    def columns(self) -> dict[str, str]:
+        """The run in three cells of a table of scores."""
+        parts = " ".join(f"{kind}={name}" for kind, name in self.components.items())
+        seed = "" if self.seed is None else str(self.seed)
+        return {"seed": seed, "checkpoint": self.checkpoint, "components": f"{self.model} {parts}".strip()}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {"format": FORMAT, **asdict(self)}
+
+    def write(self, folder: Path) -> None:
+        """Write it into a folder, whole or not at all."""
+        write_json(folder / FILE, self.as_dict())
+
+    def write_next_to(self, folder: Path) -> None:
+        """Write it next to a folder, whole or not at all."""
+        write_json(next_to(folder), self.as_dict())
+
+
+def recipe_of(options: Mapping[str, Any]) -> str:
+    """SHA-256 of plain options; it depends neither on their order nor on how numbers were written.
+
+    Example:
+        >>> recipe_of({"dim": 64, "layers": 2}) == recipe_of({"layers": 2, "dim": 64})
+        True
+    """
+    return hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def next_to(folder: Path) -> Path:
+    """Where the provenance of a folder of predictions lies."""
+    folder = folder.resolve()
+    return folder.with_name(f"{folder.name}.{FILE}")
+
+
+def read_provenance(folder: Path) -> Provenance | None:
+    """What made a folder; None if it does not say, as folders of other projects do not.
+
+    Raises:
+        FaceDiffError: if the file is damaged, or of a later format.
+    """
+    path = next((path for path in (folder / FILE, next_to(folder)) if path.is_file()), None)
+    return None if path is None else provenance_of(load_json(path, remedy=REMEDY), path)
+
+
+def provenance_of(content: object, name: object) -> Provenance:
+    """Provenance from plain data, which errors call ``name``.
+
+    Raises:
+        FaceDiffError: if a field is not of its type.
+    """
+    if not isinstance(content, dict):
+        raise FaceDiffError(f"{name}: holds no JSON object; {REMEDY}")
+    check_format(name, content.get("format", FORMAT), FORMAT)
+    made: dict[str, Any] = {}
+    kinds: dict[str, type] = {"components": dict, "versions": dict, "seed": int, "steps": int, "parameters": int}
+    for key in Provenance.__dataclass_fields__:
+        value = content.get(key)
+        if value is None:
+            continue
+        kind = kinds.get(key, str)
+        fits = isinstance(value, kind) and not isinstance(value, bool)
+        if kind is dict and fits:
+            fits = all(isinstance(each, str) for item in value.items() for each in item)
+        if not fits:
+            raise FaceDiffError(f"{name}: {key} is {quoted(value)}; {REMEDY}")
+        made[key] = value
+    if "model" not in made:
+        raise FaceDiffError(f"{name}: names no model; {REMEDY}")
+    return Provenance(**made)
