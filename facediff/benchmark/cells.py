@@ -1,0 +1,293 @@
+"""The cells of a plan: every row on every corpus with every seed, and what decides the result of each.
+
+Two cells whose recipes are equal have equal results, so the recipe's hash is the cell's name on the disk. A changed plan,
+a changed config that it names, a changed checkpoint or a changed corpus thus makes new cells of those that it concerns,
+and finds the results of all others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from facediff.benchmark.plan import MOST_CELLS, Before, CorpusEntry, MethodEntry, Options, Plan, Variant, find_config
+from facediff.errors import FaceDiffError, choices
+from facediff.utils.files import describe_files, sha256, short_name
+from facediff.utils.limits import brief
+
+Kind = Literal["fit", "checkpoint", "predictions"]
+
+
+@dataclass(frozen=True)
+class Training:
+    """A run of ``facediff fit``.
+
+    Attributes:
+        name: of the step, ``fit`` for the last one.
+        config: the experiment config.
+        options: of the command line, by name without dashes.
+    """
+
+    name: str
+    config: Path
+    options: Options
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training run of one row on one corpus, or one set of predictions.
+
+    Attributes:
+        row: name of the row.
+        corpus: the plan's name of the corpus.
+        seed: of the training; None where the plan does not train.
+        kind: whether it is trained, or a checkpoint, or predictions.
+        trainings: what is trained, in this order.
+        source: the checkpoint, or the folder of predictions.
+        options: of ``facediff evaluate``, for predictions.
+        test_options: of ``facediff test``.
+        root: the corpus's folder where the plan names it.
+        data: config of the data module where the plan names it.
+        recipe: all that decides the result, as plain data.
+        trained: the part of the recipe that decides the trained weights.
+    """
+
+    row: str
+    corpus: str
+    seed: int | None
+    kind: Kind
+    trainings: tuple[Training, ...] = ()
+    source: Path | None = None
+    options: Options = field(default_factory=dict)
+    test_options: Options = field(default_factory=dict)
+    root: Path | None = None
+    data: Path | None = None
+    recipe: Mapping[str, Any] = field(default_factory=dict)
+    trained: Mapping[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.row} on {self.corpus}" + ("" if self.seed is None else f", seed {self.seed}")
+
+    @property
+    def key(self) -> str:
+        """Hash of all that decides the result."""
+        return hash_of(self.recipe)
+
+    @property
+    def file_name(self) -> str:
+        """Name of the cell's results, without a suffix."""
+        return f"{self._stem}-{self.key[:12]}"
+
+    @property
+    def folder_name(self) -> str:
+        """Name of the folder of its training run: cells that differ in the test alone share it."""
+        return f"{self._stem}-{hash_of(self.trained)[:12]}"
+
+    @property
+    def _stem(self) -> str:
+        words = [self.row, self.corpus, *([] if self.seed is None else [f"seed{self.seed}"])]
+        return short_name("-".join(re.sub(r"[^\w.+]+", "_", word) for word in words), 100)
+
+
+def hash_of(content: object) -> str:
+    """SHA-256 of plain data, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the tables: a method, or a method in a variant."""
+
+    name: str
+    label: str
+    method: MethodEntry
+    variant: Variant | None = None
+
+    @property
+    def published(self) -> str:
+        """Its name in tables of papers."""
+        return self.variant.published if self.variant is not None and self.variant.published else self.method.published
+
+
+def rows_of(plan: Plan) -> list[Row]:
+    """The rows of a plan, in its order; where there are variants, each method once for each of them.
+
+    Raises:
+        FaceDiffError: if the baseline is none of them.
+    """
+    found = []
+    for method in plan.methods.values():
+        names = list(plan.variants) if method.variants is None else list(method.variants)
+        if method.config is None or not names:  # what is trained already has no variants
+            found.append(Row(method.name, method.label, method))
+            continue
+        alone = len(plan.methods) == 1
+        for name in names:
+            variant = plan.variants[name]
+            label = variant.label if alone else f"{method.label}, {variant.label}"
+            found.append(Row(name if alone else f"{method.name}/{name}", label, method, variant))
+    names = [row.name for row in found]
+    if plan.baseline and plan.baseline not in names:
+        raise FaceDiffError(
+            f"{plan.file}: baseline: there is no row {plan.baseline!r}: {choices(plan.baseline, names)}"
+        )
+    return found
+
+
+def cells_of(plan: Plan) -> list[Cell]:
+    """All cells, seed by seed, so that a plan that is stopped early has whole columns of few seeds.
+
+    Raises:
+        FaceDiffError: if a file or a folder is missing.
+    """
+    found = [
+        cell
+        for row in rows_of(plan)
+        for name, corpus in plan.corpora.items()
+        if row.method.corpora is None or name in row.method.corpora
+        for cell in _cells(plan, row, corpus)
+    ]
+    if not found:
+        raise FaceDiffError(f"{plan.file}: has no cell; expected one method at least that is run on one corpus")
+    if len(found) > MOST_CELLS:
+        raise FaceDiffError(f"{plan.file}: has {len(found)} cells; expected {MOST_CELLS} at most")
+    places: dict[tuple[str, str], int] = {}
+
+    def turn(cell: Cell) -> int:
+        place = places.get((cell.row, cell.corpus), 0)
+        places[cell.row, cell.corpus] = place + 1
+        return place
+
+    return sorted(found, key=turn)
+
+
+def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
+    method = row.method
+    seeds = method.seeds or plan.seeds
+    scoring = {
+        "protocol": plan.protocol,
+        "metrics": list(plan.metrics),
+        "options": {**plan.test_options, **method.test_options},
+    }
+    shared = {"corpus": {"data": _config_content(corpus.data), "manifest": _manifest(corpus.root)}}
+    if method.config is not None:
+        for seed in seeds:
+            trainings = tuple(_trainings(plan, row, corpus))
+            trained = {
+                **shared,
+                "seed": seed,
+                "threads": plan.threads,
+                "trainings": [
+                    {"name": each.name, "config": config_content(each.config), "options": dict(each.options)}
+                    for each in trainings
+                ],
+            }
+            recipe = {"kind": "fit", "trained": trained, "weights": plan.weights, "test": scoring}
+            yield Cell(
+                *(row.name, corpus.name, seed, "fit", trainings),
+                test_options=scoring["options"],  # type: ignore[arg-type]
+                root=corpus.root,
+                data=corpus.data,
+                recipe=recipe,
+                trained=trained,
+            )
+        return
+    kind: Kind = "checkpoint" if method.checkpoint is not None else "predictions"
+    text = method.checkpoint or method.predictions or ""
+    for seed in seeds if "{seed}" in text else [None]:
+        source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(seed)))
+        if kind == "predictions" and corpus.data is None:
+            raise FaceDiffError(
+                f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name its "
+                f"config, such as configs/data/biwi.yaml, for the clips of its test splits"
+            )
+        recipe = {**shared, "kind": kind, "source": _content(source), "test": scoring, "options": dict(method.options)}
+        yield Cell(
+            *(row.name, corpus.name, seed, kind),
+            source=source,
+            options=method.options,
+            test_options=scoring["options"],  # type: ignore[arg-type]
+            root=corpus.root,
+            data=corpus.data,
+            recipe=recipe,
+            trained=recipe,
+        )
+
+
+def _trainings(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Training]:
+    method = row.method
+    place = f"{plan.file}: methods: {method.name}: config"
+    variant = {} if row.variant is None else row.variant.options
+    last = Before("fit", str(method.config), {**plan.options, **method.options, **variant})
+    for step in (*method.before, last):
+        options = {**corpus.options, **step.options}
+        config = find_config(step.config.replace("{corpus}", corpus.name), place, plan.file)
+        yield Training(step.name, config, options)
+
+
+def _source(plan: Plan, kind: Kind, text: str) -> Path:
+    path = Path(text).expanduser()
+    path = path if path.is_absolute() or path.exists() else plan.file.parent / path
+    if kind == "predictions":
+        if not path.is_dir():
+            raise FaceDiffError(f"{text}: no such folder; expected a method's predictions, .npy files of vertices")
+        if not any(path.rglob("*.npy")):
+            raise FaceDiffError(f"{text}: holds no predictions; expected .npy files of vertices")
+    elif not path.exists():
+        raise FaceDiffError(f"{text}: no such checkpoint; expected a file of `facediff fit` or import-checkpoint")
+    return path.resolve()
+
+
+@cache
+def _content(path: Path) -> dict[str, Any]:
+    """What a checkpoint or a folder of predictions holds."""
+    if path.is_file():
+        return {"sha256": sha256(path)}
+    return describe_files(path, [file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file()])
+
+
+def _manifest(root: Path | None) -> str:
+    path = None if root is None else root / "manifest.json"
+    return sha256(path) if path is not None and path.is_file() else "none"
+
+
+def _config_content(path: Path | None) -> object:
+    return None if path is None else config_content(path)
+
+
+@cache
+def config_content(path: Path) -> object:
+    """The plain data of a config, with those of the configs that it names in their place: comments do not count.
+
+    Raises:
+        FaceDiffError: if one is not readable.
+    """
+    return _expanded(path, ())
+
+
+def _expanded(path: Path, outer: tuple[Path, ...]) -> object:
+    if path in outer or len(outer) > 20:
+        raise FaceDiffError(f"{path}: names itself; expected a config that ends")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        raise FaceDiffError(f"{path}: is not readable as YAML ({brief(error)}); correct the file") from error
+
+    def expand(value: object) -> object:
+        if isinstance(value, dict):
+            return {str(key): expand(each) for key, each in value.items()}
+        if isinstance(value, list):
+            return [expand(each) for each in value]
+        if isinstance(value, str) and value.endswith((".yaml", ".yml")) and (path.parent / value).is_file():
+            return _expanded((path.parent / value).resolve(), (*outer, path))
+        return value
+
+    return expand(content)

@@ -1,0 +1,154 @@
+"""What papers print, next to ours only where protocol and data agree; where they do not, the reason.
+
+The figures are data of the package, ``published.yaml``, with their source. docs/which_lve.md says why two tables of the
+field can seldom be compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from facediff.errors import FaceDiffError, choices
+
+FILE = Path(__file__).with_name("published.yaml")
+
+
+@dataclass(frozen=True)
+class Published:
+    """A table of a paper.
+
+    Attributes:
+        name: by which plans call it.
+        source: paper and table.
+        corpus: the corpus's name.
+        split: the split that was scored.
+        protocol: the named protocol that its figures follow.
+        rows: scores by the paper's name of the method.
+        lips: number of lip vertices; None if it is not said.
+        frames: that were scored; likewise.
+        sequences: that were scored; likewise.
+        doubt: why its figures cannot be compared with any others; empty if they can.
+    """
+
+    name: str
+    source: str
+    corpus: str
+    split: str
+    protocol: str
+    rows: Mapping[str, Mapping[str, float]]
+    lips: int | None = None
+    frames: int | None = None
+    sequences: int | None = None
+    doubt: str = ""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What of papers is shown next to a table of ours.
+
+    Attributes:
+        scores: the printed figures, by row and score.
+        sources: where they stand.
+        reasons: why tables that were asked for are not shown.
+    """
+
+    scores: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    sources: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
+
+
+@cache
+def published() -> dict[str, Published]:
+    """All tables of papers that are known, by name."""
+    content: dict[str, dict[str, Any]] = yaml.safe_load(FILE.read_text(encoding="utf-8"))
+    found = {}
+    for name, table in content.items():
+        rows = {row: {key: float(value) for key, value in scores.items()} for row, scores in table["rows"].items()}
+        found[name] = Published(name, **{**table, "rows": rows})
+    return found
+
+
+def find_published(names: Sequence[str]) -> list[Published]:
+    """Tables by their names.
+
+    Raises:
+        FaceDiffError: if there is none of a name.
+    """
+    for name in names:
+        if name not in published():
+            raise FaceDiffError(f"published: there is no table {name!r}: {choices(name, published())}")
+    return [published()[name] for name in names]
+
+
+def shown_tables(
+    names: Sequence[str],
+    *,
+    rows: Mapping[str, str],
+    corpus: str,
+    synthetic: bool,
+    split: str,
+    protocol: str,
+    lips: Mapping[str, Any],
+    frames: int,
+    sequences: int,
+) -> Shown:
+    """The figures of papers that may stand next to a table.
+
+    Args:
+        names: the papers' tables that are asked for.
+        rows: the paper's name of each of our rows; empty for a row that no paper has.
+        corpus: name of our corpus.
+        synthetic: whether a program made it.
+        split: that was scored.
+        protocol: by which it was scored.
+        lips: our lip region, with its ``count``.
+        frames: that were scored.
+        sequences: that were scored.
+    """
+    scores: dict[str, dict[str, float]] = {}
+    sources, reasons = [], []
+    for table in find_published(names):
+        reason = _disagreement(table, corpus, synthetic, split, protocol, lips, frames, sequences)
+        if reason:
+            reasons.append(f"{table.source}: not shown, since {reason}")
+            continue
+        sources.append(table.source)
+        for row, name in rows.items():
+            if name in table.rows:
+                scores.setdefault(row, {}).update(table.rows[name])
+    return Shown(scores, tuple(sources), tuple(reasons))
+
+
+def _disagreement(
+    table: Published,
+    corpus: str,
+    synthetic: bool,
+    split: str,
+    protocol: str,
+    lips: Mapping[str, Any],
+    frames: int,
+    sequences: int,
+) -> str:
+    """Why a paper's figures cannot stand next to ours; empty if they can."""
+    if table.corpus != corpus:
+        made = ", which a program made" if synthetic else ""
+        return f"its corpus is {table.corpus}, and this is {corpus}{made}"
+    if table.split != split:
+        return f"it scores {table.split}, and this is {split}"
+    if table.doubt:
+        return table.doubt
+    for what, theirs, ours in (
+        ("follows the protocol", table.protocol, protocol),
+        ("has lip vertices", table.lips, lips.get("count")),
+        ("scores sequences", table.sequences, sequences),
+        ("scores frames", table.frames, frames),
+    ):
+        if theirs is not None and theirs != ours:
+            return f"it {what} {theirs}, and this {ours}"
+    return ""

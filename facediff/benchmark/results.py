@@ -1,0 +1,310 @@
+"""The result of a cell: one JSON file of plain data, with everything that a number needs to be believed."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+from facediff.benchmark.cells import Cell, hash_of
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import check_format, quoted
+from facediff.utils.plain_files import load_json, read_rows, write_json
+from facediff.utils.provenance import Provenance, provenance_of, read_provenance
+from facediff.version import __version__
+
+CELLS = "cells"
+FORMAT = 1
+"""Goes up when a field changes its meaning; new fields do not count."""
+REMEDY = "remove the file, and run the benchmark again"
+CURVES = ("val/lve", "val/energy", "val/mve")
+"""Scores of validation that are kept over the steps of training."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a cell gave.
+
+    Attributes:
+        row: name of the row.
+        corpus: the plan's name of the corpus.
+        seed: of the training; None if nothing was trained.
+        kind: ``fit``, ``checkpoint`` or ``predictions``.
+        key: hash of the cell's recipe.
+        config: hash of what was trained, the seed left out.
+        problem: why the cell failed; empty if it did not.
+        code: version, and commit of a checkout.
+        source: the checkpoint or the folder that was scored.
+        provenance: the training run, as plain data; empty where it is not known.
+        synthetic: whether a program made the corpus.
+        protocol: by which it was scored.
+        definition: what each number means, in words.
+        machine: what computed.
+        measured: seconds and bytes of memory of each step.
+        columns: how each score is pooled, and which way it is better.
+        scores: a row for each split and method (``model``, ``still``, ``mean_face``, ``shuffled``), with regions, frames
+            and sequences.
+        sequences: a row for each split, method and clip.
+        curve: lists by name: steps, seconds, and scores of validation.
+    """
+
+    row: str
+    corpus: str
+    seed: int | None
+    kind: str
+    key: str
+    config: str = ""
+    problem: str = ""
+    code: Mapping[str, str] = field(default_factory=dict)
+    source: str = ""
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    synthetic: bool = False
+    protocol: str = ""
+    definition: str = ""
+    machine: Mapping[str, Any] = field(default_factory=dict)
+    measured: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
+    scores: Sequence[Mapping[str, Any]] = ()
+    sequences: Sequence[Mapping[str, Any]] = ()
+    curve: Mapping[str, Sequence[float | None]] = field(default_factory=dict)
+    name: str = ""
+
+    @classmethod
+    def failed(cls, cell: Cell, problem: str, machine: Mapping[str, Any]) -> Self:
+        """The result of a cell that failed."""
+        return cls(**_of(cell), problem=problem, machine=machine)
+
+    @property
+    def total_seconds(self) -> float | None:
+        """Seconds of all steps; None if one is not known."""
+        seconds = [step.get("seconds") for step in self.measured.values()]
+        known = [value for value in seconds if value is not None]
+        return sum(known) if known and len(known) == len(seconds) else None
+
+    @property
+    def training_seconds(self) -> float | None:
+        """Seconds of all trainings; None if nothing was trained."""
+        steps = [step for name, step in self.measured.items() if not name.startswith(("test", "evaluate"))]
+        known = [step["seconds"] for step in steps if step.get("seconds") is not None]
+        return sum(value for value in known if value is not None) if known else None
+
+    @property
+    def memory(self) -> float | None:
+        """The most bytes that any step had in memory."""
+        found = [value for step in self.measured.values() if (value := step.get("memory")) is not None]
+        return max(found, default=None)
+
+    @property
+    def parameters(self) -> int | None:
+        """Weights of the network."""
+        value = self.provenance.get("parameters")
+        return value if isinstance(value, int) else None
+
+    def real_time_factor(self) -> float | None:
+        """Seconds of computing for a second of speech, over all test splits."""
+        pairs = [
+            (row["real_time_factor"], row["frames"])
+            for row in self.scores
+            if row.get("method") == "model" and isinstance(row.get("real_time_factor"), int | float)
+        ]
+        frames = sum(count for _, count in pairs)
+        return sum(value * count for value, count in pairs) / frames if frames else None
+
+    def write(self, folder: Path) -> Path:
+        """Write it into a benchmark's folder, whole or not at all; equal content gives equal bytes."""
+        path = folder / CELLS / f"{self.name}.json"
+        write_json(path, {"format": FORMAT, **asdict(self)})
+        return path
+
+
+def cell_file(folder: Path, cell: Cell) -> Path:
+    """Where a cell's result is."""
+    return folder / CELLS / f"{cell.file_name}.json"
+
+
+def read_result(path: Path) -> Result | None:
+    """A cell's result; None if there is none yet.
+
+    Raises:
+        FaceDiffError: if the file is damaged, or of a later format.
+    """
+    if not path.is_file():
+        return None
+    content = load_json(path, remedy=REMEDY)
+    if not isinstance(content, dict):
+        raise FaceDiffError(f"{path}: holds no JSON object; {REMEDY}")
+    check_format(path, content.get("format"), FORMAT)
+    given = {key: content[key] for key in Result.__dataclass_fields__ if key in content}
+    for key, kind in _KINDS.items():
+        if not isinstance(given.get(key), kind) or isinstance(given.get(key), bool) != (kind is bool):
+            raise FaceDiffError(f"{path}: {key} is {quoted(given.get(key))}; {REMEDY}")
+    for key in ("scores", "sequences"):
+        for row in given[key]:
+            if not isinstance(row, dict) or not {"split", "method", "frames"} <= row.keys():
+                raise FaceDiffError(f"{path}: a row of {key} is {quoted(row)}; {REMEDY}")
+            if not _is_number(row["frames"]) or not isinstance(row["split"], str) or not isinstance(row["method"], str):
+                raise FaceDiffError(f"{path}: a row of {key} is {quoted(row)}; {REMEDY}")
+            for column in given["columns"]:
+                if row.get(column) is not None and not _is_number(row[column]):
+                    raise FaceDiffError(f"{path}: {column} in {key} is {quoted(row[column])}; {REMEDY}")
+        if key == "sequences" and any(not isinstance(row.get("clip"), str) for row in given[key]):
+            raise FaceDiffError(f"{path}: a row of {key} names no clip; {REMEDY}")
+    for name, columns in (("columns", given["columns"]), ("measured", given["measured"])):
+        if not all(isinstance(each, dict) for each in columns.values()):
+            raise FaceDiffError(f"{path}: {name} is {quoted(columns)}; {REMEDY}")
+    for step in given["measured"].values():
+        if not all(value is None or _is_number(value) for value in step.values()):
+            raise FaceDiffError(f"{path}: measured is {quoted(step)}; {REMEDY}")
+    for values in given["curve"].values():
+        if not isinstance(values, list) or not all(value is None or _is_number(value) for value in values):
+            raise FaceDiffError(f"{path}: curve is {quoted(values)}; {REMEDY}")
+    if given["provenance"]:
+        provenance_of(given["provenance"], path)
+    if given.get("seed") is not None and not isinstance(given["seed"], int):
+        raise FaceDiffError(f"{path}: seed is {quoted(given['seed'])}; {REMEDY}")
+    return Result(**given)
+
+
+_KINDS: dict[str, type] = {
+    **dict.fromkeys(("row", "corpus", "kind", "key", "config", "problem", "source", "protocol", "definition", "name"), str),
+    **dict.fromkeys(("code", "provenance", "machine", "measured", "columns", "curve"), dict),
+    **dict.fromkeys(("scores", "sequences"), list),
+    "synthetic": bool,
+}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _of(cell: Cell) -> dict[str, Any]:
+    trained = {key: value for key, value in cell.trained.items() if key != "seed"}
+    facts = {"row": cell.row, "corpus": cell.corpus, "seed": cell.seed, "kind": cell.kind, "key": cell.key}
+    return {**facts, "config": hash_of(trained), "name": cell.file_name}
+
+
+def model_result(
+    cell: Cell,
+    report: Mapping[str, Any],
+    *,
+    machine: Mapping[str, Any],
+    measured: Mapping[str, Mapping[str, float | None]],
+    curve: Mapping[str, Sequence[float | None]],
+    shown: str,
+) -> Result:
+    """The result of a cell from what ``facediff test`` wrote."""
+    fitted = sum(step.get("seconds") or 0.0 for name, step in measured.items() if not name.startswith("test"))
+    steps = [value for value in curve.get("step", ()) if value is not None]
+    # Validation is logged with steps; time is what the whole training took, shared out over its steps.
+    seconds = {"seconds": [fitted * value / steps[-1] for value in steps]} if steps and steps[-1] else {}
+    return Result(
+        **_of(cell),
+        code=code_of(),
+        source=shown,
+        provenance=report["provenance"],
+        synthetic=bool(report["synthetic"]),
+        protocol=str(report["scores"][0]["protocol"]),
+        definition=str(report["definition"]),
+        machine=machine,
+        measured=measured,
+        columns={name: each for name, each in report["columns"].items() if name != "real_time_factor"},
+        scores=report["scores"],
+        sequences=report["sequences"],
+        curve={**curve, **seconds},
+    )
+
+
+def predictions_result(
+    cell: Cell,
+    report: Mapping[str, Any],
+    splits: Mapping[str, str],
+    *,
+    machine: Mapping[str, Any],
+    measured: Mapping[str, Mapping[str, float | None]],
+    shown: str,
+) -> Result:
+    """The result of a cell from what ``facediff evaluate`` wrote; clips outside the test splits do not count.
+
+    Raises:
+        FaceDiffError: if no clip of a test split was predicted.
+    """
+    (method,) = report["methods"]
+    facts = {score["metric"]: score for score in method["scores"]}
+    columns = {name: {"pooling": score["pooling"], "better": score["better"]} for name, score in facts.items()}
+    sequences = []
+    for each in method["sequences"]:
+        split = splits.get(each["clip"])
+        if split is not None:
+            values = {name.partition("/")[2]: value for name, value in each["scores"].items()}
+            who = {"split": split, "method": "model", "clip": each["clip"], "identity": ""}
+            sequences.append({**who, "frames": each["frames"], **values})
+    if not sequences:
+        raise FaceDiffError(f"{cell.source}: holds no prediction of a test split's clips; expected such as {[*splits][:1]}")
+    scores = []
+    for split in dict.fromkeys(splits.values()):
+        rows = [row for row in sequences if row["split"] == split]
+        if rows:
+            pooled = {name: pool(rows, name, each["pooling"]) for name, each in columns.items()}
+            counts = {"frames": sum(row["frames"] for row in rows), "sequences": len(rows)}
+            regions = {"regions": report["regions"], "unseen_identity": report["identity"]}
+            scores.append({"split": split, "method": "model", **pooled, **counts, **regions})
+    known: Provenance | None = None if cell.source is None else read_provenance(cell.source)
+    return Result(
+        **_of(cell),
+        code=code_of(),
+        source=shown,
+        provenance={} if known is None else known.as_dict(),
+        protocol=method["scores"][0]["protocol"],
+        definition="\n".join(report["protocols"].values()),
+        machine=machine,
+        measured=measured,
+        columns=columns,
+        scores=scores,
+        sequences=sequences,
+    )
+
+
+def code_of() -> dict[str, str]:
+    """Version of the package, and the commit if it is run from a checkout."""
+    folder = Path(__file__).parents[2]
+    found = {"version": __version__}
+    git = shutil.which("git")
+    if git is not None and (folder / ".git").exists():
+        with suppress(OSError, subprocess.SubprocessError):
+            answer = subprocess.run(  # noqa: S603 - reads only
+                [git, "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"],
+                capture_output=True,
+                text=True,
+                timeout=10,
+                check=True,
+            )
+            found["commit"] = answer.stdout.strip()
+    return found
+
+
+def pool(rows: Sequence[Mapping[str, Any]], column: str, pooling: str | None) -> float | None:
+    """The score of several sequences; None if it is no mean of theirs, or none of them has one."""
+    valued = [(row[column], row["frames"] if pooling == "frames" else 1) for row in rows if row.get(column) is not None]
+    total = sum(weight for _, weight in valued)
+    return None if pooling is None or not total else sum(value * weight for value, weight in valued) / total
+
+
+def curve_of(path: Path) -> dict[str, list[float | None]]:
+    """The scores of validation over the steps of a training, as ``metrics.csv`` of its run has them."""
+    if not path.is_file():
+        return {}
+    found: dict[float, dict[str, float]] = {}
+    for row in read_rows(path, remedy="expected what CSVLogger writes during training"):
+        values = {name: float(row[name]) for name in CURVES if row.get(name)}
+        if values and row.get("step"):
+            found.setdefault(float(row["step"]) + 1, {}).update(values)
+    steps = sorted(found)
+    names = [name for name in CURVES if any(name in each for each in found.values())]
+    curve: dict[str, list[float | None]] = {name: [found[step].get(name) for step in steps] for name in names}
+    return {"step": [*steps], **curve} if steps else {}
+

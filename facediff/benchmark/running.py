@@ -1,0 +1,350 @@
+"""Running the cells of a plan: each training and each test in a process of its own, several cells at a time.
+
+What is finished is on the disk whole, and what is not leaves a training that continues where it was stopped, bit for bit.
+So it does not matter when a benchmark is killed, nor how often.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+from facediff.benchmark.cells import Cell, Training, hash_of
+from facediff.benchmark.results import Result, cell_file, curve_of, model_result, predictions_result, read_result
+from facediff.errors import FaceDiffError
+from facediff.metrics import device_name
+from facediff.utils.batch import Outcome, run_batch
+from facediff.utils.files import cache_dir, discard
+from facediff.utils.jobs import THREAD_VARIABLES
+from facediff.utils.plain_files import load_json, read_json, write_json
+
+RUNS, LOGS = "runs", "logs"
+STATE = "state.json"
+"""In the folder of a training run: how far it has come, and how long that took."""
+LOGGER = "lightning.pytorch.loggers.CSVLogger"
+LAST = Path("version_0", "checkpoints", "last.ckpt")
+BEST = Path("version_0", "checkpoints", "best.ckpt")
+REPORT = Path("version_0", "test_report.json")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all cells of a run share.
+
+    Attributes:
+        folder: the benchmark's folder.
+        protocol: by which all is scored.
+        metrics: further metrics.
+        weights: ``last`` or ``best``.
+        threads: of each process.
+        clips: split of each clip, by the plan's name of a corpus, where predictions are scored.
+        truths: folder, frame stride and so on of the truth, likewise.
+        launcher: how a facediff command is started.
+    """
+
+    folder: Path
+    protocol: str
+    metrics: tuple[str, ...]
+    weights: str
+    threads: int
+    clips: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    truths: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    launcher: tuple[str, ...] = (sys.executable, "-m", "facediff.utils.tethered", "facediff")
+
+
+def pending(cells: Sequence[Cell], folder: Path, *, retry_failed: bool) -> list[Cell]:
+    """The cells that have no result yet; those that failed are tried again only if asked."""
+    found = []
+    for cell in cells:
+        result = read_result(cell_file(folder, cell))
+        if result is None or (result.problem and retry_failed):
+            found.append(cell)
+    return found
+
+
+def run_cells(
+    cells: Sequence[Cell], setting: Setting, *, workers: int
+) -> Generator[tuple[Cell, Outcome[Result]]]:
+    """Run cells, several at a time; each gets its file when it is done, also when it fails.
+
+    Yields:
+        a cell and what became of it, as soon as it is done.
+
+    Raises:
+        FaceDiffError: if all others would fail for the same reason, such as a full disk.
+    """
+    work = partial(run_cell, setting)
+    record = partial(record_failure, setting.folder)
+    with closing(run_batch(work, cells, workers=workers, record=record, survive_bugs=True)) as outcomes:
+        yield from outcomes
+
+
+def record_failure(folder: Path, cell: Cell, problem: str) -> None:
+    """Write why a cell failed in place of its result; a result has written itself."""
+    if problem:
+        Result.failed(cell, problem, machine_of(0)).write(folder)
+
+
+def run_cell(setting: Setting, cell: Cell) -> Result:
+    """Do all that a cell needs, and write its result.
+
+    Raises:
+        FaceDiffError: if a command fails; its log is named.
+    """
+    folder = setting.folder / RUNS / cell.folder_name
+    folder.mkdir(parents=True, exist_ok=True)
+    machine = machine_of(setting.threads)
+    if cell.kind == "predictions":
+        result = _score_predictions(setting, cell, folder, machine)
+    else:
+        result = _score_model(setting, cell, folder, machine)
+    result.write(setting.folder)
+    return result
+
+
+def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, Any]) -> Result:
+    runner = Runner(setting, folder, cell)
+    made: dict[str, Path] = {}
+    for training in cell.trainings:
+        made[training.name] = runner.fit(training, made, cell)
+    checkpoint = cell.source if cell.source is not None else made[cell.trainings[-1].name]
+    place = folder / f"test-{cell.key[:12]}"
+    words = ["test", "--ckpt_path", str(checkpoint), *logger_words(place), *progress_words()]
+    metrics = list(dict.fromkeys([*setting.metrics, "real_time_factor"]))
+    options = {
+        "model.protocol": setting.protocol,
+        "model.metrics": metrics,
+        **({} if cell.root is None else {"data.root": str(cell.root)}),
+        **cell.test_options,
+    }
+    runner.run(place.name, [*words, *option_words(options)])
+    report = load_json(place / REPORT)
+    curves = {} if not cell.trainings else curve_of(folder / cell.trainings[-1].name / "version_0" / "metrics.csv")
+    return model_result(cell, report, machine=machine, measured=runner.measured, curve=curves, shown=str(checkpoint))
+
+
+def _score_predictions(setting: Setting, cell: Cell, folder: Path, machine: dict[str, Any]) -> Result:
+    runner = Runner(setting, folder, cell)
+    report = folder / f"evaluate-{cell.key[:12]}.json"
+    words = ["evaluate", str(cell.source), *setting.truths[cell.corpus], "--protocol", setting.protocol]
+    words += [word for metric in setting.metrics for word in ("--metric", metric)]
+    words += option_words(cell.options)
+    runner.run("evaluate", [*words, "--bootstrap", "0", "--quiet", "--json", str(report)])
+    content = load_json(report)
+    return predictions_result(
+        cell, content, setting.clips[cell.corpus], machine=machine, measured=runner.measured, shown=str(cell.source)
+    )
+
+
+class Runner:
+    """Runs the commands of one cell, and measures them.
+
+    Attributes:
+        measured: seconds and bytes of memory of each command, by its step.
+    """
+
+    def __init__(self, setting: Setting, folder: Path, cell: Cell) -> None:
+        self.setting, self.folder, self.cell = setting, folder, cell
+        self.measured: dict[str, dict[str, float | None]] = {}
+
+    def fit(self, training: Training, made: Mapping[str, Path], cell: Cell) -> Path:
+        """Train, or continue a training that was stopped; the checkpoint.
+
+        Raises:
+            FaceDiffError: if the training fails.
+        """
+        place = self.folder / training.name
+        state = read_json(place / STATE) or {}
+        last = place / LAST
+        if not state.get("done"):
+            words = ["fit", "--config", str(training.config)]
+            options = fit_options(training, made, cell)
+            # A training that was killed continues with the time that its last saved state had taken.
+            before = float(state.get("seconds", 0.0))
+            if last.is_file() and "started" in state:
+                before += max(0.0, last.stat().st_mtime - float(state["started"]))
+                words += ["--ckpt_path", str(last)]
+            elif place.is_dir():
+                discard(place)
+            place.mkdir(parents=True, exist_ok=True)
+            write_json(place / STATE, {"seconds": before, "started": time.time()})
+            self.run(training.name, [*words, *logger_words(place), *option_words(options), *progress_words()])
+            took = self.measured[training.name]
+            took["seconds"] = before + (took["seconds"] or 0.0)
+            write_json(place / STATE, {"done": True, **took})
+        else:
+            self.measured[training.name] = {key: state.get(key) for key in ("seconds", "memory")}
+        best = place / BEST
+        found = best if self.setting.weights == "best" and best.is_file() else last
+        if not found.is_file():
+            raise FaceDiffError(f"{found}: was not written; expected a checkpoint, look at the log {self._log}")
+        return found
+
+    def run(self, step: str, words: Sequence[str]) -> None:
+        """Run a facediff command to its end.
+
+        Raises:
+            FaceDiffError: with what the command reported, if it fails.
+        """
+        log = self._log
+        log.parent.mkdir(parents=True, exist_ok=True)
+        environment = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(self.setting.threads))}
+        started = time.monotonic()
+        with log.open("ab") as stream:
+            stream.write(f"\n$ facediff {' '.join(words)}\n".encode(errors="surrogateescape"))
+            stream.flush()
+            place = stream.tell()
+            status, memory = run_process([*self.setting.launcher, *words], environment, stream)
+        self.measured[step] = {"seconds": time.monotonic() - started, "memory": memory}
+        if status:
+            raise FaceDiffError(f"{self.cell}: {words[0]} {reason_of(log, place, status)}")
+
+    @property
+    def _log(self) -> Path:
+        return self.setting.folder / LOGS / f"{self.cell.file_name}.log"
+
+
+def fit_options(training: Training, made: Mapping[str, Path], cell: Cell) -> dict[str, Any]:
+    """The options of a training: seed, corpus, and the checkpoints of those before it in the place of their names."""
+    options: dict[str, Any] = {"seed_everything": cell.seed}
+    if cell.data is not None:
+        options["data"] = str(cell.data)
+    if cell.root is not None:
+        options["data.root"] = str(cell.root)
+    for name, value in training.options.items():
+        for step, checkpoint in made.items():
+            value = str(checkpoint) if value == f"{{{step}}}" else value  # noqa: PLW2901
+        options[name] = value
+    return options
+
+
+def option_words(options: Mapping[str, Any]) -> list[str]:
+    """Options as words of a command line; lists and mappings as JSON."""
+    words = []
+    for name, value in options.items():
+        text = value if isinstance(value, str) else json.dumps(value)
+        words += [f"--{name}"] if value is True and "." not in name else [f"--{name}={text}"]
+    return words
+
+
+def logger_words(place: Path) -> list[str]:
+    """Where a run of Lightning's commands goes."""
+    return [
+        f"--trainer.logger={LOGGER}",
+        f"--trainer.logger.save_dir={place.parent}",
+        f"--trainer.logger.name={place.name}",
+        "--trainer.logger.version=0",
+    ]
+
+
+def progress_words() -> list[str]:
+    """No bars in the log."""
+    return ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
+
+
+def run_process(words: Sequence[str], environment: Mapping[str, str], log: IO[bytes]) -> tuple[int, float | None]:
+    """Run a program that ends with this process; its exit status, and the most memory that it had, in bytes."""
+    process = subprocess.Popen(  # noqa: S603 - a command of our own
+        words, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, env=dict(environment)
+    )
+    memory: float | None = None
+    try:
+        if hasattr(os, "wait4"):
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            memory = float(usage.ru_maxrss) * (1 if sys.platform == "darwin" else 1024)
+        else:
+            process.wait()
+    finally:
+        if process.returncode is None:
+            process.kill()
+            with suppress(ChildProcessError):
+                process.wait()
+        if process.stdin is not None:
+            process.stdin.close()
+    return process.returncode, memory
+
+
+def reason_of(log: Path, place: int, status: int) -> str:
+    """Why a command failed, from what it printed after a place in its log."""
+    if status < 0:
+        return f"was killed by signal {-status}, perhaps for lack of memory; run fewer --workers (log: {log})"
+    with log.open("rb") as stream:
+        stream.seek(max(place, stream.seek(0, os.SEEK_END) - 65536))
+        lines = stream.read().decode("utf-8", "replace").splitlines()
+    mark = "facediff: error: "
+    named = next((line.removeprefix(mark) for line in reversed(lines) if line.startswith(mark)), "")
+    return f"failed: {named}" if named else f"ended with status {status}; its log {log} says why"
+
+
+def machine_of(threads: int) -> dict[str, Any]:
+    """What computes, for the speed column."""
+    import torch
+
+    gpu = torch.cuda.is_available()
+    processor = device_name("cpu").rpartition(",")[0]
+    return {
+        "processor": processor,
+        "processors": os.cpu_count(),
+        "threads": threads,
+        "gpu": torch.cuda.get_device_name(0) if gpu else None,
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+    }
+
+
+# How long it will take, by the last timings.
+
+
+def estimate(cells: Sequence[Cell], folder: Path) -> dict[Cell, float | None]:
+    """Seconds that each cell will take: as long as the latest of its row on its corpus; None where there was none.
+
+    Timings of all benchmarks of this machine are remembered in the cache folder, by what is trained and for how long.
+    """
+    known: dict[tuple[str, str], tuple[float, float]] = {}
+    for path in (folder / "cells").glob("*.json"):
+        result = read_result(path)
+        if result is not None and not result.problem and (seconds := result.total_seconds) is not None:
+            key, when = (result.row, result.corpus), path.stat().st_mtime
+            if when > known.get(key, (0.0, 0.0))[0]:
+                known[key] = (when, seconds)
+    remembered = read_json(timings_file()) or {}
+    found: dict[Cell, float | None] = {}
+    for cell in cells:
+        if (cell.row, cell.corpus) in known:
+            found[cell] = known[cell.row, cell.corpus][1]
+        else:
+            value = remembered.get(timing_key(cell))
+            found[cell] = float(value) if isinstance(value, int | float) else None
+    return found
+
+
+def timings_file() -> Path:
+    """Seconds by :func:`timing_key`, of all benchmarks of this machine."""
+    return cache_dir() / "benchmark_timings.json"
+
+
+def timing_key(cell: Cell) -> str:
+    """What decides how long a cell takes: its recipe but for the seed."""
+    recipe = json.loads(json.dumps(dict(cell.recipe), default=str))
+    recipe.get("trained", {}).pop("seed", None)
+    return hash_of(recipe)[:24]
+
+
+def remember(cell: Cell, result: Result) -> None:
+    """Keep how long a cell took, for the estimates of later runs; called by one process only."""
+    if result.total_seconds is not None:
+        known = read_json(timings_file()) or {}
+        with suppress(FaceDiffError):  # a cache that cannot be written does not matter
+            write_json(timings_file(), {**known, timing_key(cell): round(result.total_seconds, 1)})

@@ -1,0 +1,234 @@
+"""How sure a difference between two rows is, with its two sources of chance kept apart.
+
+A score depends on which sentences were recorded, and on which numbers the training happened to draw. A bootstrap or a
+permutation over sentences knows nothing of the second, and the spread over seeds nothing of the first. A difference
+counts as one between methods only if it is larger than either chance explains: its p-value is the larger of the two,
+which is a valid test that neither is the reason (an intersection–union test, Berger 1982).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.evaluation.report import Bootstrap, Interval
+
+Array = npt.NDArray[np.float64]
+
+EXACT = 14
+"""Up to so many sentences, all signs are tried; of more, some at random."""
+FLIPS = 20_000
+BLOCK = 2_000  # Random signs that are held at a time
+
+
+@dataclass(frozen=True)
+class Scores:
+    """One score of one row.
+
+    Attributes:
+        runs: the score of each training run (runs,).
+        values: of each sentence in each run (runs, sentences), NaN where it has none; None if the score is no mean of
+            those of sentences.
+        weights: of each sentence (sentences,): its frames where all frames count alike, else 1.
+        clips: names of the sentences.
+        fixed: whether nothing was trained, so that there is no chance between runs.
+    """
+
+    runs: Array
+    values: Array | None
+    weights: Array
+    clips: tuple[str, ...]
+    fixed: bool = False
+
+    @property
+    def mean(self) -> float:
+        """Mean over the runs."""
+        return float(self.runs.mean())
+
+    @property
+    def deviation(self) -> float | None:
+        """Standard deviation between the runs (n − 1); None with a single one."""
+        return float(self.runs.std(ddof=1)) if len(self.runs) > 1 else None
+
+    def shares(self, clips: Sequence[str]) -> Array:
+        """What each of some sentences adds to the mean over the runs; their sum is the score over these sentences."""
+        if self.values is None:
+            raise ValueError("the score is no mean of those of sentences")
+        places = [self.clips.index(clip) for clip in clips]
+        values = self.values[:, places]
+        weights = np.where(np.isnan(values), 0.0, self.weights[places])
+        return np.asarray((np.nan_to_num(values) * weights / weights.sum(1, keepdims=True)).mean(0))
+
+    def interval(self, bootstrap: Bootstrap) -> Interval | None:
+        """Bootstrap interval over sentences of the mean over the runs."""
+        found = self._resampled(bootstrap, self.clips)
+        return None if found is None else bootstrap.intervals(found[:, None], 1)[0]
+
+    def _resampled(self, bootstrap: Bootstrap, clips: Sequence[str]) -> Array | None:
+        if self.values is None:
+            return None
+        places = [self.clips.index(clip) for clip in clips]
+        values = self.values[:, places].T
+        weights = np.where(np.isnan(values), 0.0, self.weights[places][:, None])
+        scores = bootstrap.scores(np.nan_to_num(values), weights)
+        return None if scores is None else np.asarray(scores.mean(1))
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One row's score minus another's.
+
+    Attributes:
+        value: the difference of the means over runs, over the sentences that both have.
+        sentences: bootstrap interval over sentences; None if there is none.
+        p_sentences: of the permutation test over sentences; None if the score is no mean of those of sentences.
+        runs: interval over training runs (Welch); None if the chance between runs is not known.
+        p_runs: of Welch's test; likewise.
+        p: the larger of the two; None if one is not known.
+        common: sentences that both have.
+    """
+
+    value: float
+    sentences: Interval | None
+    p_sentences: float | None
+    runs: Interval | None
+    p_runs: float | None
+    p: float | None
+    common: int
+
+
+def difference(one: Scores, other: Scores, bootstrap: Bootstrap) -> Difference:
+    """Compare two rows by one score.
+
+    Args:
+        one: the row.
+        other: the row that is subtracted.
+        bootstrap: resamples, level and seed; the permutations have the same seed.
+    """
+    common = [clip for clip in one.clips if clip in other.clips]
+    p_runs, runs = welch(one, other, bootstrap.level)
+    if one.values is None or other.values is None or not common:
+        p = p_runs if one.values is None and other.values is None else None
+        return Difference(one.mean - other.mean, None, None, runs, p_runs, p, len(common))
+    ours, theirs = one.shares(common), other.shares(common)
+    valued = ~(np.isnan(ours) | np.isnan(theirs))
+    p_sentences = sign_flip(ours[valued] - theirs[valued], seed=bootstrap.seed)
+    mine, yours = one._resampled(bootstrap, common), other._resampled(bootstrap, common)
+    interval = None if mine is None or yours is None else bootstrap.intervals((mine - yours)[:, None], 1)[0]
+    p = None if p_runs is None else max(p_sentences, p_runs)
+    return Difference(float((ours - theirs).sum()), interval, p_sentences, runs, p_runs, p, len(common))
+
+
+def sign_flip(differences: Array, *, seed: int = 0) -> float:
+    """Two-sided p-value of a paired permutation test: each sentence's difference might as well have the other sign.
+
+    Exact for few sentences; with more, the observed signs count as one of the random ones, so that p is never 0.
+
+    Args:
+        differences: what each sentence adds to the difference (sentences,).
+        seed: of the random signs.
+
+    Example:
+        >>> sign_flip(np.array([1.0, 2.0, 3.0]))  # the two most extreme of eight
+        0.25
+    """
+    count = len(differences)
+    observed = abs(differences.sum())
+    # Sums of the same numbers in another order differ in the last digits, and must count as equal.
+    limit = observed - 1e-12 * np.abs(differences).sum()
+    if not count:
+        return 1.0
+    if count <= EXACT:
+        signs = 1 - 2 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
+        return float(np.mean(np.abs(signs @ differences) >= limit))
+    random = np.random.default_rng(seed)
+    extreme = 0
+    for _ in range(FLIPS // BLOCK):
+        signs = random.integers(0, 2, (BLOCK, count)) * 2 - 1
+        extreme += int(np.count_nonzero(np.abs(signs @ differences) >= limit))
+    return (extreme + 1) / (FLIPS + 1)
+
+
+def welch(one: Scores, other: Scores, level: float = 0.95) -> tuple[float | None, Interval | None]:
+    """Welch's t-test between the training runs of two rows, and its interval of the difference.
+
+    A row that was not trained has one value without chance. Where both are such, nothing is by chance of training.
+
+    Returns:
+        p-value and interval; None where a row that was trained has a single run.
+    """
+    from scipy.special import stdtr, stdtrit
+
+    terms = []  # (variance of the mean, degrees of freedom)
+    for scores in (one, other):
+        if scores.fixed:
+            continue
+        if len(scores.runs) < 2:
+            return None, None
+        terms.append((float(scores.runs.var(ddof=1)) / len(scores.runs), len(scores.runs) - 1))
+    gap = one.mean - other.mean
+    variance = sum(term for term, _ in terms)
+    if variance == 0:
+        return (0.0 if gap else 1.0), Interval(gap, gap)
+    freedom = variance**2 / sum(term**2 / count for term, count in terms)
+    deviation = math.sqrt(variance)
+    p = 2 * float(stdtr(freedom, -abs(gap) / deviation))
+    half = float(stdtrit(freedom, (1 + level) / 2)) * deviation
+    return min(p, 1.0), Interval(gap - half, gap + half)
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """Holm's step-down correction (1979): p-values of a family, such that the chance of any false one is bounded.
+
+    Example:
+        >>> holm([0.01, 0.04, 0.03])
+        [0.03, 0.06, 0.06]
+    """
+    order = np.argsort(values, kind="stable")
+    adjusted = [0.0] * len(values)
+    highest = 0.0
+    for place, index in enumerate(order.tolist()):
+        highest = max(highest, min(1.0, (len(values) - place) * values[index]))
+        adjusted[index] = highest
+    return adjusted
+
+
+def compared(
+    rows: Mapping[str, Scores], baseline: str, bootstrap: Bootstrap
+) -> dict[str, tuple[Difference, float | None]]:
+    """Every row against one, with p-values corrected for the number of rows: one family for each score and split."""
+    found = {name: difference(scores, rows[baseline], bootstrap) for name, scores in rows.items() if name != baseline}
+    known = {name: each.p for name, each in found.items() if each.p is not None}
+    adjusted = dict(zip(known, holm(list(known.values())), strict=True))
+    return {name: (each, adjusted.get(name)) for name, each in found.items()}
+
+
+def marked(rows: Mapping[str, Scores], better: str | None, bootstrap: Bootstrap) -> dict[str, str]:
+    """Which rows are ``best`` and ``second``, each only where its difference from every row behind it is significant.
+
+    Args:
+        rows: scores by row, without the reference rows.
+        better: ``lower`` or ``higher``; with another value nothing is marked, since no direction is the better one.
+        bootstrap: its level decides what is significant.
+    """
+    if better not in ("lower", "higher") or len(rows) < 2:
+        return {}
+    sign = 1 if better == "lower" else -1
+    order = sorted(rows, key=lambda name: (sign * rows[name].mean, name))
+    marks: dict[str, str] = {}
+    for place, mark in enumerate(("best", "second")):
+        behind = order[place + 1 :]
+        if not behind:
+            break
+        leader = rows[order[place]]
+        values = [difference(leader, rows[name], bootstrap).p for name in behind]
+        known = [value for value in values if value is not None]
+        if len(known) < len(values) or max(holm(known)) >= 1 - bootstrap.level:
+            break
+        marks[order[place]] = mark
+    return marks
+

@@ -1,0 +1,396 @@
+"""The tables of a benchmark, from the results of its cells: one for each corpus and test split."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from facediff.benchmark.published import Shown, shown_tables
+from facediff.benchmark.results import Result
+from facediff.benchmark.statistics import Difference, Scores, compared, marked
+from facediff.evaluation.report import Bootstrap, Interval
+from facediff.utils import ranges
+
+REFERENCE_LABELS = {
+    "still": "still face",
+    "mean_face": "speaker's mean face",
+    "shuffled": "{row}, shuffled speech",
+}
+SPLIT_LABELS = {"test_a": "test A, seen speakers", "test_b": "test B, unseen speakers"}
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What a report needs of the plan, as plain data in the benchmark's folder.
+
+    Attributes:
+        name: of the plan.
+        title: of the tables.
+        description: what they are of.
+        protocol: by which all was scored.
+        columns: scores that are shown; all if empty.
+        baseline: the row that others are compared with; the first if empty.
+        references: rows that were not trained.
+        rows: label, and name in papers' tables, by row.
+        corpora: label by corpus.
+        published: names of papers' tables.
+        cells: files of results by row and corpus, in the order of the plan.
+        command: that made it.
+    """
+
+    name: str
+    title: str
+    description: str
+    protocol: str
+    columns: tuple[str, ...]
+    baseline: str
+    references: tuple[str, ...]
+    rows: Mapping[str, tuple[str, str]]
+    corpora: Mapping[str, str]
+    published: tuple[str, ...]
+    cells: tuple[str, ...]
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a row costs, mean over its runs."""
+
+    parameters: int | None = None
+    factor: float | None = None  # real-time factor: seconds of computing for a second of speech
+    training: float | None = None  # seconds
+    memory: float | None = None  # bytes, the most of any step
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A row of a table.
+
+    Attributes:
+        name: by which the plan calls it.
+        label: by which the table calls it.
+        seeds: of its training runs.
+        reference: whether it is none of the compared methods.
+        scores: by column.
+        intervals: over sentences, by column.
+        marks: ``best`` or ``second``, by column.
+        differences: from the baseline, with the corrected p-value, by column.
+        cost: speed and size.
+        clips: sentences that it was scored on.
+        failed: problems of its cells that failed.
+    """
+
+    name: str
+    label: str
+    seeds: tuple[int | None, ...]
+    reference: bool
+    scores: Mapping[str, Scores]
+    intervals: Mapping[str, Interval | None]
+    marks: Mapping[str, str] = field(default_factory=dict)
+    differences: Mapping[str, tuple[Difference, float | None]] = field(default_factory=dict)
+    cost: Cost = Cost()
+    clips: int = 0
+    failed: tuple[str, ...] = ()
+
+    def significant(self, column: str, level: float) -> bool:
+        """Whether the difference from the baseline is larger than both sorts of chance explain."""
+        adjusted = self.differences[column][1] if column in self.differences else None
+        return adjusted is not None and adjusted < 1 - level
+
+
+@dataclass(frozen=True)
+class Table:
+    """One corpus, one test split."""
+
+    corpus: str
+    label: str
+    split: str
+    synthetic: bool
+    columns: Mapping[str, str | None]  # score to ``lower``, ``higher``, ``zero`` or None
+    rows: list[TableRow]
+    baseline: str
+    frames: int
+    sequences: int
+    regions: Mapping[str, Any]
+    notes: list[str]
+    published: Shown
+
+    @property
+    def title(self) -> str:
+        """Corpus and split in words."""
+        return f"{self.label}, {SPLIT_LABELS.get(self.split, self.split)}"
+
+    def row(self, name: str) -> TableRow:
+        """A row by its name."""
+        return next(row for row in self.rows if row.name == name)
+
+
+@dataclass(frozen=True)
+class BenchmarkReport:
+    """All tables of a benchmark, with how sure they are, and of what."""
+
+    outline: Outline
+    tables: list[Table]
+    bootstrap: Bootstrap
+    definition: str
+    results: list[Result]
+    missing: list[str]  # cells without a result
+    failed: list[str]  # why cells failed
+    remarks: list[str]
+
+
+def report_of(
+    outline: Outline,
+    results: Sequence[Result],
+    missing: Sequence[str] = (),
+    *,
+    baseline: str | None = None,
+    resamples: ranges.Resamples = 2000,
+    level: ranges.Level = 0.95,
+    seed: ranges.Seed = 0,
+) -> BenchmarkReport:
+    """Make the tables.
+
+    Args:
+        outline: of the plan.
+        results: of its cells.
+        missing: cells that have no result yet.
+        baseline: the row that all others are compared with, instead of the plan's.
+        resamples: of the bootstrap over sentences.
+        level: of intervals, and 1 − the level of significance.
+        seed: of resamples and permutations.
+    """
+    bootstrap = Bootstrap(resamples, level, seed)
+    done = [result for result in results if not result.problem]
+    failed = [result.problem for result in results if result.problem]
+    tables = []
+    for corpus in outline.corpora:
+        of_corpus = [result for result in done if result.corpus == corpus]
+        splits = dict.fromkeys(str(row["split"]) for result in of_corpus for row in result.scores)
+        tables += [_table(outline, of_corpus, results, corpus, split, baseline, bootstrap) for split in splits]
+    definition = "\n".join(dict.fromkeys(line for result in done for line in result.definition.splitlines()))
+    return BenchmarkReport(
+        outline, tables, bootstrap, definition, list(results), list(missing), failed, _remarks(done)
+    )
+
+
+def _remarks(results: Sequence[Result]) -> list[str]:
+    """What makes cells of one benchmark differ that should not."""
+    found = []
+    for what, values in (
+        ("versions of the code", {(" ".join(result.code.values())) for result in results}),
+        ("machines", {str(result.machine.get("gpu") or result.machine.get("processor")) for result in results}),
+        ("threads", {str(result.machine.get("threads")) for result in results}),
+    ):
+        if len(values) > 1:
+            found.append(f"the cells are of several {what}: {', '.join(sorted(values))}")
+    return found
+
+
+def _table(
+    outline: Outline,
+    results: Sequence[Result],
+    everything: Sequence[Result],
+    corpus: str,
+    split: str,
+    baseline: str | None,
+    bootstrap: Bootstrap,
+) -> Table:
+    groups = {name: [result for result in results if result.row == name] for name in outline.rows}
+    groups = {name: group for name, group in groups.items() if any(_row_of(each, split, "model") for each in group)}
+    first = next(iter(groups.values()))[0]
+    columns = _columns(outline, [result for group in groups.values() for result in group], split)
+    chosen = next((name for name in (baseline, outline.baseline) if name in groups), next(iter(groups)))
+    rows = []
+    for name, group in groups.items():
+        label = outline.rows[name][0]
+        failures = tuple(each.problem for each in everything if each.problem and (each.row, each.corpus) == (name, corpus))
+        rows.append(_row(name, label, group, split, "model", columns, bootstrap, failed=failures))
+    for reference in outline.references:
+        # A face that does not move is the same in every run; shuffled speech is the baseline's.
+        group = groups[chosen] if reference == "shuffled" else [
+            result for result in results if _row_of(result, split, reference)
+        ][:1]
+        if any(_row_of(each, split, reference) for each in group):
+            label = REFERENCE_LABELS[reference].format(row=outline.rows[chosen][0])
+            rows.append(_row(reference, label, group, split, reference, columns, bootstrap))
+    rows = _with_comparisons(rows, columns, chosen, bootstrap)
+    scored = _row_of(first, split, "model") or {}
+    clips = {clip for row in rows for scores in row.scores.values() for clip in scores.clips}
+    regions = dict(scored.get("regions") or {})
+    frames = sum(_frames(group, split) for group in [groups[chosen]])
+    manifests = {str(each.provenance.get("manifest")) for each in results if each.provenance}
+    published = shown_tables(
+        outline.published,
+        rows={name: outline.rows[name][1] for name in groups},
+        corpus=str(first.provenance.get("corpus") or corpus),
+        synthetic=first.synthetic,
+        split=split,
+        protocol=first.protocol,
+        lips=dict(regions.get("lips") or {}),
+        frames=frames,
+        sequences=len(clips),
+    )
+    return Table(
+        corpus=corpus,
+        label=outline.corpora[corpus],
+        split=split,
+        synthetic=any(each.synthetic for each in results),
+        columns={name: each.get("better") for name, each in columns.items()},
+        rows=rows,
+        baseline=chosen,
+        frames=frames,
+        sequences=len(clips),
+        regions=regions,
+        notes=_notes(rows, columns, len(clips), manifests),
+        published=published,
+    )
+
+
+def _frames(group: Sequence[Result], split: str) -> int:
+    row = _row_of(group[0], split, "model")
+    return 0 if row is None else int(row["frames"])
+
+
+def _row_of(result: Result, split: str, method: str) -> Mapping[str, Any] | None:
+    """What a cell scored of a method on a split."""
+    return next((row for row in result.scores if (row["split"], row["method"]) == (split, method)), None)
+
+
+def _columns(outline: Outline, results: Sequence[Result], split: str) -> dict[str, Mapping[str, str | None]]:
+    """The scores that are shown, in order, and how each is pooled."""
+    known: dict[str, Mapping[str, str | None]] = {}
+    for result in results:
+        for name, each in result.columns.items():
+            row = _row_of(result, split, "model")
+            if row is not None and row.get(name) is not None:
+                known.setdefault(name, each)
+    wanted = [name for name in outline.columns if name in known] or list(known)
+    return {name: known[name] for name in wanted}
+
+
+def _row(
+    name: str,
+    label: str,
+    group: Sequence[Result],
+    split: str,
+    method: str,
+    columns: Mapping[str, Mapping[str, str | None]],
+    bootstrap: Bootstrap,
+    failed: tuple[str, ...] = (),
+) -> TableRow:
+    fixed = method in ("still", "mean_face")
+    runs = [each for each in group if _row_of(each, split, method)]
+    scores = {}
+    for column, facts in columns.items():
+        found = _scores(runs, split, method, column, facts.get("pooling"), fixed=fixed)
+        if found is not None:
+            scores[column] = found
+    intervals = {column: each.interval(bootstrap) for column, each in scores.items()}
+    cost = Cost() if method != "model" else _cost(runs)
+    seeds = tuple(() if fixed else (each.seed for each in runs))
+    clips = max((len(each.clips) for each in scores.values()), default=0)
+    return TableRow(name, label, seeds, method != "model", scores, intervals, cost=cost, clips=clips, failed=failed)
+
+
+def _scores(
+    runs: Sequence[Result], split: str, method: str, column: str, pooling: str | None, *, fixed: bool
+) -> Scores | None:
+    totals = [(_row_of(each, split, method) or {}).get(column) for each in runs]
+    known = [value for value in totals if value is not None]
+    if not known or len(known) < len(totals):
+        return None
+    of_runs: list[dict[str, list[tuple[float, float]]]] = []
+    for each in runs:
+        clips: dict[str, list[tuple[float, float]]] = {}
+        for row in each.sequences:
+            if (row["split"], row["method"]) == (split, method) and row.get(column) is not None:
+                clips.setdefault(str(row["clip"]), []).append((float(row[column]), float(row["frames"])))
+        of_runs.append(clips)
+    names = tuple(sorted({clip for clips in of_runs for clip in clips}))
+    if pooling is None or not names:
+        return Scores(np.array(known, np.float64), None, np.ones(0), (), fixed)
+    # A clip that was scored under several identities is one sentence: the mean of them.
+    values = np.array(
+        [[np.mean([value for value, _ in clips[name]]) if name in clips else np.nan for name in names] for clips in of_runs]
+    )
+    frames = {name: clips[name][0][1] for clips in of_runs for name in clips}
+    weights = np.array([frames[name] if pooling == "frames" else 1.0 for name in names])
+    return Scores(np.array(known, np.float64), values, weights, names, fixed)
+
+
+def _cost(runs: Sequence[Result]) -> Cost:
+    def mean(values: Sequence[float | None]) -> float | None:
+        known = [value for value in values if value is not None]
+        return sum(known) / len(known) if known else None
+
+    parameters = next((each.parameters for each in runs if each.parameters is not None), None)
+    return Cost(
+        parameters,
+        mean([each.real_time_factor() for each in runs]),
+        mean([each.training_seconds for each in runs]),
+        max((each.memory for each in runs if each.memory is not None), default=None),
+    )
+
+
+def _with_comparisons(
+    rows: Sequence[TableRow],
+    columns: Mapping[str, Mapping[str, str | None]],
+    baseline: str,
+    bootstrap: Bootstrap,
+) -> list[TableRow]:
+    marks: dict[str, dict[str, str]] = {}
+    differences: dict[str, dict[str, tuple[Difference, float | None]]] = {}
+    for column, facts in columns.items():
+        all_rows = {row.name: row.scores[column] for row in rows if column in row.scores}
+        own = {row.name: row.scores[column] for row in rows if column in row.scores and not row.reference}
+        for name, mark in marked(own, facts.get("better"), bootstrap).items():
+            marks.setdefault(name, {})[column] = mark
+        if baseline in all_rows:
+            for name, each in compared(all_rows, baseline, bootstrap).items():
+                differences.setdefault(name, {})[column] = each
+    return [
+        TableRow(
+            **{
+                **vars(row),
+                "marks": marks.get(row.name, {}),
+                "differences": differences.get(row.name, {}),
+            }
+        )
+        for row in rows
+    ]
+
+
+def _notes(
+    rows: Sequence[TableRow],
+    columns: Mapping[str, Mapping[str, str | None]],
+    clips: int,
+    manifests: set[str],
+) -> list[str]:
+    """What a reader of the table has to know."""
+    notes = []
+    own = [row for row in rows if not row.reference]
+    single = [row.label for row in own if len(row.seeds) == 1]
+    if single:
+        notes.append(
+            f"of one training run only, so that nothing is known of the chance between runs, and no difference from it "
+            f"is called significant: {', '.join(single)}"
+        )
+    fewer = [f"{row.label} ({row.clips} of {clips})" for row in rows if row.clips < clips]
+    if fewer:
+        notes.append(f"not scored on all sentences; compare differences, not scores: {', '.join(fewer)}")
+    notes += [f"{row.label}: a cell failed: {problem}" for row in rows for problem in row.failed]
+    for column, facts in columns.items():
+        sign = {"lower": 1, "higher": -1}.get(str(facts.get("better")))
+        scored = [row for row in own if column in row.scores]
+        for row in rows if sign is not None and scored else ():
+            if row.reference and column in row.scores:
+                best = min(sign * each.scores[column].mean for each in scored)
+                if sign * row.scores[column].mean < best:
+                    notes.append(f"by {column}, no method is better than this reference: {row.label}")
+    if len(manifests) > 1:
+        notes.append("the cells were run on different states of the corpus: their manifests differ")
+    return notes
