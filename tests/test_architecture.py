@@ -34,6 +34,7 @@ ALLOWED: dict[str, set[str]] = {
     "callbacks": {"version", "models", "data", "metrics", "mesh", "render", *BASE},
     "export": {"animation", "editing", "render", "mesh", *BASE},
     "evaluation": {"data", "metrics", "mesh", "render", *BASE},
+    "benchmark": {"version", "evaluation", "metrics", *BASE},
     "pipelines": {"version", "models", "data", "editing", "export", "animation", "mesh", *BASE},
 }
 ALLOWED["cli"] = set(ALLOWED) - {"__main__"}

@@ -1,8 +1,8 @@
 """The cells of a plan: every row on every corpus with every seed, and what decides the result of each.
 
-Two cells whose recipes are equal have equal results, so the recipe's hash is the cell's name on the disk. A changed plan,
-a changed config that it names, a changed checkpoint or a changed corpus thus makes new cells of those that it concerns,
-and finds the results of all others.
+Two cells whose recipes are equal have equal results, so the recipe's hash is the cell's name on the disk. A changed
+plan, a changed config that it names, a changed checkpoint or a changed corpus thus makes new cells of those that it
+concerns, and finds the results of all others.
 """
 
 from __future__ import annotations
@@ -16,12 +16,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
 from facediff.benchmark.plan import MOST_CELLS, Before, CorpusEntry, MethodEntry, Options, Plan, Variant, find_config
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.files import describe_files, sha256, short_name
-from facediff.utils.limits import brief
+from facediff.utils.yaml_files import load_yaml
 
 Kind = Literal["fit", "checkpoint", "predictions"]
 
@@ -41,7 +39,7 @@ class Training:
     options: Options
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cell:
     """One training run of one row on one corpus, or one set of predictions.
 
@@ -202,12 +200,13 @@ def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
         return
     kind: Kind = "checkpoint" if method.checkpoint is not None else "predictions"
     text = method.checkpoint or method.predictions or ""
-    for seed in seeds if "{seed}" in text else [None]:
+    wanted: list[int | None] = [*seeds] if "{seed}" in text else [None]
+    for seed in wanted:
         source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(seed)))
         if kind == "predictions" and corpus.data is None:
             raise FaceDiffError(
-                f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name its "
-                f"config, such as configs/data/biwi.yaml, for the clips of its test splits"
+                f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name "
+                f"its config, such as configs/data/biwi.yaml, for the clips of its test splits"
             )
         recipe = {**shared, "kind": kind, "source": _content(source), "test": scoring, "options": dict(method.options)}
         yield Cell(
@@ -276,10 +275,7 @@ def config_content(path: Path) -> object:
 def _expanded(path: Path, outer: tuple[Path, ...]) -> object:
     if path in outer or len(outer) > 20:
         raise FaceDiffError(f"{path}: names itself; expected a config that ends")
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise FaceDiffError(f"{path}: is not readable as YAML ({brief(error)}); correct the file") from error
+    content = load_yaml(path, "expected a config such as configs/experiment/puppet.yaml")
 
     def expand(value: object) -> object:
         if isinstance(value, dict):

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.files import config_dir
-from facediff.utils.limits import brief, quoted
+from facediff.utils.limits import quoted
+from facediff.utils.yaml_files import load_yaml
 
 Weights = Literal["last", "best"]
 Options = Mapping[str, Any]
@@ -272,11 +271,7 @@ def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> Plan:
     Raises:
         FaceDiffError: naming the key that is wrong, and what was expected.
     """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise FaceDiffError(f"{path}: is not readable as YAML ({brief(error)}); correct the file") from error
-    return plan_of(content, path, roots or {})
+    return plan_of(load_yaml(path, "expected a plan such as configs/benchmark/quick.yaml"), path, roots or {})
 
 
 def plan_of(content: object, path: Path, roots: Mapping[str, Path]) -> Plan:
@@ -336,9 +331,7 @@ def _corpus(name: str, section: Section, roots: Mapping[str, Path], path: Path) 
     data, root = section.optional("data"), section.optional("root")
     folder = roots.get(name) or (None if root is None else _beside(path, root))
     if folder is not None and not folder.is_dir():
-        raise FaceDiffError(
-            f"{folder}: no such folder; expected the corpus {name}, give it with --root {name}=FOLDER"
-        )
+        raise FaceDiffError(f"{folder}: no such folder; expected the corpus {name}, give it with --root {name}=FOLDER")
     file = None if data is None else find_config(data, f"{section.place}: data", path)
     return CorpusEntry(name, section.text("label", name), file, folder, section.options("options"))
 
@@ -390,8 +383,10 @@ def _per_seed(method: MethodEntry) -> bool:
 def _beside(plan: Path, text: str) -> Path:
     """A path of the plan: from the working folder, or else from the plan's own."""
     path = Path(text).expanduser()
-    return path if path.is_absolute() or path.exists() else next(
-        (found for found in [plan.parent / path] if found.exists()), path
+    return (
+        path
+        if path.is_absolute() or path.exists()
+        else next((found for found in [plan.parent / path] if found.exists()), path)
     )
 
 

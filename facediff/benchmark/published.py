@@ -12,9 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from facediff.errors import FaceDiffError, choices
+from facediff.utils.yaml_files import load_yaml
 
 FILE = Path(__file__).with_name("published.yaml")
 
@@ -66,7 +65,7 @@ class Shown:
 @cache
 def published() -> dict[str, Published]:
     """All tables of papers that are known, by name."""
-    content: dict[str, dict[str, Any]] = yaml.safe_load(FILE.read_text(encoding="utf-8"))
+    content: dict[str, dict[str, Any]] = load_yaml(FILE, "it is part of the package; install it again")
     found = {}
     for name, table in content.items():
         rows = {row: {key: float(value) for key, value in scores.items()} for row, scores in table["rows"].items()}

@@ -47,8 +47,8 @@ class Result:
         machine: what computed.
         measured: seconds and bytes of memory of each step.
         columns: how each score is pooled, and which way it is better.
-        scores: a row for each split and method (``model``, ``still``, ``mean_face``, ``shuffled``), with regions, frames
-            and sequences.
+        scores: a row for each split and method (``model``, ``still``, ``mean_face``, ``shuffled``), with regions,
+            frames and sequences.
         sequences: a row for each split, method and clip.
         curve: lists by name: steps, seconds, and scores of validation.
     """
@@ -171,7 +171,9 @@ def read_result(path: Path) -> Result | None:
 
 
 _KINDS: dict[str, type] = {
-    **dict.fromkeys(("row", "corpus", "kind", "key", "config", "problem", "source", "protocol", "definition", "name"), str),
+    **dict.fromkeys(
+        ("row", "corpus", "kind", "key", "config", "problem", "source", "protocol", "definition", "name"), str
+    ),
     **dict.fromkeys(("code", "provenance", "machine", "measured", "columns", "curve"), dict),
     **dict.fromkeys(("scores", "sequences"), list),
     "synthetic": bool,
@@ -244,7 +246,9 @@ def predictions_result(
             who = {"split": split, "method": "model", "clip": each["clip"], "identity": ""}
             sequences.append({**who, "frames": each["frames"], **values})
     if not sequences:
-        raise FaceDiffError(f"{cell.source}: holds no prediction of a test split's clips; expected such as {[*splits][:1]}")
+        raise FaceDiffError(
+            f"{cell.source}: holds no prediction of a test split's clips; expected such as {[*splits][:1]}"
+        )
     scores = []
     for split in dict.fromkeys(splits.values()):
         rows = [row for row in sequences if row["split"] == split]
@@ -307,4 +311,3 @@ def curve_of(path: Path) -> dict[str, list[float | None]]:
     names = [name for name in CURVES if any(name in each for each in found.values())]
     curve: dict[str, list[float | None]] = {name: [found[step].get(name) for step in steps] for name in names}
     return {"step": [*steps], **curve} if steps else {}
-

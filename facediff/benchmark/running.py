@@ -1,7 +1,7 @@
 """Running the cells of a plan: each training and each test in a process of its own, several cells at a time.
 
-What is finished is on the disk whole, and what is not leaves a training that continues where it was stopped, bit for bit.
-So it does not matter when a benchmark is killed, nor how often.
+What is finished is on the disk whole, and what is not leaves a training that continues where it was stopped, bit for
+bit. So it does not matter when a benchmark is killed, nor how often.
 """
 
 from __future__ import annotations
@@ -72,9 +72,7 @@ def pending(cells: Sequence[Cell], folder: Path, *, retry_failed: bool) -> list[
     return found
 
 
-def run_cells(
-    cells: Sequence[Cell], setting: Setting, *, workers: int
-) -> Generator[tuple[Cell, Outcome[Result]]]:
+def run_cells(cells: Sequence[Cell], setting: Setting, *, workers: int) -> Generator[tuple[Cell, Outcome[Result]]]:
     """Run cells, several at a time; each gets its file when it is done, also when it fails.
 
     Yields:

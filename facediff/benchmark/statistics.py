@@ -231,4 +231,3 @@ def marked(rows: Mapping[str, Scores], better: str | None, bootstrap: Bootstrap)
             break
         marks[order[place]] = mark
     return marks
-

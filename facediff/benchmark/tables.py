@@ -172,9 +172,7 @@ def report_of(
         splits = dict.fromkeys(str(row["split"]) for result in of_corpus for row in result.scores)
         tables += [_table(outline, of_corpus, results, corpus, split, baseline, bootstrap) for split in splits]
     definition = "\n".join(dict.fromkeys(line for result in done for line in result.definition.splitlines()))
-    return BenchmarkReport(
-        outline, tables, bootstrap, definition, list(results), list(missing), failed, _remarks(done)
-    )
+    return BenchmarkReport(outline, tables, bootstrap, definition, list(results), list(missing), failed, _remarks(done))
 
 
 def _remarks(results: Sequence[Result]) -> list[str]:
@@ -207,13 +205,17 @@ def _table(
     rows = []
     for name, group in groups.items():
         label = outline.rows[name][0]
-        failures = tuple(each.problem for each in everything if each.problem and (each.row, each.corpus) == (name, corpus))
+        failures = tuple(
+            each.problem for each in everything if each.problem and (each.row, each.corpus) == (name, corpus)
+        )
         rows.append(_row(name, label, group, split, "model", columns, bootstrap, failed=failures))
     for reference in outline.references:
         # A face that does not move is the same in every run; shuffled speech is the baseline's.
-        group = groups[chosen] if reference == "shuffled" else [
-            result for result in results if _row_of(result, split, reference)
-        ][:1]
+        group = (
+            groups[chosen]
+            if reference == "shuffled"
+            else [result for result in results if _row_of(result, split, reference)][:1]
+        )
         if any(_row_of(each, split, reference) for each in group):
             label = REFERENCE_LABELS[reference].format(row=outline.rows[chosen][0])
             rows.append(_row(reference, label, group, split, reference, columns, bootstrap))
@@ -315,7 +317,10 @@ def _scores(
         return Scores(np.array(known, np.float64), None, np.ones(0), (), fixed)
     # A clip that was scored under several identities is one sentence: the mean of them.
     values = np.array(
-        [[np.mean([value for value, _ in clips[name]]) if name in clips else np.nan for name in names] for clips in of_runs]
+        [
+            [np.mean([value for value, _ in clips[name]]) if name in clips else np.nan for name in names]
+            for clips in of_runs
+        ]
     )
     frames = {name: clips[name][0][1] for clips in of_runs for name in clips}
     weights = np.array([frames[name] if pooling == "frames" else 1.0 for name in names])
@@ -386,7 +391,9 @@ def _notes(
     for column, facts in columns.items():
         sign = {"lower": 1, "higher": -1}.get(str(facts.get("better")))
         scored = [row for row in own if column in row.scores]
-        for row in rows if sign is not None and scored else ():
+        if sign is None or not scored:
+            continue
+        for row in rows:
             if row.reference and column in row.scores:
                 best = min(sign * each.scores[column].mean for each in scored)
                 if sign * row.scores[column].mean < best:

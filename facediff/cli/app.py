@@ -44,6 +44,8 @@ COMMANDS = {
     "test": Command("facediff.cli.lightning:lightning", "score a model on the test splits"),
     "predict": Command("facediff.cli.lightning:lightning", "write a model's motion for a split"),
     "evaluate": Command("facediff.cli.evaluate:evaluate", "score anybody's predicted motion files by named protocols"),
+    "benchmark": Command("facediff.cli.benchmark:benchmark", "train and score many methods, and write the tables"),
+    "benchmark report": Command("facediff.cli.benchmark:report", "write the tables of benchmarks again"),
     "yardsticks": Command("facediff.cli.yardsticks:yardsticks", "does a model generate? every score that tells"),
     "figure frames": Command("facediff.cli.figure:frames", "faces of truth and methods at chosen moments"),
     "figure heatmap": Command("facediff.cli.figure:heatmap", "mean and deviation of motion at every vertex"),
@@ -72,8 +74,8 @@ def usage(group: str = "") -> str:
         own = {name: command for name, command in COMMANDS.items() if name.startswith(f"{group} ")}
         rows = {name.partition(" ")[2]: command.help for name, command in own.items()}
     else:
-        firsts = {name.partition(" ")[0]: command.help for name, command in COMMANDS.items()}
-        rows = {**firsts, **GROUPS}
+        rows = {name: command.help for name, command in COMMANDS.items() if name.partition(" ")[0] not in GROUPS}
+        rows |= GROUPS
     program = f"facediff {group}".strip()
     return "\n".join(
         [
@@ -94,6 +96,8 @@ def usage(group: str = "") -> str:
 def find(words: Sequence[str]) -> tuple[str, list[str]]:
     """The command's name, which may have two words, and the rest."""
     first, rest = words[0], list(words[1:])
+    if rest and f"{first} {rest[0]}" in COMMANDS:
+        return f"{first} {rest[0]}", rest[1:]
     if first in COMMANDS:
         return first, rest
     if first not in GROUPS:

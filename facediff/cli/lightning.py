@@ -84,6 +84,26 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
         return run_lightning_cli(name, words, experiment_name(words) or name)
 
 
+def parse_fit(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
+    """Check the words of ``facediff fit`` without running it: names, options and values of model, data and trainer.
+
+    Returns:
+        class and options of the data module.
+
+    Raises:
+        FaceDiffError: as ``facediff fit`` itself.
+    """
+    check_options("fit", arguments)
+    words = change_values(change_values(arguments, find_config), fresh_component)
+    from facediff.cli.lightning_cli import parse_lightning_cli
+
+    for kind in registry.KINDS.values():
+        kind.load()
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    return parse_lightning_cli(words)
+
+
 @contextmanager
 def exit_statuses() -> Iterator[None]:
     """Let what is stopped end as a shell expects it, with 130 on Ctrl-C and 143 on SIGTERM; Lightning has 1 and 0.

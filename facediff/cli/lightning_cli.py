@@ -110,6 +110,42 @@ def run_lightning_cli(name: str, words: Sequence[str], experiment: str) -> FaceD
         sys.argv = argv
 
 
+def parse_lightning_cli(words: Sequence[str]) -> tuple[str, dict[str, Any]]:
+    """Parse the words of ``fit`` and make nothing of them; class and options of the data module.
+
+    Raises:
+        FaceDiffError: in one sentence, where an option, a name or a value is wrong.
+    """
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    guard_configs("omegaconf+")
+    OmegaConf.register_resolver("experiment_name", lambda *, _root_: "benchmark", replace=True)
+    argv, sys.argv = sys.argv, [sys.argv[0], *words]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            parsed = ParsedCLI(
+                AnimationModel,
+                SpeechMotionDataModule,
+                subclass_mode_model=True,
+                subclass_mode_data=True,
+                auto_configure_optimizers=False,
+                parser_class=Parser,
+                parser_kwargs={"parser_mode": "omegaconf+"},
+                save_config_callback=None,
+                experiment="benchmark",
+                run=False,
+            )
+    except Exception as error:
+        ours = next((cause for cause in causes(error) if isinstance(cause, FaceDiffError)), None)
+        if ours is None or ours is error:
+            raise
+        raise ours from error
+    finally:
+        sys.argv = argv
+    data = parsed.config["data"]
+    return str(data["class_path"]), dict(data.get("init_args") or {})
+
+
 def restores(error: BaseException) -> bool:
     """Whether an error comes from restoring a checkpoint: of loops, optimisers, schedules or callbacks."""
     frames = [frame.f_code for frame, _ in walk_tb(error.__traceback__)]
@@ -311,6 +347,19 @@ class FaceDiffCLI(LightningCLI):
 
     def _parse_ckpt_path(self) -> None:
         """Do nothing: upstream would let a checkpoint override the flags; ``words_of_checkpoint`` does the opposite."""
+
+
+class ParsedCLI(FaceDiffCLI):
+    """Parses, and makes nothing of what it has parsed."""
+
+    def before_instantiate_classes(self) -> None:
+        """Leave wandb alone."""
+
+    def instantiate_classes(self) -> None:
+        """Make nothing."""
+
+    def _set_seed(self) -> None:
+        """Leave the random numbers alone."""
 
 
 class RunConfig(SaveConfigCallback):

@@ -1,0 +1,284 @@
+"""``facediff benchmark`` and ``facediff benchmark report``: tables of methods, corpora and seeds from one command."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from facediff.cli.options import OutputFolder, Seed, Workers
+from facediff.cli.parsing import Option
+from facediff.cli.process import tell
+from facediff.errors import FaceDiffError, choices
+from facediff.utils import ranges
+
+if TYPE_CHECKING:
+    from facediff.benchmark import BenchmarkReport, Cell, Plan
+    from facediff.benchmark.running import Setting
+    from facediff.data import SpeechMotionDataModule
+
+RESAMPLES = 2000
+
+
+def benchmark(
+    plan: Annotated[Path, Option(metavar="PLAN", reads=True)],
+    *,
+    output: OutputFolder = Path("benchmarks"),
+    root: Annotated[list[str] | None, Option(metavar="CORPUS=FOLDER", reads=True)] = None,
+    workers: Workers = None,
+    retry_failed: bool = False,
+    dry_run: bool = False,
+) -> int:
+    """Train and score the methods of a plan on its corpora with its seeds, and write the tables.
+
+    PLAN is a YAML file; those that come with facediff are configs/benchmark/quick.yaml and others. Each cell, a method
+    on a corpus with a seed, is trained and tested in processes of its own, several cells at a time. What is done is
+    not done again: after any interruption, the same command continues. A cell that fails stops no other.
+    Exit status: 0 all done, 1 some cells failed, 2 something to put right.
+
+    For example:
+      facediff benchmark configs/benchmark/quick.yaml
+      facediff benchmark configs/benchmark/table1_biwi.yaml --root biwi=BIWI --dry-run
+
+    Args:
+        plan: the plan, see docs/benchmark.md
+        output: folder for benchmarks; each plan gets one of its name below it
+        root: folder of one of the plan's corpora; repeatable
+        workers: cells at a time (default: the plan's, or as many as processors allow)
+        retry_failed: try cells again that failed
+        dry_run: say what would run, and for how long by the last timings
+    """
+    from facediff.benchmark.plan import find_plan, read_plan
+
+    found = read_plan(find_plan(plan), corpus_folders(root or []))
+    from facediff.benchmark.cells import cells_of
+    from facediff.benchmark.outline import outline_of, read_results, write_outline
+    from facediff.benchmark.published import find_published
+    from facediff.benchmark.running import estimate, pending, remember, run_cells
+    from facediff.evaluation.evaluator import find_protocols
+    from facediff.metrics.by_name import parse_all
+    from facediff.utils.files import locked
+    from facediff.utils.jobs import processors
+
+    find_protocols([found.protocol])
+    parse_all(found.metrics)
+    find_published(found.published)
+    cells = cells_of(found)
+    folder = output / found.name
+    left = pending(cells, folder, retry_failed=retry_failed)
+    count = workers or found.workers or max(1, processors() // found.threads)
+    setting = check_cells(found, cells, left, folder, dry_run=dry_run)
+    seconds = estimate(left, folder)
+    announce(found, cells, left, seconds, count)
+    if dry_run:
+        return 0
+    command = shlex.join(["facediff", "benchmark", str(plan), *[w for each in root or [] for w in ("--root", each)]])
+    failed = 0
+    with locked(folder / "benchmark.lock", "facediff benchmark"):
+        outline = outline_of(found, cells, command)
+        write_outline(folder, outline)
+        with closing(run_cells(left, setting, workers=count)) as outcomes:
+            for number, (cell, outcome) in enumerate(outcomes, 1):
+                failed += bool(outcome.problem)
+                what = outcome.problem or f"{cell}: {outcome.seconds:.0f} s"
+                tell(f"[{number}/{len(left)}] {what}")
+                if outcome.result is not None:
+                    remember(cell, outcome.result)
+        results, _ = read_results(folder, outline)
+        old = sum(1 for result in results if result.problem) - failed
+        if old:
+            tell(f"{old} cells had failed before; --retry-failed tries them again")
+        if all(result.problem for result in results):
+            raise FaceDiffError(f"every cell failed, the first: {next(result.problem for result in results)}")
+        write_and_tell(folder, None, RESAMPLES, 0.95, 0)
+    return 1 if failed or old else 0
+
+
+def report(
+    folders: Annotated[list[Path], Option(metavar="FOLDER", reads=True)],
+    *,
+    baseline: Annotated[str | None, Option(metavar="ROW")] = None,
+    bootstrap: Annotated[ranges.Resamples, Option(metavar="N")] = RESAMPLES,
+    level: Annotated[ranges.Level, Option(metavar="P")] = 0.95,
+    seed: Seed = 0,
+    page: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
+) -> None:
+    """Write the tables of benchmarks again: Markdown, LaTeX, CSV, a page for the browser, and plots.
+
+    They are in report/ of each folder. Nothing is trained or tested; cells that are not done yet are named.
+
+    For example:
+      facediff benchmark report benchmarks/quick
+      facediff benchmark report benchmarks/puppet_table1 benchmarks/puppet_table3 --page docs/benchmark.md
+
+    Args:
+        folders: folders of benchmarks, such as benchmarks/quick
+        baseline: the row that all others are compared with (default: the plan's)
+        bootstrap: resamples of the sentences for intervals; 0: none
+        level: of the intervals; a corrected p below 1 - level is significant
+        seed: of resamples and permutations
+        page: a Markdown page whose marked blocks get the tables of the plans that they name
+    """
+    from facediff.benchmark.outline import read_outline
+
+    if page is not None and not page.is_file():
+        raise FaceDiffError(f"--page {page}: no such file; expected a Markdown page with marked blocks")
+    for folder in folders:
+        rows = read_outline(folder).rows
+        if baseline is not None and baseline not in rows:
+            raise FaceDiffError(f"--baseline {baseline}: {folder} has no such row: {choices(baseline, rows)}")
+    for folder in folders:
+        found = write_and_tell(folder, baseline, bootstrap, level, seed)
+        if page is not None:
+            from facediff.benchmark.writing import replace_block
+
+            replace_block(page, found)
+            tell(f"written: {page}")
+
+
+def corpus_folders(words: Sequence[str]) -> dict[str, Path]:
+    """Folders of corpora, from words CORPUS=FOLDER."""
+    found: dict[str, Path] = {}
+    for word in words:
+        name, equals, folder = word.partition("=")
+        if not equals or not name or not folder:
+            raise FaceDiffError(f"--root {word}: expected CORPUS=FOLDER, such as biwi=BIWI")
+        if name in found:
+            raise FaceDiffError(f"--root {word}: the corpus {name} has a folder already; give one")
+        found[name] = Path(folder)
+    return found
+
+
+def announce(
+    plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], seconds: Mapping[Cell, float | None], workers: int
+) -> None:
+    """Say what will run, and for how long."""
+    from facediff.utils.tables import format_table
+
+    tell(f"{plan.title}: {len(cells)} cells, {len(cells) - len(left)} done, {len(left)} to run, {workers} at a time")
+    if not left:
+        return
+    rows = [[str(cell), cell.kind, None if seconds[cell] is None else f"{seconds[cell]:.0f} s"] for cell in left]
+    tell(*format_table(["to run", "", "last time"], rows, left=2).split("\n"))
+    known = [value for value in seconds.values() if value is not None]
+    missing = len(left) - len(known)
+    if known:
+        # With one worker the times add up; several share them, and the longest cell is the least that it takes.
+        total = max(sum(known) / workers, max(known))
+        unknown = f", and {missing} cells that were never timed" if missing else ""
+        tell(f"about {total / 60:.0f} minutes by the last timings{unknown}")
+    else:
+        tell("no cell of these was ever timed here")
+
+
+def write_and_tell(folder: Path, baseline: str | None, resamples: int, level: float, seed: int) -> BenchmarkReport:
+    """Make a report from the results on the disk, write it and print it."""
+    from facediff.benchmark.outline import read_outline, read_results
+    from facediff.benchmark.tables import report_of
+    from facediff.benchmark.writing import text, write_report
+
+    outline = read_outline(folder)
+    results, missing = read_results(folder, outline)
+    found = report_of(outline, results, missing, baseline=baseline, resamples=resamples, level=level, seed=seed)
+    files = write_report(found, folder / "report")
+    tell(*text(found).split("\n"), *(f"written: {path}" for path in files))
+    return found
+
+
+# What can be found out before anything runs.
+
+
+def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder: Path, *, dry_run: bool) -> Setting:
+    """Parse every command that will be run, find every corpus, and make the built-in one; what all cells share.
+
+    Raises:
+        FaceDiffError: naming the row, with what its command would have reported.
+    """
+    from facediff.benchmark.running import Setting, fit_options, option_words
+    from facediff.cli.lightning import parse_fit
+
+    setting = Setting(folder, plan.protocol, plan.metrics, plan.weights, plan.threads)
+    seen: set[str] = set()
+    prepared: dict[str, SpeechMotionDataModule] = {}
+    clips: dict[str, dict[str, str]] = {}
+    truths: dict[str, tuple[str, ...]] = {}
+    for cell in left:
+        for training in cell.trainings:
+            made = {each.name: Path(f"{each.name}.ckpt") for each in cell.trainings}
+            options = fit_options(training, {}, cell)
+            unknown = [step for step in made if f"{{{step}}}" in map(str, options.values())]
+            options = {name: value for name, value in options.items() if value not in [f"{{{s}}}" for s in unknown]}
+            words = ["--config", str(training.config), *option_words({**options, "seed_everything": 0})]
+            mark = " ".join(words)
+            if mark in seen:
+                continue
+            seen.add(mark)
+            try:
+                class_path, arguments = parse_fit(words)
+                data_of(prepared, class_path, arguments, make=not dry_run)
+            except FaceDiffError as error:
+                raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
+        if cell.kind == "predictions" and cell.corpus not in truths and cell.data is not None:
+            try:
+                class_path, arguments = read_data(cell.data)
+                arguments |= {} if cell.root is None else {"root": str(cell.root)}
+                data = data_of(prepared, class_path, arguments, make=not dry_run)
+                if not (dry_run and not data.root.is_dir()):
+                    truths[cell.corpus], clips[cell.corpus] = truth_words(data), test_clips(data)
+            except FaceDiffError as error:
+                raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
+    return replace(setting, clips=clips, truths=truths)
+
+
+def read_data(path: Path) -> tuple[str, dict[str, Any]]:
+    """Class and options of a data module's config."""
+    from facediff.utils.yaml_files import load_yaml
+
+    content = load_yaml(path, "expected a config such as configs/data/biwi.yaml")
+    return str(content.get("class_path")), dict(content.get("init_args") or {})
+
+
+def data_of(
+    known: dict[str, SpeechMotionDataModule], class_path: str, arguments: Mapping[str, Any], *, make: bool
+) -> SpeechMotionDataModule:
+    """The data module of a config, each once; the built-in corpus is made, any other must be there.
+
+    Raises:
+        FaceDiffError: if the corpus is missing.
+    """
+    from facediff.cli.data import find_own_module
+    from facediff.data.check.layouts import by_name
+
+    mark = f"{class_path} {sorted((key, str(value)) for key, value in arguments.items())}"
+    if mark in known:
+        return known[mark]
+    if "." in class_path and not class_path.startswith("facediff."):
+        find_own_module(class_path)
+    module = by_name(class_path if not class_path.startswith("facediff.data.") else class_path.rpartition(".")[2], None)
+    if "root" not in arguments and module.__name__ != "Puppet":
+        raise FaceDiffError(
+            f"the corpus {module.corpus_name} has no folder; give it with --root {module.corpus_name}=FOLDER"
+        )
+    data = module(**dict(arguments))
+    if make:
+        data.prepare_data()
+    if not data.root.is_dir() and (make or module.__name__ != "Puppet"):
+        raise FaceDiffError(
+            f"{data.root}: no such folder; expected the corpus {module.corpus_name}. {data.obtain}".strip()
+        )
+    known[mark] = data
+    return data
+
+
+def truth_words(data: SpeechMotionDataModule) -> tuple[str, ...]:
+    """How `facediff evaluate` is told of a corpus's truth."""
+    stride = round(data.stored_frame_rate / data.frame_rate) if data.stored_frame_rate else 1
+    return (str(data.root), *(["--truth-stride", str(stride)] if stride > 1 else []))
+
+
+def test_clips(data: SpeechMotionDataModule) -> dict[str, str]:
+    """The split of each test clip."""
+    return {clip.name: split for split in data.test_splits for clip in data.clips(split)}
