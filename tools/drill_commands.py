@@ -163,6 +163,13 @@ DRILLS = [
         "ours corpus --bootstrap 10 --workers 1 --quiet --json a.json --csv a.csv",
         pieces=True,
     ),
+    Drill("benchmark", "plan.yaml -o out", also="ours corpus tiny.yaml", pieces=True),
+    Drill(
+        "benchmark report",
+        "benchmark --bootstrap 20 --baseline method_0",
+        "benchmark --bootstrap 10 --baseline method_1",
+        pieces=True,
+    ),
     Drill(
         "yardsticks",
         f"model.ckpt --corpus {TINY} --data-root corpus --samples 2 --references 1 --max-clips 1 --quiet --json a.json",
@@ -200,6 +207,7 @@ def write_inputs(folder: Path, run: object) -> None:
 
     from facediff.animation import Animation, write_archive
     from tests.fakes import biwi, flame, mead3d, person, published, vocaset
+    from tests.fakes.benchmark import write_benchmark
     from tests.fakes.tiny import write_tiny
 
     assert callable(run)
@@ -259,6 +267,7 @@ def write_inputs(folder: Path, run: object) -> None:
     (folder / "FLAME_masks.pkl").write_bytes(masks)
 
     published.write_author_files(folder)
+    write_benchmark(folder)
 
     person.write_auxiliary(folder / "persons")
     person.write_speech(folder / "person.wav", person.FRAMES / person.RATE)

@@ -201,8 +201,8 @@ def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
     kind: Kind = "checkpoint" if method.checkpoint is not None else "predictions"
     text = method.checkpoint or method.predictions or ""
     wanted: list[int | None] = [*seeds] if "{seed}" in text else [None]
-    for seed in wanted:
-        source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(seed)))
+    for given in wanted:
+        source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(given)))
         if kind == "predictions" and corpus.data is None:
             raise FaceDiffError(
                 f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name "
@@ -210,7 +210,7 @@ def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
             )
         recipe = {**shared, "kind": kind, "source": _content(source), "test": scoring, "options": dict(method.options)}
         yield Cell(
-            *(row.name, corpus.name, seed, kind),
+            *(row.name, corpus.name, given, kind),
             source=source,
             options=method.options,
             test_options=scoring["options"],  # type: ignore[arg-type]

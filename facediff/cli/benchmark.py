@@ -220,6 +220,9 @@ def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder:
                 class_path, arguments = parse_fit(words)
                 data_of(prepared, class_path, arguments, make=not dry_run)
             except FaceDiffError as error:
+                if "--data.root must be given" in str(error):
+                    remedy = f"give it with --root {cell.corpus}=FOLDER; docs/data.md says how to obtain it"
+                    raise FaceDiffError(f"{plan.file}: the corpus {cell.corpus} has no folder; {remedy}") from error
                 raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
         if cell.kind == "predictions" and cell.corpus not in truths and cell.data is not None:
             try:

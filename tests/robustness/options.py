@@ -68,6 +68,8 @@ BASES: dict[str, str] = {
     "retarget": "WORLD/clicks.npz --target-mesh WORLD/face.obj -o out.npz",
     "yardsticks": "WORLD/model.ckpt --corpus tests.fakes.tiny.Tiny --samples 2 --references 1 --max-clips 1 --quiet",
     "evaluate": "WORLD/ours WORLD/corpus --bootstrap 10 --workers 1 --quiet",
+    "benchmark": "WORLD/plan.yaml -o benchmarks --dry-run",
+    "benchmark report": "WORLD/benchmark --bootstrap 20",
     "figure frames": f"{DRAWN} --times 0.1",
     "figure heatmap": DRAWN,
     "figure error": DRAWN,
@@ -93,6 +95,7 @@ def build_world(folder: Path) -> Path:
     import trimesh
 
     from facediff.animation import write_archive
+    from tests.fakes.benchmark import write_benchmark
     from tests.fakes.clicks import clicks
     from tests.fakes.person import person, write_auxiliary, write_speech
     from tests.fakes.published import write_author_files
@@ -125,6 +128,7 @@ def build_world(folder: Path) -> Path:
     (folder / "text.txt").write_text("no file of any format\n")
     write_checkpoint(folder / "model.ckpt", corpus)
     write_author_files(folder)
+    write_benchmark(folder)
     return folder
 
 

@@ -123,6 +123,52 @@ def read_plan(path: Path) -> object:
     return load_yaml(path, "expected a plan")
 
 
+def benchmark_plan(path: Path) -> None:
+    from facediff.benchmark.outline import write_outline
+    from tests.fakes.benchmark import outline
+
+    write_outline(path.parent, outline())
+    (path.parent / "plan.json").rename(path)
+
+
+def read_a_benchmark_plan(path: Path) -> object:
+    from facediff.benchmark.outline import read_outline
+
+    if path.is_file():
+        shutil.copy(path, path.with_name("plan.json"))
+    return read_outline(path.parent)
+
+
+def benchmark_cell(path: Path) -> None:
+    from tests.fakes.benchmark import results
+
+    (found,) = results(rows=1, seeds=1, clips=2)
+    found.write(path.parent).rename(path)
+
+
+def read_a_benchmark_cell(path: Path) -> object:
+    from facediff.benchmark import read_result, report_of
+    from tests.fakes.benchmark import outline
+
+    found = read_result(path)
+    return None if found is None else report_of(outline(rows=1), [found], resamples=10)
+
+
+def provenance(path: Path) -> None:
+    from facediff.utils.plain_files import write_json
+    from facediff.utils.provenance import Provenance
+
+    write_json(path, Provenance("FaceFormer", {"audio_encoder": "mel"}, "recipe", 3, 10, "hash").as_dict())
+
+
+def read_a_provenance(path: Path) -> object:
+    from facediff.utils.provenance import read_provenance
+
+    if path.is_file():
+        shutil.copy(path, path.with_name("provenance.json"))
+    return read_provenance(path.parent)
+
+
 # Speech
 
 
@@ -680,6 +726,9 @@ def _output_to(stream: object) -> object:
 
 READERS = {
     "plan": Reader(".yaml", plan, read_plan),
+    "benchmark, plan": Reader(".json", benchmark_plan, read_a_benchmark_plan),
+    "benchmark, cell": Reader(".json", benchmark_cell, read_a_benchmark_cell),
+    "provenance": Reader(".json", provenance, read_a_provenance),
     **{suffix: Reader(f".{suffix}", sound, read_sound) for suffix in ("wav", "flac", "ogg", "opus", "mp3", "aiff")},
     "wav, a part": Reader(".wav", sound, read_a_stretch),
     **{

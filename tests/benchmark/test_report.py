@@ -1,0 +1,169 @@
+"""Reports: what is marked, what is said of papers' figures, and names that mean something to LaTeX or HTML."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Sequence
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from facediff.benchmark import report_of
+from facediff.benchmark.outline import read_outline, read_results, write_outline
+from facediff.benchmark.published import published, shown_tables
+from facediff.benchmark.tables import BenchmarkReport
+from facediff.benchmark.writing import BEGIN, END, latex, markdown, page, replace_block, text, write_report
+from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from tests.fakes.benchmark import outline, results
+
+BIWI: dict[str, Any] = {
+    "rows": {"ours": "FaceFormer"},
+    "corpus": "biwi",
+    "synthetic": False,
+    "split": "test_a",
+    "protocol": "paper",
+    "lips": {"count": 4996},
+    "frames": 3879,
+    "sequences": 24,
+}
+
+
+def made(*, seeds: int = 3, effects: Sequence[float] = (0.0, 0.6, 1.2)) -> BenchmarkReport:
+    return report_of(outline(seeds=seeds), results(seeds=seeds, effects=effects, of_runs=0.01), resamples=200)
+
+
+def test_means_and_deviations_are_over_seeds_and_intervals_over_sentences() -> None:
+    found = results(effects=(0.0, 0.6, 1.2), of_runs=0.01)
+    (table,) = report_of(outline(), found, resamples=500).tables
+    row = table.row("method_1")
+    runs = [each.scores[0]["lve"] for each in found if each.row == "method_1"]
+    assert row.scores["lve"].mean == pytest.approx(np.mean(runs))
+    assert row.scores["lve"].deviation == pytest.approx(np.std(runs, ddof=1))
+    interval = row.intervals["lve"]
+    assert interval is not None
+    # Sentences differ by 0.3, runs by 0.01: an interval over sentences is the wider one.
+    assert interval.high - interval.low > 3 * float(row.scores["lve"].deviation or 0)
+    assert [each.marks.get("lve") for each in table.rows] == ["best", "second", None, None]
+    assert table.row("still").reference
+    assert row.significant("lve", 0.95)
+
+
+def test_the_order_of_cells_changes_nothing() -> None:
+    found = results(effects=(0.0, 0.6, 1.2))
+    assert markdown(report_of(outline(), found, resamples=50)) == markdown(
+        report_of(outline(), sorted(found, key=lambda each: (each.seed, each.row)), resamples=50)
+    )
+
+
+def test_a_single_seed_is_said_and_nothing_is_marked() -> None:
+    report = made(seeds=1)
+    (table,) = report.tables
+    assert not any(row.marks for row in table.rows)
+    assert not any(row.significant("lve", 0.95) for row in table.rows if not row.reference)
+    assert "one training run" in table.notes[0]
+
+
+def test_a_method_that_a_still_face_beats_is_noted() -> None:
+    report = made(effects=(9.0, 9.6, 10.2))
+    assert any("no method is better than this reference: still face" in note for note in report.tables[0].notes)
+
+
+def test_all_forms_are_written_and_hold_the_same_numbers(tmp_path: Path) -> None:
+    report = made()
+    files = write_report(report, tmp_path)
+    assert {path.suffix for path in files} == {".md", ".tex", ".html", ".csv", ".svg"}
+    mean = report.tables[0].row("method_0").scores["lve"].mean
+    with (tmp_path / "made.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    (row,) = [each for each in rows if (each["row"], each["score"]) == ("method_0", "lve")]
+    assert float(row["mean"]) == mean
+    assert row["mark"] == "best"
+    for form in (markdown(report), latex(report), page(report), text(report)):
+        assert f"{mean:.4f}" in form
+    tex = latex(report)
+    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 1
+    assert all(f"\\{rule}rule" in tex for rule in ("top", "mid", "bottom"))
+    assert rf"\textbf{{{mean:.4f}" in tex
+
+
+def test_the_page_needs_no_network_and_shows_hostile_names_as_they_are() -> None:
+    evil = '<script>alert("x")</script> & \\input{x} | _a_ %'
+    found = dataclasses.replace(outline(), rows={name: (evil, "") for name in outline().rows}, title=evil)
+    report = report_of(found, results(), resamples=20)
+
+    class Tags(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            assert tag != "script"
+            assert not any(name in ("src", "href") or name.startswith("on") for name, _ in attrs)
+
+    whole = page(report)
+    Tags().feed(whole)
+    assert "http" not in whole.replace("http://www.w3.org/2000/svg", "")
+    assert r"\textbackslash{}input\{x\}" in latex(report)
+    assert "\\<script\\>" in markdown(report)
+    assert "\\|" in markdown(report)
+
+
+def test_the_block_of_a_page_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
+    file = tmp_path / "page.md"
+    begin, end = BEGIN.format(name="made"), END.format(name="made")
+    file.write_text(f"# Title\n\n{begin}\nwas here\n{end}\n\nlast\n")
+    replace_block(file, made())
+    once = file.read_text()
+    assert once.startswith(f"# Title\n\n{begin}\n")
+    assert once.endswith(f"{end}\n\nlast\n")
+    assert "was here" not in once
+    replace_block(file, made())
+    assert file.read_text() == once
+    file.write_text("nothing\n")
+    with pytest.raises(FaceDiffError, match="made"):
+        replace_block(file, made())
+
+
+def test_figures_of_papers_stand_next_to_ours_only_where_all_agrees() -> None:
+    shown = shown_tables(["dual_path_biwi"], **BIWI)
+    assert shown.scores == {"ours": {"mve": 7.1767e-3, "lve": 5.1780e-4, "fdd": 5.0296e-5}}
+    assert not shown.reasons
+    for key, value in (
+        ("corpus", "puppet"), ("split", "test_b"), ("protocol", "codetalker"), ("lips", {"count": 250}),
+        ("frames", 3878), ("sequences", 23),
+    ):  # fmt: skip
+        other = shown_tables(["dual_path_biwi"], **{**BIWI, key: value})
+        assert not other.scores
+        assert len(other.reasons) == 1, key
+    doubted = shown_tables(["dual_path_vocaset"], **{**BIWI, "corpus": "vocaset", "split": "test_b"})
+    assert "lip vertices" in doubted.reasons[0]
+    with pytest.raises(FaceDiffError, match="dual_path_biwi"):
+        shown_tables(["dual_path_bivi"], **BIWI)
+
+
+def test_printed_figures_are_those_of_the_page_on_definitions() -> None:
+    words = (Path(__file__).parents[2] / "docs" / "which_lve.md").read_text()
+    line = next(line for line in words.splitlines() if line.startswith("| the paper's method | 6.5194"))
+    wanted = [float(cell) for cell in line.split("|")[2:-1]]
+    paper = "the paper's method"
+    biwi, mead, voca = (published()[f"dual_path_{name}"].rows[paper] for name in ("biwi", "mead3d", "vocaset"))
+    scaled = [biwi["mve"] * 1e3, biwi["lve"] * 1e4, biwi["fdd"] * 1e5]
+    scaled += [mead["mve"] * 1e3, mead["lve"] * 1e4, mead["fdd"] * 1e7, voca["lve"] * 1e5]
+    assert scaled == pytest.approx(wanted)
+
+
+def test_the_command_writes_a_report_from_results_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_outline(tmp_path, outline())
+    for result in results(effects=(0.0, 0.6, 1.2), of_runs=0.01)[1:]:
+        result.write(tmp_path)
+    assert main(["benchmark", "report", str(tmp_path), "--bootstrap", "50", "--baseline", "method_1"]) == 0
+    printed = capsys.readouterr().out
+    assert "method_0-tiny-seed0" in printed  # the cell that has no result yet
+    assert (tmp_path / "report" / "made.html").is_file()
+    found, missing = read_results(tmp_path, read_outline(tmp_path))
+    assert (len(found), len(missing)) == (8, 1)
+    assert main(["benchmark", "report", str(tmp_path), "--baseline", "nobody"]) == 2
+    assert "nobody" in capsys.readouterr().err
+    assert main(["benchmark", "report", str(tmp_path / "none")]) == 2
+    assert str(tmp_path / "none") in capsys.readouterr().err

@@ -1,0 +1,146 @@
+"""The statistics of benchmarks against SciPy, against formulas, and on tables of pure noise."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from facediff.benchmark.statistics import Scores, compared, difference, holm, marked, sign_flip, welch
+from facediff.evaluation.report import Bootstrap
+
+BOOTSTRAP = Bootstrap(2000, 0.95, 0)
+
+
+def scores(values: np.ndarray, weights: np.ndarray | None = None, *, fixed: bool = False) -> Scores:
+    """Scores of a row from values (runs, sentences)."""
+    weights = np.ones(values.shape[1]) if weights is None else weights
+    return Scores(
+        (values * weights).sum(1) / weights.sum(), values, weights, tuple(map(str, range(len(weights)))), fixed
+    )
+
+
+def table(rows: int, rng: np.random.Generator, *, runs: int = 3, sentences: int = 12) -> dict[str, Scores]:
+    """Rows without any difference but chance: of sentences, of runs, and of both together."""
+    difficulty = rng.normal(0, 1, sentences)
+    return {
+        str(row): scores(difficulty + rng.normal(0, 0.2, (runs, 1)) + rng.normal(0, 0.3, (runs, sentences)))
+        for row in range(rows)
+    }
+
+
+def test_welch_is_scipys() -> None:
+    rng = np.random.default_rng(0)
+    for runs in (2, 3, 7):
+        one, other = (scores(rng.normal(level, 1, (runs + place, 5))) for place, level in enumerate((0.0, 1.5)))
+        p, interval = welch(one, other)
+        wanted = scipy.stats.ttest_ind(one.runs, other.runs, equal_var=False)
+        assert p == pytest.approx(wanted.pvalue, rel=1e-9)
+        low, high = wanted.confidence_interval(0.95)
+        assert interval is not None
+        assert (interval.low, interval.high) == pytest.approx((low, high), rel=1e-9)
+
+
+def test_a_row_without_training_is_a_constant() -> None:
+    rng = np.random.default_rng(1)
+    one = scores(rng.normal(0, 1, (4, 6)))
+    still = scores(np.full((1, 6), 0.7), fixed=True)
+    assert welch(one, still)[0] == pytest.approx(scipy.stats.ttest_1samp(one.runs, 0.7).pvalue, rel=1e-9)
+    assert welch(still, scores(np.full((1, 6), 0.5), fixed=True))[0] == 0.0
+    assert welch(one, scores(rng.normal(0, 1, (1, 6)))) == (None, None)
+
+
+@pytest.mark.parametrize("sentences", [5, 9])
+def test_the_permutation_test_is_scipys(sentences: int) -> None:
+    differences = np.random.default_rng(sentences).normal(0.4, 1, sentences)
+    wanted = scipy.stats.permutation_test(
+        (differences, np.zeros(sentences)), lambda x, y, axis: (x - y).sum(axis), permutation_type="samples",
+        vectorized=True, n_resamples=np.inf,
+    )  # fmt: skip
+    assert sign_flip(differences) == pytest.approx(wanted.pvalue, abs=1e-12)
+
+
+def test_many_sentences_are_drawn_and_agree_with_the_exact_test() -> None:
+    differences = np.random.default_rng(2).normal(0.25, 1, 40)
+    wanted = scipy.stats.permutation_test(
+        (differences, np.zeros(40)), lambda x, y, axis: (x - y).sum(axis), permutation_type="samples",
+        vectorized=True, n_resamples=50_000, rng=np.random.default_rng(5),
+    )  # fmt: skip
+    assert sign_flip(differences) == pytest.approx(wanted.pvalue, abs=0.01)
+    assert sign_flip(differences, seed=3) == sign_flip(differences, seed=3)
+
+
+def test_holm_is_closed_testing_by_bonferroni() -> None:
+    """A hypothesis is rejected if every intersection that holds it is: that is what the step-down shortcut computes."""
+    values = [0.012, 0.2, 0.03, 0.012, 0.9]
+    wanted = []
+    for place in range(len(values)):
+        groups = [g for size in range(1, 6) for g in combinations(range(5), size) if place in g]
+        wanted.append(max(min(1.0, len(g) * min(values[i] for i in g)) for g in groups))
+    assert holm(values) == pytest.approx(wanted)
+    assert holm([]) == []
+
+
+def test_the_interval_over_sentences_is_scipys() -> None:
+    rng = np.random.default_rng(3)
+    values = rng.normal(2, 1, (3, 30))
+    found = scores(values).interval(BOOTSTRAP)
+    wanted = scipy.stats.bootstrap(
+        (values.mean(0),), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1)
+    ).confidence_interval
+    assert found is not None
+    assert (found.low, found.high) == pytest.approx((wanted.low, wanted.high), abs=0.03)
+
+
+def test_a_difference_is_that_of_the_pooled_scores_over_common_sentences() -> None:
+    rng = np.random.default_rng(4)
+    frames = rng.integers(10, 90, 12).astype(float)
+    one, other = (scores(rng.normal(0, 1, (2, 12)), frames) for _ in range(2))
+    found = difference(one, other, BOOTSTRAP)
+    assert found.value == pytest.approx(one.mean - other.mean)
+    assert found.p == max(found.p_sentences or 0, found.p_runs or 0)
+    part = Scores(other.runs, other.values[:, 3:], frames[3:], other.clips[3:])  # type: ignore[index]
+    less = difference(one, part, BOOTSTRAP)
+    assert less.common == 9
+    mine = np.average(one.values[:, 3:], axis=1, weights=frames[3:]).mean()  # type: ignore[index]
+    theirs = np.average(other.values[:, 3:], axis=1, weights=frames[3:]).mean()  # type: ignore[index]
+    assert less.value == pytest.approx(mine - theirs)
+
+
+def test_tables_of_noise_mark_nothing_as_best() -> None:
+    """In at most 5 % of them, up to the chance of 150 tables; sentences alone would mark far more."""
+    rng = np.random.default_rng(5)
+    quick = Bootstrap(0)
+    tables = [table(5, rng) for _ in range(150)]
+    wrong = sum(bool(marked(rows, "lower", quick)) for rows in tables)
+    starred = sum(any(p is not None and p < 0.05 for _, p in compared(rows, "0", quick).values()) for rows in tables)
+    limit = scipy.stats.binom.ppf(0.999, 150, 0.05)
+    assert wrong <= limit
+    assert starred <= limit
+    by_sentences = sum(difference(rows["0"], rows["1"], quick).p_sentences < 0.05 for rows in tables)  # type: ignore[operator]
+    assert by_sentences > 3 * limit  # what a star that knows nothing of training runs would do
+
+
+def test_a_true_difference_is_found_and_second_needs_best() -> None:
+    rng = np.random.default_rng(6)
+    difficulty = rng.normal(0, 1, 30)
+    rows = {
+        name: scores(difficulty + level + rng.normal(0, 0.02, (4, 1)) + rng.normal(0, 0.1, (4, 30)))
+        for name, level in (("a", 0.0), ("b", 0.5), ("c", 1.0), ("d", 1.0))
+    }
+    assert marked(rows, "lower", BOOTSTRAP) == {"a": "best", "b": "second"}
+    assert marked(rows, "higher", BOOTSTRAP) == {}  # c and d are alike
+    assert marked(rows, None, BOOTSTRAP) == {}
+    assert marked(rows, "zero", BOOTSTRAP) == {}
+
+
+def test_one_training_run_is_never_best() -> None:
+    rng = np.random.default_rng(7)
+    rows = {"a": scores(rng.normal(0, 0.1, (1, 30))), "b": scores(rng.normal(5, 0.1, (3, 30)))}
+    found = difference(rows["a"], rows["b"], BOOTSTRAP)
+    assert found.p is None
+    assert found.p_sentences is not None
+    assert found.p_sentences < 0.01
+    assert marked(rows, "lower", BOOTSTRAP) == {}
