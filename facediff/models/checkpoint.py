@@ -328,7 +328,8 @@ def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[Spe
     """
     source = checkpoint.get(DATA_SOURCE_KEY) or {}
     found = corpus_class(path, source)
-    given = checkpoint.get("datamodule_hyper_parameters") or {"root": source.get("root")}
+    # An imported model knows its corpus, but not where its folder is.
+    given = checkpoint.get("datamodule_hyper_parameters") or {name: source[name] for name in source.keys() & {"root"}}
     options = {name: value for name, value in given.items() if not name.startswith("_")}
     read_options(str(path), found, options, component_finders())
     return found, options

@@ -721,10 +721,15 @@ def build(weights: Weights, method: Recogniser, found: Found, options: dict[str,
 
 
 def label(model: AnimationModel, method: Recogniser, dataset: str) -> None:
-    """Keep the licences of the authors' weights, of the data set and of the pretrained network with the model."""
+    """Keep the data set's class with the model, and the licences of weights, data set and pretrained network.
+
+    By the class, ``facediff test`` knows what to read; where its folder is, no checkpoint knows.
+    """
     corpora: list[Any] = [entry.implementation for entry in registry.corpus]
     known = next((each for each in corpora if each.corpus_name == dataset), None)
     data = known.corpus_licence() if known is not None else Licence(f"corpus {dataset}")
+    if known is not None:
+        model.data_source = {"class_path": f"{known.__module__}.{known.__qualname__}"}
     weights = Licence(f"weights of {method.method}", method.licence, method.commercial, method.licence_source)
     model.licences = merged([weights], [data], network_licences(dict(model.hparams)))
 

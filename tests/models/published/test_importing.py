@@ -125,6 +125,17 @@ def test_new_and_old_names_of_weight_norm_are_the_same(tmp_path: Path) -> None:
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
 
 
+def test_an_imported_model_knows_its_corpus_but_not_its_folder(tmp_path: Path) -> None:
+    """So that ``facediff test --ckpt_path`` asks for nothing but the folder."""
+    from facediff.data import Vocaset
+    from facediff.models.checkpoint import corpus_of, read_checkpoint
+
+    write_author_files(tmp_path)
+    assert main(words(tmp_path)) == 0
+    path = tmp_path / "model.ckpt"
+    assert corpus_of(path, read_checkpoint(path)) == (Vocaset, {})
+
+
 class Hostile:
     def __reduce__(self) -> tuple[Any, ...]:
         import os
