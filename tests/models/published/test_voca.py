@@ -23,6 +23,7 @@ from facediff.errors import FaceDiffError
 from facediff.models import Voca, import_checkpoint, load_model
 from facediff.models.deepspeech import DeepSpeechEncoder, cepstra
 from facediff.models.published.importing import import_files, save_model
+from facediff.models.styles import read_styles
 from tests.fakes import tensorflow, voca
 from tests.fakes.tiny import Tiny
 from tests.fakes.voca import IDENTITIES, VERTICES, write_voca
@@ -89,6 +90,16 @@ def test_without_a_speaker_vertices_are_mixed(tmp_path: Path) -> None:
     parts = [voca.voca_reference(speech.numpy(), k, templates()["A"]) for k in range(3)]
     expected = torch.from_numpy(sum(parts) / 3).float()
     torch.testing.assert_close(made[0].flatten(1).detach(), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("shares", [(0.2, 0.3, 0.5), (1.0, -0.5, 0.5)])
+def test_a_style_mixes_vertices(shares: tuple[float, ...], tmp_path: Path) -> None:
+    """Also where one weight alone is 1, and others lead away from a style."""
+    model, speech = imported(write_voca(tmp_path)), speech_of(3000)
+    words = ",".join(f"{name}:{share}" for name, share in zip(IDENTITIES, shares, strict=True))
+    made = model.animate(speech, identity="A", style=read_styles(words, "A", model)).vertices
+    parts = [share * voca.voca_reference(speech.numpy(), k, templates()["A"]) for k, share in enumerate(shares)]
+    torch.testing.assert_close(made.flatten(1), torch.from_numpy(sum(parts)).float(), rtol=0, atol=1e-5)
 
 
 def test_any_file_of_a_checkpoint_stands_for_it(tmp_path: Path) -> None:
