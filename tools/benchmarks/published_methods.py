@@ -1,31 +1,37 @@
-"""How quickly the published methods animate, at the size of VOCASET and BIWI, and what their literal ways cost.
+"""How quickly every published method animates at the size of VOCASET and BIWI, and what its literal way costs.
 
-The weights are random, which changes no time. Every ratio is of one run on one machine:
+The weights are random, which changes no time; audio encoders have their published size. The table is Markdown, for
+docs/methods.md, and every ratio in it is of one run on one machine:
 
-    python tools/benchmarks/published_methods.py --seconds 10
+    python tools/benchmarks/published_methods.py
+    python tools/benchmarks/published_methods.py --without-literal --sets BIWI --methods DiffSpeaker
+
+The literal ways take up to an hour, most of it CodeTalker's and FaceDiffuser's.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
+from sampling_tables import processor
 
+from facediff import registry
 from facediff.data import Assets
-from facediff.models import AnimationModel, CodeTalker, FaceDiffuser, FaceFormer, SelfTalk, TalkingStyle
-from facediff.models.published.autoregressive import AutoregressiveModel, Loop
-from facediff.models.speech_networks import Wav2Vec2Encoder
-from facediff.utils.tables import print_table
+from facediff.models.deepspeech import DeepSpeechEncoder
+from facediff.models.published.autoregressive import AutoregressiveModel
+from facediff.models.published.base import PublishedModel
+from facediff.models.published.diffspeaker import DiffSpeaker
+from facediff.models.published.facediffuser import FaceDiffuser
 
-Size = tuple[int, float, int]
-"""Vertices, frames a second and identities."""
-
-SETS: dict[str, Size] = {"VOCASET": (5023, 30.0, 8), "BIWI": (23_370, 25.0, 6)}
+SETS = {"VOCASET": (5023, 30.0, 8), "BIWI": (23_370, 25.0, 6)}
 BASE = {"model_type": "wav2vec2", "hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12}
 LARGE = {
     "model_type": "wav2vec2",
@@ -37,30 +43,88 @@ LARGE = {
     "feat_extract_norm": "layer",
     "do_stable_layer_norm": True,
 }
-
-
-LOOPED: dict[str, type[AutoregressiveModel]] = {
-    "FaceFormer": FaceFormer,
-    "TalkingStyle": TalkingStyle,
-    "CodeTalker": CodeTalker,
+TOY = {
+    "model_type": "wav2vec2",
+    "hidden_size": 8,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 2,
+    "intermediate_size": 8,
+    "conv_dim": [4] * 7,
+    "num_conv_pos_embeddings": 4,
+    "num_conv_pos_embedding_groups": 2,
 }
-"""Methods that go frame by frame."""
+DEEPSPEECH = {"inputs": 494, "first": 2048, "second": 2048, "third": 4096, "cell": 2048, "fifth": 2048, "logits": 29}
+TOY_OPTIONS: dict[str, dict[str, Any]] = {
+    "CodeTalker": {"num_layers": 1, "prior_dim": 16, "prior_layers": 1, "tokens": 2, "codes": 4},
+    "FaceDiffuser": {"diffusion_steps": 8},
+    "Voca": {"components": 8},
+}
+"""Sizes of methods that ``dim=8`` alone does not make small."""
+
+OPTIONS: dict[str, dict[str, Any]] = {"SelfTalk": {"lip_reader": "none"}}
+"""Options of methods whose defaults are for training."""
+
+WARM_UP = 4_000
+"""Samples of an animation before the one that is timed, since the first one is slower."""
+
+HEAD = ("method", "faces", "way", "parameters", "seconds", "real-time factor", "times as fast as literal")
 
 
-def made(
-    kind: type[AnimationModel],
-    vertices: int,
-    rate: float,
-    count: int,
-    network: dict[str, Any] = BASE,
-    **options: Any,  # noqa: ANN401
-) -> AnimationModel:
-    """A model of random weights with a face."""
+@dataclass(frozen=True)
+class Way:
+    """A way to animate that a method has.
+
+    Attributes:
+        name: for the table.
+        attributes: of the model that choose it.
+        literal: whether the published code computes so.
+        every_step: whether speech is encoded again in every denoising step.
+    """
+
+    name: str
+    attributes: dict[str, Any] = field(default_factory=dict)
+    literal: bool = False
+    every_step: bool = False
+
+
+def ways_of(kind: type[PublishedModel]) -> list[Way]:
+    """The ways of a method, the quickest first."""
+    if issubclass(kind, AutoregressiveModel):
+        return [
+            Way("keys and values kept", {"loop": "cached"}),
+            Way("literal", {"loop": "literal"}, literal=True),
+        ]
+    if issubclass(kind, FaceDiffuser):
+        return [
+            Way("speech once, folded", {"encode_speech": "once", "sampling_space": "folded"}),
+            Way("speech once", {"encode_speech": "once", "sampling_space": "vertices"}),
+            Way("literal", {"encode_speech": "every_step", "sampling_space": "vertices"}, True, every_step=True),
+        ]
+    if issubclass(kind, DiffSpeaker):
+        return [Way("folded", {"sampling_space": "folded"}), Way("literal", {"sampling_space": "vertices"}, True)]
+    return [Way("one pass", literal=True)]
+
+
+def methods() -> dict[str, type[PublishedModel]]:
+    """Every published method by name."""
+    found = {name: registry.model.get(name) for name in registry.model.names()}
+    return {name: kind for name, kind in found.items() if issubclass(kind, PublishedModel)}
+
+
+def made(name: str, faces: tuple[int, float, int], *, toy: bool) -> PublishedModel:
+    """A method of random weights, with faces."""
+    kind, (vertices, rate, count) = methods()[name], faces
     names = [f"speaker{i}" for i in range(count)]
-    encoder = partial(Wav2Vec2Encoder, config=network, edges=False, epsilon=1e-5)
+    encoder: Any = kind.published_encoder
+    if encoder is DeepSpeechEncoder:
+        config = {name: 8 if toy and size > 494 else size for name, size in DEEPSPEECH.items()}
+    else:
+        config = TOY if toy else LARGE if "large" in encoder.keywords["source"] else BASE
+    encoder = partial(encoder, config=config)
+    options = {**OPTIONS.get(name, {}), **({"dim": 8, **TOY_OPTIONS.get(name, {})} if toy else {})}
     model = kind(n_vertices=vertices, identities=names, frame_rate=rate, audio_encoder=encoder, **options)
     everything = torch.arange(vertices)
-    templates = {name: torch.randn(vertices, 3) for name in names}
+    templates = {each: torch.randn(vertices, 3) for each in names}
     model.adopt(Assets("none", True, "m", rate, names, templates, None, {"lips": everything, "upper_face": everything}))
     return model.eval()
 
@@ -72,82 +136,63 @@ def seconds_of(work: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-Note = Callable[[str, AnimationModel, float], None]
-"""Takes a way, its model and its seconds."""
-
-
-def time_loops(
-    kind: type[AutoregressiveModel], network: dict[str, Any], size: Size, speech: Tensor, note: Note
-) -> None:
-    """A method that goes frame by frame: with keys and values kept, and without."""
-    model = made(kind, *size, network)
-    assert isinstance(model, AutoregressiveModel)
-    model.animate(speech[:16_000], identity="speaker0")  # the first call is slower
-    loops: tuple[Loop, Loop] = ("cached", "literal")
-    spent = []
-    for model.loop in loops:
-        spent.append(seconds_of(partial(model.animate, speech, identity="speaker0")))
-        note(model.loop, model, spent[-1])
-    print(f"{kind.__name__}: cached is {spent[1] / spent[0]:.1f} times as fast as literal")
-
-
-def time_selftalk(size: Size, speech: Tensor, note: Note) -> None:
-    """SelfTalk without its lip reader, of which only training has any use."""
-    model = made(SelfTalk, *size, LARGE, lip_reader="none")
-    model.animate(speech[:16_000], identity="speaker0")
-    note("one pass", model, seconds_of(partial(model.animate, speech, identity="speaker0")))
-
-
-def time_facediffuser(size: Size, speech: Tensor, note: Note, steps: int) -> None:
-    """FaceDiffuser with speech encoded in each step or once, on vertices and folded; some of the steps are timed."""
-    model = made(FaceDiffuser, *size)
-    assert isinstance(model, FaceDiffuser)
-    # All steps cost the same; the speech of the other ways is encoded once among those that are timed.
-    part = model.steps / steps
-    model.skip_steps = model.steps - steps
-    clip = model.clip_of(speech, "speaker0", None)
+def timed(model: PublishedModel, way: Way, speech: torch.Tensor, steps: int) -> float:
+    """Seconds of one animation; what is computed once a model is computed before."""
+    for name, value in way.attributes.items():
+        setattr(model, name, value)
+    animate = partial(model.animate, identity=model.identities[0])
+    if isinstance(model, FaceDiffuser):
+        # All of its steps cost the same, and so some of them are timed.
+        model.skip_steps = max(0, model.steps - steps)
+    animate(speech[:WARM_UP])
+    taken = seconds_of(partial(animate, speech))
+    if not isinstance(model, FaceDiffuser):
+        return taken
+    count = model.steps - model.skip_steps
+    if way.every_step:
+        return taken * model.steps / count
+    clip = model.clip_of(speech, model.identities[0], None)
     heard = seconds_of(partial(torch.no_grad()(model.hear), clip, clip.frame_lengths))
-    found = {}
-    for way, encode, space in (
-        ("literal", "every_step", "vertices"),
-        ("speech once", "once", "vertices"),
-        ("speech once, folded", "once", "folded"),
-    ):
-        model.encode_speech, model.sampling_space = encode, space  # type: ignore[assignment]
-        taken = seconds_of(partial(model.animate, speech, identity="speaker0"))
-        taken = taken * part if encode == "every_step" else heard + max(taken - heard, 0.0) * part
-        found[way] = taken
-        note(way, model, taken)
-    for way in ("speech once", "speech once, folded"):
-        print(f"FaceDiffuser: {way} is {found['literal'] / found[way]:.1f} times as fast as literal")
+    return heard + max(taken - heard, 0.0) * model.steps / count
+
+
+def rows_of(asked: argparse.Namespace) -> Iterator[tuple[str, ...]]:
+    """The table's rows, each as soon as it is known with those of the same model."""
+    speech = 0.1 * torch.randn(round(asked.seconds * 16_000))
+    for faces in asked.sets:
+        for name, kind in methods().items():
+            if asked.methods and name not in asked.methods:
+                continue
+            model = made(name, (30, *SETS[faces][1:]) if asked.toy else SETS[faces], toy=asked.toy)
+            parameters = f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f} M"
+            chosen = [
+                way for way in ways_of(kind) if not (asked.without_literal and way.literal) or len(ways_of(kind)) == 1
+            ]
+            taken = {way.name: timed(model, way, speech, asked.steps) for way in chosen}
+            literal = next((taken[way.name] for way in chosen if way.literal and len(chosen) > 1), None)
+            for way, seconds in taken.items():
+                ratio = "" if literal is None or way == "literal" else f"{literal / seconds:.1f}"
+                yield f"`{name}`", faces, way, parameters, f"{seconds:.2f}", f"{seconds / asked.seconds:.3f}", ratio
 
 
 def main() -> None:
     """Print one row for each method, data set and way."""
-    methods = (*LOOPED, "SelfTalk", "FaceDiffuser")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of the speech")
     parser.add_argument("--steps", type=int, default=10, help="denoising steps of FaceDiffuser that are timed")
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS), help="sizes of faces")
-    parser.add_argument("--methods", nargs="+", choices=methods, default=methods, help="which are timed")
+    parser.add_argument("--methods", nargs="+", choices=list(methods()), help="these methods alone")
+    parser.add_argument("--without-literal", action="store_true", help="leave out the slow ways of the published code")
+    parser.add_argument("--toy", action="store_true", help="tiny networks and faces, to try the benchmark itself")
     asked = parser.parse_args()
-    speech = 0.1 * torch.randn(int(asked.seconds * 16_000))
-    rows: list[tuple[object, ...]] = []
-    for name, size in ((name, SETS[name]) for name in asked.sets):
-        for method in asked.methods:
-
-            def note(way: str, model: AnimationModel, taken: float, name: str = name, method: str = method) -> None:
-                parameters = sum(p.numel() for p in model.parameters()) / 1e6
-                rows.append((method, name, way, f"{parameters:.1f} M", f"{taken:.2f}", f"{taken / asked.seconds:.2f}"))
-                print(*rows[-1], flush=True)
-
-            if method == "FaceDiffuser":
-                time_facediffuser(size, speech, note, asked.steps)
-            elif method == "SelfTalk":
-                time_selftalk(size, speech, note)
-            else:
-                time_loops(LOOPED[method], LARGE if method == "TalkingStyle" else BASE, size, speech, note)
-    print_table(["method", "faces", "way", "parameters", "seconds", "seconds per second of speech"], rows)
+    threads, load = torch.get_num_threads(), os.getloadavg()[0]
+    print(
+        f"machine: {processor('cpu')}, {threads} threads, load {load:.1f}; {asked.seconds:g} s of speech",
+        file=sys.stderr,
+    )
+    print(f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}", flush=True)
+    for row in rows_of(asked):
+        print(f"| {' | '.join(row)} |", flush=True)
 
 
 if __name__ == "__main__":
