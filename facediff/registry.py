@@ -251,7 +251,7 @@ model = Kind(
     "model",
     "facediff.models.dual_path "
     "facediff.models.style_content "
-    "facediff.models.published.codetalker "
+    "facediff.models.published.codetalker facediff.models.published.codetalker_checkpoints "
     "facediff.models.published.diffspeaker "
     "facediff.models.published.facediffuser "
     "facediff.models.published.faceformer "

@@ -319,6 +319,7 @@ class FaceDiffCLI(LightningCLI):
             return
         path = find_checkpoint(trainer, self._get(self.config_init, "ckpt_path"))
         content = read_checkpoint(path) if path is not None and path.is_file() else {}
+        self.model.check_training(resumed=bool(content))
         if continue_run(trainer, path, content, sys.argv):
             self.config[str(self.subcommand)].ckpt_path = None  # the config that is saved describes the whole run
         if path is not None:

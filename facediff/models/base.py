@@ -461,6 +461,13 @@ class AnimationModel(LightningModule, Inference, ABC):
             assets: those of the corpus.
         """
 
+    def check_training(self, *, resumed: bool) -> None:
+        """Refuse, before a run writes anything, what cannot be trained; by itself a model refuses nothing.
+
+        Args:
+            resumed: whether a checkpoint will be loaded into the model.
+        """
+
     def setup(self, stage: str) -> None:
         """Take the assets from the data module; a checkpoint's own replace them when it is loaded."""
         self._styles_of_step = None

@@ -2,8 +2,8 @@
 
 Xing, Xia, Zhang, Cun, Wang, Wong: "CodeTalker: Speech-Driven 3D Facial Animation with Discrete Motion Prior". Two
 stages of one model: a prior, which learns to write motion in a table of codes (``motion_prior.py``), and a predictor,
-FaceFormer's decoder, which finds the codes that speech asks for. From top to bottom: the model, the predictor, the
-authors' checkpoints. docs/methods/codetalker.md says what of the published code is an option here.
+FaceFormer's decoder, which finds the codes that speech asks for. Its authors' files are read in
+``codetalker_checkpoints.py``; docs/methods/codetalker.md says what of the published code is an option here.
 """
 
 from __future__ import annotations
@@ -26,10 +26,8 @@ from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, Le
 from facediff.models.base import AnimationModel
 from facediff.models.inference import BatchMotion, Motion, Progress, Style
 from facediff.models.layers import Frames, Heads, Layers, Weight, Width, frame_mask
-from facediff.models.published.autoregressive import AutoregressiveModel, MotionDecoder, decoder_sizes, read_period
+from facediff.models.published.autoregressive import AutoregressiveModel, MotionDecoder
 from facediff.models.published.base import SpeakerTable, masked_mean
-from facediff.models.published.faceformer import LAYER_NAMES
-from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
 from facediff.models.published.motion_prior import MotionPrior, PriorPositions, PriorScale, perplexity
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.ranges import Range
@@ -39,6 +37,9 @@ Stage = Literal["prior", "predictor"]
 
 FirstFrame = Literal["duplicated", "still"]
 """What the second frame follows: a decoding of the first frame alone, or a face that does not move."""
+
+History = Literal["true", "own"]
+"""Which frames the predictor continues in training: the true ones, or those that it makes itself."""
 
 Output = Literal["together", "fed_back"]
 """Which motion is given: all codes decoded together at the end, or the frames that were fed back."""
@@ -76,6 +77,9 @@ class CodeTalker(AutoregressiveModel):
         first_frame: what the second frame follows: the first frame's codes ``duplicated`` and decoded as published,
             which gives one constant face whatever the speech is, since normalisation over equal frames leaves nothing
             of them; or a ``still`` face.
+        history: which frames the predictor continues in training: the ``true`` ones as published, which lets it learn
+            to continue motion rather than to hear; or its ``own``, which it makes from a face that does not move, and
+            then anew from what it has made, once to three times.
         output: which motion is given: all codes decoded ``together`` as published, or the frames that were ``fed_back``
             while it was generated, each decoded with those before it only.
         commitment: weight with which tokens are drawn to their codes.
@@ -115,6 +119,7 @@ class CodeTalker(AutoregressiveModel):
         positions: PriorPositions = "constant",
         attention_scale: PriorScale = "width",
         first_frame: FirstFrame = "duplicated",
+        history: History = "true",
         output: Output = "together",
         commitment: Weight = 0.25,
         quantisation_weight: Weight = 1.0,
@@ -127,6 +132,7 @@ class CodeTalker(AutoregressiveModel):
         self.stage: Stage = stage
         self.prior_file = prior
         self.first_frame: FirstFrame = first_frame
+        self.history: History = history
         self.output: Output = output
         self.commitment, self.quantisation_weight = commitment, quantisation_weight
         self.feature_weight = feature_weight
@@ -176,12 +182,23 @@ class CodeTalker(AutoregressiveModel):
 
     # The prior of a predictor.
 
+    def check_training(self, *, resumed: bool) -> None:
+        """Take the prior of a new predictor, before a run writes anything.
+
+        Raises:
+            FaceDiffError: if there is none, with what to train first; or as :meth:`take_prior`.
+        """
+        if self.stage == "prior" or resumed or self._assets is not None:
+            return
+        if self.prior_file is None:
+            raise no_prior()
+        self.take_prior(self.prior_file)
+
     def setup(self, stage: str) -> None:
         """Take the prior's weights and its scale of motion, where a predictor is new."""
-        if stage == "fit" and self.stage == "predictor" and self._assets is None:
-            self._lacks_prior = self.prior_file is None
-            if self.prior_file is not None:
-                self.take_prior(self.prior_file)
+        if stage == "fit" and self.prior_file is not None:
+            self.check_training(resumed=False)
+        self._lacks_prior = stage == "fit" and self.stage == "predictor" and self._assets is None
         super().setup(stage)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -190,16 +207,13 @@ class CodeTalker(AutoregressiveModel):
         self._lacks_prior = False
 
     def on_fit_start(self) -> None:
-        """Refuse to train a predictor on a prior that was never trained.
+        """Refuse to train a predictor on a prior that was never trained; a checkpoint has been loaded by now.
 
         Raises:
             FaceDiffError: with what to train first.
         """
         if self._lacks_prior:
-            raise FaceDiffError(
-                f"--model.prior: is missing, and CodeTalker's predictor learns to speak a trained prior's codes; train "
-                f"one with --model.stage=prior ({RECIPE}) and give its checkpoint"
-            )
+            raise no_prior()
 
     def take_prior(self, path: str) -> None:
         """Take the prior of another checkpoint of CodeTalker, with its scale of motion and its licences.
@@ -213,7 +227,10 @@ class CodeTalker(AutoregressiveModel):
         from facediff.models.checkpoint import load_model
         from facediff.utils.licences import merged
 
-        found = load_model(path)
+        try:
+            found = load_model(path)
+        except FaceDiffError as error:
+            raise FaceDiffError(f"--model.prior {error}") from error
         if not isinstance(found, CodeTalker):
             raise FaceDiffError(
                 f"--model.prior {path}: is a checkpoint of {type(found).__name__}; expected one of CodeTalker, trained "
@@ -270,17 +287,28 @@ class CodeTalker(AutoregressiveModel):
             "loss": error + self.quantisation_weight * quantisation,
         }
 
-    def predictor_losses(self, batch: Batch, truth: Tensor, frames: Int[Tensor, " batch"]) -> dict[str, Tensor]:
-        """The squared error of motion, and the distance from true motion's codes; from true frames, in one pass."""
+    def predictor_losses(
+        self, batch: Batch, truth: Tensor, frames: Int[Tensor, " batch"], generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """The squared error of motion, and the distance of features from true motion's codes, in parallel."""
         self.check_length(frames, batch.names[0])
         style, memory = self.conditions(batch, frames)
-        features = self.network.teacher_forced(style, memory, truth)
+        before = truth
+        if self.history == "own":
+            before = torch.zeros_like(truth)
+            with torch.no_grad():
+                for _ in range(int(torch.randint(3, (), generator=generator, device=truth.device))):
+                    before = self.motion_of(self.network.in_parallel(style, memory, before), frames)
+        features = self.network.in_parallel(style, memory, before)
         with torch.no_grad():
             wanted = self.prior.quantise(self.prior.encode_clips(truth, frames)).chosen
-        made = self.prior.decode_clips(self.prior.quantise(features).values, frames)
-        error = masked_mean((made - truth).square(), frames)
+        error = masked_mean((self.motion_of(features, frames) - truth).square(), frames)
         distance = masked_mean((features - wanted).square(), frames)
         return {"reconstruction": error, "features": distance, "loss": error + self.feature_weight * distance}
+
+    def motion_of(self, features: Tensor, frames: Int[Tensor, " batch"]) -> Tensor:
+        """Motion (B, T, 3V) of the codes nearest to features."""
+        return self.prior.decode_clips(self.prior.quantise(features).values, frames)
 
     def conditions(
         self, batch: Batch, frames: Int[Tensor, " batch"]
@@ -382,6 +410,14 @@ class CodeTalker(AutoregressiveModel):
         super().test_step(batch, batch_idx, dataloader_idx)
 
 
+def no_prior() -> FaceDiffError:
+    """The error for a predictor without a trained prior."""
+    return FaceDiffError(
+        f"--model.prior: is missing, and CodeTalker's predictor learns to speak a trained prior's codes; train one "
+        f"with --model.stage=prior ({RECIPE}) and give its checkpoint"
+    )
+
+
 class NoSpeech(AudioEncoder):
     """In place of an audio encoder where no speech is heard.
 
@@ -424,10 +460,10 @@ class Predictor(nn.Module):
         self.style = SpeakerTable(n_identities, dim, "embedding")
         nn.init.zeros_(self.out.weight)
 
-    def teacher_forced(
+    def in_parallel(
         self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], motion: Tensor
     ) -> Float[Tensor, "batch frames width"]:
-        """Features of every frame from the true motion (B, T, 3V) of the frame before it; the first one's is zero."""
+        """Features of every frame from motion (B, T, 3V) of the frame before it, zero before the first."""
         before = F.pad(motion, (0, 0, 1, 0))[:, :-1]
         return self.out(self.decoder(self.motion_in(before) + style[:, None], memory))
 
@@ -449,149 +485,3 @@ def check_sizes(dim: int, heads: int, kernel: int, tokens: int, token_dim: int |
             {"tokens": tokens, "token_dim": token_dim, "prior_dim": dim},
             "without token_maps, all tokens of a frame together must have prior_dim channels",
         )
-
-
-# The authors' checkpoints.
-
-HALF_NAMES = (
-    ("squasher.0.0", "smooth"),
-    ("expander.0.0", "smooth"),
-    ("encoder_linear_embedding.net", "embed"),
-    ("decoder_linear_embedding.net", "embed"),
-)
-"""What the maps of a half are called by the authors, and here."""
-
-BLOCK_NAMES = (
-    {"fn.norm": "attention_norm", "fn.fn.to_qkv": "project", "fn.fn.to_out": "out"},
-    {"fn.norm": "hidden_norm", "fn.fn.l1": "first", "fn.fn.l2": "second"},
-)
-"""The same for attention and feed-forward layers, which take turns in the authors' numbering."""
-
-
-def convert_prior(weights: Weights, prefix: str = "") -> dict[str, Any]:
-    """The first stage's tensors under the names of this file, and its options."""
-    codes, token_dim = weights.shape(f"{prefix}quantize.embedding.weight")
-    dim, _ = weights.shape(f"{prefix}encoder.vertice_mapping.0.weight")
-    hidden, _ = weights.shape(f"{prefix}encoder.encoder_transformer.net.1.fn.fn.l1.weight")
-    kernel = weights.shape(f"{prefix}encoder.squasher.0.0.weight", 3)[2]
-    maps = f"{prefix}encoder.encoder_linear_embedding_post.net.weight" in weights
-    width = weights.shape(f"{prefix}encoder.encoder_linear_embedding_post.net.weight")[0] if maps else dim
-    if width % token_dim:
-        raise FaceDiffError(
-            f"{weights.source}: its frames have {width} channels and its codes {token_dim}, which does not go into "
-            f"them; it is a variant of CodeTalker"
-        )
-    for half in ("encoder", "decoder"):
-        check_positions(weights, f"{prefix}{half}.{half}_pos_embedding.pe")
-        own = f"{prefix}{half}."
-        for name in weights.names(f"{own}{half}_transformer.net."):
-            place, _, rest = name.removeprefix(f"{own}{half}_transformer.net.").partition(".")
-            part, _, kind = rest.rpartition(".")
-            number = int(place) if place.isdecimal() else -1
-            if part not in BLOCK_NAMES[number % 2] or number < 0:
-                raise FaceDiffError(
-                    f"{weights.source}: holds the tensor {name}, which CodeTalker has no place for; it is a variant of "
-                    f"the method"
-                )
-            weights.move(name, f"prior.{half}.blocks.{number // 2}.{BLOCK_NAMES[number % 2][part]}.{kind}")
-        for old, new in HALF_NAMES:
-            weights.move_all(f"{own}{old}.", f"prior.{half}.{new}.")
-    weights.move_all(f"{prefix}encoder.vertice_mapping.0.", "prior.motion_in.")
-    weights.move_all(f"{prefix}encoder.encoder_linear_embedding_post.net.", "prior.to_tokens.")
-    weights.move_all(f"{prefix}decoder.decoder_linear_embedding_pre.net.", "prior.from_tokens.")
-    weights.move_all(f"{prefix}decoder.vertice_map_reverse.", "prior.motion_out.")
-    weights.move(f"{prefix}quantize.embedding.weight", "prior.codebook")
-    blocks = [name for name in weights.made if name.startswith("prior.encoder.blocks.")]
-    return {
-        "prior_dim": dim,
-        "prior_layers": 1 + max(int(name.split(".")[3]) for name in blocks),
-        "prior_feed_forward_dim": hidden,
-        "kernel": kernel,
-        "tokens": width // token_dim,
-        "token_dim": token_dim,
-        "codes": codes,
-        "token_maps": maps,
-        "out_bias": "prior.motion_out.bias" in weights.made,
-    }
-
-
-def check_positions(weights: Weights, name: str) -> None:
-    """Leave out a table of positions, of which the published code uses the first row, once it is seen to be one.
-
-    Raises:
-        FaceDiffError: if it is anything else.
-    """
-    if name not in weights:
-        return
-    table = weights.get(name).flatten(0, -2)
-    expected = torch.zeros(table.shape[-1])
-    expected[1::2] = 1.0
-    if not len(table) or not torch.allclose(table[0], expected, rtol=0, atol=1e-5):
-        raise FaceDiffError(
-            f"{weights.source}: its table of positions {name} is not what the published formula gives; the checkpoint "
-            f"is of a variant of the method"
-        )
-    weights.ignore(name, "the table of positions is computed by its formula")
-
-
-def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
-    """CodeTalker's tensors of both stages, and its options."""
-    stage_one = [name for prefix in ("encoder.", "decoder.", "quantize.") for name in weights.names(prefix)]
-    inside = bool(weights.names("autoencoder."))
-    if inside:
-        for name in stage_one:
-            weights.ignore(name, "the file of the second stage holds a prior of its own")
-    elif "quantize.embedding.weight" not in weights:
-        raise FaceDiffError(
-            f"{weights.source}: is CodeTalker's second stage without the first, whose prior it needs; give both files, "
-            f"such as vocaset_stage1.pth.tar and vocaset_stage2.pth.tar"
-        )
-    options = convert_prior(weights, "autoencoder." if inside else "")
-    dim, _ = weights.shape("audio_feature_map.weight")
-    period = read_period(weights, "PPE.pe", found)
-    encoder = weights.backbone(
-        "audio_encoder.",
-        kind="wav2vec2",
-        request=request,
-        **{name: value for name, value in CodeTalker.published_encoder.keywords.items() if name != "source"},  # type: ignore[attr-defined]
-    )
-    for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("feat_map", "out")):
-        weights.move_all(f"{old}.", f"network.{new}.")
-    weights.move("learnable_style_emb.weight", "network.style.weight")
-    weights.move_all("transformer_decoder.layers.", "network.decoder.layers.", LAYER_NAMES)
-    sizes = decoder_sizes(weights, "transformer_decoder.", dim)
-    return {**options, "audio_encoder": encoder, **sizes, "period": period}
-
-
-def convert_stage_one(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
-    """A prior alone, on which a predictor can be trained."""
-    return {"stage": "prior", **convert_prior(weights)}
-
-
-LICENCE: dict[str, Any] = {
-    "licence": "unknown: no statement on the weights, whose code is under MIT and whose data is for research",
-    "licence_source": "github.com/Doubiiu/CodeTalker",
-}
-
-recogniser(
-    Recogniser(
-        method="CodeTalker",
-        marks=("learnable_style_emb.weight", "feat_map.weight", "vertice_map.weight"),
-        unless=(),
-        convert=convert,
-        vertices=lambda weights: weights.shape("vertice_map.weight")[1] // 3,
-        count=lambda weights: weights.shape("learnable_style_emb.weight")[0],
-        **LICENCE,
-    )
-)
-recogniser(
-    Recogniser(
-        method="CodeTalker",
-        marks=("quantize.embedding.weight", "encoder.vertice_mapping.0.weight", "decoder.vertice_map_reverse.weight"),
-        unless=("learnable_style_emb.", "feat_map.", "vertice_map."),
-        convert=convert_stage_one,
-        vertices=lambda weights: weights.shape("decoder.vertice_map_reverse.weight")[0] // 3,
-        count=lambda weights: 0,
-        **LICENCE,
-    )
-)

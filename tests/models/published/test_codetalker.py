@@ -12,6 +12,7 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
+from facediff.cli.app import main
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, CodeTalker, import_checkpoint, load_model
@@ -176,6 +177,28 @@ def test_the_losses_of_both_stages_are_the_published_ones(tmp_path: Path) -> Non
     torch.testing.assert_close(found["loss"], wrong + far)
 
 
+def test_a_predictor_may_continue_its_own_motion(make_method: MakeMethod) -> None:
+    model = laws.with_assets(make_method("CodeTalker", history="own", motion_scale="none"))
+    assert isinstance(model, CodeTalker)
+    batch = collate(laws.clips(9, 14))
+    given: list[Tensor] = []
+    made: list[Tensor] = []
+    model.network.motion_in.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
+    model.network.out.register_forward_hook(lambda _, inputs, output: made.append(output))
+    passes = set()
+    for seed in range(8):
+        given.clear()
+        made.clear()
+        model.losses(batch, torch.Generator().manual_seed(seed))
+        assert not given[0].any()
+        for before, now in zip(made, given[1:], strict=False):
+            motion = model.motion_of(before, model.trained_frames(batch))
+            torch.testing.assert_close(now[:, 1:], motion[:, :-1])
+            assert not now[:, 0].any()
+        passes.add(len(given))
+    assert passes == {1, 2, 3}
+
+
 def test_gradients_pass_the_codes_and_move_them(make_method: MakeMethod) -> None:
     prior = make_method("CodeTalker", stage="prior").prior
     assert isinstance(prior, torch.nn.Module)
@@ -242,6 +265,16 @@ def test_without_a_prior_no_predictor_is_trained(
         make_trainer().fit(make_method("CodeTalker", prior=None), datamodule=tiny)
 
 
+def test_a_run_without_a_prior_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = Path("configs/experiment/puppet_codetalker.yaml").resolve()
+    monkeypatch.chdir(tmp_path)
+    assert main(["fit", "--config", str(config)]) == 2
+    assert "--model.prior" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("option", ["codes", "prior_layers", "tokens", "motion_scale", "leak"])
 def test_a_prior_of_other_options_is_refused(
     option: str, make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer
@@ -296,12 +329,12 @@ def test_a_tiny_one_learns_one_clip_by_heart(make_method: MakeMethod, tiny: Tiny
     batch = collate([sample])
     sizes: dict[str, Any] = {"motion_scale": "none", "codes": 32, "tokens": 2, "prior_dim": 32, "dim": 32}
     prior = laws.with_assets(make_method("CodeTalker", stage="prior", **sizes))
-    train(prior, batch, 120)
+    train(prior, batch, 80)
     model = laws.with_assets(make_method("CodeTalker", **sizes))
     assert isinstance(prior, CodeTalker)
     assert isinstance(model, CodeTalker)
     model.prior.load_state_dict(prior.prior.state_dict())
-    train(model, batch, 80)
+    train(model, batch, 60)
     still = batch.motion.square().mean()
     for each in (prior, model):
         with torch.no_grad():
