@@ -35,6 +35,7 @@ ALLOWED: dict[str, set[str]] = {
     "export": {"animation", "editing", "render", "mesh", *BASE},
     "evaluation": {"data", "metrics", "mesh", "render", *BASE},
     "benchmark": {"version", "evaluation", "metrics", *BASE},
+    "study": {"version", "animation", "data", "evaluation", "mesh", "render", *BASE},
     "pipelines": {"version", "models", "data", "editing", "export", "animation", "mesh", *BASE},
 }
 ALLOWED["cli"] = set(ALLOWED) - {"__main__"}

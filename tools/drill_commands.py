@@ -1,6 +1,6 @@
 """What ``tools/fault_drill.py`` runs: every command that writes, on inputs of a few kilobytes.
 
-A command without an entry in :data:`DRILLS` or :data:`WRITES_NOTHING` makes a test fail.
+A command without an entry in :data:`DRILLS`, :data:`WRITES_NOTHING` or :data:`SERVES` makes a test fail.
 """
 
 from __future__ import annotations
@@ -180,6 +180,18 @@ DRILLS = [
     Drill("figure error", f"{PAPER} --dpi 80 -o a.svg", f"{PAPER} --dpi 100 -o a.svg"),
     Drill("figure lips", f"{PAPER} --dpi 80 -o a.pdf", f"{PAPER} --dpi 100 -o a.pdf"),
     Drill("figure training", "one=curve --width 60 --dpi 50 -o a.png", "one=curve --width 50 --dpi 50 -o a.png"),
+    Drill(
+        "study make",
+        "ours=ours theirs=theirs --truth corpus --mesh corpus/tiny.ply --frame-rate 25 --max-clips 1 "
+        "--still-controls 0 --same-controls 0 --repeats 0 --languages en --size 32 --workers 1 --quiet -o study",
+        pieces=True,
+    ),
+    Drill(
+        "study report",
+        "answered --bootstrap 20 -o tables --json a.json",
+        "answered --bootstrap 10 -o tables --json a.json",
+        pieces=True,
+    ),
     Drill("data prepare", "biwi biwi out --workers 1 --quiet", label="biwi", pieces=True),
     Drill("data prepare", "vocaset vocaset out --workers 1 --quiet", label="vocaset", pieces=True),
     Drill("data prepare", "mead3d mead3d out --flame flame.pkl --workers 1 --quiet", label="mead3d", pieces=True),
@@ -192,6 +204,8 @@ DRILLS = [
 """One or several for each command that writes, except ``fit``, which has a drill of its own."""
 
 WRITES_NOTHING = ("components", "data check")
+SERVES = ("study serve",)
+"""Runs until it is stopped, and writes in transactions of SQLite; tests/study/test_store.py kills it."""
 FIT = "fit"
 
 
@@ -206,7 +220,7 @@ def write_inputs(folder: Path, run: object) -> None:
     import trimesh
 
     from facediff.animation import Animation, write_archive
-    from tests.fakes import biwi, flame, mead3d, person, published, vocaset
+    from tests.fakes import biwi, flame, mead3d, person, published, study, vocaset
     from tests.fakes.benchmark import write_benchmark
     from tests.fakes.tiny import write_tiny
 
@@ -268,6 +282,10 @@ def write_inputs(folder: Path, run: object) -> None:
 
     published.write_author_files(folder)
     write_benchmark(folder)
+
+    asked = study.small_study(clips=3)
+    store = study.write_answers(study.write_study(folder / "answered", asked), asked, 3)
+    assert len(store.raters()) == 3
 
     person.write_auxiliary(folder / "persons")
     person.write_speech(folder / "person.wav", person.FRAMES / person.RATE)

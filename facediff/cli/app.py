@@ -52,6 +52,9 @@ COMMANDS = {
     "figure error": Command("facediff.cli.figure:error", "error at every vertex"),
     "figure lips": Command("facediff.cli.figure:lips", "lip opening over time"),
     "figure training": Command("facediff.cli.figure:training", "training curves of runs"),
+    "study make": Command("facediff.cli.study:make", "make a user study: videos side by side and a page of questions"),
+    "study serve": Command("facediff.cli.study:serve", "serve a study's page, and store what raters answer"),
+    "study report": Command("facediff.cli.study:report", "analyse the answers: preference, scores, agreement; plan"),
     "data prepare": Command("facediff.cli.data:run", "make a corpus folder from a raw distribution"),
     "data check": Command(
         "facediff.cli.data:check", "report what a folder is, what is missing and what is wrong in it"
@@ -64,6 +67,7 @@ HELP = ("-h", "--help")
 GROUPS = {
     "style": "speaking styles of trained models",
     "figure": "draw the figures of a paper: faces, heat maps, lip and training curves",
+    "study": "user studies: make, serve, report",
     "data": "prepare and check corpora, import a reconstructed video",
 }
 

@@ -311,7 +311,8 @@ def add(parser: Any, parameter: Parameter) -> None:  # noqa: ANN401 - argparse's
     if option.bare is not None:
         words |= {"nargs": "?", "const": option.bare}
     if parameter.positional:
-        words |= {} if parameter.default is MISSING else {"nargs": "?", "default": parameter.default}
+        if parameter.default is not MISSING:
+            words |= {"nargs": "*" if parameter.is_list else "?", "default": parameter.default}
         parser.add_argument(parameter.name, **words)
         return
     if parameter.default is MISSING:

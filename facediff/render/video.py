@@ -1,11 +1,11 @@
-"""Frames and sound to an mp4 file: H.264 and AAC, encoded in this process by PyAV."""
+"""Frames and sound to a video file, encoded in this process by PyAV: H.264 and AAC in .mp4, VP9 and Opus in .webm."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from facediff.utils.files import atomic
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
+    from av.video.stream import VideoStream
 
 Frame = npt.NDArray[np.uint8]
 
@@ -23,6 +24,28 @@ AAC_RATES = (96000, 88200, 64000, 48000, 44100, 32000, 24000, 22050, 16000, 1200
 
 X264_OPTIONS = {"crf": "18", "preset": "medium", "threads": "1"}
 """One thread, since x264's output depends on the number of threads, which would otherwise follow the machine."""
+
+VP9_OPTIONS = {"crf": "24", "b": "0", "deadline": "good", "cpu-used": "4", "row-mt": "0", "threads": "1"}
+"""Constant quality, which needs a bit rate of 0, on one thread like x264."""
+
+OPUS_RATES = (48000, 24000, 16000, 12000, 8000)
+"""Rates (Hz) that Opus supports."""
+
+
+class Codecs(NamedTuple):
+    """What a container holds: the names and options of its encoders, and the rates that its sound may have."""
+
+    video: str
+    options: Mapping[str, str]
+    audio: str
+    rates: tuple[int, ...]
+    container: Mapping[str, str]
+
+
+CONTAINERS = {
+    ".mp4": Codecs("libx264", X264_OPTIONS, "aac", AAC_RATES, {"movflags": "+faststart"}),
+    ".webm": Codecs("libvpx-vp9", VP9_OPTIONS, "libopus", OPUS_RATES, {}),
+}
 
 CHUNK = 1024
 
@@ -34,16 +57,17 @@ def write_video(
     audio: npt.NDArray[np.float32] | None = None,
     sample_rate: int | None = None,
 ) -> int:
-    """Write an mp4 whose sound starts with its first frame.
+    """Write a video whose sound starts with its first frame.
 
     The file appears under its name only when it is complete: until then it is a hidden sibling, which is removed if
     anything fails (so is every folder that had to be made). The same input gives the same pictures bit by bit; the
     sound may differ inaudibly, since FFmpeg's AAC encoder now and then chooses other bits for the same samples.
 
     Args:
-        path: ends in ".mp4"; missing folders are made.
-        frames: pictures (height, width, 3), sRGB, all of one size; read one by one. An odd size is made even, as H.264
-            requires, by repeating the last row or column.
+        path: ends in ".mp4" (H.264 and AAC, which every player shows) or ".webm" (VP9 and Opus, for browsers without
+            H.264); missing folders are made.
+        frames: pictures (height, width, 3), sRGB, all of one size; read one by one. An odd size is made even, as
+            H.264 requires, by repeating the last row or column.
         frame_rate: frames per second.
         audio: mono sound (samples,) with full scale 1, or None for a silent video. All of it is written, even where it
             is longer than the picture.
@@ -62,8 +86,11 @@ def write_video(
         127
     """
     target = Path(path)
-    if target.suffix.lower() != ".mp4":
-        raise FaceDiffError(f'video file "{target}" must end in .mp4: other containers are not written.')
+    codecs = CONTAINERS.get(target.suffix.lower())
+    if codecs is None:
+        raise FaceDiffError(
+            f'video file "{target}" must end in {" or ".join(CONTAINERS)}: other containers are not written.'
+        )
     if not 0 < frame_rate <= 1000:
         raise FaceDiffError(f"frame_rate is {frame_rate}: give frames per second above 0, such as 25.")
     rate = Fraction(frame_rate).limit_denominator(1001)
@@ -90,7 +117,7 @@ def write_video(
 
     try:
         with atomic(target) as partial:
-            return _encode(partial, guarded(), rate, sound, sample_rate or 0)
+            return _encode(partial, guarded(), rate, sound, sample_rate or 0, codecs)
     except FaceDiffError:
         if failed:
             raise failed[0] from None
@@ -107,7 +134,12 @@ def _check_frame(frame: Frame, size: tuple[int, int] | None, index: int = 0) -> 
 
 
 def _encode(
-    path: Path, frames: Iterable[Frame], rate: Fraction, sound: npt.NDArray[np.float32] | None, hertz: int
+    path: Path,
+    frames: Iterable[Frame],
+    rate: Fraction,
+    sound: npt.NDArray[np.float32] | None,
+    hertz: int,
+    codecs: Codecs,
 ) -> int:
     """Encode everything into `path`; the first frame sets the size. Returns the number of frames."""
     try:
@@ -121,14 +153,14 @@ def _encode(
     size = _check_frame(first, None)
     try:
         # Opening creates the file; bitexact keeps version strings and dates out of it.
-        container = av.open(str(path), "w", options={"movflags": "+faststart", "fflags": "+bitexact"})
+        container = av.open(str(path), "w", options={**codecs.container, "fflags": "+bitexact"})
     except OSError as error:
         raise FaceDiffError(
             f'cannot write a video into "{path.parent}" ({error.strerror}): choose another folder.'
         ) from error
     try:
         with container:
-            return _Encoder(container, rate, size, sound, hertz).run(first, iterator)
+            return _Encoder(container, rate, size, sound, hertz, codecs).run(first, iterator)
     except av.error.FFmpegError as error:
         raise FaceDiffError(
             f'writing the video in "{path.parent}" failed ({error.strerror}): check whether the disk is full.'
@@ -145,13 +177,15 @@ class _Encoder:
         size: tuple[int, int],
         sound: npt.NDArray[np.float32] | None,
         hertz: int,
+        codecs: Codecs,
     ) -> None:
         import av
         from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
         self.container, self.rate, self.size, self.sound, self.hertz = container, rate, size, sound, hertz
         self.encoded_samples = 0
-        self.video = container.add_stream("libx264", rate=rate, options=X264_OPTIONS)
+        stream = container.add_stream(codecs.video, rate=rate, options=dict(codecs.options))
+        self.video = cast("VideoStream", stream)
         self.video.height, self.video.width = (side + side % 2 for side in size)
         self.video.pix_fmt = "yuv420p"
         context = self.video.codec_context
@@ -162,10 +196,10 @@ class _Encoder:
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.IEC61966_2_1
         self.audio: Any = None
         if sound is not None:
-            out_rate = hertz if hertz in AAC_RATES else 48000
+            out_rate = hertz if hertz in codecs.rates else 48000
             # AAC allows 6 bits per sample and channel.
             bit_rate = min(128_000, 6 * out_rate)
-            self.audio = container.add_stream("aac", rate=out_rate, layout="mono", bit_rate=bit_rate)
+            self.audio = container.add_stream(codecs.audio, rate=out_rate, layout="mono", bit_rate=bit_rate)
             # Sound of the same rate passes unchanged.
             self.resampler = av.AudioResampler(format="fltp", layout="mono", rate=out_rate)
 

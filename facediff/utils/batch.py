@@ -125,18 +125,23 @@ class Recipe:
 
 @dataclass(frozen=True)
 class FileTask:
-    """A file to make of another one; ``recipe`` is what else decides it."""
+    """A file to make of another one; ``recipe`` is what else decides it.
+
+    The record lies in a hidden folder next to the output, or in ``records`` where a folder is handed to others who need
+    not know what its files were made of.
+    """
 
     source: Path
     output: Path
     recipe: Recipe
+    records: Path | None = None
 
     def __str__(self) -> str:
         return str(self.source)
 
     @property
     def _record_file(self) -> Path:
-        return self.output.parent / RECORDS / f"{short_name(self.output.name, 200)}.json"
+        return (self.records or self.output.parent) / RECORDS / f"{short_name(self.output.name, 200)}.json"
 
     def record(self, problem: str) -> None:
         """Record that the task is done; an empty problem means that the output is there."""

@@ -1,7 +1,8 @@
-"""Tables for the terminal and for pipes."""
+"""Tables for the terminal, for pipes, and for documents."""
 
 from __future__ import annotations
 
+import html
 import io
 from collections.abc import Iterable, Sequence
 from typing import TextIO
@@ -59,3 +60,68 @@ def print_table(
     for row in cells:
         table.add_row(*row)
     console.print(table)
+
+
+# The same as text for documents. Cells are text; None becomes –.
+
+_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+_LATEX |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
+_LATEX |= {"±": r"$\pm$", "−": "$-$", "–": "--", "α": r"$\alpha$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
+
+
+def latex_text(text: object) -> str:
+    r"""Text that LaTeX shows as it is.
+
+    Example:
+        >>> latex_text("50 % of a_b")
+        '50 \\% of a\\_b'
+    """
+    return "".join(_LATEX.get(letter, letter) for letter in printable(text))
+
+
+def latex_table(head: Sequence[str], rows: Iterable[Sequence[object]], *, caption: str = "") -> str:
+    """A table for a paper, with the package booktabs; the first column is aligned to the left.
+
+    Args:
+        head: titles of the columns.
+        rows: cells.
+        caption: below the table; none if empty.
+    """
+    lines = [r"\begin{table}", r"\centering", rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}", r"\toprule"]
+    lines += [" & ".join(map(latex_text, head)) + r" \\", r"\midrule"]
+    lines += [" & ".join(latex_text(_cell(cell)) for cell in row) + r" \\" for row in rows]
+    lines += [r"\bottomrule", r"\end{tabular}"]
+    lines += [rf"\caption{{{latex_text(caption)}}}"] if caption else []
+    return "\n".join([*lines, r"\end{table}"])
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    r"""A table in Markdown.
+
+    Example:
+        >>> print(markdown_table(["", "share"], [["a|b", 0.5]]))
+        |  | share |
+        |---|---:|
+        | a\|b | 0.5 |
+    """
+    lines = [list(head), *([_cell(cell) for cell in row] for row in rows)]
+    shown = ["| " + " | ".join(_markdown(cell) for cell in line) + " |" for line in lines]
+    return "\n".join([shown[0], f"|---|{'---:|' * (len(head) - 1)}", *shown[1:]])
+
+
+def html_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table for a page."""
+    titles = "".join(f'<th scope="col">{html.escape(printable(text))}</th>' for text in head)
+    body = "\n".join(
+        "<tr>" + "".join(f"<td>{html.escape(printable(_cell(cell)))}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    return f'<div class="scroll"><table><thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
+
+
+def _cell(cell: object) -> str:
+    return "–" if cell is None else str(cell)
+
+
+def _markdown(text: str) -> str:
+    special = "\\`*_{}[]<>|#"
+    return "".join(f"\\{letter}" if letter in special else letter for letter in printable(text))

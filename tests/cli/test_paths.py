@@ -39,7 +39,7 @@ NO_PATHS = {
         "voice_gate",
         "guidance",
     ),
-    *("identities", "option"),
+    *("host", "identities", "option"),
     *("identity", "kind", "labels", "languages", "license", "push"),
     *("metric", "name", "output_unit", "pattern", "phonemes", "protocol", "region", "sampler", "scalar", "split"),
     "splits",

@@ -43,6 +43,12 @@ MISTAKES = [
     "data check missing",
     "data regions missing",
     "data import-person missing --audio a --name b --corpus c -o d --frame-rate 25",
+    "study make missing other -o a",
+    "study make a=. --truth missing -o a",
+    "study serve missing --prot 3",
+    "study report",
+    "study report missing",
+    "study report --plan 0.7",
     "components samplr",
     "demo --epoch 3",
 ]

@@ -78,12 +78,13 @@ def test_video_sound_keeps_its_length(tmp_path: Path, rate: int) -> None:
     assert np.abs(middle).max() == pytest.approx(0.5, abs=0.05)
 
 
-def test_video_flash_and_click_agree(tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", [".mp4", ".webm"])
+def test_video_flash_and_click_agree(suffix: str, tmp_path: Path) -> None:
     moment, frame_rate = 1.5, 30
     click = np.zeros(3 * SAMPLE_RATE, np.float32)
     click[round(moment * SAMPLE_RATE)] = 1
     flash = [np.full((48, 48, 3), 255 if i >= round(moment * frame_rate) else 0, np.uint8) for i in range(90)]
-    path = tmp_path / "a.mp4"
+    path = tmp_path / f"a{suffix}"
     write_video(path, iter(flash), frame_rate, click, SAMPLE_RATE)
     capture = cv2.VideoCapture(str(path))
     seen = None
@@ -150,6 +151,20 @@ def test_video_mouth_opens_with_its_clicks(tmp_path: Path) -> None:
     (offsets,) = _boxes(path.read_bytes(), b"moov", b"trak", b"mdia", b"minf", b"stbl", b"ctts")
     assert edits[0][3] == struct.unpack_from(">I", offsets, 12)[0]  # the first picture's delay by re-ordering
     assert edits[1][3] == 1024  # AAC's priming, in samples
+
+
+def test_a_webm_holds_vp9_and_opus_and_its_pictures_are_equal_when_written_twice(tmp_path: Path) -> None:
+    sound = np.zeros(SAMPLE_RATE + 77, np.float32)
+    packets = []
+    for name in ("a.webm", "b.webm"):
+        assert write_video(tmp_path / name, _frames(31, (33, 48)), 29.97, sound, 44_100) == 31
+        with av.open(str(tmp_path / name)) as container:
+            video, audio = container.streams.video[0], container.streams.audio[0]
+            assert (video.codec_context.name, audio.codec_context.name) == ("vp9", "opus")
+            assert (video.height, video.width) == (34, 48)
+            packets.append([bytes(packet) for packet in container.demux(video=0)])
+    assert packets[0] == packets[1]
+    assert sum(bool(packet) for packet in packets[0]) == 31
 
 
 def test_video_is_equal_when_written_twice(tmp_path: Path) -> None:

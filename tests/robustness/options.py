@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import io
+import json
 import os
 import random
 import shutil
@@ -75,6 +76,10 @@ BASES: dict[str, str] = {
     "figure error": DRAWN,
     "figure lips": DRAWN,
     "figure training": "WORLD/run -o out.png --dpi 80 --width 85",
+    "study make": "ours=WORLD/ours --truth WORLD/corpus --mesh WORLD/corpus/tiny.ply --frame-rate 25 --max-clips 1 "
+    "--still-controls 1 --same-controls 0 --repeats 0 --languages en --size 32 -o study --workers 1 --quiet",
+    "study serve": "WORLD/study --port 0",
+    "study report": "WORLD/study --answers WORLD/answers.json --bootstrap 10 -o out",
     "data check": "WORLD/corpus --corpus tests.fakes.tiny.Tiny --workers 1 --quiet",
     "data regions": "WORLD/corpus --corpus tests.fakes.tiny.Tiny --size 64 -o out.png",
     "data import-person": "WORLD/motion.npy --audio WORLD/person.wav --name P --corpus WORLD/people --frame-rate 30 "
@@ -95,10 +100,12 @@ def build_world(folder: Path) -> Path:
     import trimesh
 
     from facediff.animation import write_archive
+    from facediff.study import simulate
     from tests.fakes.benchmark import write_benchmark
     from tests.fakes.clicks import clicks
     from tests.fakes.person import person, write_auxiliary, write_speech
     from tests.fakes.published import write_author_files
+    from tests.fakes.study import SCORES, as_file, small_study, write_study
     from tests.fakes.tiny import write_tiny
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -122,6 +129,9 @@ def build_world(folder: Path) -> Path:
     write_speech(folder / "person.wav", 3)
     (folder / "run").mkdir()
     (folder / "run" / "metrics.csv").write_text("epoch,step,train/loss\n0,0,1.0\n1,1,0.5\n2,2,0.3\n")
+    study = small_study(clips=3)
+    write_study(folder / "study", study)
+    (folder / "answers.json").write_text(json.dumps(as_file(simulate(study, SCORES, 1)[0], study)))
     (folder / "empty").mkdir()
     for name in ("empty.npz", "empty.png"):
         (folder / name).touch()
@@ -234,14 +244,16 @@ class Counts:
 def snapshot(folder: Path) -> dict[str, tuple[int, int]]:
     """Size and time of change of every file, but for those that may be named as outputs."""
     files = [path for path in folder.rglob("*") if not path.is_dir() and path.stem != "empty"]
+    files = [path for path in files if not path.name.startswith("answers.sqlite")]  # `study serve` is told to
     return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
 
 
 @contextmanager
 def nothing_leaves() -> Iterator[None]:
-    """No browser, no training."""
+    """No browser, no server, no training."""
     with ExitStack() as stack:
         stack.enter_context(mock.patch("webbrowser.open"))
+        stack.enter_context(mock.patch("uvicorn.Server.run"))
         yield
 
 
@@ -277,7 +289,7 @@ def obey(world: Path, name: str, words: Sequence[str], folder: Path) -> tuple[in
         problem = f"an error of {len(said)} characters"
     if not problem and status not in (0, 1, 2):
         problem = f"status {status}"
-    if not problem and status == 1 and name not in ("animate", "data check"):
+    if not problem and status == 1 and name not in ("animate", "data check", "study report"):
         problem = "status 1"
     if not problem and snapshot(world) != before:
         problem = "changed a file that it was not told to write"

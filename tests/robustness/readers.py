@@ -169,6 +169,42 @@ def read_a_provenance(path: Path) -> object:
     return read_provenance(path.parent)
 
 
+# User studies
+
+
+def answers(path: Path) -> None:
+    from facediff.study import simulate
+    from tests.fakes.study import SCORES, as_file, small_study
+
+    study = small_study(clips=2, still=1)
+    path.write_text(json.dumps(as_file(simulate(study, SCORES, 1)[0], study)))
+
+
+def read_the_answers(path: Path) -> object:
+    from facediff.study.answers import read_answers
+    from tests.fakes.study import small_study
+
+    return read_answers(path, small_study(clips=2, still=1))
+
+
+def a_study(path: Path) -> None:
+    from facediff.study.definition import STUDY_FILE
+    from tests.fakes.study import small_study
+
+    small_study(clips=2, still=1).write(path.parent)
+    (path.parent / STUDY_FILE).rename(path)
+
+
+def read_the_study(path: Path) -> object:
+    from facediff.study import read_study
+    from facediff.study.definition import STUDY_FILE
+
+    folder = path.parent / "study"
+    folder.mkdir(exist_ok=True)
+    shutil.copy(path, folder / STUDY_FILE)
+    return read_study(folder)
+
+
 # Speech
 
 
@@ -729,6 +765,8 @@ READERS = {
     "benchmark, plan": Reader(".json", benchmark_plan, read_a_benchmark_plan),
     "benchmark, cell": Reader(".json", benchmark_cell, read_a_benchmark_cell),
     "provenance": Reader(".json", provenance, read_a_provenance),
+    "answers of a rater": Reader(".json", answers, read_the_answers),
+    "study": Reader(".json", a_study, read_the_study),
     **{suffix: Reader(f".{suffix}", sound, read_sound) for suffix in ("wav", "flac", "ogg", "opus", "mp3", "aiff")},
     "wav, a part": Reader(".wav", sound, read_a_stretch),
     **{

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import html
-import json
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import resources
@@ -30,6 +26,7 @@ from facediff.export.viewer.packing import (
 )
 from facediff.registry import export_format
 from facediff.utils.files import atomic, check_writable
+from facediff.utils.pages import fill, hash_source, script_data
 
 FORMAT = "facediff page 1"
 MOST_ANIMATIONS = 4
@@ -189,30 +186,18 @@ def _page_parts(facts: dict[str, Any], blobs: Blobs) -> list[str]:
     """The text of the page in pieces, in order."""
     style = _asset("style.css")
     script = "(() => {\n" + "\n".join(_asset(f"{name}.js") for name in SCRIPTS) + "\n})();\n"
-    # JSON that cannot end the element it stands in, whatever names are in it; without characters beyond ASCII.
-    data = json.dumps(facts, allow_nan=False)
-    data = data.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     values = {
         "title": html.escape(" · ".join(animation["name"] for animation in facts["animations"])),
         # Lets this script and this style run, and nothing be loaded.
-        "policy": f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; "
+        "policy": f"default-src 'none'; script-src {hash_source(script)}; style-src {hash_source(style)}; "
         f"img-src data:; media-src blob:; base-uri 'none'; form-action 'none'",
         "style": style,
-        "facts": data,
+        "facts": script_data(facts),
         "script": script,
     }
-    # Values are put into the places {{name}} in one pass, so that a value is never searched for places.
-    before, after = (
-        re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], part)
-        for part in _asset("page.html").split("{{blobs}}")
-    )
+    before, after = (fill(part, values) for part in _asset("page.html").split("{{blobs}}"))
     texts = enumerate(blobs.texts)
     return [before, *(f'<script type="text/plain" id="blob-{n}">{text}</script>\n' for n, text in texts), after]
-
-
-def _digest(text: str) -> str:
-    """A text's hash as a content security policy names it."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
 
 
 def _asset(name: str) -> str:

@@ -1,0 +1,35 @@
+"""User studies: videos of methods side by side, a page that asks raters about them, and what their answers say.
+
+From top to bottom: :func:`plan_study` reads and checks animations and makes a :class:`StudyPlan`, whose ``make`` writes
+the study's folder; :func:`serve` hands the page out and stores answers; :func:`analyse_folder` makes a :class:`Report`
+of them. :func:`simulate` gives answers of raters whose preference is known. Names are loaded on first use.
+"""
+
+from typing import TYPE_CHECKING
+
+from facediff.utils.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from facediff.study.definition import Study as Study
+    from facediff.study.definition import read_study as read_study
+    from facediff.study.making import StudyOptions as StudyOptions
+    from facediff.study.making import StudyPlan as StudyPlan
+    from facediff.study.making import plan_study as plan_study
+    from facediff.study.report import Report as Report
+    from facediff.study.report import analyse as analyse
+    from facediff.study.report import analyse_folder as analyse_folder
+    from facediff.study.server import serve as serve
+    from facediff.study.simulation import simulate as simulate
+    from facediff.study.statistics import raters_needed as raters_needed
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "definition": "Study read_study",
+        "making": "StudyOptions StudyPlan plan_study",
+        "report": "Report analyse analyse_folder",
+        "server": "serve",
+        "simulation": "simulate",
+        "statistics": "raters_needed",
+    },
+)

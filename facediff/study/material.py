@@ -1,0 +1,357 @@
+"""The animations of a study: each method's, the truth's and the references', matched by the names of their clips."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation, metres_per_unit
+from facediff.animation.files import AnimationFacts, read_animation
+from facediff.data.audio import CONTAINERS, SUFFIXES, read_speech
+from facediff.data.corpus import MOTION_FOLDERS
+from facediff.errors import FaceDiffError
+from facediff.evaluation.figures.gather import gather
+from facediff.evaluation.figures.material import few
+from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, NamePattern
+from facediff.mesh import read_mesh
+from facediff.study.design import STILL, TRUTH
+from facediff.utils import SAMPLE_RATE
+
+ANIMATIONS = (".npz", ".npy")
+UNEQUAL = 0.1
+"""Share of a clip's frames by which its animations may differ in length; the rest of the longer ones is not shown."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where an animation comes from; picklable, and read where it is drawn.
+
+    Attributes:
+        path: .npz of ``facediff animate``, or .npy of vertices.
+        facts: what a bare array lacks.
+        stride: every n-th frame is used.
+    """
+
+    path: Path
+    facts: AnimationFacts = field(default_factory=AnimationFacts)
+    stride: int = 1
+
+    def read(self) -> Animation:
+        """The animation; all of its frames are finite, and it can be drawn.
+
+        Raises:
+            FaceDiffError: if the file is damaged, or its mesh or its frame rate is not known.
+        """
+        animation = read_animation(self.path, {}, self.facts)
+        if animation.faces is None:
+            raise FaceDiffError(f"{self.path}: comes without a mesh (triangles); give one with --mesh")
+        if self.stride > 1:
+            animation = replace(animation, vertices=animation.vertices[:: self.stride])
+        animation.refuse_not_finite()
+        return animation
+
+    def digest(self) -> str:
+        """What of the facts decides pictures, as a checksum."""
+        found = hashlib.sha256(str(self.stride).encode())
+        for name, value in sorted(self.facts.items()):
+            found.update(name.encode())
+            found.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+        return found.hexdigest()
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clip that all methods have.
+
+    Attributes:
+        name: its name, by which the methods' files are matched.
+        subject: who speaks.
+        motions: by condition: a method, or ``truth``.
+        sound: the recording, or an animation (.npz) that holds it.
+        frames: that every condition has; what is longer is cut.
+        frame_rate: frames a second.
+        templates: neutral faces in one unit, for a camera that sees them all.
+        colours: vertex colours (V, 3) that all are drawn with; None for the material of the renderer.
+        reference: another clip of the speaker's truth; None if there is none.
+    """
+
+    name: str
+    subject: str
+    motions: Mapping[str, Motion]
+    sound: Path
+    frames: int
+    frame_rate: float
+    templates: tuple[npt.NDArray[np.float32], ...]
+    colours: npt.NDArray[np.uint8] | None
+    reference: str | None = None
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts."""
+        return self.frames / self.frame_rate
+
+    def motion(self, condition: str) -> Motion:
+        """The motion that a condition shows; a still face is that of the truth, or else of the first method."""
+        if condition == STILL:
+            return self.motions.get(TRUTH) or next(iter(self.motions.values()))
+        return self.motions[condition]
+
+
+class Material:
+    """The files of a study.
+
+    Args:
+        methods: each method's folder.
+        truth: a corpus folder, a folder of animations, or ``puppet``; None for a study without truth.
+        references: folder of animations whose speakers' names begin the names of its files; the truth's other clips if
+            None.
+        identity: whose style the predictions were given: ``own``, or an identity's name.
+        speech: folder of recordings; the corpus's, or those that the animations hold, if None.
+        mesh: what bare arrays lack: a file with the triangles.
+        frame_rate: frames a second of bare arrays.
+        unit: unit of length of bare arrays.
+
+    Attributes:
+        methods: names of the methods.
+        remark: stands below every video, such as that the corpus is synthetic.
+
+    Raises:
+        FaceDiffError: if a folder holds no animation, or there is no clip that all have.
+    """
+
+    def __init__(
+        self,
+        methods: Mapping[str, Path],
+        truth: Path | None = None,
+        *,
+        references: Path | None = None,
+        identity: str = OWN,
+        speech: Path | None = None,
+        mesh: Path | None = None,
+        frame_rate: float | None = None,
+        unit: str | None = None,
+    ) -> None:
+        for name in (TRUTH, STILL):
+            if name in methods:
+                raise FaceDiffError(f'a method cannot be called "{name}"; name it with NAME=FOLDER')
+        self.methods = list(methods)
+        self.speech = speech
+        self.remark = ""
+        self._sounds: dict[str, Path] = {} if speech is None else _recordings(speech)
+        self._subjects: dict[str, str] = {}
+        self._facts: AnimationFacts = {}
+        if mesh is not None:
+            read = read_mesh(mesh)
+            self._facts = {"template": read.vertices.astype(np.float32), "faces": read.faces}
+            if read.colours is not None:
+                self._facts["colours"] = read.colours
+        if frame_rate is not None:
+            self._facts["frame_rate"] = frame_rate
+        if unit is not None:
+            self._facts["unit"] = unit
+        self._templates: dict[str, AnimationFacts] = {}
+        self._files: dict[str, dict[str, Motion]] = {}
+        if truth is not None:
+            self._files[TRUTH] = self._truths(truth, mesh, frame_rate, unit)
+        for name, folder in methods.items():
+            found = find_animations(folder, list(self._templates), identity)
+            self._files[name] = {clip: Motion(path, self.facts_for(clip)) for clip, path in found.items()}
+        self.references = {
+            clip: Motion(path, self.facts_for(clip))
+            for clip, path in ({} if references is None else find_animations(references, list(self._templates))).items()
+        } or self._files.get(TRUTH, {})
+        sets = [set(files) for files in self._files.values()]
+        self.clips = sorted(set.intersection(*sets))
+        self.left_out = {name: sorted(set(files) - set(self.clips)) for name, files in self._files.items()}
+        if not self.clips:
+            named = "; ".join(f"{name} has {few(dict.fromkeys(sorted(files)))}" for name, files in self._files.items())
+            raise FaceDiffError(
+                f"there is no clip that all have: {named}. Name files alike: <clip>.npz, <clip>.npy or "
+                f"<clip>_condition_<identity>.npy"
+            )
+
+    def _truths(self, truth: Path, mesh: Path | None, frame_rate: float | None, unit: str | None) -> dict[str, Motion]:
+        """The truth's motions by clip; what its corpus knows of faces and sound is kept for bare arrays."""
+        corpus_like = truth == Path("puppet") or any((truth / name).is_dir() for name in MOTION_FOLDERS)
+        if not corpus_like and any(truth.glob("*.npz")):
+            found = find_animations(truth)
+            return {clip: Motion(path, self._facts) for clip, path in found.items()}
+        known = gather({}, truth, mesh=mesh, frame_rate=frame_rate, unit=unit)
+        self.remark = known.remark
+        facts: dict[str, Any] = {"unit": known.unit or "m"}
+        if known.frame_rate is not None:
+            facts["frame_rate"] = known.rate
+        if known.faces is not None:
+            facts["faces"] = known.faces
+        if known.colours is not None:
+            facts["colours"] = known.colours
+        if known.rest is not None:
+            facts["template"] = known.rest.astype(np.float32)
+        self._facts = {**facts, **self._facts}  # type: ignore[typeddict-item]
+        for subject, template in known.templates.items():
+            self._templates[subject] = {**self._facts, "template": np.asarray(template, np.float32)}
+        for clip, found_truth in known.truths.items():
+            self._subjects[clip] = found_truth.name.subject
+            if self.speech is None and known.corpus is not None:
+                sound = known.corpus / "wav" / f"{found_truth.path.stem}.wav"
+                if sound.is_file():
+                    self._sounds[clip] = sound
+        return {
+            clip: Motion(found_truth.path, self.facts_for(clip), known.truth_stride)
+            for clip, found_truth in known.truths.items()
+        }
+
+    def subject(self, clip: str) -> str:
+        """Who speaks in a clip: as the corpus says, else what stands before the last underscore of its name."""
+        return self._subjects.get(clip) or clip.rpartition("_")[0] or clip
+
+    def facts_for(self, clip: str) -> AnimationFacts:
+        """What a bare array of a clip lacks."""
+        return self._templates.get(self.subject(clip), self._facts)
+
+    def open(self, name: str) -> Clip:
+        """Read and check all animations of a clip.
+
+        Raises:
+            FaceDiffError: if a file is damaged, or the animations cannot be shown side by side.
+        """
+        motions = {condition: files[name] for condition, files in self._files.items()}
+        read = {condition: motion.read() for condition, motion in motions.items()}
+        rates = {condition: animation.frame_rate for condition, animation in read.items()}
+        if len(set(rates.values())) > 1:
+            listed = ", ".join(f"{condition} {rate:g}" for condition, rate in rates.items())
+            raise FaceDiffError(
+                f"{name}: differs in frames a second ({listed}); one video has one rate, so generate all at one"
+            )
+        lengths = {condition: len(animation.vertices) for condition, animation in read.items()}
+        frames = min(lengths.values())
+        if max(lengths.values()) > (1 + UNEQUAL) * frames + 1:
+            listed = ", ".join(f"{condition} {length}" for condition, length in lengths.items())
+            raise FaceDiffError(f"{name}: differs in length ({listed} frames); are these animations of one recording?")
+        sound = self._sounds.get(name)
+        if sound is None:
+            speaking = [c for c, animation in read.items() if animation.speech is not None]
+            if not speaking:
+                folder = f"{self.speech}: has no recording {name}" if self.speech else f"{name}: comes without speech"
+                raise FaceDiffError(f"{folder}; give a folder of recordings named like the clips with --speech")
+            sound = motions[speaking[0]].path
+        first = next(iter(read.values()))
+        templates = tuple(in_unit_of(first, animation).template for animation in read.values())
+        colours = next((animation.colours for animation in read.values() if animation.colours is not None), None)
+        same_mesh = len({len(template) for template in templates}) == 1
+        return Clip(
+            name,
+            self.subject(name),
+            motions,
+            sound,
+            frames,
+            first.frame_rate,
+            templates,
+            colours if same_mesh else None,
+        )
+
+    def reference(self, clip: str, used: Sequence[str], rng: np.random.Generator) -> str | None:
+        """Another clip of the same speaker, one that the study does not ask about if there is any; None without one."""
+        own = [
+            other for other in sorted(self.references) if self.subject(other) == self.subject(clip) and other != clip
+        ]
+        if not own:
+            own = [other for other in self.references if other == self.subject(clip) and other != clip]
+        unused = [other for other in own if other not in used]
+        return str(rng.choice(unused or own)) if own else None
+
+    def sound_of(self, clip: str, motion: Motion) -> Path | None:
+        """The sound of a reference: its recording, or its own file if that is an archive."""
+        return self._sounds.get(clip) or (motion.path if motion.path.suffix == ".npz" else None)
+
+
+def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = OWN) -> dict[str, Path]:
+    """The animations of a folder by clip, as ``facediff animate`` and ``facediff predict`` name them.
+
+    Args:
+        folder: holds ``<clip>.npz``, ``<clip>.npy`` or ``<clip>_condition_<identity>.npy``.
+        subjects: known speakers.
+        identity: which of several conditions is taken: ``own``, the speaker's own, or an identity's name.
+
+    Raises:
+        FaceDiffError: if there is no animation, or two of one clip.
+    """
+    if not folder.is_dir():
+        raise FaceDiffError(f"{folder}: no such folder; expected the animations of a method")
+    files = sorted(
+        file for file in folder.iterdir() if file.suffix in ANIMATIONS and file.is_file() and file.name[0] != "."
+    )
+    if not files:
+        raise FaceDiffError(
+            f"{folder}: holds no animation; expected .npz files of `facediff animate --suffix .npz`, or .npy files of "
+            f"`facediff predict`"
+        )
+    pattern = NamePattern(DEFAULT_PATTERNS[0], subjects)
+    found: dict[str, dict[str | None, Path]] = {}
+    own: dict[str, str] = {}
+    for file in files:
+        read = pattern.match(file.stem)
+        clip, condition = (read.clip, read.identity) if read is not None else (file.stem, None)
+        conditions = found.setdefault(clip, {})
+        if condition in conditions:
+            raise FaceDiffError(f"{file}: is of the same clip as {conditions[condition]}; keep one of them")
+        conditions[condition] = file
+        if read is not None and read.identity == read.subject:
+            own[clip] = read.subject
+    chosen = {}
+    for clip, conditions in found.items():
+        wanted = own.get(clip) if identity == OWN else identity
+        if wanted in conditions:
+            chosen[clip] = conditions[wanted]
+        elif None in conditions:
+            chosen[clip] = conditions[None]
+        elif identity == OWN and len(conditions) == 1:
+            chosen[clip] = next(iter(conditions.values()))
+    if not chosen:
+        known = sorted({str(name) for conditions in found.values() for name in conditions if name})
+        raise FaceDiffError(
+            f"{folder}: holds no animation under the condition {identity}, but under {', '.join(known)}; choose one "
+            f"with --identity"
+        )
+    return chosen
+
+
+def _recordings(folder: Path) -> dict[str, Path]:
+    """Recordings of a folder by their names without the suffix."""
+    if not folder.is_dir():
+        raise FaceDiffError(f"--speech {folder}: no such folder; expected recordings named like the clips")
+    found = {file.stem: file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES + CONTAINERS}
+    if not found:
+        raise FaceDiffError(f"--speech {folder}: holds no recording; expected {', '.join(SUFFIXES)}")
+    return found
+
+
+def in_unit_of(first: Animation, other: Animation) -> Animation:
+    """An animation in the unit of length of another one, so that one camera shows both in their sizes."""
+    factor = np.float32(metres_per_unit(other.unit) / metres_per_unit(first.unit))
+    if factor == 1:
+        return other
+    return replace(other, vertices=other.vertices * factor, template=other.template * factor, unit=first.unit)
+
+
+def read_sound(path: Path, seconds: float) -> tuple[npt.NDArray[np.float32], int]:
+    """Speech (S,) of so many seconds, cut or padded with silence, and its sample rate; from a recording or an archive.
+
+    Raises:
+        FaceDiffError: if the file is damaged or holds no speech.
+    """
+    if path.suffix == ".npz":
+        animation = read_animation(path)
+        if animation.speech is None:
+            raise FaceDiffError(f"{path}: holds no speech; give a folder of recordings with --speech")
+        speech, rate = animation.speech, animation.sample_rate
+    else:
+        speech, rate = read_speech(path), SAMPLE_RATE
+    wanted = round(seconds * rate)
+    return np.pad(speech[:wanted], (0, max(0, wanted - len(speech)))).astype(np.float32), rate

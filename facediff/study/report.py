@@ -1,0 +1,482 @@
+"""What the answers to a study say: who is counted, which method is preferred, how certain that is, and who agrees."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from facediff.errors import FaceDiffError
+from facediff.study.answers import Rater, merge, read_answers
+from facediff.study.definition import DATABASE, LEFT, RIGHT, SAME, Study, Trial, read_study
+from facediff.study.design import TRUTH
+from facediff.study.statistics import (
+    alpha_interval,
+    binomial_interval,
+    binomial_p,
+    bradley_terry,
+    holm,
+    krippendorff_alpha,
+    share_between_raters,
+    wilson_interval,
+)
+from facediff.study.store import Store
+from facediff.utils import ranges
+
+Interval = Literal["wilson", "binomial"]
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What the controls say of a rater.
+
+    Attributes:
+        rater: the rater's token.
+        answered: videos that the rater has answered.
+        right: share of the answers to the truth against a still face that name the truth; None without any.
+        consistent: share of the answers to repeated pairs that name the same condition as before; None without any.
+        one_side: share of all answers that name the side that is named more often; None without any.
+        reasons: why the rater is not counted; none if the rater is.
+    """
+
+    rater: str
+    answered: int
+    right: float | None
+    consistent: float | None
+    one_side: float | None
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Preference:
+    """How often a condition was preferred to another one.
+
+    Attributes:
+        question: what was asked.
+        first: the condition whose share this is.
+        second: what it was compared with.
+        wins: answers that name the first.
+        losses: answers that name the second.
+        same: answers that see no difference; half of them count for each.
+        share: of the first, from 0 to 1.
+        interval: of single answers, Wilson's or the exact binomial one.
+        between_raters: of raters that are drawn again; wider where answers of one rater are alike.
+        p: of the exact binomial test against one half; answers without difference do not count.
+        p_corrected: by Holm, for all comparisons of the question.
+    """
+
+    question: str
+    first: str
+    second: str
+    wins: int
+    losses: int
+    same: int
+    share: float
+    interval: tuple[float, float]
+    between_raters: tuple[float, float]
+    p: float
+    p_corrected: float
+
+    @property
+    def answers(self) -> int:
+        """All answers."""
+        return self.wins + self.losses + self.same
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Bradley-Terry scores of one question.
+
+    Attributes:
+        question: what was asked.
+        scores: by condition, natural logarithms of strength, with mean 0.
+        intervals: by condition.
+        robust: whether the intervals take raters, not single answers, as independent.
+        bounded: False if a condition always won or lost, and half a win was added to each side of every pair.
+    """
+
+    question: str
+    scores: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
+    robust: bool
+    bounded: bool
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Krippendorff's alpha of one question.
+
+    Attributes:
+        question: what was asked.
+        alpha: 1 if all raters agree, 0 if they do not more than by chance.
+        interval: over the videos, drawn again.
+        units: videos that at least two raters judged.
+    """
+
+    question: str
+    alpha: float
+    interval: tuple[float, float]
+    units: int
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the answers to a study say.
+
+    Attributes:
+        name: of the data set or the study, the title of its column in tables.
+        study: what was asked.
+        raters: all raters.
+        checks: what the controls say of each.
+        preferences: by question and pair.
+        scores: by question; none where conditions cannot be put on one scale.
+        agreement: by question.
+        sides: by question, the share of answers ``left`` in controls of the same animation twice, with its interval.
+        level: of all intervals.
+        notes: what was set aside, and why.
+    """
+
+    name: str
+    study: Study
+    raters: tuple[Rater, ...]
+    checks: tuple[Checks, ...]
+    preferences: tuple[Preference, ...]
+    scores: tuple[Scores, ...]
+    agreement: tuple[Agreement, ...]
+    sides: dict[str, tuple[float, tuple[float, float], int]]
+    level: float
+    interval: Interval
+    notes: tuple[str, ...] = ()
+
+    @property
+    def counted(self) -> list[Rater]:
+        """The raters whose answers are counted."""
+        kept = {check.rater for check in self.checks if not check.reasons}
+        return [rater for rater in self.raters if rater.token in kept]
+
+    def preference(self, question: str, first: str, second: str) -> Preference | None:
+        """The preference of one pair."""
+        return next(
+            (
+                each
+                for each in self.preferences
+                if (each.question, each.first, each.second) == (question, first, second)
+            ),
+            None,
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything but the raters, as plain data; numbers that are not finite become None."""
+        content = {
+            "study": self.study.id,
+            "name": self.name,
+            "raters": len(self.raters),
+            "counted": len(self.counted),
+            "rule": asdict(self.study.rule),
+            "level": self.level,
+            "interval": self.interval,
+            "checks": [asdict(check) for check in self.checks],
+            "preferences": [asdict(each) | {"answers": each.answers} for each in self.preferences],
+            "bradley_terry": [asdict(each) for each in self.scores],
+            "agreement": [asdict(each) for each in self.agreement],
+            "sides": {
+                question: {"left": share, "interval": interval, "answers": count}
+                for question, (share, interval, count) in self.sides.items()
+            },
+            "notes": self.notes,
+        }
+        found: dict[str, Any] = _finite(content)
+        return found
+
+
+def _finite(value: Any) -> Any:  # noqa: ANN401 - plain data
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def gather_raters(
+    folder: Path, study: Study, files: Sequence[Path] = (), others: Collection[str] = ()
+) -> tuple[list[Rater], list[str]]:
+    """All raters of a study, each once: of the server's file, and of files that were downloaded.
+
+    Args:
+        folder: the study's folder.
+        study: what was asked.
+        files: downloaded files, and folders of them.
+        others: ids of other studies, whose files are passed over.
+
+    Returns:
+        the raters, and a note on every file that was set aside.
+    """
+    stored = Store(folder / DATABASE, study, read_only=True).raters() if (folder / DATABASE).is_file() else []
+    found: list[Rater] = []
+    notes: list[str] = []
+    for path in answer_files(files):
+        try:
+            rater = read_answers(path, study, others)
+        except FaceDiffError as error:
+            notes.append(f"set aside: {error}")
+            continue
+        found += [] if rater is None else [rater]
+    return merge([stored, found]), notes
+
+
+def answer_files(paths: Sequence[Path]) -> list[Path]:
+    """Files, and the .json files of folders, each once.
+
+    Raises:
+        FaceDiffError: if one is not there, or a folder has none.
+    """
+    found: dict[Path, Path] = {}
+    for path in paths:
+        inside = sorted(path.glob("*.json")) if path.is_dir() else [path]
+        if not inside:
+            raise FaceDiffError(f"--answers {path}: holds no .json file; expected answers that raters have downloaded")
+        if not path.exists():
+            raise FaceDiffError(f"--answers {path}: no such file; expected answers that a rater has downloaded")
+        for file in inside:
+            found.setdefault(file.resolve(), file)
+    return list(found.values())
+
+
+def check_rater(rater: Rater, study: Study) -> Checks:
+    """What the controls say of a rater, and whether the study's rule counts them."""
+    rule = study.rule
+    trials = study.by_id
+    first: dict[tuple[str, frozenset[str], str], str | None] = {}
+    right: list[bool] = []
+    consistent: list[bool] = []
+    sides: Counter[str] = Counter()
+    for trial, question, answer in answers_of(rater, trials):
+        sides[answer] += 1
+        if trial.kind == "still":
+            right.append(trial.chosen(answer) == TRUTH)
+        elif trial.kind == "pair":
+            first[trial.clip, frozenset((trial.left, trial.right)), question] = trial.chosen(answer)
+    for trial, question, answer in answers_of(rater, trials):
+        if trial.kind == "repeat":
+            before = (trial.clip, frozenset((trial.left, trial.right)), question)
+            if before in first:
+                consistent.append(first[before] == trial.chosen(answer))
+    named = sides[LEFT] + sides[RIGHT]
+    one_side = max(sides[LEFT], sides[RIGHT]) / named if named else None
+    share_right = sum(right) / len(right) if right else None
+    share_consistent = sum(consistent) / len(consistent) if consistent else None
+    reasons = []
+    if rule.finished and rater.finished is None:
+        reasons.append("has not finished")
+    if share_right is not None and share_right < rule.least_right:
+        reasons.append(f"named the truth in {share_right:.0%} of the controls, less than {rule.least_right:.0%}")
+    if share_consistent is not None and share_consistent < rule.least_consistent:
+        reasons.append(
+            f"answered repeated pairs alike in {share_consistent:.0%}, less than {rule.least_consistent:.0%}"
+        )
+    if one_side is not None and one_side > rule.most_on_one_side:
+        reasons.append(f"named one side in {one_side:.0%} of all answers, more than {rule.most_on_one_side:.0%}")
+    return Checks(rater.token, len(rater.answers), share_right, share_consistent, one_side, tuple(reasons))
+
+
+def answers_of(rater: Rater, trials: dict[str, Trial]) -> list[tuple[Trial, str, str]]:
+    """Trial, question and answer, for every answer of a rater to a trial that the study has."""
+    return [
+        (trials[answer.trial], question, given)
+        for answer in rater.answers.values()
+        if answer.trial in trials
+        for question, given in answer.answers.items()
+    ]
+
+
+@ranges.checked
+def analyse(
+    study: Study,
+    raters: Sequence[Rater],
+    *,
+    name: str = "study",
+    level: ranges.Level = 0.95,
+    interval: Interval = "wilson",
+    resamples: ranges.Resamples = 1000,
+    seed: ranges.Seed = 0,
+    notes: Sequence[str] = (),
+) -> Report:
+    """Analyse the answers to a study. Controls and repeated pairs are no part of preferences.
+
+    Args:
+        study: what was asked.
+        raters: who answered.
+        name: of the data set, for tables.
+        level: of all intervals.
+        interval: of shares of single answers.
+        resamples: for intervals between raters and of alpha.
+        seed: of the resamples.
+        notes: on what was set aside before.
+    """
+    checks = [check_rater(rater, study) for rater in raters]
+    kept = [rater for rater, check in zip(raters, checks, strict=True) if not check.reasons]
+    conditions = study.conditions
+    place = {condition: i for i, condition in enumerate(conditions)}
+    questions = [question.name for question in study.choices]
+    # (rater, preferred, other) for every question; an answer without difference is half a win for both.
+    shape = (len(kept), len(conditions), len(conditions))
+    wins = {question: np.zeros(shape) for question in questions}
+    ties = {question: np.zeros(shape) for question in questions}
+    units: dict[str, dict[tuple[str, frozenset[str]], list[str]]] = {question: {} for question in questions}
+    sides: dict[str, Counter[str]] = {question: Counter() for question in questions}
+    for row, rater in enumerate(kept):
+        for trial, question, answer in answers_of(rater, study.by_id):
+            if trial.kind == "same":
+                sides[question][answer] += 1
+            if trial.kind != "pair":
+                continue
+            chosen = trial.chosen(answer)
+            i, j = sorted((place[trial.left], place[trial.right]))
+            if chosen is None:
+                ties[question][row, i, j] += 1
+            else:
+                won = place[chosen]
+                wins[question][row, won, i + j - won] += 1
+            # What is judged is a clip with a pair, whichever side its faces are on.
+            unit = units[question].setdefault((trial.clip, frozenset((trial.left, trial.right))), [])
+            unit.append(SAME if chosen is None else "first" if place[chosen] == i else "second")
+    preferences: list[Preference] = []
+    scores: list[Scores] = []
+    agreement: list[Agreement] = []
+    for question in questions:
+        preferences += _preferences(
+            question, conditions, wins[question], ties[question], level, interval, resamples, seed
+        )
+        both = ties[question] + ties[question].transpose(0, 2, 1)
+        try:
+            found = bradley_terry(wins[question] + both / 2)
+        except FaceDiffError:
+            found = None  # nobody has answered, or conditions that nobody has compared
+        if found is not None:
+            ends = found.intervals(level)
+            scores.append(
+                Scores(
+                    question,
+                    {condition: float(found.scores[i]) for condition, i in place.items()},
+                    {condition: (float(ends[i, 0]), float(ends[i, 1])) for condition, i in place.items()},
+                    found.robust,
+                    found.bounded,
+                )
+            )
+        judged = [unit for unit in units[question].values() if len(unit) > 1]
+        agreement.append(
+            Agreement(
+                question,
+                krippendorff_alpha(judged),
+                alpha_interval(judged, level, resamples=resamples, seed=seed),
+                len(judged),
+            )
+        )
+    left = {
+        question: (
+            counted[LEFT] / (counted[LEFT] + counted[RIGHT]),
+            wilson_interval(counted[LEFT], counted[LEFT] + counted[RIGHT], level),
+            counted[LEFT] + counted[RIGHT],
+        )
+        for question, counted in sides.items()
+        if counted[LEFT] + counted[RIGHT]
+    }
+    return Report(
+        name,
+        study,
+        tuple(raters),
+        tuple(checks),
+        tuple(preferences),
+        tuple(scores),
+        tuple(agreement),
+        left,
+        level,
+        interval,
+        tuple(notes),
+    )
+
+
+def _preferences(
+    question: str,
+    conditions: Sequence[str],
+    wins: np.ndarray,
+    ties: np.ndarray,
+    level: float,
+    interval: Interval,
+    resamples: int,
+    seed: int,
+) -> list[Preference]:
+    """The preferences of one question, the pairs in the order of the conditions."""
+    of_answers = wilson_interval if interval == "wilson" else binomial_interval
+    found = []
+    for i, first in enumerate(conditions):
+        for j in range(i + 1, len(conditions)):
+            won, lost, same = wins[:, i, j], wins[:, j, i], ties[:, i, j]
+            each = won + lost + same
+            count = int(each.sum())
+            if not count:
+                continue
+            better = won + same / 2
+            found.append(
+                Preference(
+                    question,
+                    first,
+                    conditions[j],
+                    int(won.sum()),
+                    int(lost.sum()),
+                    int(same.sum()),
+                    float(better.sum()) / count,
+                    of_answers(float(better.sum()), count, level),
+                    share_between_raters(better, each, level, resamples=resamples, seed=seed),
+                    binomial_p(int(won.sum()), int(won.sum() + lost.sum())),
+                    1.0,
+                )
+            )
+    corrected = holm([each.p for each in found])
+    return [Preference(**{**vars(each), "p_corrected": value}) for each, value in zip(found, corrected, strict=True)]
+
+
+def analyse_folder(
+    folder: Path,
+    files: Sequence[Path] = (),
+    *,
+    name: str | None = None,
+    others: Collection[str] = (),
+    **options: Any,  # noqa: ANN401 - passed on
+) -> Report:
+    """Analyse the study of a folder: what its server has stored, and files that raters have downloaded.
+
+    Args:
+        folder: the study's folder.
+        files: downloaded files, and folders of them.
+        name: of the data set, for tables; the folder's name if None.
+        others: ids of other studies, whose files are passed over.
+        options: as :func:`analyse` takes them.
+
+    Raises:
+        FaceDiffError: if the folder holds no study, or nobody has answered.
+    """
+    study = read_study(folder)
+    raters, notes = gather_raters(folder, study, files, others)
+    if not any(rater.answers for rater in raters):
+        more = f" ({notes[0]})" if notes else ""
+        raise FaceDiffError(
+            f"{folder}: has no answers{more}; let raters answer with `facediff study serve`, or give the files that "
+            f"they have downloaded with --answers"
+        )
+    return analyse(study, raters, name=name or folder.resolve().name, notes=notes, **options)
+
+
+def design_of(study: Study) -> tuple[int, int]:
+    """How many answers a rater gives to one comparison, at least one, and how many comparisons there are."""
+    pairs = {frozenset((trial.left, trial.right)) for trial in study.trials if trial.kind == "pair"}
+    counts = [
+        sum(trial.kind == "pair" for trial in study.trials_of(number)) / len(pairs)
+        for number in range(len(study.schedules))
+    ]
+    return max(1, int(np.mean(counts))), len(pairs)

@@ -1,0 +1,325 @@
+"""The numbers of a report: intervals of shares, Bradley-Terry scores, agreement, and how many raters a study needs.
+
+Each follows one formula of the literature, named in its docstring; none knows anything of studies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.utils import ranges
+
+Array = npt.NDArray[np.float64]
+
+STEPS, PRECISE = 200, 1e-10
+FEW_RATERS = 10
+"""With fewer raters, the variance between them is too uncertain to be used in place of the model's."""
+
+
+def wilson_interval(wins: float, count: float, level: float = 0.95) -> tuple[float, float]:
+    """Wilson's (1927) score interval of a share.
+
+    Args:
+        wins: how often it happened; half for no difference.
+        count: out of how many.
+        level: of the interval.
+
+    Returns:
+        lower and upper end; 0 and 1 if nothing was counted.
+
+    Example:
+        >>> [round(end, 4) for end in wilson_interval(89, 120)]
+        [0.6567, 0.8117]
+    """
+    if not count:
+        return 0.0, 1.0
+    from scipy.stats import norm
+
+    z = float(norm.ppf((1 + level) / 2))
+    share = wins / count
+    middle = (share + z * z / (2 * count)) / (1 + z * z / count)
+    half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    # Without a win, the lower end is 0, which rounding may miss.
+    return (0.0 if wins <= 0 else middle - half), (1.0 if wins >= count else middle + half)
+
+
+def binomial_interval(wins: float, count: float, level: float = 0.95) -> tuple[float, float]:
+    """The exact binomial interval of Clopper and Pearson (1934), which never covers less than its level.
+
+    The arguments are those of :func:`wilson_interval`; half wins, of no difference, are taken as they are.
+
+    Example:
+        >>> [round(end, 4) for end in binomial_interval(89, 120)]
+        [0.6538, 0.8172]
+    """
+    if not count:
+        return 0.0, 1.0
+    from scipy.stats import beta
+
+    tail = (1 - level) / 2
+    lower = 0.0 if wins <= 0 else float(beta.ppf(tail, wins, count - wins + 1))
+    upper = 1.0 if wins >= count else float(beta.ppf(1 - tail, wins + 1, count - wins))
+    return lower, upper
+
+
+def binomial_p(wins: int, count: int) -> float:
+    """Two-sided p value of the exact binomial test of a share against one half; 1 if nothing was counted.
+
+    Example:
+        >>> round(binomial_p(15, 20), 6)
+        0.041389
+    """
+    if not count:
+        return 1.0
+    from scipy.stats import binomtest
+
+    return float(binomtest(wins, count, 0.5).pvalue)
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """P values corrected for their number as Holm (1979) does: the chance of any false one stays below the level.
+
+    Example:
+        >>> holm([0.01, 0.04, 0.03])
+        [0.03, 0.06, 0.06]
+    """
+    order = sorted(range(len(values)), key=lambda i: values[i])
+    corrected = [1.0] * len(values)
+    largest = 0.0
+    for rank, index in enumerate(order):
+        largest = max(largest, min(1.0, (len(values) - rank) * values[index]))
+        corrected[index] = largest
+    return corrected
+
+
+def share_between_raters(
+    wins: Array, counts: Array, level: float = 0.95, *, resamples: int = 2000, seed: int = 0
+) -> tuple[float, float]:
+    """Percentile interval of a share over raters that are drawn again with replacement.
+
+    Answers of one rater are alike, which intervals of single answers do not know; this one takes raters as they come.
+
+    Args:
+        wins: of each rater (R,).
+        counts: answers of each rater (R,).
+        level: of the interval.
+        resamples: how often raters are drawn.
+        seed: of the draws.
+    """
+    if not counts.sum():
+        return 0.0, 1.0
+    if len(counts) < 2 or not resamples:
+        return math.nan, math.nan
+    drawn = np.random.default_rng(seed).multinomial(len(counts), np.full(len(counts), 1 / len(counts)), resamples)
+    totals = drawn @ counts
+    shares = (drawn @ wins)[totals > 0] / totals[totals > 0]
+    lower, upper = np.quantile(shares, [(1 - level) / 2, (1 + level) / 2])
+    return float(lower), float(upper)
+
+
+@dataclass(frozen=True)
+class BradleyTerry:
+    """Scores of several conditions from comparisons of two at a time.
+
+    Attributes:
+        scores: natural logarithms of the strengths (K,), with mean 0: the chance that i is preferred to j is
+            1 / (1 + exp(s_j - s_i)).
+        covariance: of the scores (K, K).
+        bounded: False if some condition was always (or never) preferred to the others, so that no finite score is most
+            likely; half a win for each side of every pair was then added.
+        robust: whether the covariance takes raters, and not single answers, as independent.
+    """
+
+    scores: Array
+    covariance: Array
+    bounded: bool
+    robust: bool
+
+    def intervals(self, level: float = 0.95) -> Array:
+        """Lower and upper ends (K, 2) of each score, by the normal distribution."""
+        from scipy.stats import norm
+
+        half = float(norm.ppf((1 + level) / 2)) * np.sqrt(np.clip(np.diag(self.covariance), 0, None))
+        return np.stack([self.scores - half, self.scores + half], 1)
+
+
+def bradley_terry(wins: Array) -> BradleyTerry:
+    """Scores of Bradley and Terry (1952), by maximum likelihood.
+
+    The covariance is the sandwich of Liang and Zeger (1986) with raters as clusters, from :data:`FEW_RATERS` raters on;
+    of fewer, the inverse of the information.
+
+    Args:
+        wins: (R, K, K): how often rater r preferred i to j; half for no difference.
+
+    Raises:
+        FaceDiffError: if some conditions were never compared with the others, not even through third ones.
+
+    Example:
+        >>> found = bradley_terry(np.array([[[0.0, 3.0], [1.0, 0.0]]]))
+        >>> bool(np.isclose(found.scores[0] - found.scores[1], np.log(3)))
+        True
+    """
+    conditions = wins.shape[1]
+    total = wins.sum(0)
+    if _components(total + total.T) > 1:
+        raise FaceDiffError("some conditions were never compared with the others; their scores have no common scale")
+    bounded = _components(total, strong=True) == 1
+    played = wins + wins.transpose(0, 2, 1)
+    if not bounded:
+        total = total + 0.5 * (total + total.T > 0)
+    counts = total + total.T
+    scores = np.zeros(conditions)
+    centre = np.full((conditions, conditions), 1 / conditions)
+    for _ in range(STEPS):  # Newton; the likelihood is concave, and the mean of the scores is free
+        chance = 1 / (1 + np.exp(scores[None] - scores[:, None]))
+        gradient = (total - counts * chance).sum(1)
+        weight = counts * chance * (1 - chance)
+        information = np.diag(weight.sum(1)) - weight
+        step = np.linalg.solve(information + centre, gradient)
+        scores += step * min(1.0, 2 / max(np.abs(step).max(), PRECISE))
+        if np.abs(step).max() < PRECISE:
+            break
+    scores -= scores.mean()
+    inverse = np.linalg.inv(information + centre) - centre
+    robust = bounded and len(wins) >= FEW_RATERS
+    if robust:
+        parts = (wins - played * chance).sum(2)  # each rater's share of the gradient
+        scatter = parts.T @ parts * len(wins) / (len(wins) - 1)
+        inverse = inverse @ scatter @ inverse
+    return BradleyTerry(scores, inverse, bounded, robust)
+
+
+def _components(links: Array, *, strong: bool = False) -> int:
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    kind = "strong" if strong else "weak"
+    return int(connected_components(csr_array(links > 0), directed=True, connection=kind, return_labels=False))
+
+
+def krippendorff_alpha(units: Sequence[Sequence[str]]) -> float:
+    """Krippendorff's (2011) alpha for nominal data: agreement beyond chance, 1 if all agree and 0 if chance rules.
+
+    Args:
+        units: for everything that was judged, the judgements; those with fewer than two count for nothing.
+
+    Returns:
+        alpha; NaN if no two judgements can be compared, or all are alike everywhere.
+
+    Example:
+        >>> round(krippendorff_alpha([["a", "a"], ["a", "b"], ["b", "b"], ["b", "b"]]), 4)
+        0.5333
+    """
+    usable = [unit for unit in units if len(unit) > 1]
+    values = sorted({value for unit in usable for value in unit})
+    counts = np.array([[unit.count(value) for value in values] for unit in usable], np.float64)
+    return _alpha(counts) if usable else math.nan
+
+
+def _alpha(counts: Array) -> float:
+    """Alpha of how often each value was given to each unit (U, C)."""
+    judged = counts.sum(1)
+    every = counts.sum(0)
+    total = every.sum()
+    observed = float((counts * (judged[:, None] - counts) / (judged - 1)[:, None]).sum())
+    expected = float((every * (total - every)).sum()) / (total - 1) if total > 1 else 0.0
+    return 1 - observed / expected if expected else math.nan
+
+
+def alpha_interval(
+    units: Sequence[Sequence[str]], level: float = 0.95, *, resamples: int = 1000, seed: int = 0
+) -> tuple[float, float]:
+    """Percentile interval of alpha over units that are drawn again with replacement; NaN where alpha is."""
+    usable = [unit for unit in units if len(unit) > 1]
+    if len(usable) < 2 or not resamples:
+        return math.nan, math.nan
+    values = sorted({value for unit in usable for value in unit})
+    counts = np.array([[unit.count(value) for value in values] for unit in usable], np.float64)
+    rng = np.random.default_rng(seed)
+    found = np.array([_alpha(counts[rng.integers(0, len(counts), len(counts))]) for _ in range(resamples)])
+    found = found[np.isfinite(found)]
+    if not len(found):
+        return math.nan, math.nan
+    lower, upper = np.quantile(found, [(1 - level) / 2, (1 + level) / 2])
+    return float(lower), float(upper)
+
+
+def power_of(count: int, share: float, level: float = 0.95) -> float:
+    """The chance that an exact two-sided binomial test against one half notices a share, in ``count`` answers."""
+    return float(_powers(np.array([count]), share, level)[0])
+
+
+def _powers(counts: npt.NDArray[np.int64], share: float, level: float) -> Array:
+    from scipy.stats import binom
+
+    # The largest number of wins that is still rejected at the lower end; the upper end mirrors it.
+    low = binom.ppf((1 - level) / 2, counts, 0.5)
+    low = np.where(binom.cdf(low, counts, 0.5) > (1 - level) / 2, low - 1, low)
+    found: Array = binom.cdf(low, counts, share) + binom.sf(counts - low - 1, counts, share)
+    return np.where(low < 0, 0.0, found)
+
+
+@dataclass(frozen=True)
+class PowerPlan:
+    """How many raters a study needs.
+
+    Attributes:
+        raters: that are needed.
+        answers: independent answers to one comparison that are needed.
+        power: the chance that the difference is noticed with so many.
+        design_effect: by how much answers of the same rater being alike raises the number.
+    """
+
+    raters: int
+    answers: int
+    power: float
+    design_effect: float
+
+
+@ranges.checked
+def raters_needed(
+    difference: ranges.Preference,
+    *,
+    power: ranges.Power = 0.8,
+    level: ranges.Level = 0.95,
+    per_rater: ranges.PerRater = 1,
+    correlation: ranges.Correlation = 0.1,
+    comparisons: ranges.PerRater = 1,
+) -> PowerPlan:
+    """How many raters a difference of preference takes to be noticed.
+
+    Answers are counted by the exact two-sided binomial test against one half, at the level of Bonferroni where there
+    are several comparisons; the number is the smallest from which on the power is never less. Answers of one rater are
+    alike: their number is raised by the design effect of Kish (1965), 1 + (k - 1) ρ.
+
+    Args:
+        difference: how far the share lies above one half: 0.1 for 60 to 40.
+        power: the chance that a difference of this size is noticed.
+        level: one minus the chance that a difference is seen where there is none.
+        per_rater: answers of one rater to one comparison, k.
+        correlation: of two answers of one rater to one comparison, ρ.
+        comparisons: that are made, of which none may be wrong.
+
+    Example:
+        >>> plan = raters_needed(0.1, per_rater=4, correlation=0.1)
+        >>> plan.answers, plan.raters
+        (210, 69)
+    """
+    share, corrected = 0.5 + difference, 1 - (1 - level) / comparisons
+    from scipy.stats import norm
+
+    z = norm.ppf((1 + corrected) / 2) + norm.ppf(power)
+    most = math.ceil(2 * (0.5 * z / difference) ** 2) + 60
+    counts = np.arange(1, most + 1)
+    powers = _powers(counts, share, corrected)
+    # The power goes up and down by turns, since wins are whole numbers.
+    answers = int(counts[np.flatnonzero(powers < power).max() + 1])
+    effect = 1 + (per_rater - 1) * correlation
+    return PowerPlan(math.ceil(answers * effect / per_rater), answers, float(powers[answers - 1]), effect)
