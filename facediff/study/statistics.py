@@ -35,7 +35,7 @@ def wilson_interval(wins: float, count: float, level: float = 0.95) -> tuple[flo
 
     Example:
         >>> [round(end, 4) for end in wilson_interval(89, 120)]
-        [0.6567, 0.8117]
+        [0.6567, 0.8116]
     """
     if not count:
         return 0.0, 1.0
@@ -230,7 +230,7 @@ def _alpha(counts: Array) -> float:
     total = every.sum()
     observed = float((counts * (judged[:, None] - counts) / (judged - 1)[:, None]).sum())
     expected = float((every * (total - every)).sum()) / (total - 1) if total > 1 else 0.0
-    return 1 - observed / expected if expected else math.nan
+    return float(1 - observed / expected) if expected else math.nan
 
 
 def alpha_interval(
