@@ -524,13 +524,25 @@ def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
     return load_pretrained(HubertModel, source, "HuBERT")
 
 
-def load_recogniser(source: str, config: dict[str, Any] | None) -> PreTrainedModel:
+SOURCE = "audio_encoder.source"
+"""The option that says where a pretrained network comes from, unless a model has one more."""
+
+
+def load_recogniser(source: str, config: dict[str, Any] | None, option: str = SOURCE) -> PreTrainedModel:
     """A network with a CTC head from a directory, from the hub, or from a plain configuration without weights."""
-    return load_typed(source, config, RECOGNISERS, "ForCTC", "recogniser with a CTC head", encoder="ctc")
+    what = "recogniser with a CTC head"
+    return load_typed(source, config, RECOGNISERS, "ForCTC", what, encoder="ctc", option=option)
 
 
 def load_typed(
-    source: str, config: dict[str, Any] | None, kinds: Mapping[str, str], head: str, what: str, *, encoder: str
+    source: str,
+    config: dict[str, Any] | None,
+    kinds: Mapping[str, str],
+    head: str,
+    what: str,
+    *,
+    encoder: str,
+    option: str = SOURCE,
 ) -> PreTrainedModel:
     """A network whose own configuration says its type, from a directory, the hub, or a configuration without weights.
 
@@ -541,6 +553,7 @@ def load_typed(
         head: how they end for a network with this head.
         what: what is expected, in errors.
         encoder: the audio encoder that needs it, in errors.
+        option: the option that ``source`` comes from, in errors.
 
     Raises:
         FaceDiffError: if ``source`` cannot be read, or is of another type.
@@ -551,22 +564,22 @@ def load_typed(
     except ImportError as error:
         raise MissingExtraError("transformers", "train", f"the {encoder} audio encoder") from error
     if config is None:
-        check_source(source)
+        check_source(source, option)
         try:
             kind = transformers.PretrainedConfig.get_config_dict(os.path.expanduser(source))[0].get("model_type")
         except Exception as error:  # the hub's errors are of many classes
-            raise unreadable(source, f"a {what}", error) from error
+            raise unreadable(source, f"a {what}", error, option) from error
     else:
         kind = config.get("model_type")
     if kind not in kinds:
         raise FaceDiffError(
-            f'audio_encoder.source: "{source}" is of the type {kind}; expected a {what} of the type '
+            f'{option}: "{source}" is of the type {kind}; expected a {what} of the type '
             f"{' or '.join(kinds)}, such as facebook/wav2vec2-base-960h"
         )
     network: type[PreTrainedModel] = getattr(transformers, f"{kinds[kind]}{head}")
     if config is not None:
         return network(known_options(getattr(transformers, f"{kinds[kind]}Config"), config))
-    return load_pretrained(network, source, what)
+    return load_pretrained(network, source, what, option)
 
 
 RECOGNISERS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
@@ -580,25 +593,25 @@ def known_options(kind: Any, config: dict[str, Any]) -> Any:  # noqa: ANN401 - o
     return kind.from_dict({key: value for key, value in config.items() if key in known})
 
 
-def check_source(source: str) -> None:
+def check_source(source: str, option: str = SOURCE) -> None:
     """Refuse a directory that does not exist: it would be taken for a name on the hub, with a puzzling message."""
     if (source.startswith((".", "/", "~")) or source.count("/") > 1) and not Path(source).expanduser().is_dir():
         raise FaceDiffError(
-            f"audio_encoder.source: no directory {source}; expected one with config.json and model.safetensors, "
+            f"{option}: no directory {source}; expected one with config.json and model.safetensors, "
             f"or a name on the Hugging Face hub such as facebook/hubert-base-ls960"
         )
 
 
-def unreadable(source: str, what: str, error: Exception) -> FaceDiffError:
+def unreadable(source: str, what: str, error: Exception, option: str = SOURCE) -> FaceDiffError:
     """What is reported where a source cannot be loaded."""
     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
     return FaceDiffError(
-        f'audio_encoder.source: cannot load {what} from "{source}" ({reason}); give a directory '
+        f'{option}: cannot load {what} from "{source}" ({reason}); give a directory '
         f"that holds config.json and model.safetensors, or go online once to fetch it"
     )
 
 
-def load_pretrained(network: Any, source: str, what: str) -> Any:  # noqa: ANN401 - one of transformers' models
+def load_pretrained(network: Any, source: str, what: str, option: str = SOURCE) -> Any:  # noqa: ANN401 - one of transformers' models
     """A complete network from a directory or from the hub.
 
     Raises:
@@ -606,7 +619,7 @@ def load_pretrained(network: Any, source: str, what: str) -> Any:  # noqa: ANN40
     """
     from transformers.utils import logging
 
-    check_source(source)
+    check_source(source, option)
     bar = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     try:
@@ -614,7 +627,7 @@ def load_pretrained(network: Any, source: str, what: str) -> Any:  # noqa: ANN40
             os.path.expanduser(source), use_safetensors=None, output_loading_info=True, dtype=torch.float32
         )
     except Exception as error:  # a broken file makes safetensors, pickle and transformers raise anything
-        raise unreadable(source, what, error) from error
+        raise unreadable(source, what, error, option) from error
     finally:
         if bar:
             logging.enable_progress_bar()
@@ -622,7 +635,7 @@ def load_pretrained(network: Any, source: str, what: str) -> Any:  # noqa: ANN40
     missing = sorted(key for key in info["missing_keys"] if not key.endswith("masked_spec_embed"))
     if missing:
         raise FaceDiffError(
-            f'audio_encoder.source: "{source}" holds no complete {what} ({len(missing)} weights are missing, '
+            f'{option}: "{source}" holds no complete {what} ({len(missing)} weights are missing, '
             f"the first is {missing[0]}); its config.json and model.safetensors must belong together"
         )
     # from_pretrained leaves evaluation mode on, and Lightning trains modules in the mode that it finds them in.

@@ -365,7 +365,7 @@ class TextNetwork(nn.Module):
 
     def __init__(self, source: str, config: dict[str, Any] | None) -> None:
         super().__init__()
-        self.network: PreTrainedModel = load_recogniser(source, config)
+        self.network: PreTrainedModel = load_recogniser(source, config, option="model.text_source")
         self.network.requires_grad_(False)
         self.network.eval()
         settings = self.network.config

@@ -215,7 +215,7 @@ def test_without_a_lip_reader_its_terms_are_left_out(make_method: Callable[..., 
         ({"lip_vertices": [-1]}, "lip_vertices"),
         ({"lip_heads": 3}, "lip_heads"),
         ({"num_heads": 3}, "num_heads"),
-        ({"text_source": "./nowhere", "text_config": None}, "nowhere"),
+        ({"text_source": "./nowhere", "text_config": None}, "text_source: .*nowhere"),
     ],
 )
 def test_options_that_do_not_fit_are_named(
