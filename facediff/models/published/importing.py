@@ -28,6 +28,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.metrics import Region
 from facediff.models.checkpoint import check_weights
 from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.registry import component_class
 from facediff.utils.licences import Commercial, Licence, merged, network_licences
 from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import load_json
@@ -573,7 +574,8 @@ def with_options(method: str, made: dict[str, Any], given: Mapping[str, Any]) ->
     Raises:
         FaceDiffError: if there is no such option, or a value does not fit it.
     """
-    own, encoders = parameters(registry.model.get(method)), parameters(Wav2Vec2Encoder)
+    own = parameters(registry.model.get(method))
+    encoders = parameters(component_class(made["audio_encoder"])) if "audio_encoder" in made else {}
     for name in ("n_vertices", "identities", "frame_rate", "audio_encoder"):
         own.pop(name, None)
     for name in ("dim", "config", "source"):
@@ -582,7 +584,7 @@ def with_options(method: str, made: dict[str, Any], given: Mapping[str, Any]) ->
         if name == "frame_rate" and chooses_rate(method):
             continue
         hints = own if name in own else encoders
-        if name not in hints or (name not in own and "audio_encoder" not in made):
+        if name not in hints:
             raise FaceDiffError(f"--option {name}: {method} has no such option: {choices(name, [*own, *encoders])}")
         value = read_value(text)
         if not fits(value, hints[name]):

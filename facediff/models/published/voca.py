@@ -280,6 +280,8 @@ def convert(weights: Weights, request: Request, found: Found, *, scope: str) -> 
             f"{weights.source}: holds VOCA without DeepSpeech, through whose logits it hears; give the graph "
             f"output_graph.pb of DeepSpeech 0.1.0 as a further file, or as --option deepspeech=output_graph.pb"
         )
+    if request.audio_config is not None:
+        raise FaceDiffError("--audio-config: DeepSpeech's graph says all of its sizes by itself; omit the option")
     state, sizes, left = network_of(read_graph(request.graph), str(request.graph))
     weights.made.update({f"audio_encoder.network.{name}": value for name, value in state.items()})
     weights.ignored.update({f"{request.graph.name}: {name}": "a constant of the graph" for name in left})

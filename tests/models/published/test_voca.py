@@ -149,6 +149,12 @@ def test_the_command_and_its_checkpoint(
     torch.testing.assert_close(made.flatten(1), torch.from_numpy(expected).float(), rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("options", [{"epsilon": 1e-5}, {"audio_config": {"hidden_size": 16}}, {"alignment": "both"}])
+def test_an_option_of_no_use_is_named(options: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match=next(iter(options)).replace("_", "[-_]")):
+        imported(write_voca(tmp_path), **options)
+
+
 def drop(name: str) -> Callable[[voca.Arrays], object]:
     return lambda state: state.pop(name)
 
