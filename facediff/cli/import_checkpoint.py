@@ -85,7 +85,10 @@ def import_checkpoint(
         tell(f"licence: {licence}")
     for note in made.notes:
         tell(f"note: {note}")
-    tell(f"next: facediff animate speech.wav --checkpoint {output} -o speech.npy")
+    if model.animates:
+        tell(f"next: facediff animate speech.wav --checkpoint {output} -o speech.npy")
+    else:
+        tell(f"next: train what hears speech on it, with --model.prior={output}")
 
 
 def gathered(ignored: Mapping[str, str]) -> list[tuple[str, str]]:

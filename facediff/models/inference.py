@@ -334,6 +334,11 @@ class Inference(ABC):
             raise FaceDiffError(f"style: the checkpoint holds no reference motion of {identity}; give one with --style")
         return self.assets.references[identity]
 
+    @property
+    def animates(self) -> bool:
+        """Whether the model makes motion of speech; the first stage of one that is trained in stages may not."""
+        return True
+
     def own_styles(self) -> dict[str, Style]:
         """Styles that the model has by name, in addition to those of reference motion, for ``--style``; here none."""
         return {}

@@ -368,6 +368,11 @@ class CodeTalker(AutoregressiveModel):
 
     # A prior alone.
 
+    @property
+    def animates(self) -> bool:
+        """Whether there is a predictor."""
+        return self.stage == "predictor"
+
     def clip_of(
         self,
         audio: Float[Tensor, " samples"],
@@ -381,7 +386,7 @@ class CodeTalker(AutoregressiveModel):
         Raises:
             FaceDiffError: also if there is no predictor.
         """
-        if self.stage == "prior":
+        if not self.animates:
             raise FaceDiffError(
                 "this checkpoint is CodeTalker's prior alone, which reconstructs motion and hears no speech; train the "
                 "predictor with model.stage=predictor and --model.prior, and animate with its checkpoint"
