@@ -225,6 +225,23 @@ def test_options_that_do_not_fit_are_named(
         make_method("SelfTalk", **options)
 
 
+def test_the_recogniser_is_read_from_a_folder_and_kept(
+    make_method: Callable[..., AnimationModel], tiny: Tiny, ctc_source: Path, tmp_path: Path
+) -> None:
+    model = make_method("SelfTalk", text_config=None, text_source=str(ctc_source))
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    assert isinstance(model, SelfTalk)
+    assert model.text is not None
+    assert (model.text.width, model.text.letters) == (16, 29)
+    save_model(model, tmp_path / "model.ckpt")
+    content = torch.load(tmp_path / "model.ckpt", weights_only=True)
+    content["hyper_parameters"]["text_source"] = "./nowhere"  # it is read from the checkpoint alone
+    torch.save(content, tmp_path / "moved.ckpt")
+    loaded = load_model(tmp_path / "moved.ckpt")
+    batch = collate([tiny.dataset("train")[0]])
+    assert torch.equal(loaded.losses(batch)["loss"], model.eval().losses(batch)["loss"])
+
+
 def test_a_checkpoint_cannot_have_a_recogniser_fetched(
     make_method: Callable[..., AnimationModel], tiny: Tiny, tmp_path: Path
 ) -> None:
