@@ -85,10 +85,10 @@ def check_positions(weights: Weights, name: str) -> None:
     """
     if name not in weights:
         return
-    table = weights.get(name).flatten(0, -2)
-    expected = torch.zeros(table.shape[-1])
+    *_, width = weights.shape(name, 3)
+    table, expected = weights.get(name).flatten(0, 1), torch.zeros(width)
     expected[1::2] = 1.0
-    if not len(table) or not torch.allclose(table[0], expected, rtol=0, atol=1e-5):
+    if not torch.allclose(table[0], expected, rtol=0, atol=1e-5):
         raise FaceDiffError(
             f"{weights.source}: its table of positions {name} is not what the published formula gives; the checkpoint "
             f"is of a variant of the method"

@@ -398,6 +398,10 @@ def test_a_second_stage_alone_says_what_to_give(tmp_path: Path) -> None:
 WRONG: dict[str, tuple[Callable[[State, State], object], str]] = {
     "half a first stage": (lambda one, two: one.pop("decoder.expander.0.0.weight"), "smooth.weight"),
     "another table of positions": (lambda one, two: one["decoder.decoder_pos_embedding.pe"].add_(1), "decoder_pos"),
+    "a table of no rows": (
+        lambda one, two: one.update({"encoder.encoder_pos_embedding.pe": torch.tensor(1.0)}),
+        "encoder_pos",
+    ),
     "an unknown layer": (
         lambda one, two: one.update({"encoder.encoder_transformer.net.0.fn.gate.weight": torch.ones(2)}),
         "gate",
