@@ -12,7 +12,6 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -121,18 +120,22 @@ def rows_of(plan: Plan) -> list[Row]:
     Raises:
         FaceDiffError: if the baseline is none of them.
     """
-    found = []
+    found: list[Row] = []
+    # Where one method alone is trained, its variants are the rows, and their names say enough.
+    alone = sum(method.config is not None for method in plan.methods.values()) == 1
     for method in plan.methods.values():
         names = list(plan.variants) if method.variants is None else list(method.variants)
         if method.config is None or not names:  # what is trained already has no variants
             found.append(Row(method.name, method.label, method))
             continue
-        alone = len(plan.methods) == 1
         for name in names:
             variant = plan.variants[name]
             label = variant.label if alone else f"{method.label}, {variant.label}"
             found.append(Row(name if alone else f"{method.name}/{name}", label, method, variant))
     names = [row.name for row in found]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise FaceDiffError(f"{plan.file}: two rows are called {twice!r}; give the method or the variant another name")
     if plan.baseline and plan.baseline not in names:
         raise FaceDiffError(
             f"{plan.file}: baseline: there is no row {plan.baseline!r}: {choices(plan.baseline, names)}"
@@ -245,7 +248,6 @@ def _source(plan: Plan, kind: Kind, text: str) -> Path:
     return path.resolve()
 
 
-@cache
 def _content(path: Path) -> dict[str, Any]:
     """What a checkpoint or a folder of predictions holds."""
     if path.is_file():
@@ -262,7 +264,6 @@ def _config_content(path: Path | None) -> object:
     return None if path is None else config_content(path)
 
 
-@cache
 def config_content(path: Path) -> object:
     """The plain data of a config, with those of the configs that it names in their place: comments do not count.
 

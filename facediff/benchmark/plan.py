@@ -6,6 +6,7 @@ folders of predictions, none of which it holds.
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -404,4 +405,8 @@ def find_config(text: str, place: str, plan: Path) -> Path:
         return bundled
     folder = Path(text).parent.name
     known = [f"configs/{folder}/{each.name}" for each in sorted((config_dir() / folder).glob("*.yaml"))]
-    raise FaceDiffError(f"{place} {text}: no such config; {choices(text, known) if known else 'expected a YAML file'}")
+    near = difflib.get_close_matches(text, known, n=3, cutoff=0.3)
+    hint = (
+        f"the nearest are {', '.join(near)}" if near else "expected a YAML file such as configs/experiment/puppet.yaml"
+    )
+    raise FaceDiffError(f"{place} {text}: no such config; {hint}")

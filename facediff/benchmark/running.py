@@ -49,6 +49,7 @@ class Setting:
         threads: of each process.
         clips: split of each clip, by the plan's name of a corpus, where predictions are scored.
         truths: folder, frame stride and so on of the truth, likewise.
+        classes: data module of each corpus that is no part of facediff, which a checkpoint may not import by itself.
         launcher: how a facediff command is started.
     """
 
@@ -59,6 +60,7 @@ class Setting:
     threads: int
     clips: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     truths: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    classes: Mapping[str, str] = field(default_factory=dict)
     launcher: tuple[str, ...] = (sys.executable, "-m", "facediff.utils.tethered", "facediff")
 
 
@@ -122,6 +124,7 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
     options = {
         "model.protocol": setting.protocol,
         "model.metrics": metrics,
+        **({"data": setting.classes[cell.corpus]} if cell.corpus in setting.classes else {}),
         **({} if cell.root is None else {"data.root": str(cell.root)}),
         **cell.test_options,
     }

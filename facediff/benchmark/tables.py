@@ -80,7 +80,6 @@ class TableRow:
         differences: from the baseline, with the corrected p-value, by column.
         cost: speed and size.
         clips: sentences that it was scored on.
-        failed: problems of its cells that failed.
     """
 
     name: str
@@ -93,7 +92,6 @@ class TableRow:
     differences: Mapping[str, tuple[Difference, float | None]] = field(default_factory=dict)
     cost: Cost = Cost()
     clips: int = 0
-    failed: tuple[str, ...] = ()
 
     def significant(self, column: str, level: float) -> bool:
         """Whether the difference from the baseline is larger than both sorts of chance explain."""
@@ -170,7 +168,7 @@ def report_of(
     for corpus in outline.corpora:
         of_corpus = [result for result in done if result.corpus == corpus]
         splits = dict.fromkeys(str(row["split"]) for result in of_corpus for row in result.scores)
-        tables += [_table(outline, of_corpus, results, corpus, split, baseline, bootstrap) for split in splits]
+        tables += [_table(outline, of_corpus, corpus, split, baseline, bootstrap) for split in splits]
     definition = "\n".join(dict.fromkeys(line for result in done for line in result.definition.splitlines()))
     return BenchmarkReport(outline, tables, bootstrap, definition, list(results), list(missing), failed, _remarks(done))
 
@@ -191,7 +189,6 @@ def _remarks(results: Sequence[Result]) -> list[str]:
 def _table(
     outline: Outline,
     results: Sequence[Result],
-    everything: Sequence[Result],
     corpus: str,
     split: str,
     baseline: str | None,
@@ -205,10 +202,7 @@ def _table(
     rows = []
     for name, group in groups.items():
         label = outline.rows[name][0]
-        failures = tuple(
-            each.problem for each in everything if each.problem and (each.row, each.corpus) == (name, corpus)
-        )
-        rows.append(_row(name, label, group, split, "model", columns, bootstrap, failed=failures))
+        rows.append(_row(name, label, group, split, "model", columns, bootstrap))
     for reference in outline.references:
         # A face that does not move is the same in every run; shuffled speech is the baseline's.
         group = (
@@ -282,7 +276,6 @@ def _row(
     method: str,
     columns: Mapping[str, Mapping[str, str | None]],
     bootstrap: Bootstrap,
-    failed: tuple[str, ...] = (),
 ) -> TableRow:
     fixed = method in ("still", "mean_face")
     runs = [each for each in group if _row_of(each, split, method)]
@@ -295,7 +288,7 @@ def _row(
     cost = Cost() if method != "model" else _cost(runs)
     seeds = tuple(() if fixed else (each.seed for each in runs))
     clips = max((len(each.clips) for each in scores.values()), default=0)
-    return TableRow(name, label, seeds, method != "model", scores, intervals, cost=cost, clips=clips, failed=failed)
+    return TableRow(name, label, seeds, method != "model", scores, intervals, cost=cost, clips=clips)
 
 
 def _scores(
@@ -387,7 +380,6 @@ def _notes(
     fewer = [f"{row.label} ({row.clips} of {clips})" for row in rows if row.clips < clips]
     if fewer:
         notes.append(f"not scored on all sentences; compare differences, not scores: {', '.join(fewer)}")
-    notes += [f"{row.label}: a cell failed: {problem}" for row in rows for problem in row.failed]
     for column, facts in columns.items():
         sign = {"lower": 1, "higher": -1}.get(str(facts.get("better")))
         scored = [row for row in own if column in row.scores]

@@ -260,6 +260,7 @@ def about(report: BenchmarkReport) -> list[str]:
         )
     lines += report.remarks
     lines += [f"no result yet: {name}" for name in report.missing]
+    lines += [f"failed: {problem}" for problem in report.failed]
     codes = sorted({" ".join(each.code.values()) for each in report.results if each.code})
     lines.append(
         f"facediff {', '.join(codes)}" + (f"; made by `{report.outline.command}`" if report.outline.command else "")

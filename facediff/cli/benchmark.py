@@ -63,9 +63,16 @@ def benchmark(
     from facediff.utils.files import locked
     from facediff.utils.jobs import processors
 
-    find_protocols([found.protocol])
-    parse_all(found.metrics)
-    find_published(found.published)
+    try:
+        (protocol,) = find_protocols([found.protocol])
+        parse_all(found.metrics)
+        find_published(found.published)
+    except FaceDiffError as error:
+        raise FaceDiffError(f"{found.file}: {error}") from error
+    scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *found.metrics]
+    for column in found.columns:
+        if column not in scores:
+            raise FaceDiffError(f"{found.file}: columns: there is no score {column!r}: {choices(column, scores)}")
     cells = cells_of(found)
     folder = output / found.name
     left = pending(cells, folder, retry_failed=retry_failed)
@@ -200,11 +207,13 @@ def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder:
     from facediff.benchmark.running import Setting, fit_options, option_words
     from facediff.cli.lightning import parse_fit
 
+    check_test_options(plan)
     setting = Setting(folder, plan.protocol, plan.metrics, plan.weights, plan.threads)
     seen: set[str] = set()
     prepared: dict[str, SpeechMotionDataModule] = {}
     clips: dict[str, dict[str, str]] = {}
     truths: dict[str, tuple[str, ...]] = {}
+    classes: dict[str, str] = {}
     for cell in left:
         for training in cell.trainings:
             made = {each.name: Path(f"{each.name}.ckpt") for each in cell.trainings}
@@ -218,12 +227,17 @@ def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder:
             seen.add(mark)
             try:
                 class_path, arguments = parse_fit(words)
+                if not class_path.startswith("facediff."):
+                    classes[cell.corpus] = class_path
                 data_of(prepared, class_path, arguments, make=not dry_run)
             except FaceDiffError as error:
                 if "--data.root must be given" in str(error):
                     remedy = f"give it with --root {cell.corpus}=FOLDER; docs/data.md says how to obtain it"
                     raise FaceDiffError(f"{plan.file}: the corpus {cell.corpus} has no folder; {remedy}") from error
                 raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
+        if cell.kind == "checkpoint" and str(cell.source) not in seen:
+            seen.add(str(cell.source))
+            check_checkpoint(cell)
         if cell.kind == "predictions" and cell.corpus not in truths and cell.data is not None:
             try:
                 class_path, arguments = read_data(cell.data)
@@ -233,7 +247,30 @@ def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder:
                     truths[cell.corpus], clips[cell.corpus] = truth_words(data), test_clips(data)
             except FaceDiffError as error:
                 raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
-    return replace(setting, clips=clips, truths=truths)
+    return replace(setting, clips=clips, truths=truths, classes=classes)
+
+
+def check_test_options(plan: Plan) -> None:
+    """Refuse options of a test that would change the model: its weights fit no other."""
+    from facediff.cli.lightning import FREE
+
+    for options in [plan.test_options, *(method.test_options for method in plan.methods.values())]:
+        for name in options:
+            if name.startswith("model.") and name.split(".")[1] not in FREE:
+                free = [f"model.{each}" for each in FREE]
+                raise FaceDiffError(f"{plan.file}: test_options: {name} is none of a test's: {choices(name, free)}")
+
+
+def check_checkpoint(cell: Cell) -> None:
+    """Refuse a checkpoint that cannot be tested, or whose corpus is not here."""
+    from facediff.cli.lightning import corpus_and_folder
+    from facediff.models.checkpoint import read_checkpoint
+
+    path = Path(str(cell.source))
+    _, options = corpus_and_folder(path, read_checkpoint(path), cell.test_options.get("data"), cell.root)
+    folder = options.get("root")
+    if folder is not None and not Path(str(folder)).expanduser().is_dir():
+        raise FaceDiffError(f"{path}: its corpus {folder} is not there; give it with --root {cell.corpus}=FOLDER")
 
 
 def read_data(path: Path) -> tuple[str, dict[str, Any]]:

@@ -1,0 +1,241 @@
+"""What runs, what runs again, and what a kill leaves; the commands themselves are played by a stand-in."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from facediff.benchmark import Cell, cells_of, read_plan, read_result, report_of
+from facediff.benchmark.outline import outline_of, read_results
+from facediff.benchmark.results import cell_file
+from facediff.benchmark.running import Setting, estimate, fit_options, pending, remember, run_cells
+from facediff.benchmark.writing import markdown
+from facediff.cli.benchmark import corpus_folders
+from facediff.errors import FaceDiffError
+
+LAUNCHER = (sys.executable, "-m", "facediff.utils.tethered", "tests.fakes.stand_in")
+PLAN = """\
+seeds: [0, 1]
+baseline: one
+corpora: {tiny: {}}
+methods:
+  one: {config: one.yaml}
+  two: {config: two.yaml, before: {prior: {config: one.yaml}}, options: {model.prior: "{prior}"}}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a plan and two configs."""
+    monkeypatch.setenv("STAND_IN_CALLS", str(tmp_path / "calls"))
+    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    (tmp_path / "part.yaml").write_text("dim: 3\n")
+    (tmp_path / "one.yaml").write_text("model: part.yaml\n")
+    (tmp_path / "two.yaml").write_text("model: {dim: 4}\n")
+    (tmp_path / "plan.yaml").write_text(PLAN)
+    return tmp_path
+
+
+def setting(folder: Path, **options: Any) -> Setting:  # noqa: ANN401
+    facts = {"protocol": "paper", "metrics": (), "weights": "last", "threads": 1, "launcher": LAUNCHER}
+    return Setting(folder / "out", **{**facts, **options})
+
+
+def run(folder: Path, *, retry_failed: bool = False) -> list[Cell]:
+    """Run what is pending, and give back the cells that ran."""
+    cells = cells_of(read_plan(folder / "plan.yaml"))
+    left = pending(cells, folder / "out", retry_failed=retry_failed)
+    return [cell for cell, _ in run_cells(left, setting(folder), workers=1)]
+
+
+def calls(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "calls").read_text().splitlines()]
+
+
+def report(folder: Path) -> str:
+    plan = read_plan(folder / "plan.yaml")
+    outline = outline_of(plan, cells_of(plan), "")
+    results, missing = read_results(folder / "out", outline)
+    text = markdown(report_of(outline, results, missing, resamples=50))
+    measured = ("training", "memory", "RTF", "facediff ")  # columns and lines that a clock decides
+    lines = [line for line in text.splitlines() if not any(word in line for word in measured)]
+    return "\n".join(line.rpartition("| 2 |")[0] or line for line in lines)
+
+
+def test_every_cell_is_trained_and_tested_once_with_its_seed(folder: Path) -> None:
+    assert len(run(folder)) == 4
+    done = calls(folder)
+    assert [each["command"] for each in done].count("test") == 4
+    assert sorted(each["seed_everything"] for each in done if each["name"] == "fit") == ["0", "0", "1", "1"]
+    priors = [each for each in done if each["name"] == "prior"]
+    assert len(priors) == 2
+    followers = [each for each in done if "model.prior" in each]
+    assert {Path(each["model.prior"]).parts[-4] for each in followers} == {"prior"}
+    assert run(folder) == []
+    (result,) = (read_result(cell_file(folder / "out", cell)) for cell in cells_of(read_plan(folder / "plan.yaml"))[:1])
+    assert result is not None
+    assert result.curve["val/lve"] == [2.0, 1.0]
+    assert result.measured["fit"]["memory"]
+
+
+def test_a_changed_config_runs_its_own_cells_again_and_those_alone(folder: Path) -> None:
+    run(folder)
+    (folder / "one.yaml").write_text("# a comment\nmodel: part.yaml\n")
+    assert run(folder) == []
+    (folder / "two.yaml").write_text("model: {dim: 5}\n")
+    assert {cell.row for cell in run(folder)} == {"two"}
+    (folder / "two.yaml").write_text("model: {dim: 4}\n")
+    assert run(folder) == []  # the results of before are found again
+    (folder / "part.yaml").write_text("dim: 4\n")  # which one.yaml names, and so does the prior of two
+    assert {cell.row for cell in run(folder)} == {"one", "two"}
+    (folder / "plan.yaml").write_text(PLAN.replace("[0, 1]", "[0, 1, 2]"))
+    assert {cell.seed for cell in run(folder)} == {2}
+
+
+def test_another_protocol_tests_again_and_trains_nothing(folder: Path) -> None:
+    run(folder)
+    before = len([each for each in calls(folder) if each["command"] == "fit"])
+    (folder / "plan.yaml").write_text(PLAN + "protocol: codetalker\n")
+    assert len(run(folder)) == 4
+    assert len([each for each in calls(folder) if each["command"] == "fit"]) == before
+
+
+@pytest.mark.parametrize("step", ["fit", "test"])
+def test_a_cell_that_fails_stops_no_other_and_says_why(folder: Path, step: str) -> None:
+    key = "options" if step == "fit" else "test_options"
+    failing = PLAN.replace("one: {config: one.yaml}", f"one: {{config: one.yaml, {key}: {{trainer.fail: {step}}}}}")
+    (folder / "plan.yaml").write_text(failing)
+    assert len(run(folder)) == 4
+    results = [read_result(cell_file(folder / "out", cell)) for cell in cells_of(read_plan(folder / "plan.yaml"))]
+    problems = [result.problem for result in results if result is not None and result.problem]
+    assert len(problems) == 2
+    assert all("model.dim 0: made to fail" in problem for problem in problems)
+    assert "made to fail" in report(folder)
+    assert run(folder) == []
+    assert len(run(folder, retry_failed=True)) == 2
+
+
+def begin(folder: Path) -> subprocess.Popen[bytes]:
+    """Run the plan in a process that can be killed."""
+    program = (
+        "import sys; from pathlib import Path; from tests.benchmark.test_running import run\n"
+        "if __name__ == '__main__': run(Path(sys.argv[1]))"
+    )
+    (folder / "main.py").write_text(program)
+    environment = {**os.environ, "STAND_IN_WAITS": "1"}
+    words = [sys.executable, folder / "main.py", folder]
+    return subprocess.Popen(words, cwd=Path(__file__).parents[2], env=environment)
+
+
+def wait_for(condition: Any, seconds: float = 60) -> None:  # noqa: ANN401 - a function
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def is_running(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes")
+def test_killed_and_started_again_the_table_is_the_same(folder: Path) -> None:
+    process = begin(folder)
+    trained = folder / "out" / "runs"
+    wait_for(lambda: list(trained.rglob("last.ckpt")))
+    (call,) = calls(folder)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    wait_for(lambda: not is_running(call["pid"]))  # the training ends with whoever started it
+    assert len(run(folder)) == 4
+    again = calls(folder)[1]
+    assert (again["command"], again["name"], again["continues"]) == ("fit", call["name"], True)
+    killed = report(folder)
+    os.rename(folder / "out", folder / "killed")
+    run(folder)
+    assert report(folder) == killed
+
+
+def test_two_benchmarks_with_the_same_seeds_agree(folder: Path) -> None:
+    run(folder)
+    first = report(folder)
+    os.rename(folder / "out", folder / "first")
+    run(folder)
+    assert report(folder) == first
+
+
+def test_the_estimate_is_the_time_of_the_last_run(folder: Path) -> None:
+    cells = cells_of(read_plan(folder / "plan.yaml"))
+    assert set(estimate(cells, folder / "out").values()) == {None}
+    for cell, outcome in run_cells(cells[:1], setting(folder), workers=1):
+        assert outcome.result is not None
+        remember(cell, outcome.result)
+    found = estimate(cells, folder / "out")
+    assert [found[cell] is None for cell in cells] == [cell.row != cells[0].row for cell in cells]
+    elsewhere = estimate(cells, folder / "another")  # the cache folder remembers equal cells of other seeds
+    assert [elsewhere[cell] is None for cell in cells] == [cell.row != cells[0].row for cell in cells]
+
+
+def test_options_take_the_place_of_the_checkpoints_before_them(folder: Path) -> None:
+    cell = next(cell for cell in cells_of(read_plan(folder / "plan.yaml")) if cell.row == "two")
+    options = fit_options(cell.trainings[-1], {"prior": Path("p.ckpt")}, cell)
+    assert options["model.prior"] == "p.ckpt"
+    assert options["seed_everything"] == cell.seed
+
+
+WRONG: Sequence[tuple[str, str, str]] = (
+    ("seeds: [0, 1]\n", "", "seeds"),
+    ("seeds: [0, 1]", "seeds: []", "seeds"),
+    ("seeds: [0, 1]", "seeds: [0, 0]", "seeds"),
+    ("seeds: [0, 1]", "seeds: [-1]", "seeds"),
+    ("corpora: {tiny: {}}", "corpora: {}", "corpora"),
+    ("corpora: {tiny: {}}", "corpora: {tiny: {root: nowhere}}", "nowhere"),
+    ("config: one.yaml}", "config: missing.yaml}", "missing.yaml"),
+    ("one: {config: one.yaml}", "one: {}", "one"),
+    ("one: {config: one.yaml}", "one: {config: one.yaml, checkpoint: a.ckpt}", "checkpoint"),
+    ("one: {config: one.yaml}", "one: {checkpoint: a.ckpt}", "a.ckpt"),
+    ("one: {config: one.yaml}", "one: {predictions: a}", "a"),
+    ("one: {config: one.yaml}", "one: {predictions: .}", "."),
+    ("one: {config: one.yaml}", "one: {config: one.yaml, options: {--model.dim: 3}}", "--model.dim"),
+    ("one: {config: one.yaml}", "one: {config: one.yaml, options: {seed_everything: 3}}", "seed_everything"),
+    ("baseline: one", "baseline: three", "three"),
+    ("baseline: one", "basline: one", "basline"),
+    ("baseline: one", "weights: middle", "weights"),
+    ("baseline: one", "threads: 0", "threads"),
+    ("baseline: one", "references: [moving]", "moving"),
+)
+
+
+@pytest.mark.parametrize(("old", "new", "named"), WRONG)
+def test_a_bad_plan_meets_one_sentence(folder: Path, old: str, new: str, named: str) -> None:
+    assert old in PLAN
+    (folder / "plan.yaml").write_text(PLAN.replace(old, new, 1))
+    with pytest.raises(FaceDiffError) as caught:
+        cells_of(read_plan(folder / "plan.yaml"))
+    assert named in str(caught.value)
+    assert not (folder / "out").exists()
+
+
+def test_a_root_overrides_the_plans_and_must_be_one_of_its_corpora(folder: Path) -> None:
+    (folder / "here").mkdir()
+    (cell, *_) = cells_of(read_plan(folder / "plan.yaml", corpus_folders([f"tiny={folder / 'here'}"])))
+    assert cell.root == folder / "here"
+    for words in (["tiny"], ["=x"], ["tiny=a", "tiny=b"]):
+        with pytest.raises(FaceDiffError, match="--root"):
+            corpus_folders(words)
+    with pytest.raises(FaceDiffError, match="huge"):
+        read_plan(folder / "plan.yaml", {"huge": folder})
