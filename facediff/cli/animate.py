@@ -51,10 +51,16 @@ class SpeechOptions:
         voice_gate: what finds the pauses, in which the mouth comes to rest: energy or webrtc, with options
             (energy:release=0.3); off for the model's own motion there
         denoise: take steady noise out of the recording before the model hears it (the file keeps the recording)
+        alignment: when which phoneme is spoken, .TextGrid or .csv (start, end, ipa): the lips touch at each p, b and m
+        transcript: the English words that are spoken, from which these times are found
+        closure_budget: mm that a vertex is moved by at most for that (default: 12)
     """
 
     voice_gate: Annotated[str, Option(metavar="GATE")] = "energy"
     denoise: bool = False
+    alignment: File = None
+    transcript: Annotated[str | None, Option(metavar="TEXT")] = None
+    closure_budget: Annotated[ranges.Millimetres | None, Option(metavar="MM")] = None
 
 
 @dataclass(frozen=True)
@@ -154,6 +160,10 @@ def animate(
         refuse_idle("is for recordings, and a stream ends by itself", max_seconds=windows.max_seconds is not None)
     else:
         refuse_idle("is for --stream", rate=changed(windows)["rate"])
+    if len(speech) > 1 or speech[0].is_dir():
+        refuse_idle(
+            "is for one recording", alignment=sound.alignment is not None, transcript=sound.transcript is not None
+        )
     if windows.stream or (len(speech) == 1 and not speech[0].is_dir()):
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
     if not streamed and len(speech) == 1 and not speech[0].exists():
@@ -182,6 +192,9 @@ def animate(
         overlap=windows.overlap,
         voice_gate=sound.voice_gate,
         denoise=sound.denoise,
+        alignment=sound.alignment,
+        transcript=sound.transcript,
+        closure_budget=sound.closure_budget,
         controls=controls.controls(),
         target_mesh=target_mesh,
         correspondence=correspondence,

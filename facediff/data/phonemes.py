@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from facediff.errors import FaceDiffError
+from facediff.utils.limits import LIMITS
 from facediff.utils.plain_files import read_rows
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
 STRESS, LENGTH = "ˈˌ", "ː"
 BILABIALS = ("p", "b", "m")
@@ -75,6 +82,15 @@ def read_phonemes(path: Path) -> list[Phoneme]:
     return found
 
 
+def closed_times(phonemes: Iterable[Phoneme]) -> list[tuple[float, float]]:
+    """Start and end, in seconds, of each p, b and m, in order."""
+    return [
+        (phoneme.start, phoneme.end)
+        for phoneme in sorted(phonemes, key=lambda each: each.start)
+        if phoneme.ipa.strip(STRESS + LENGTH) in BILABIALS
+    ]
+
+
 def closures(phonemes: Iterable[Phoneme], frame_rate: float) -> list[tuple[int, int]]:
     """The frames in which the lips close for p, b and m, as `facediff.metrics.BilabialClosureRate` takes them.
 
@@ -91,13 +107,108 @@ def closures(phonemes: Iterable[Phoneme], frame_rate: float) -> list[tuple[int, 
         [(0, 2), (8, 9)]
     """
     found: list[tuple[int, int]] = []
-    for phoneme in sorted(phonemes, key=lambda each: each.start):
-        if phoneme.ipa.strip(STRESS + LENGTH) not in BILABIALS:
-            continue
-        start = round(phoneme.start * frame_rate)
-        end = max(start + 1, round(phoneme.end * frame_rate))
+    for opens, closes in closed_times(phonemes):
+        start = round(opens * frame_rate)
+        end = max(start + 1, round(closes * frame_rate))
         if found and start <= found[-1][1]:
             found[-1] = (found[-1][0], max(end, found[-1][1]))
         else:
             found.append((start, end))
     return found
+
+
+def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[Phoneme]]:
+    """An English text as espeak-ng speaks it, (S,) at 16 kHz, with the times of its phonemes but for pauses.
+
+    Raises:
+        MissingExtraError: if espeak-ng is not installed.
+    """
+    from facediff.synthetic.speech import Voice, speak
+
+    said = speak(" ".join(text.split()), Voice("en-us", rate=165, pitch=50, pitch_range=50))
+    return said.samples, [Phoneme(each.start, each.end, each.ipa) for each in said.phonemes if each.ipa]
+
+
+# Alignments from elsewhere: Praat's TextGrid, which the usual aligners write.
+
+SILENCES = ("", "sil", "sp", "spn", "pau", "<eps>", "<sil>", "_", "#", "silence")
+"""Labels of pauses."""
+
+TIERS = ("phones", "phone", "phonemes", "phoneme", "mau", "segments", "segment")
+"""Names of the tier that has the phonemes, in order of preference."""
+
+
+def read_alignment(path: Path) -> list[Phoneme]:
+    """Phonemes in time from a TextGrid (``.TextGrid``), or a table as :func:`read_phonemes` reads it.
+
+    Labels may be IPA, also with marks, or ARPAbet with or without digits of stress.
+
+    Raises:
+        FaceDiffError: if the file is neither, or holds no phonemes.
+    """
+    found = _read_textgrid(path) if path.suffix.lower() == ".textgrid" else read_phonemes(path)
+    return [replace(each, ipa=_plain_label(each.ipa)) for each in found]
+
+
+def _plain_label(label: str) -> str:
+    """A label as IPA as far as the lips' closing goes: p, b, m without marks, nothing for a pause."""
+    label = label.strip()
+    if label.lower() in SILENCES:
+        return ""
+    bare = label.strip(STRESS).rstrip("ʰʲʷˠ̩̚ːˑ0123456789")
+    return bare.lower() if bare.lower() in BILABIALS else label
+
+
+def _read_textgrid(path: Path) -> list[Phoneme]:
+    expected = "expected a TextGrid with an interval tier named phones, as Praat or an aligner writes it"
+    try:
+        LIMITS.check("bytes", 40 * path.stat().st_size, path)
+        content = path.read_bytes()
+        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); {expected}") from error
+    except UnicodeDecodeError as error:
+        raise FaceDiffError(f"{path}: is no text; {expected}") from error
+    # Long and short form hold the same values in the same order: texts in quotes, numbers that stand alone, and flags.
+    # What the long form has around them, such as `xmin =` or `intervals [3]:`, is left out.
+    tokens: list[str] = []
+    for quoted_text, number in _TEXTGRID.findall(text):
+        tokens.append(number or f'"{quoted_text.replace(chr(34) * 2, chr(34))}')
+    try:
+        if tokens[:2] != ['"ooTextFile', '"TextGrid']:
+            raise ValueError("its head is another one")
+        tiers = _tiers(tokens[4:])
+    except (ValueError, IndexError) as error:
+        raise FaceDiffError(f"{path}: not readable as a TextGrid ({error}); {expected}") from error
+    for wanted in TIERS:
+        for name, intervals in tiers:
+            # Several speakers have a tier each: "Anna - phones".
+            if intervals and name.lower().split(" - ")[-1].strip() == wanted:
+                return intervals
+    raise FaceDiffError(
+        f"{path}: has no tier of phonemes but {', '.join(name for name, _ in tiers) or 'none'}; {expected}"
+    )
+
+
+def _tiers(tokens: list[str]) -> list[tuple[str, list[Phoneme]]]:
+    """The interval tiers of a TextGrid, from its values behind its times."""
+    rest = iter(tokens)
+    found = []
+    for _ in range(int(float(next(rest, "0")))):
+        kind, name = next(rest, ""), next(rest, "")
+        next(rest, ""), next(rest, "")
+        intervals = []
+        for _ in range(int(float(next(rest, "0")))):
+            start = float(next(rest, ""))
+            if kind != '"IntervalTier':
+                next(rest, "")
+                continue
+            end, label = float(next(rest, "")), next(rest, "")
+            if not (0 <= start <= end < math.inf) or not label.startswith('"'):
+                raise ValueError(f"an interval from {start:g} to {end:g} s")
+            intervals.append(Phoneme(start, end, label[1:]))
+        found.append((name.removeprefix('"'), intervals))
+    return found
+
+
+_TEXTGRID = re.compile(r'"((?:[^"]|"")*)"|(?<![\w\[.-])(-?[0-9]+(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?)(?![\w\].])')

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from facediff.animation import Animation
     from facediff.data import Assets, Reference
+    from facediff.data.phonemes import Phoneme
     from facediff.data.voice_activity import VoiceGate
     from facediff.editing.correspondence import Correspondence
     from facediff.models import AnimationModel, Style
@@ -59,6 +60,9 @@ class AnimationOptions:
     controls: AnimationControls = field(default_factory=AnimationControls)
     voice_gate: str = "energy"
     denoise: bool = False
+    alignment: Path | None = None
+    transcript: str | None = None
+    closure_budget: ranges.Millimetres | None = None
     target_mesh: Path | None = None
     correspondence: Path | None = None
     export: ExportOptions = field(default_factory=ExportOptions)
@@ -100,6 +104,10 @@ class AnimationOptions:
         Args:
             styled: whether there is a style that is no words.
         """
+        if self.alignment is not None and self.transcript is not None:
+            raise FaceDiffError("--alignment and --transcript both say when what is spoken; give one of them")
+        if self.closure_budget is not None and self.alignment is None and self.transcript is None:
+            raise FaceDiffError("--closure-budget: has no effect without --alignment or --transcript; give one of them")
         if self.correspondence is not None and self.target_mesh is None:
             raise FaceDiffError("--correspondence: belongs to a mesh; give --target-mesh as well")
         if self.style_template is not None and self.style is None and not styled:
@@ -180,6 +188,7 @@ class AnimationPipeline:
 
             self.rest = MouthAtRest(gate, facts["template"], facts["regions"], self.model.frame_rate)
         self._correspondence: Correspondence | None = None
+        self._phonemes: list[Phoneme] | None = None  # of the recording, once they are known
         self.style: Reference | Style | None = None
         wanted = style if style is not None else options.style or None
         if wanted is not None:
@@ -289,7 +298,7 @@ class AnimationPipeline:
 
     def finished(self, animation: Animation, seed: int) -> Animation:
         """A sample after everything that the options ask for after inference."""
-        animation = self.options.controls.apply(animation, seed=seed)
+        animation = self.options.controls.apply(self.closed(animation), seed=seed)
         target = self.options.target_mesh
         if target is None:
             return animation
@@ -301,6 +310,24 @@ class AnimationPipeline:
         # All samples have one face, so that one correspondence serves all.
         made, self._correspondence = retarget(animation, target, self.options.correspondence)
         return made
+
+    def closed(self, animation: Animation) -> Animation:
+        """A sample whose lips touch where its phonemes say so, if their times are given."""
+        alignment, transcript, speech = self.options.alignment, self.options.transcript, animation.speech
+        from facediff.data.phonemes import closed_times, read_alignment
+        from facediff.editing.closures import BUDGET, close_lips
+
+        if self._phonemes is None:
+            if alignment is not None:
+                self._phonemes = read_alignment(alignment)
+            elif transcript is not None and speech is not None:
+                from facediff.pipelines.transcripts import align_transcript
+
+                self._phonemes = align_transcript(transcript, speech)
+            else:
+                return animation
+        budget = self.options.closure_budget
+        return close_lips(animation, closed_times(self._phonemes), BUDGET if budget is None else budget)
 
     def precision(self) -> AbstractContextManager[object]:
         """Within it the network multiplies in the precision asked for; noise and vertices stay as they are."""

@@ -225,6 +225,9 @@ class Animator:
         max_seconds: float | None = None,
         voice_gate: str = "energy",
         denoise: bool = False,
+        alignment: str | Path | None = None,
+        transcript: str | None = None,
+        closure_budget: float | None = None,
         expressiveness: Scales | None = None,
         blinks: float | bool | None = None,
         gaze: float | bool | None = None,
@@ -263,6 +266,10 @@ class Animator:
             voice_gate: what finds the pauses, in which the mouth comes to rest, with its options
                 (``"energy:release=0.3"``); ``"off"`` for the model's own motion there.
             denoise: take steady noise out of the speech before the model hears it.
+            alignment: when which phoneme is spoken (.TextGrid, or .csv with start, end, ipa), so that the lips touch at
+                each p, b and m.
+            transcript: the English words that are spoken, from which these times are found.
+            closure_budget: millimetres that a vertex is moved by at most for that; 12 if None.
             expressiveness: as :meth:`Animation.control` takes it.
             blinks: likewise.
             gaze: likewise.
@@ -294,6 +301,9 @@ class Animator:
             overlap=overlap,
             voice_gate=voice_gate,
             denoise=denoise,
+            alignment=None if alignment is None else Path(alignment),
+            transcript=transcript,
+            closure_budget=closure_budget,
             controls=controls_of(
                 **_given(
                     {

@@ -170,6 +170,8 @@ def check_stream(options: AnimationOptions, output: Path) -> None:
         "up": export.up,
         "samples": None if options.samples == 1 else options.samples,
         "denoise": options.denoise or None,
+        "alignment": options.alignment,
+        "transcript": options.transcript,
     }
     for option, value in whole.items():
         if value is not None:

@@ -36,6 +36,7 @@ NO_PATHS = {
         "expressiveness",
         "expressivity",
         "font",
+        "transcript",
         "voice_gate",
         "guidance",
     ),

@@ -476,6 +476,18 @@ def read_the_phonemes(path: Path) -> object:
     return read_phonemes(path)
 
 
+def textgrid(path: Path) -> None:
+    head = 'File type = "ooTextFile"\nObject class = "TextGrid"\n\n0\n0.3\n<exists>\n1\n'
+    head += '"IntervalTier"\n"phones"\n0\n0.3\n2\n'
+    path.write_text(head + '0\n0.1\n"m"\n0.1\n0.3\n"a"\n')
+
+
+def read_the_textgrid(path: Path) -> object:
+    from facediff.data.phonemes import read_alignment
+
+    return read_alignment(path)
+
+
 def manifest(path: Path) -> None:
     path.write_text(json.dumps({"frame_rate": 25, "unit": "m", "files": {"a": {"bytes": 1, "sha256": "b"}}}))
 
@@ -794,6 +806,7 @@ READERS = {
     "clip table": Reader(".csv", clip_table, read_the_clip_table),
     "a corpus's lip pairs": Reader(".txt", pairs, corpus_pairs),
     "phonemes": Reader(".csv", phonemes, read_the_phonemes),
+    "alignment": Reader(".TextGrid", textgrid, read_the_textgrid),
     "manifest": Reader(".json", manifest, read_the_manifest),
     **{
         f"check, {name}": Reader(Path(name).suffix, of_tiny(name), checking(name), 0.3)

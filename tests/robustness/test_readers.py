@@ -47,6 +47,7 @@ NOT_FROM_ELSEWHERE = {
     "facediff/synthetic/speech.py": "the answer of a process of our own",
     "facediff/export/viewer/page.py": "part of the package",
     "facediff/registry.py": "part of the package",
+    "facediff/data/augmentation.py": "what it has just encoded itself",
     "facediff/cli": "hands files over to the readers of other packages",
     "facediff/pipelines": "hands files over to the readers of other packages",
     "facediff/render": "writes",
