@@ -151,7 +151,7 @@ class PublishedModel(AnimationModel):
     # The speaker.
 
     def identity_weights(self, batch: Batch) -> Float[Tensor, "batch identities"]:
-        """One-hot rows of the clips' identities; of an unknown speaker, equal weights of all training identities.
+        """One-hot rows of the clips' identities; of an unknown speaker :meth:`unknown_weights`.
 
         A clip that has a style of :meth:`own_styles`, or a mixture of them, has its weights.
         """
@@ -159,7 +159,12 @@ class PublishedModel(AnimationModel):
         if batch.style is not None and batch.style.shape[1] == count:
             return batch.style.to(batch.template)
         known = nn.functional.one_hot(batch.identity.clamp_min(0), count).to(batch.template)
-        return torch.where(batch.identity[:, None] >= 0, known, known.new_full((count,), 1.0 / count))
+        return torch.where(batch.identity[:, None] >= 0, known, self.unknown_weights().to(known))
+
+    def unknown_weights(self) -> Float[Tensor, " identities"]:
+        """The weights of an unknown speaker."""
+        count = len(self.identities)
+        return torch.full((count,), 1.0 / count)
 
     def styled_identities(self) -> list[str]:
         """Every training identity: the table is the style."""

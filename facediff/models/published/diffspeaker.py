@@ -8,7 +8,6 @@ checkpoints. docs/methods/diffspeaker.md says what of the published code is an o
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -169,11 +168,11 @@ class DiffSpeaker(DiffusionModel):
         """As many as the truth has, as in the published test."""
         return [int(frames) for frames in batch.frame_lengths]
 
-    def identity_weights(self, batch: Batch) -> Float[Tensor, "batch identities"]:
-        """One-hot rows of the clips' identities; an unknown speaker's as ``unknown_speaker`` says."""
-        if self.unknown_speaker == "first":
-            batch = replace(batch, identity=batch.identity.clamp_min(0))
-        return super().identity_weights(batch)
+    def unknown_weights(self) -> Float[Tensor, " identities"]:
+        """Of the first identity, or of all, as ``unknown_speaker`` says."""
+        if self.unknown_speaker == "mean":
+            return super().unknown_weights()
+        return torch.eye(len(self.identities))[0]
 
     def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states, interpolated to the frames."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
-from facediff.models import AnimationModel, DiffSpeaker, import_checkpoint
+from facediff.models import AnimationModel, DiffSpeaker, Style, import_checkpoint
 from facediff.models.published.importing import import_files
 from tests.fakes import diffspeaker, published
 from tests.fakes.published import COORDINATES, IDENTITIES
@@ -93,6 +93,17 @@ def test_an_unknown_speaker_gets_the_row_that_is_chosen(policy: str, tmp_path: P
     made = model.animate(speech_of(40), identity="Z").vertices.flatten(1)
     rows = state["denoiser.obj_vector.weight"]
     row = rows[0] if policy == "first" else rows.mean(0)
+    expected = diffspeaker.reference(state, speech_of(40), "biwi", 0, torch.zeros(()), noise_of(20, 0), row=row)
+    torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
+
+
+def test_rows_of_speakers_are_mixed(tmp_path: Path) -> None:
+    state = diffspeaker.state("biwi")
+    model = model_of(state, tmp_path, "biwi")
+    model.assets.templates["Z"] = torch.zeros(published.VERTICES, 3)  # whose row would be the first one
+    shares = torch.tensor([0.0, 0.25, 0.75])
+    made = model.animate(speech_of(40), identity="Z", style=Style("B and C", shares)).vertices.flatten(1)
+    row = shares @ state["denoiser.obj_vector.weight"]
     expected = diffspeaker.reference(state, speech_of(40), "biwi", 0, torch.zeros(()), noise_of(20, 0), row=row)
     torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
 
