@@ -73,7 +73,7 @@ class DiffSpeaker(DiffusionModel):
             them, as published; animate ``windows`` of them; or ``extend`` the tables by their formula.
         alignment: speech is interpolated at every frame rate.
         weight_decay: AdamW's, as PyTorch has it.
-        options: those of :class:`PublishedModel`, and of every model.
+        options: those of :class:`DiffusionModel`, and of every model.
     """
 
     chosen: ClassVar[tuple[str, ...]] = (*DiffusionModel.chosen, "scheduler", "sampling_steps")

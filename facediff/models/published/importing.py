@@ -407,11 +407,6 @@ def import_files(
             f"of the method? If they may be left out, give --option ignore={left[0]}"
         )
     assets, notes = read_assets(found, templates, regions, mesh)
-    if found.frame_rate != (usual := dataset_facts()[found.dataset].frame_rate):
-        notes.append(
-            f"it animates at {found.frame_rate:g} frames a second, as {method.method} was published, and the corpus "
-            f"{found.dataset} has {usual:g}; to test it there, import it with --option frame_rate={usual:g}"
-        )
     model = build(weights, method, found, with_options(method.method, made, request.options))
     model.adopt(assets)
     label(model, method, found.dataset)

@@ -25,7 +25,7 @@ from facediff.models.deepspeech import DeepSpeechEncoder, network_of
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Width, frame_mask
 from facediff.models.published.base import PublishedModel, SpeakerTable, masked_mean
-from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
+from facediff.models.published.importing import Found, Recogniser, Request, Weights, dataset_facts, recogniser
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 from facediff.utils.tensorflow_files import read_graph
@@ -274,6 +274,12 @@ def convert(weights: Weights, request: Request, found: Found, *, scope: str) -> 
         raise FaceDiffError(
             f"--option frame_rate={rate:g}: VOCA gives {PUBLISHED_RATE:g} frames a second; expected a rate that "
             f"divides it, such as 30, which takes every second frame"
+        )
+    usual = dataset_facts()[found.dataset].frame_rate
+    if rate != usual:
+        remedy = f"; to test it there, import it with --option frame_rate={usual:g}" * (PUBLISHED_RATE % usual == 0)
+        weights.notes.append(
+            f"it animates at {rate:g} frames a second, and the corpus {found.dataset} has {usual:g}{remedy}"
         )
     if request.graph is None:
         raise FaceDiffError(
