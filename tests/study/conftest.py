@@ -1,0 +1,62 @@
+"""Studies that are served, and the browser that opens their pages."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import uvicorn
+
+from facediff.study import StudyOptions, plan_study, read_study
+from facediff.study.definition import DATABASE
+from facediff.study.server import make_app, make_server
+from facediff.study.store import Store
+from tests.export.viewer.conftest import browser, program
+from tests.fakes.study import write_methods
+
+__all__ = ["browser", "program"]
+
+Serve = Callable[[Path], str]
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """Serves a study's folder on a free port, and gives the address without a slash at its end."""
+    running: list[tuple[uvicorn.Server, threading.Thread, socket.socket]] = []
+
+    def start(folder: Path) -> str:
+        study = read_study(folder)
+        app = make_app(folder, study, Store(folder / DATABASE, study))
+        listening = socket.create_server(("127.0.0.1", 0))
+        ready = threading.Event()
+        config = uvicorn.Config(app, log_level="error", lifespan="off", ws="none")
+        server = make_server(config, ready.set)
+        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
+        thread.start()
+        assert ready.wait(20)
+        running.append((server, thread, listening))
+        return f"http://127.0.0.1:{listening.getsockname()[1]}"
+
+    yield start
+    for server, thread, listening in running:
+        server.should_exit = True
+        thread.join(10)
+        listening.close()
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a study of two clips with two questions and comments, whose videos play."""
+    root = tmp_path_factory.mktemp("study")
+    folders = write_methods(root)
+    truth = folders.pop("truth")
+    lips = "{name: lips, text: {en: 'Whose lips?', de: 'Welche Lippen?'}, no_difference: true}"
+    (root / "q.yaml").write_text(f"questions: [realism, {lips}, comments]\ntitle: <b>Faces</b> & more\n")
+    options = StudyOptions(
+        questions=root / "q.yaml", languages=["en", "de"], size=48, still=1, same=0, repeats=0, max_clips=2
+    )
+    plan_study(folders, options, truth=truth).make(root / "made", workers=1, progress=False)
+    return root / "made"
