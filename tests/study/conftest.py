@@ -32,7 +32,7 @@ def serve() -> Iterator[Serve]:
         app = make_app(folder, study, Store(folder / DATABASE, study))
         listening = socket.create_server(("127.0.0.1", 0))
         ready = threading.Event()
-        config = uvicorn.Config(app, log_level="error", lifespan="off", ws="none")
+        config = uvicorn.Config(app, log_level="error", lifespan="off", ws="none", server_header=False)
         server = make_server(config, ready.set)
         thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
         thread.start()

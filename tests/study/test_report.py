@@ -1,0 +1,233 @@
+"""Reports: simulated raters of known preference are recovered, careless ones are left out, and tables are as stated."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from facediff.study import analyse, analyse_folder, simulate
+from facediff.study.answers import Rater, merge
+from facediff.study.definition import Rule, Study
+from facediff.study.report import check_rater
+from facediff.study.tables import latex, main_table, markdown, page, write_report
+from tests.fakes.study import SCORES, as_file, small_study, write_answers, write_study
+
+HOSTILE = "=cmd|' /C calc'!A0 <script>alert(1)</script> \\input{x} %_& | `"
+
+
+def expected(first: str, second: str) -> float:
+    return 1 / (1 + math.exp(SCORES[second] - SCORES[first]))
+
+
+def answered(study: Study, rater: Rater, **sides: str) -> Rater:
+    """A rater who answers all trials of a kind so: a side, or a condition's name."""
+    answers = {}
+    for trial in study.trials_of(rater.number):
+        wanted = sides.get(trial.kind)
+        given = dict(rater.answers[trial.id].answers)
+        if wanted is not None:
+            side = wanted if wanted in ("left", "right") else "left" if trial.left == wanted else "right"
+            given = dict.fromkeys(given, side)
+        answers[trial.id] = replace(rater.answers[trial.id], answers=given)
+    return replace(rater, answers=answers)
+
+
+def test_known_preferences_are_recovered_within_the_stated_intervals() -> None:
+    study = small_study(methods=("ours", "theirs", "third"), clips=9, pairs="all")
+    inside = {"wilson": [], "binomial": [], "raters": [], "scores": []}
+    for seed in range(14):
+        raters = simulate(study, SCORES, 54, seed=seed)
+        for interval in ("wilson", "binomial"):
+            report = analyse(study, raters, interval=interval, resamples=200, seed=seed)
+            for each in report.preferences:
+                inside[interval].append(each.interval[0] <= expected(each.first, each.second) <= each.interval[1])
+                if interval == "wilson":
+                    low, high = each.between_raters
+                    inside["raters"].append(low <= expected(each.first, each.second) <= high)
+        centre = np.mean([SCORES[name] for name in report.study.conditions])
+        for scores in report.scores:
+            assert scores.robust
+            for name, (low, high) in scores.intervals.items():
+                inside["scores"].append(low <= SCORES[name] - centre <= high)
+        assert len(report.preferences) == 2 * 6
+    # Of some 170 intervals of 95 %; the two questions of a study are independent, pairs of one question are not.
+    assert {name: 0.88 < np.mean(found) < 0.998 for name, found in inside.items()} == dict.fromkeys(inside, True)
+
+
+def test_every_pair_is_asked_equally_often_and_controls_are_no_preference() -> None:
+    study = small_study(clips=4)
+    raters = simulate(study, SCORES, len(study.schedules))
+    report = analyse(study, raters)
+    counts = {each.answers for each in report.preferences}
+    kept = len(report.counted)
+    assert kept == len(raters)
+    assert sum(each.answers for each in report.preferences if each.question == "realism") == 4 * kept
+    assert max(counts) - min(counts) <= 0.2 * max(counts)
+    assert {(each.first, each.second) for each in report.preferences} == {("ours", "theirs"), ("ours", "truth")}
+
+
+def test_preferences_are_counted_by_hand() -> None:
+    study = small_study(clips=2, still=1, same=1, repeats=0, rule=Rule(most_on_one_side=1.0, least_right=1.0))
+    (rater,) = simulate(study, SCORES, 1)
+    always = answered(study, rater, pair="ours", still="truth", same="left")
+    never = replace(answered(study, rater, pair="ours", still="still", same="left"), token="e" * 32)
+    left = answered(study, replace(rater, token="d" * 32), pair="left", still="truth", same="right")
+    report = analyse(study, [always, never, left], resamples=0)
+    assert [bool(check.reasons) for check in report.checks] == [False, True, False]
+    assert "named the truth in 0% of the controls" in report.checks[1].reasons[0]
+    for each in report.preferences:
+        pairs = [t for t in study.trials_of(0) if t.kind == "pair" and each.second in (t.left, t.right)]
+        on_left = sum(trial.left == "ours" for trial in pairs)
+        assert (each.wins, each.losses) == (len(pairs) + on_left, len(pairs) - on_left)
+        assert each.share == each.wins / (2 * len(pairs))
+    share, _, count = report.sides["realism"]
+    assert (share, count) == (0.5, 2)
+
+
+def test_the_rule_decides_who_is_counted() -> None:
+    study = small_study(clips=4, still=2, repeats=2, rule=Rule(least_consistent=1.0, most_on_one_side=0.7))
+    rater = answered(study, simulate(study, SCORES, 1)[0], pair="ours", still="truth", repeat="ours", same="left")
+    assert check_rater(rater, study).reasons == ()
+    torn = answered(study, rater, repeat="theirs")
+    pairs = [t for t in study.trials_of(0) if t.kind == "repeat" and "theirs" in (t.left, t.right)]
+    assert check_rater(torn, study).consistent == 1 - len(pairs) / 2 or check_rater(torn, study).consistent == 0
+    assert ("alike" in " ".join(check_rater(torn, study).reasons)) == (check_rater(torn, study).consistent < 1)
+    lazy = answered(study, rater, pair="left", still="truth", repeat="left", same="left")
+    assert check_rater(lazy, study).one_side > 0.7
+    assert any("one side" in reason for reason in check_rater(lazy, study).reasons)
+    early = replace(rater, finished=None)
+    assert check_rater(early, study).reasons == ("has not finished",)
+    assert check_rater(early, replace(study, rule=replace(study.rule, finished=False))).reasons == ()
+
+
+def test_careless_raters_are_mostly_left_out() -> None:
+    study = small_study(clips=8, still=4, rule=Rule(least_right=0.8))
+    report = analyse(study, simulate(study, SCORES, 200, careless=0.3, seed=2))
+    assert 200 * 0.65 < len(report.counted) < 200 * 0.8
+    clean = analyse(study, simulate(study, SCORES, 100, seed=5))
+    assert len(clean.counted) > 95
+
+
+def test_answers_without_difference_are_half_for_each() -> None:
+    study = small_study(clips=6, no_difference=True)
+    report = analyse(study, simulate(study, SCORES, 40, no_difference=0.4, seed=1))
+    for each in report.preferences:
+        assert (each.same > 0) == (each.question == "realism")
+        assert each.share == pytest.approx((each.wins + each.same / 2) / each.answers)
+    assert "no difference" in markdown([report])
+
+
+def test_noise_is_seldom_called_a_preference() -> None:
+    """Of studies in which nothing is better, at most the stated share has any corrected p below 0.05."""
+    study = small_study(methods=("ours", "theirs", "third"), clips=6, rule=Rule(least_right=0, most_on_one_side=1))
+    even = dict.fromkeys(SCORES, 0.0)
+    false = [
+        any(
+            each.p_corrected < 0.05
+            for each in analyse(study, simulate(study, even, 24, seed=s), resamples=0).preferences
+            if each.question == "realism"
+        )
+        for s in range(70)
+    ]
+    assert np.mean(false) < 0.1
+
+
+def test_files_and_database_of_one_rater_are_one_rater(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    study = small_study(clips=3)
+    folder = write_study(tmp_path / "study", study)
+    write_answers(folder, study, 3)
+    downloads = tmp_path / "downloads"
+    downloads.mkdir()
+    for rater in simulate(study, SCORES, 5):
+        (downloads / f"{rater.number}.json").write_text(json.dumps(as_file(rater, study)))
+    report = analyse_folder(folder, [downloads, downloads / "0.json"])
+    assert len(report.raters) == 5
+    assert report.notes == ()
+    (downloads / "5.json").write_text("{}")
+    (downloads / "6.json").write_text(json.dumps(as_file(rater, study) | {"study": "0" * 16}))
+    assert main(["study", "report", str(folder), "--answers", str(downloads), "--bootstrap", "20"]) == 1
+    said = capsys.readouterr().out
+    assert said.count("set aside") == 2
+    assert "5.json" in said
+    assert "6.json" in said
+
+
+def test_the_table_has_a_column_for_every_data_set_and_hostile_names_stay_text(tmp_path: Path) -> None:
+    study = small_study(clips=3, methods=("ours", HOSTILE))
+    scores = {**SCORES, HOSTILE: 0.0}
+    raters = [replace(r, comments={"comments": HOSTILE}) for r in simulate(study, scores, 8)]
+    reports = [analyse(study, raters, name=name) for name in ("BIWI", "3DMEAD")]
+    head, rows = main_table(reports, "realism")
+    assert head[1:] == ["BIWI", "3DMEAD"]
+    assert [row[0] for row in rows] == [f"ours and {HOSTILE}", "ours and truth"]
+    each = reports[0].preference("realism", "ours", "truth")
+    assert each is not None
+    assert rows[1][1] == f"{100 * each.share:.2f} [{100 * each.interval[0]:.2f}, {100 * each.interval[1]:.2f}]"
+    files = {path.name: path.read_text() for path in write_report(reports, tmp_path / "out")}
+    assert set(files) == {
+        *("report.md", "report.html", "report.json", "table.tex", "table.csv", "answers.csv", "answers.json"),
+        "comments.csv",
+    }
+    assert "<script>" not in files["report.html"]
+    assert r"\input" not in files["table.tex"].replace(r"\textbackslash{}input", "")
+    assert files["table.tex"].count(r"\toprule") == 2
+    assert latex(reports) == files["table.tex"]
+    assert page(reports) == files["report.html"]
+    with (tmp_path / "out" / "table.csv").open(newline="") as stream:
+        table = list(csv.DictReader(stream))
+    assert len(table) == 2 * 2 * 2
+    assert float(table[0]["share"]) == reports[0].preferences[0].share
+    for name in ("answers.csv", "comments.csv"):
+        with (tmp_path / "out" / name).open(newline="") as stream:
+            cells = [cell for row in csv.reader(stream) for cell in row]
+        assert not [cell for cell in cells if cell.startswith("=")]
+    content = json.loads(files["report.json"])
+    assert [each["name"] for each in content["studies"]] == ["BIWI", "3DMEAD"]
+    assert len(json.loads(files["answers.json"])["answers"]) == 2 * sum(
+        len(answer.answers) for rater in raters for answer in rater.answers.values()
+    )
+
+
+def test_the_plan_is_printed_without_and_with_a_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["study", "report", "--plan", "0.1"]) == 0
+    assert capsys.readouterr().out.startswith("210 raters")
+    folder = write_study(tmp_path / "study", small_study(clips=8))
+    assert main(["study", "report", str(folder), "--plan", "0.1", "--correlation", "0"]) == 0
+    found = re.match(r"study: (\d+) raters", capsys.readouterr().out)
+    assert found is not None
+    from facediff.study import raters_needed
+
+    assert int(found[1]) == raters_needed(0.1, per_rater=4, correlation=0, comparisons=2).raters
+    for wrong in (["--plan", "0.6"], ["--power", "0.9"], ["--plan", "0.1", "--json", "a.json"], [str(folder)]):
+        assert main(["study", "report", *wrong]) == 2
+        error = capsys.readouterr().err
+        assert wrong[0] in error
+        assert error.count("\n") == 1
+
+
+def test_raters_of_several_sources_are_merged_and_what_was_first_stays() -> None:
+    study = small_study(clips=3)
+    rater = simulate(study, SCORES, 1)[0]
+    names = list(rater.answers)
+    one = replace(rater, answers={name: rater.answers[name] for name in names[:2]}, finished=None)
+    other = replace(rater, answers={n: replace(a, seconds=99.0) for n, a in rater.answers.items()})
+    (whole,) = merge([[one], [other]])
+    assert [whole.answers[name].seconds == 99 for name in names] == [False, False, *[True] * (len(names) - 2)]
+    assert whole.finished == rater.finished
+
+
+def test_no_answers_is_one_sentence(tmp_path: Path) -> None:
+    folder = write_study(tmp_path / "study", small_study())
+    with pytest.raises(FaceDiffError, match="--answers"):
+        analyse_folder(folder)
+    with pytest.raises(FaceDiffError, match=r"missing\.json"):
+        analyse_folder(folder, [tmp_path / "missing.json"])

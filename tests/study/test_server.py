@@ -1,0 +1,188 @@
+"""The server takes what the page sends, once, and nothing else; Ctrl-C ends it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.study import serve as serve_study
+from facediff.study import simulate
+from facediff.study.definition import DATABASE, Study
+from facediff.study.server import MOST_BYTES, check_folder
+from facediff.study.store import Store
+from tests.fakes.study import SCORES, small_study, write_study
+from tests.study.conftest import Serve
+
+TOKEN = "00112233445566778899aabbccddeeff"  # noqa: S105 - of a rater
+JSON = "application/json"
+
+
+@pytest.fixture
+def study() -> Study:
+    return small_study(clips=3)
+
+
+@pytest.fixture
+def address(study: Study, tmp_path: Path, serve: Serve) -> str:
+    return serve(write_study(tmp_path / "study", study))
+
+
+def ask(url: str, content: object = None, *, raw: bytes | None = None, kind: str = JSON) -> tuple[int, Any]:
+    """Status and answer; a POST if there is anything to send."""
+    body = raw if raw is not None else None if content is None else json.dumps(content).encode()
+    headers = {"Content-Type": kind} if body is not None else {}
+    request = urllib.request.Request(url, body, headers)  # noqa: S310 - our own server
+    try:
+        with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310 - our own server
+            found = response.read()
+            return response.status, json.loads(found) if response.headers["Content-Type"] == JSON else found
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read()
+
+
+def given(asked: Study, number: int, place: int = 0, **changed: object) -> dict[str, object]:
+    """What the page sends of a trial."""
+    trial = asked.trials_of(number)[place]
+    content = {"study": asked.id, "rater": TOKEN, "trial": trial.id, "answers": {"realism": "left", "style": "right"}}
+    return {**content, "seconds": 2.5, "plays": 1, "at": "2026-01-01T00:00:00.000Z", **changed}
+
+
+def begin(address: str, study: Study, **changed: object) -> tuple[int, Any]:
+    content = {"study": study.id, "rater": TOKEN, "language": "en", "code": "", "agreed": True, **changed}
+    return ask(f"{address}/api/raters", content)
+
+
+def test_a_rater_answers_and_finishes_and_repeats_change_nothing(address: str, study: Study, tmp_path: Path) -> None:
+    assert begin(address, study) == begin(address, study) == (200, {"number": 0})
+    assert begin(address, study, rater="f" * 32) == (200, {"number": 1})
+    assert ask(f"{address}/api/answers", given(study, 0)) == (200, {"new": True})
+    assert ask(f"{address}/api/answers", given(study, 0, seconds=9)) == (200, {"new": False})
+    end = {"study": study.id, "rater": TOKEN, "comments": {"comments": "'; DROP TABLE raters; --"}}
+    assert ask(f"{address}/api/finish", end)[0] == 409
+    for place in range(len(study.trials_of(0))):
+        assert ask(f"{address}/api/answers", given(study, 0, place))[0] == 200
+    assert ask(f"{address}/api/finish", end) == ask(f"{address}/api/finish", end) == (200, {"finished": True})
+    first, second = Store(tmp_path / "study" / DATABASE, study).raters()
+    assert first.comments == {"comments": "'; DROP TABLE raters; --"}
+    assert [len(first.answers), len(second.answers)] == [len(study.trials_of(0)), 0]
+    assert first.answers[study.trials_of(0)[0].id].seconds == 2.5
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", first.finished or "")
+
+
+WRONG: dict[str, dict[str, object]] = {
+    "another study": {"study": "0" * 16},
+    "no token": {"rater": None},
+    "a token that is none": {"rater": "x' OR 1=1 --"},
+    "an unknown trial": {"trial": "0" * 16},
+    "a trial that is no text": {"trial": ["a"]},
+    "no answers": {"answers": {}},
+    "an answer that is none": {"answers": {"realism": "both", "style": "left"}},
+    "an answer that cannot be hashed": {"answers": {"realism": ["left"], "style": "left"}},
+    "a question too many": {"answers": {"realism": "left", "style": "left", "more": "left"}},
+    "no number of seconds": {"seconds": "2"},
+    "negative seconds": {"seconds": -1},
+    "endless seconds": {"seconds": 1e300},
+    "half a play": {"plays": 0.5},
+    "no time": {"at": "now"},
+    "a time of many letters": {"at": "2" * 5000},
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_the_page_does_not_send_is_refused_and_not_stored(
+    name: str, address: str, study: Study, tmp_path: Path
+) -> None:
+    begin(address, study)
+    status, _ = ask(f"{address}/api/answers", given(study, 0, **WRONG[name]))
+    assert status == 400
+    assert not Store(tmp_path / "study" / DATABASE, study).raters()[0].answers
+
+
+def test_bodies_of_other_kinds_and_sizes_are_refused(address: str, study: Study) -> None:
+    assert begin(address, study, agreed=False)[0] == 400
+    assert begin(address, study, code="x" * 41)[0] == 400
+    assert begin(address, study, language="<script>")[0] == 400
+    url = f"{address}/api/answers"
+    assert ask(url, given(study, 0))[0] == 404  # nobody has begun
+    assert ask(url, raw=b"{" * 20_000)[0] == 400
+    assert ask(url, raw=b"[" + b"0," * MOST_BYTES + b"0]")[0] == 413
+    assert ask(url, raw=b"\xff\xfe{")[0] == 400
+    assert ask(url, raw=b"[1, 2]")[0] == 400
+    assert ask(url, raw=b'{"study": NaN}')[0] == 400
+    assert ask(url, raw=json.dumps(given(study, 0)).encode(), kind="text/plain")[0] == 415
+    assert ask(url)[0] == 405
+    trial_of_another = next(
+        trial.id for trial in study.trials if trial.id not in {each.id for each in study.trials_of(0)}
+    )
+    begin(address, study)
+    assert ask(url, given(study, 0, trial=trial_of_another))[0] == 400
+
+
+def test_the_page_and_its_videos_are_served_in_parts_and_nothing_else(address: str, study: Study) -> None:
+    status, page = ask(f"{address}/")
+    assert status == 200
+    assert study.id.encode() in page
+    assert ask(f"{address}/api/study") == (200, {"id": study.id})
+    video = f"{address}/videos/{study.videos()[0]}"
+    request = urllib.request.Request(video, headers={"Range": "bytes=6-11"})  # noqa: S310 - our own server
+    with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310 - our own server
+        assert (response.status, response.read()) == (206, b"video ")
+        assert response.headers["X-Content-Type-Options"] == "nosniff"
+        assert response.headers["Server"] is None
+    for path in (
+        "study.json",
+        "videos/../study.json",
+        "videos/..%2f..%2fstudy.json",
+        "answers.sqlite",
+        "videos/",
+        "docs",
+    ):
+        assert ask(f"{address}/{path}")[0] == 404
+
+
+def test_what_cannot_be_served_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match=r"study\.json"):
+        serve_study(tmp_path)
+    study = small_study()
+    folder = write_study(tmp_path / "study", study)
+    for host, port in (("127.0.0.1", 1), ("no such host", 0), ("256.1.1.1", 0), ("a\0b", 0)):
+        if os.geteuid() or port == 0:  # the superuser may listen anywhere
+            with pytest.raises(FaceDiffError, match="--host"):
+                serve_study(folder, host=host, port=port)
+    (folder / "page" / "videos" / study.videos()[0]).unlink()
+    with pytest.raises(FaceDiffError, match=study.videos()[0]):
+        check_folder(folder)
+
+
+def test_the_command_serves_until_ctrl_c_and_continues(tmp_path: Path) -> None:
+    study = small_study(clips=2)
+    write_study(tmp_path / "study", study)
+    words = [sys.executable, "-m", "facediff", "study", "serve", "study", "--port", "0"]
+    for number, rater in enumerate(simulate(study, SCORES, 2)):
+        with subprocess.Popen(
+            words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
+        ) as process:
+            assert process.stdout is not None
+            found = re.match(r"(http://127\.0\.0\.1:\d+)/ serves study", process.stdout.readline())
+            assert found is not None
+            assert begin(found[1], study, rater=rater.token) == (200, {"number": number})
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=60)
+        assert (process.returncode, err) == (0, "")
+        assert f"{number + 1} raters" in out
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
