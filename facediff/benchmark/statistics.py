@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.evaluation.report import Bootstrap, Interval
+from facediff.utils.statistics import holm
 
 Array = npt.NDArray[np.float64]
 
@@ -179,22 +180,6 @@ def welch(one: Scores, other: Scores, level: float = 0.95) -> tuple[float | None
     p = 2 * float(stdtr(freedom, -abs(gap) / deviation))
     half = float(stdtrit(freedom, (1 + level) / 2)) * deviation
     return min(p, 1.0), Interval(gap - half, gap + half)
-
-
-def holm(values: Sequence[float]) -> list[float]:
-    """Holm's step-down correction (1979): p-values of a family, such that the chance of any false one is bounded.
-
-    Example:
-        >>> holm([0.01, 0.04, 0.03])
-        [0.03, 0.06, 0.06]
-    """
-    order = np.argsort(values, kind="stable")
-    adjusted = [0.0] * len(values)
-    highest = 0.0
-    for place, index in enumerate(order.tolist()):
-        highest = max(highest, min(1.0, (len(values) - place) * values[index]))
-        adjusted[index] = highest
-    return adjusted
 
 
 def compared(

@@ -18,6 +18,7 @@ from facediff.evaluation.report import Interval
 from facediff.utils.files import atomic
 from facediff.utils.plain_files import write_rows
 from facediff.utils.tables import format_table
+from facediff.utils.tables import latex_text as tex
 
 NONE = "–"
 TITLES = {"mve": "MVE", "lve": "LVE", "fdd": "FDD", "fdd_absolute": "FDD, absolute", "fdd_signed": "FDD, signed"}
@@ -297,14 +298,6 @@ def latex(report: BenchmarkReport) -> str:
     for table in report.tables:
         lines += latex_table(table, report)
     return "\n".join([*lines, ""])
-
-
-def tex(text: object) -> str:
-    """Text that LaTeX shows as it is."""
-    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    special |= {char: f"\\{char}" for char in "&%$#_{}"}
-    signs = {"±": r"$\pm$", "−": "$-$", "–": "--", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "→": r"$\to$"}
-    return "".join((special | signs).get(char, char) for char in printable(text))
 
 
 def latex_table(table: Table, report: BenchmarkReport) -> list[str]:

@@ -202,9 +202,13 @@ def check_output(output: Path, study: Study) -> None:
         FaceDiffError: naming the folder.
     """
     check_folder_writable(output)
-    if not output.exists() or not any(entry.name != LOCK for entry in output.iterdir()):
+    if not output.exists():
         return
-    if not (output / STUDY_FILE).is_file() and not (output / RECORDS).is_dir():
+    inside = [*output.iterdir(), *(output / PAGE_FOLDER).glob("*")]
+    # What a run leaves that is killed before its first video is recorded.
+    begun = {output / LOCK, output / PAGE_FOLDER, output / PAGE_FOLDER / VIDEO_FOLDER}
+    own = (output / STUDY_FILE).is_file() or (output / RECORDS).is_dir()
+    if not own and any(path not in begun and ".partial-" not in path.name for path in inside):
         raise FaceDiffError(f"{output}: is not empty, and holds no study; choose a new folder")
     if (output / DATABASE).exists():
         from facediff.study.store import count_raters, study_of

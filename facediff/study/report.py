@@ -20,13 +20,13 @@ from facediff.study.statistics import (
     binomial_interval,
     binomial_p,
     bradley_terry,
-    holm,
     krippendorff_alpha,
     share_between_raters,
     wilson_interval,
 )
 from facediff.study.store import Store
 from facediff.utils import ranges
+from facediff.utils.statistics import holm
 
 Interval = Literal["wilson", "binomial"]
 

@@ -82,22 +82,6 @@ def binomial_p(wins: int, count: int) -> float:
     return float(binomtest(wins, count, 0.5).pvalue)
 
 
-def holm(values: Sequence[float]) -> list[float]:
-    """P values corrected for their number as Holm (1979) does: the chance of any false one stays below the level.
-
-    Example:
-        >>> holm([0.01, 0.04, 0.03])
-        [0.03, 0.06, 0.06]
-    """
-    order = sorted(range(len(values)), key=lambda i: values[i])
-    corrected = [1.0] * len(values)
-    largest = 0.0
-    for rank, index in enumerate(order):
-        largest = max(largest, min(1.0, (len(values) - rank) * values[index]))
-        corrected[index] = largest
-    return corrected
-
-
 def share_between_raters(
     wins: Array, counts: Array, level: float = 0.95, *, resamples: int = 2000, seed: int = 0
 ) -> tuple[float, float]:

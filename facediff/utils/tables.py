@@ -66,7 +66,15 @@ def print_table(
 
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
-_LATEX |= {"±": r"$\pm$", "−": "$-$", "–": "--", "α": r"$\alpha$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
+_LATEX |= {
+    "±": r"$\pm$",
+    "−": "$-$",
+    "–": "--",
+    "α": r"$\alpha$",
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    "→": r"$\to$",
+}
 
 
 def latex_text(text: object) -> str:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from facediff.benchmark.statistics import Scores, compared, difference, holm, marked, sign_flip, welch
+from facediff.benchmark.statistics import Scores, compared, difference, marked, sign_flip, welch
 from facediff.evaluation.report import Bootstrap
+from facediff.utils.statistics import holm
 
 BOOTSTRAP = Bootstrap(2000, 0.95, 0)
 

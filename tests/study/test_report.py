@@ -19,6 +19,7 @@ from facediff.study.answers import Rater, merge
 from facediff.study.definition import Rule, Study
 from facediff.study.report import check_rater
 from facediff.study.tables import latex, main_table, markdown, page, write_report
+from facediff.study.texts import Questionnaire
 from tests.fakes.study import SCORES, as_file, small_study, write_answers, write_study
 
 HOSTILE = "=cmd|' /C calc'!A0 <script>alert(1)</script> \\input{x} %_& | `"
@@ -231,3 +232,19 @@ def test_no_answers_is_one_sentence(tmp_path: Path) -> None:
         analyse_folder(folder)
     with pytest.raises(FaceDiffError, match=r"missing\.json"):
         analyse_folder(folder, [tmp_path / "missing.json"])
+
+
+def test_the_page_of_the_manual_runs_as_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    manual = (Path(__file__).parents[2] / "docs" / "user_study.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", manual, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    write_study(tmp_path / "study", small_study(methods=("sample", "mean")))
+    for block in blocks:
+        exec(compile(block, "docs/user_study.md", "exec"), {})  # noqa: S102 - our own page
+    assert capsys.readouterr().out.startswith("69\nPreference(question='realism', first='sample', second='mean'")
+    (tmp_path / "q.yaml").write_text(re.findall(r"```yaml\n(.*?)```", manual, re.DOTALL)[0], encoding="utf-8")
+    found = Questionnaire(tmp_path / "q.yaml", ["en", "de"])
+    assert [question.name for question in found.questions] == ["realism", "lip_sync", "emotion", "remarks"]
+    assert found.rule == Rule()

@@ -16,13 +16,13 @@ from facediff.study.statistics import (
     binomial_interval,
     binomial_p,
     bradley_terry,
-    holm,
     krippendorff_alpha,
     power_of,
     raters_needed,
     share_between_raters,
     wilson_interval,
 )
+from facediff.utils.statistics import holm
 
 COUNTS = [(0, 7), (7, 7), (3, 7), (89, 120), (52, 120), (1, 1000)]
 
