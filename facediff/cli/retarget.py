@@ -13,6 +13,7 @@ from facediff.errors import FaceDiffError
 if TYPE_CHECKING:
     from facediff.animation import Animation
     from facediff.editing.correspondence import Correspondence
+    from facediff.editing.fit_check import FitReport
 
 TURNED = 0.7
 """A cosine below this between both meshes' up axes is reported."""
@@ -26,6 +27,7 @@ def retarget(
     correspondence: Map = None,
     landmarks: Annotated[Path | None, Option(metavar="CSV", reads=True)] = None,
     show: Picture = None,
+    accept_poor: bool = False,
     source: SourceOptions,
 ) -> None:
     """Transfer an animation to another mesh. The suffix of OUT chooses the format, as in `facediff export`.
@@ -38,6 +40,7 @@ def retarget(
         landmarks: pairs of vertices that are one place, `source,target` a line, counted from 0: for meshes that show
             other parts of the head
         show: picture of both faces at the most open mouth
+        accept_poor: write the animation although its lips, its folds or its coverage are found to be wrong
         source: what completes a bare .npy.
     """
     if output.suffix == ".csv":
@@ -48,23 +51,31 @@ def retarget(
             raise FaceDiffError(f"{option} {file}: no such file")
     check_picture_path(show)
 
+    from facediff.editing.fit_check import check_fit, refuse_poor
     from facediff.editing.retargeting import retarget as transfer
     from facediff.export import ExportOptions, check_export, write_animations
+    from facediff.export.pictures import draw_correspondence
 
     check_export(output, ExportOptions())
     own = source.read(animation)
-    made, found = transfer(own, target_mesh, correspondence, landmarks)
+    reports = []
+
+    def judge(made: Animation, found: Correspondence) -> None:
+        reports.append(check_fit(own, made, found))
+        if show is not None:  # the picture shows what is wrong
+            draw_correspondence(show, own, made, found)
+        if not accept_poor:
+            refuse_poor(target_mesh, reports[-1])
+
+    made, found = transfer(own, target_mesh, correspondence, landmarks, judge=judge)
     written = write_animations(output, [made], ExportOptions())
     if show is not None:
-        from facediff.export.pictures import draw_correspondence
-
-        draw_correspondence(show, own, made, found)
         written.append(show)
-    tell(*written, *remarks(own, made, found))
+    tell(*written, *remarks(own, made, found, reports[-1]))
 
 
-def remarks(animation: Animation, made: Animation, found: Correspondence) -> list[str]:
-    """What a user should know of a correspondence, a sentence each."""
+def remarks(animation: Animation, made: Animation, found: Correspondence, report: FitReport) -> list[str]:
+    """What a user should know of a result, a sentence each."""
     import numpy as np
 
     from facediff.animation import metres_per_unit
@@ -78,8 +89,8 @@ def remarks(animation: Animation, made: Animation, found: Correspondence) -> lis
         f"{unsure} vertices lie where the source has no similar surface and follow their neighbours; {still} lie far "
         f"from it and stand still",
     ]
-    if found.fits_badly:
-        lines.append("the meshes fit badly: look at the result with --show, and give --landmarks")
+    lines.append(report.summary)
+    lines += [f"WARNING: {fault}" for fault in report.faults]
     if found.similarity.rotation[1, 1] < TURNED:
         lines.append("the target mesh is turned against the animation, whose y axis points up; so is what is written")
     return lines

@@ -6,23 +6,21 @@ the target onto the source, and nearest points of a surface, which all of them n
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from facediff.editing.face_features import OPPOSITE, Features, find_features
+from facediff.editing.placing import place, place_face
+from facediff.editing.surface import Nearest, Surface, nearest
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, align, face_size, robust_align
-from facediff.mesh.alignment import TUKEY
-from facediff.mesh.flame import rotations
-from facediff.mesh.mesh import check_coordinates, closest_on_triangles, triangle_areas
+from facediff.mesh.mesh import check_coordinates, triangle_areas
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
-    from scipy.spatial import cKDTree
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -104,23 +102,37 @@ def correspond(
     start = None
     if len(pairs) >= 3:
         start = align(target.vertices[pairs[:, 1]], source.vertices[pairs[:, 0]], scale=True)
-    back = place(target, source, start)
+    features = find_features(source.vertices, source.faces)
+    if features is None:
+        back, seen = place(target, source, start), None
+    else:
+        back, seen = place_face(target, source, features, start)
+    known = None if features is None or seen is None else (features, seen)
     laid = Surface(back.apply(target.vertices), target.faces)
-    places = partners(source, laid)
-    bent = _bent(source, laid, places, pairs)
+    if known is not None and _one_surface(source, laid):
+        known = None  # what lies on the other mesh already need not be bent, and is exact to rounding
+    places = partners(source, laid, known)
+    bent = _bent(source, laid, places, pairs, known)
     found = places.nearest(bent.vertices, bent.normals)
     # Bending decides which place belongs to a vertex. The distance of the meshes is measured before bending, and the
     # trust in a place by the distance that is left after it.
     away = np.linalg.norm(laid.vertices - found.points, axis=1) / source.size
     left = found.distances / source.size
     trust = np.clip((FAR - left) / (FAR - EXACT), 0.0, 1.0) * np.clip((found.cosines + 0.3) / 0.6, 0.0, 1.0)
+    share = np.clip((FAR - left) / (FAR - CLOSE), 0.0, 1.0)
+    corners, weights = found.corners, found.weights
+    if known is not None:
+        # Which side of an opening a vertex belongs to is known there: no neighbour on the other side is asked.
+        sided = (known[1].codes > 0) & (left < FAR)
+        trust[sided] = np.maximum(trust[sided], 1.0 - left[sided] / FAR)
+        _hold_pieces(source, laid, known, places, corners, weights, trust, share)
     return Correspondence(
-        corners=found.corners,
-        weights=found.weights,
+        corners=corners,
+        weights=weights,
         similarity=back.inverse(),
         distances=away * source.size / back.scale,
         trust=np.where(trust > 0.99, 1.0, trust),
-        share=np.clip((FAR - left) / (FAR - CLOSE), 0.0, 1.0),
+        share=share,
         source_vertices=source.vertices,
         source_faces=source.faces,
         target_vertices=target.vertices,
@@ -143,6 +155,17 @@ def _checked(name: str, vertices: npt.NDArray[np.floating], faces: npt.NDArray[n
     if np.count_nonzero(triangle_areas(points, corners)) < 4:
         raise FaceDiffError(f"{name}: its {len(corners)} triangles have no area; give the mesh of a face")
     return Surface(points, corners)
+
+
+SAME = 1e-4  # Half of the vertices nearer than this share of the face's size make two meshes one surface
+
+
+def _one_surface(source: Surface, laid: Surface) -> bool:
+    """Whether two meshes that are aligned are cuts of one surface into other triangles."""
+    used = np.unique(laid.faces)
+    some = used if len(used) <= 500 else np.random.default_rng(0).choice(used, 500, replace=False)
+    there = nearest(source, laid.vertices[some], laid.normals[some], 0.0)
+    return bool(np.median(there.distances) < SAME * source.size)
 
 
 def _volume(surface: Surface) -> float:
@@ -215,99 +238,6 @@ def refuse_other_mesh(
     )
 
 
-# Step 1: the similarity that aligns two meshes of unknown unit, axes and vertices.
-
-SAMPLES = 400  # Vertices of each mesh by which starts are compared
-FINE_SAMPLES = 1500  # Vertices of the moved mesh by which the alignment is refined
-COARSE_ROUNDS, FINE_ROUNDS = 30, 60
-TRIMMED = 0.8  # Share of the nearest pairs that counts, so that a neck or hair that one mesh lacks does not
-CLEARLY = 0.9  # Another start than the meshes' own axes must fit better by this factor
-SETTLED = 1e-10
-
-
-def place(moved: Surface, goal: Surface, start: Similarity | None = None) -> Similarity:
-    """The similarity that aligns one surface with another.
-
-    Starts are the 24 rotations of one frame of axes into another and those of principal axes, with sizes made equal;
-    the best by nearest vertices, both ways and trimmed, is refined by nearest points of the surface: Besl and McKay, "A
-    method for registration of 3-D shapes", PAMI 1992, and Chen and Medioni, "Object modelling by registration of
-    multiple range images", IVC 1992 (distances to planes).
-    """
-    random = np.random.default_rng(0)
-    used = np.unique(moved.faces)
-    used = used if len(used) <= FINE_SAMPLES else np.sort(random.choice(used, FINE_SAMPLES, replace=False))
-    points, normals, found = moved.vertices[used], moved.normals[used], start or _start(moved, goal)
-    for _ in range(FINE_ROUNDS):  # Gauss-Newton on the distances to the planes, with Tukey's biweight
-        laid = found.apply(points)
-        there = nearest(goal, laid, normals @ found.rotation.T, size=0.0)
-        # The weights follow the spread of the distances, so that parts that one mesh lacks lose their influence as the
-        # rest comes closer.
-        spread = max(1.4826 * float(np.median(there.distances)), 1e-9 * goal.size)
-        weights = np.square(np.clip(1.0 - np.square(there.distances / (TUKEY * spread)), 0.0, None))
-        weights *= there.cosines > 0.5
-        if np.count_nonzero(weights) < 20:
-            break
-        step = _towards_planes(laid, there.points, there.normals, weights, goal.size)
-        found = found.then(step)
-        if np.abs(step.apply(laid) - laid).max() < SETTLED * goal.size:
-            break
-    return found
-
-
-def _start(moved: Surface, goal: Surface) -> Similarity:
-    from scipy.spatial.transform import Rotation
-
-    random = np.random.default_rng(0)
-    used = [(surface.vertices, np.unique(surface.faces)) for surface in (moved, goal)]
-    source, target = (points[random.choice(some, min(SAMPLES, len(some)), replace=False)] for points, some in used)
-    axes = [np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2] for points in (source, target)]
-    principal = [axes[1].T @ np.diag(signs) @ axes[0] for signs in itertools.product((1.0, -1.0), repeat=3)]
-    proper = [turn for turn in principal if np.linalg.det(turn) > 0]
-    scale = face_size(target) / face_size(source)
-    trials = []
-    for rotation in (np.eye(3), *Rotation.create_group("O").as_matrix(), *proper):
-        trial = Similarity(rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0), scale)
-        for _ in range(5):
-            trial, apart = _by_vertices(source, target, trial)
-        trials.append((apart, trial))
-    # Five rounds are enough to tell good starts from bad ones; only the best one is continued.
-    own, (least, best) = trials[0], min(trials, key=lambda pair: pair[0])
-    # Faces are nearly symmetric, so that a mirrored start fits almost as well: the meshes' own axes win unless another
-    # start is clearly better.
-    found = best if least < CLEARLY * own[0] else own[1]
-    for _ in range(COARSE_ROUNDS):
-        found, _ = _by_vertices(source, target, found)
-    return found
-
-
-def _by_vertices(source: Array, target: Array, current: Similarity) -> tuple[Similarity, float]:
-    """One round of nearest vertices, both ways; and how far apart the pairs were, as a share of the size."""
-    from scipy.spatial.distance import cdist
-
-    away = cdist(current.apply(source), target)
-    to, back = away.argmin(axis=1), away.argmin(axis=0)
-    pairs = np.concatenate([np.stack([np.arange(len(source)), to]), np.stack([back, np.arange(len(target))])], axis=1)
-    apart = away[pairs[0], pairs[1]]
-    counted = apart <= np.quantile(apart, TRIMMED)
-    found = align(source[pairs[0]], target[pairs[1]], weights=counted.astype(np.float64), scale=True)
-    return found, float(apart[counted].mean() / face_size(target))
-
-
-def _towards_planes(points: Array, goals: Array, normals: Array, weights: Array, size: float) -> Similarity:
-    """The small similarity with the least weighted squared distances to planes, to first order."""
-    centre = points.mean(axis=0)
-    arms = (points - centre) / size
-    # The seven unknowns are rotation and growth about the centre, and translation.
-    rows = np.concatenate([np.cross(arms, normals), normals, (arms * normals).sum(axis=1, keepdims=True)], axis=1)
-    left = ((goals - points) * normals).sum(axis=1) / size
-    weighted = rows * weights[:, None]
-    # Planes leave some directions undetermined (the rotation of a sphere): least squares does not move along them.
-    turn, shift, growth = np.split(np.linalg.lstsq(weighted.T @ rows, weighted.T @ left, rcond=1e-9)[0], [3, 6])
-    rotation = rotations(turn[None])[0]
-    scale = float(np.exp(np.clip(growth[0], -0.5, 0.5)))
-    return Similarity(rotation, centre + size * shift - scale * rotation @ centre, scale)
-
-
 # Step 2: separate pieces of a mesh (teeth, eyes, skin), and which piece of the other mesh each one is.
 
 MOST = 32  # So many of the largest pieces are paired; hair may consist of thousands
@@ -322,6 +252,7 @@ class Partners:
 
     parts: list[tuple[Indices, Surface]]  # vertices of the target, together all, and the part of the source they lie on
     size: float  # of the whole source
+    alone: list[Indices]  # vertices of each of the target's pieces that has no partner
 
     def nearest(self, points: Array, normals: Array) -> Nearest:
         """The nearest point of each target vertex (Vt, 3) on its part of the source."""
@@ -331,11 +262,13 @@ class Partners:
         return Nearest(**{name: np.concatenate([getattr(part, name) for part in found])[order] for name in names})
 
 
-def partners(source: Surface, laid: Surface) -> Partners:
+def partners(source: Surface, laid: Surface, known: tuple[Features, Features] | None = None) -> Partners:
     """Pair the pieces of a target that is aligned with a source with the source's.
 
     Partners are about as large and lie about in one place; of all pairings, the one with the least sum of distances
-    counts, so that lower teeth are not taken for upper ones. What has no partner is searched for on all of the source.
+    counts, so that lower teeth are not taken for upper ones. Where the features of both are known, their skins are
+    partners, and what lies on one side of an opening is not searched for on the other. What has no partner is searched
+    for on all of the source, or on its skin.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -346,17 +279,36 @@ def partners(source: Surface, laid: Surface) -> Partners:
     away = np.linalg.norm(goals[:, None] - centres[None], axis=2)
     alike = np.abs(np.log(extents[:, None] / sizes[None])) < np.log(ALIKE)
     limit = NEAR * np.minimum(extents[:, None], sizes[None])
+    cost = np.where(alike & (away < limit), away / limit, 1e6)
+    rest = source
+    if known is not None:
+        is_skin = [
+            np.isin(names, label[features.skin])
+            for names, label, features in zip((kept, others), labels, known, strict=True)
+        ]
+        cost[is_skin[1]] = 1e6
+        cost[:, is_skin[0]] = 1e6
+        rest = Surface(source.vertices, source.faces[known[0].skin[source.faces[:, 0]]])
     # Every piece may also stay without a partner, which costs as much as a partner at the limit.
-    cost = np.concatenate([np.where(alike & (away < limit), away / limit, 1e6), np.ones((len(goals),) * 2)], axis=1)
-    parts, left = [], np.ones(len(laid.vertices), bool)
+    cost = np.concatenate([cost, np.ones((len(goals),) * 2)], axis=1)
+    parts, left, alone = [], np.ones(len(laid.vertices), bool), []
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
+        some = np.flatnonzero(labels[1] == others[row])
         if column < len(kept):
-            some = np.flatnonzero(labels[1] == others[row])
             parts.append((some, Surface(source.vertices, source.faces[labels[0][source.faces[:, 0]] == kept[column]])))
             left[some] = False
+        elif known is None or not is_skin[1][row]:
+            alone.append(some)
+    if known is not None:
+        codes, sides = known[1].codes, known[0].codes[rest.faces]
+        for code in np.unique(codes[left & (codes > 0)]):
+            some = np.flatnonzero(left & (codes == code))
+            faces = rest.faces[(sides != OPPOSITE[code]).all(axis=1)]
+            parts.append((some, Surface(source.vertices, faces)))
+            left[some] = False
     if left.any():
-        parts.append((np.flatnonzero(left), source))
-    return Partners(parts, source.size)
+        parts.append((np.flatnonzero(left), rest))
+    return Partners(parts, source.size, alone)
 
 
 def pieces(surface: Surface) -> Indices:
@@ -389,22 +341,126 @@ STIFFNESSES = (100.0, 30.0, 10.0, 10.0, 3.0, 3.0, 1.0, 1.0, 0.3, 0.3)
 """How stiff the target is held while it is bent onto the source, from round to round."""
 
 
-def _bent(source: Surface, laid: Surface, places: Partners, pairs: Indices) -> Surface:
+RIM_TRUST = 30.0  # Vertices along an opening are held to the other mesh's opening
+KNOWN_TO = 0.04  # How exactly an opening's sides are known, as a share of its width
+RIM = 0.06  # So near to an opening, as a share of its width, its side is held
+WARP = 0.5, 1.2
+"""Widths of an opening over which the first bending is averaged, and over which it fades."""
+
+
+def _bent(
+    source: Surface, laid: Surface, places: Partners, pairs: Indices, known: tuple[Features, Features] | None
+) -> Surface:
     """The target, bent onto the source."""
     edges = edges_of(laid.faces)
-    bent = laid
+    base = laid if known is None else Surface(laid.vertices + _warp(laid.vertices, *known), laid.faces)
+    rim, rim_pull = (np.zeros(0, np.int64), np.zeros((0, 3))) if known is None else _rims(base.vertices, laid, *known)
+    bent = base
     for stiffness in STIFFNESSES:
         # Nearest points of a mesh that is still far away are often wrong: they count less the less the surfaces face
         # the same way, and a stiff target follows them only on average.
         there = places.nearest(bent.vertices, bent.normals)
         trust = np.clip(2.0 * there.cosines - 0.5, 0.0, 1.0)
         trust *= np.clip((FAR - there.distances / source.size) / (FAR - CLOSE), 0.0, 1.0)
-        pull = there.points - laid.vertices
+        pull = there.points - base.vertices
+        pull[rim], trust[rim] = rim_pull, RIM_TRUST
         if len(pairs):
-            pull[pairs[:, 1]] = source.vertices[pairs[:, 0]] - laid.vertices[pairs[:, 1]]
+            pull[pairs[:, 1]] = source.vertices[pairs[:, 0]] - base.vertices[pairs[:, 1]]
             trust[pairs[:, 1]] = LANDMARK_TRUST
-        bent = Surface(laid.vertices + smooth_field(pull, trust, edges, stiffness), laid.faces)
+        bent = Surface(base.vertices + smooth_field(pull, trust, edges, stiffness), laid.faces)
     return bent
+
+
+def _sides(known: tuple[Features, Features]) -> list[tuple[int, Array, Array, Indices, float]]:
+    """Per side of an opening of both: code, where the target's curve belongs, the curve, vertices along it, width."""
+    found = []
+    for index, (one, two) in enumerate(zip(known[0].openings, known[1].openings, strict=True)):
+        if one is None or two is None:
+            continue
+        for side, goal, own, seeds in (
+            (1, one.upper, two.upper, two.upper_seeds),
+            (2, one.lower, two.lower, two.lower_seeds),
+        ):
+            # Curves are known to a pixel or two: what lies nearer is left to the nearest points.
+            apart = np.linalg.norm(goal - own, axis=1, keepdims=True)
+            step = (goal - own) * np.clip(1.0 - KNOWN_TO * two.width / np.maximum(apart, 1e-12), 0.0, None)
+            found.append((2 * index + side, own + step, own, seeds, two.width))
+    return found
+
+
+def _warp(points: Array, features: Features, seen: Features) -> Array:
+    """Displacements (V, 3) that bring the target's openings onto the source's, and fade away from them."""
+    sides = _sides((features, seen))
+    total, weight, most = np.zeros_like(points), np.zeros(len(points)), np.zeros(len(points))
+    for code, goal, own, _, width in sides:
+        allowed = seen.codes != OPPOSITE[code]
+        square = np.square(points[allowed, None] - own[None, ::2]).sum(axis=2)
+        near = np.exp(-square / (WARP[0] * width) ** 2)
+        total[allowed] += near @ (goal - own)[::2]
+        weight[allowed] += near.sum(axis=1)
+        most[allowed] = np.maximum(most[allowed], np.exp(-square.min(axis=1) / (WARP[1] * width) ** 2))
+    # Far away the weights vanish and the fading does first.
+    return np.asarray(most[:, None] * total / np.maximum(weight, 1e-12)[:, None])
+
+
+def _rims(base: Array, laid: Surface, features: Features, seen: Features) -> tuple[Indices, Array]:
+    """Vertices along the openings, and displacements (N, 3) from the base that lay them on the source's openings."""
+    from scipy.spatial import cKDTree
+
+    names, pulls = [], []
+    for code, goal, own, seeds, width in _sides((features, seen)):
+        away, sample = cKDTree(own).query(laid.vertices[seeds])
+        kept = (away < RIM * width) & (seen.codes[seeds] == code)
+        names.append(seeds[kept])
+        pulls.append((laid.vertices[seeds] + (goal - own)[sample] - base[seeds])[kept])
+    rim = np.concatenate([np.zeros(0, np.int64), *names])
+    rim, first = np.unique(rim, return_index=True)
+    return rim, np.concatenate([np.zeros((0, 3)), *pulls])[first]
+
+
+ORAL = 0.9  # Pieces whose middle is so near to the mouth's, in its widths, are teeth or a tongue
+SMALL = 1.6  # and are no larger than this
+
+
+def _hold_pieces(
+    source: Surface,
+    laid: Surface,
+    known: tuple[Features, Features],
+    places: Partners,
+    corners: Indices,
+    weights: Array,
+    trust: Array,
+    share: Array,
+) -> None:
+    """Let pieces inside the head that the source lacks move as a whole: lower teeth with the jaw, others not at all.
+
+    What lies in front of the skin, such as brows, lashes and beards, follows the skin.
+    """
+    from scipy.spatial import cKDTree
+
+    features, seen = known
+    mouth, width = features.mouth.centre, features.mouth.width
+    skin = cKDTree(laid.vertices[seen.skin])
+    normals = laid.normals[seen.skin]
+    jaw = nearest(
+        Surface(source.vertices, source.faces[features.skin[source.faces[:, 0]]]),
+        mouth[None] - [[0.0, 0.45 * width, 0.0]],
+        np.array([[0.0, 0.0, 1.0]]),
+    )
+    for some in places.alone:
+        points = laid.vertices[some]
+        near = skin.query(points)[1]
+        behind = np.einsum("nd,nd->n", points - laid.vertices[seen.skin][near], normals[near])
+        oral = (
+            np.linalg.norm(points.mean(axis=0) - mouth) < ORAL * width and np.ptp(points, axis=0).max() < SMALL * width
+        )
+        if np.ptp(points, axis=0).max() > 2.0 * width or (not oral and np.mean(behind < 0) < 0.7):
+            continue
+        if oral and points[:, 1].mean() < mouth[1]:
+            corners[some], weights[some], share[some] = jaw.corners[0], jaw.weights[0], 1.0
+        else:
+            share[some] = 0.0
+        trust[some] = 1.0
 
 
 def edges_of(faces: Indices) -> Indices:
@@ -447,139 +503,3 @@ def _adjacency(edges: Indices, count: int) -> csr_array:
 
     both = np.concatenate([edges, edges[:, ::-1]])
     return csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
-
-
-# Step 4: the nearest points of a surface, among the sheets that face the same way.
-
-SLACK = 0.04
-"""A sheet that faces the same way is preferred to one that faces away and is nearer by up to this share of the face's
-size: lips that touch are two sheets in one place."""
-FACING, AWAY = 0.3, -0.3
-"""Cosines between normals from which on two sheets face the same way, and up to which they face away."""
-TIE = 1e-6
-"""Of two places whose distances differ by less than this share of a triangle, the one that faces the same way wins."""
-CHUNK_NUMBERS = 4_000_000  # Candidate pairs of a point and a triangle that are held in memory at a time, at most
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """A triangle mesh (V, 3), (F, 3) whose nearest points can be searched for."""
-
-    vertices: Array
-    faces: Indices
-
-    @cached_property
-    def normals(self) -> Array:
-        """(V, 3) unit normals of the vertices; zero where no triangle touches."""
-        return vertex_normals(self.vertices, self.faces)
-
-    @cached_property
-    def size(self) -> float:
-        """Size of the part that triangles touch."""
-        return face_size(self.vertices[np.unique(self.faces)])
-
-    @cached_property
-    def triangles(self) -> Array:
-        """(F, 3, 3) corners."""
-        return self.vertices[self.faces]
-
-    @cached_property
-    def balls(self) -> tuple[Array, Array, list[tuple[Indices, cKDTree]]]:
-        """Centres (F, 3) and radii (F,) of balls around the triangles; and trees of those about equally large.
-
-        A tree finds the balls that may hold a nearest point by the largest radius in it, so that a few large triangles
-        among many small ones (the back of a head) need a tree of their own.
-        """
-        from scipy.spatial import cKDTree
-
-        centres = self.triangles.mean(axis=1)
-        radii = np.linalg.norm(self.triangles - centres[:, None], axis=2).max(axis=1)
-        most = max(float(radii.max()), np.finfo(float).tiny)
-        octave = np.floor(np.log2(np.maximum(radii / most, 2.0**-10)))
-        groups = [np.flatnonzero(octave == one) for one in np.unique(octave)]
-        return centres, radii, [(faces, cKDTree(centres[faces])) for faces in groups]
-
-
-@dataclass(frozen=True, eq=False)
-class Nearest:
-    """N points of a surface, each the nearest one to a given point."""
-
-    corners: Indices  # (N, 3) vertices of its triangle
-    weights: Array  # (N, 3) barycentric weights of the corners, none negative, which sum to one
-    points: Array  # (N, 3) where it lies
-    normals: Array  # (N, 3) unit normals of the surface there
-    distances: Array  # (N,) from the given point
-    cosines: Array  # (N,) between the surface's normal and that of the given point
-
-
-def vertex_normals(vertices: Array, faces: Indices) -> Array:
-    """Unit normals (V, 3), each the mean of its triangles' weighted by the angles at the vertex.
-
-    Thürmer and Wüthrich, "Computing vertex normals from polygonal facets", Journal of Graphics Tools 1998: unlike
-    weights by area, these do not depend on how a flat piece is cut into triangles.
-    """
-    from trimesh import Trimesh
-
-    return np.asarray(Trimesh(vertices, faces, process=False).vertex_normals, np.float64)
-
-
-def nearest(surface: Surface, points: Array, normals: Array, size: float | None = None) -> Nearest:
-    """The nearest point of a surface to each point (N, 3), where normals decide between sheets.
-
-    Every triangle that could hold it is looked at, so that the point found is the nearest of all of its sheet. Normals
-    (N, 3) are zero where a point has none. The slack between sheets is relative to ``size``, that of the surface if
-    None; at 0, the nearest point counts, whatever its normal.
-    """
-    slack = SLACK * (surface.size if size is None else size)
-    faces, weights, cosines = _best(surface, points, normals, 0.0)
-    # A nearest place that faces the same way stays the best one with slack, which only costs places that do not.
-    doubtful = np.flatnonzero(cosines < FACING)
-    if slack and len(doubtful):
-        faces[doubtful], weights[doubtful], cosines[doubtful] = _best(
-            surface, points[doubtful], normals[doubtful], slack
-        )
-    corners = surface.faces[faces]
-    where = np.einsum("nc,ncd->nd", weights, surface.vertices[corners])
-    there = _unit(np.einsum("nc,ncd->nd", weights, surface.normals[corners]))
-    return Nearest(corners, weights, where, there, np.linalg.norm(points - where, axis=1), cosines)
-
-
-def _best(surface: Surface, points: Array, normals: Array, slack: float) -> tuple[Indices, Array, Array]:
-    """Face (N,), weights (N, 3) and cosine (N,) of the best place; a sheet that faces away must be nearer by slack."""
-    faces, weights, cosines = np.empty(len(points), np.int64), np.empty((len(points), 3)), np.empty(len(points))
-    step = max(1, CHUNK_NUMBERS // len(surface.faces))
-    for first in range(0, len(points), step):
-        some = slice(first, first + step)
-        point, face = _candidates(surface, points[some], slack)
-        shares, square = closest_on_triangles(points[some][point], surface.triangles[face])
-        there = _unit(np.einsum("nc,ncd->nd", shares, surface.normals[surface.faces[face]]))
-        cosine = np.einsum("nd,nd->n", there, normals[some][point])
-        wrong = np.clip((FACING - cosine) / (FACING - AWAY), 0.0, 1.0)
-        # The distance decides; a sheet that faces away costs the slack, and between equal distances the normal decides.
-        cost = np.sqrt(square) + slack * wrong + TIE * surface.balls[1][face] * (1.0 - cosine)
-        order = np.lexsort((face, cost, point))
-        best = order[np.unique(point[order], return_index=True)[1]]
-        faces[some], weights[some], cosines[some] = face[best], shares[best], cosine[best]
-    return faces, weights, cosines
-
-
-def _candidates(surface: Surface, points: Array, slack: float) -> tuple[Indices, Indices]:
-    """Pairs (point, face): all triangles that may hold a place not further away than the nearest one and the slack."""
-    centres, radii, trees = surface.balls
-    rounding = 1e-6 * float(radii.max() + np.abs(centres).max())
-    # A centre is on the surface, so the surface is no further away; a triangle is no nearer than its ball.
-    limit = np.min([tree.query(points)[0] for _, tree in trees], axis=0) + slack + rounding
-    found = []
-    for faces, tree in trees:
-        near = tree.query_ball_point(points, limit + radii[faces].max())
-        point = np.repeat(np.arange(len(points)), [len(some) for some in near])
-        face = faces[np.fromiter(itertools.chain.from_iterable(near), np.int64)]
-        kept = np.linalg.norm(points[point] - centres[face], axis=1) - radii[face] <= limit[point]
-        found.append((point[kept], face[kept]))
-    point, face = (np.concatenate(part) for part in zip(*found, strict=True))
-    return point, face
-
-
-def _unit(vectors: Array) -> Array:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +15,13 @@ from facediff.editing.correspondence import (
     Array,
     Correspondence,
     Indices,
-    Surface,
     averaging,
     correspond,
     refuse_other_mesh,
 )
+from facediff.editing.face_features import sides_of_pairs
 from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
+from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.utils.arrays import read_arrays
@@ -33,7 +35,12 @@ SAME_UNIT = 1.4  # Named units lie further apart than this factor, and heads dif
 
 
 def retarget(
-    animation: Animation, mesh_path: Path, correspondence_path: Path | None = None, landmarks_path: Path | None = None
+    animation: Animation,
+    mesh_path: Path,
+    correspondence_path: Path | None = None,
+    landmarks_path: Path | None = None,
+    *,
+    judge: Callable[[Animation, Correspondence], object] | None = None,
 ) -> tuple[Animation, Correspondence]:
     """An animation on the mesh in a file, and the correspondence between both meshes.
 
@@ -42,6 +49,7 @@ def retarget(
         mesh_path: the other face at rest.
         correspondence_path: used if it exists, else written; None for neither.
         landmarks_path: CSV of vertex pairs, for a correspondence that does not exist yet.
+        judge: called with the result before a new correspondence is written; raises where it should not be.
 
     Raises:
         FaceDiffError: if a file is unreadable, or a mesh is not the correspondence's or has its vertices in another
@@ -57,7 +65,10 @@ def retarget(
             )
         found = load_correspondence(correspondence_path)
         refuse_other_mesh(str(mesh_path), mesh.vertices, mesh.faces, found.target_vertices, found.target_faces)
-        return carry(animation, found, mesh), found
+        made = carry(animation, found, mesh)
+        if judge is not None:
+            judge(made, found)
+        return made, found
     if correspondence_path is not None:
         if correspondence_path.suffix != ".npz":
             raise FaceDiffError(f"--correspondence {correspondence_path}: expected a name that ends in .npz")
@@ -69,6 +80,8 @@ def retarget(
     except FaceDiffError as error:
         raise FaceDiffError(f"{mesh_path}: {error}") from error
     made = carry(animation, found, mesh)
+    if judge is not None:
+        judge(made, found)
     if correspondence_path is not None:
         save_correspondence(correspondence_path, found)
     return made, found
@@ -160,20 +173,43 @@ def carried_region(correspondence: Correspondence, indices: npt.NDArray[np.integ
 
 
 def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer] | None) -> Indices | None:
-    """Pairs of facing vertices of the source as those of the target's vertices that lie nearest on the same sheet."""
+    """Pairs of facing vertices of the source as those of the target's vertices that lie there, each pair once."""
     if pairs is None or not len(pairs):
         return None
-    source = Surface(correspondence.source_vertices, correspondence.source_faces)
-    shown = np.einsum("vc,vcd->vd", correspondence.weights, source.vertices[correspondence.corners])
-    facing = np.einsum("vc,vcd->vd", correspondence.weights, source.normals[correspondence.corners])
-    wanted, places = np.unique(np.asarray(pairs).ravel(), return_inverse=True)
-    away = np.linalg.norm(shown[None] - source.vertices[wanted, None], axis=2)
-    # Lips touch at rest: a vertex of the other lip is nearer than none, but never nearer than one of the same lip.
-    away += source.size * ((facing[None] * source.normals[wanted, None]).sum(axis=2) <= 0)
-    # Of vertices in one place, the first is the same one in both meshes where these have one topology.
-    found = away.argmin(axis=1)[places].reshape(-1, 2)
+    found = facing_pairs(correspondence, pairs)
     made = np.unique(found[found[:, 0] != found[:, 1]], axis=0)
     return made if len(made) else None
+
+
+CHOICE = 6  # So many of the nearest vertices of each lip may be a pair's
+
+
+def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]) -> Indices:
+    """For each pair (P, 2) of facing vertices of the source, a pair of the target's.
+
+    Of the vertices whose places are near to the source's and on the same lip, those two face each other that are
+    nearest to one another: on a coarse mesh the very nearest ones may lie far apart.
+    """
+    source = Surface(correspondence.source_vertices, correspondence.source_faces)
+    shown = np.einsum("vc,vcd->vd", correspondence.weights, source.vertices[correspondence.corners])
+    sides = sides_of_pairs(source.vertices, source.faces, np.asarray(pairs, np.int64))
+    side = (correspondence.weights * sides[correspondence.corners]).sum(axis=1)
+    rest = correspondence.similarity.inverse().apply(correspondence.target_vertices)
+    made = np.empty((len(pairs), 2), np.int64)
+    for row, (upper, lower) in enumerate(np.asarray(pairs)):
+        chosen, costs = [], []
+        for vertex, sign in ((upper, 1.0), (lower, -1.0)):
+            away = np.linalg.norm(shown - source.vertices[vertex], axis=1)
+            # Lips touch at rest: a vertex of the other lip is nearer than none, but never nearer than one of the same.
+            away = away + source.size * (sign * side <= 0) + source.size * (correspondence.share <= 0)
+            near = np.argsort(away, kind="stable")[:CHOICE]
+            chosen.append(near)
+            costs.append(away[near])
+        gaps = np.linalg.norm(rest[chosen[0]][:, None] - rest[chosen[1]][None], axis=2)
+        total = gaps + costs[0][:, None] + costs[1][None]
+        one, two = np.unravel_index(total.argmin(), total.shape)
+        made[row] = chosen[0][one], chosen[1][two]
+    return made
 
 
 def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:

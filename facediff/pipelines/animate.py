@@ -302,13 +302,20 @@ class AnimationPipeline:
         target = self.options.target_mesh
         if target is None:
             return animation
+        from facediff.editing.fit_check import check_fit, refuse_poor
         from facediff.editing.retargeting import carry, retarget
         from facediff.mesh import read_mesh
 
         if self._correspondence is not None:
             return carry(animation, self._correspondence, read_mesh(target))
         # All samples have one face, so that one correspondence serves all.
-        made, self._correspondence = retarget(animation, target, self.options.correspondence)
+        known = self.options.correspondence is not None and self.options.correspondence.exists()
+        made, self._correspondence = retarget(
+            animation,
+            target,
+            self.options.correspondence,
+            judge=None if known else lambda made, found: refuse_poor(target, check_fit(animation, made, found)),
+        )
         return made
 
     def closed(self, animation: Animation) -> Animation:

@@ -6,16 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from facediff.editing.correspondence import (
-    Surface,
-    averaging,
-    edges_of,
-    nearest,
-    partners,
-    pieces,
-    smooth_field,
-    vertex_normals,
-)
+from facediff.editing.correspondence import averaging, edges_of, partners, pieces, smooth_field
+from facediff.editing.surface import Surface, nearest, vertex_normals
 
 RNG = np.random.default_rng(0)
 

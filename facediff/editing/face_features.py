@@ -1,0 +1,540 @@
+"""The openings of a face mesh, found by its shape alone: between the lips, and between the lids of either eye.
+
+Lips that touch at rest are one surface to the eye and two to the mesh. An opening is where two points that are seen
+next to each other from the front lie far apart on the surface: across a cut, over a hole, or by way of the inside of
+the mouth. The meshes are seen along z, with y up, as animations are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.mesh.mesh import triangle_areas
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+WELD = 1e-6  # Vertices nearer than this share of the mesh's size are one: seams of textures do not part a mesh
+SAMPLES = 33  # points of each side of an opening, from corner to corner
+
+UPPER_LIP, LOWER_LIP, OPPOSITE = 1, 2, (0, 2, 1, 4, 3, 6, 5)
+"""Codes of vertices next to an opening: lips 1 and 2, then 3 and 4, 5 and 6 for the lids of either eye; 0 elsewhere.
+``OPPOSITE`` is the code on the other side of the same opening."""
+
+
+@dataclass(frozen=True, eq=False)
+class Opening:
+    """Both sides of an opening, from the smaller to the larger x."""
+
+    upper: Array  # (SAMPLES, 3)
+    lower: Array  # (SAMPLES, 3)
+    upper_seeds: Indices  # vertices of the triangles along the upper side
+    lower_seeds: Indices
+
+    @property
+    def centre(self) -> Array:
+        """(3,) between both sides."""
+        return np.asarray(0.5 * (self.upper.mean(axis=0) + self.lower.mean(axis=0)))
+
+    @property
+    def width(self) -> float:
+        """From corner to corner."""
+        return float(np.ptp(np.concatenate([self.upper[:, 0], self.lower[:, 0]])))
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """What a mesh shows of a face."""
+
+    mouth: Opening
+    eyes: tuple[Opening | None, Opening | None]  # at smaller and at larger x
+    skin: npt.NDArray[np.bool_]  # (V,) the piece that the mouth is in
+    codes: Indices  # (V,) which side of which opening a vertex is next to
+
+    @property
+    def openings(self) -> list[Opening | None]:
+        """The mouth and the eyes, in the order of the codes."""
+        return [self.mouth, *self.eyes]
+
+    def lips(self, vertices: Array, count: int) -> Indices:
+        """Vertices (count, 2) of the upper and the lower lip along the mouth, without its corners."""
+        from scipy.spatial import cKDTree
+
+        at = np.linspace(0, SAMPLES - 1, count + 4).round().astype(int)[2:-2]
+        sides = []
+        for curve, seeds, code in (
+            (self.mouth.upper, self.mouth.upper_seeds, UPPER_LIP),
+            (self.mouth.lower, self.mouth.lower_seeds, LOWER_LIP),
+        ):
+            own = seeds[self.codes[seeds] == code]
+            own = own if len(own) else seeds
+            sides.append(own[cKDTree(vertices[own]).query(curve[at])[1]])
+        return np.stack(sides, axis=1)
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle in which an opening is searched for, and how wide the opening is expected to be."""
+
+    x: float
+    y: float
+    half_width: float
+    half_height: float
+    expected: float
+
+
+class Seen:
+    """A mesh as it is seen from the front.
+
+    Args:
+        vertices: (V, 3), y up and z to the viewer.
+        faces: (F, 3).
+    """
+
+    def __init__(self, vertices: Array, faces: Indices) -> None:
+        self.vertices = vertices
+        self.faces = faces[triangle_areas(vertices, faces) > 0] if len(faces) else faces
+
+    @cached_property
+    def welded(self) -> Indices:
+        """(V,) one number for all vertices in one place that a seam of a texture parts; lips that touch stay apart.
+
+        A seam lies on the border of the mesh, which the inside of lips that touch does not. The border runs in loops: a
+        cut, such as that between the closed lips of a mask, is one loop whose two halves lie on one another.
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        count = len(self.vertices)
+        made = np.arange(count)
+        border = border_edges(self.faces)
+        if not len(border):
+            return made
+        extent = max(float(np.ptp(self.vertices, axis=0).max()), np.finfo(float).tiny)
+        rim = np.unique(border)
+        _, first, names = np.unique(
+            np.rint(self.vertices[rim] / (WELD * extent)), axis=0, return_index=True, return_inverse=True
+        )
+        made[rim] = rim[first[names.reshape(-1)]]
+        if (made == np.arange(count)).all():
+            return made
+        joined = coo_array((np.ones(len(border)), (border[:, 0], border[:, 1])), shape=(count, count))
+        loops = connected_components(joined, directed=False)[1][rim]
+        for name in np.flatnonzero(np.bincount(loops) >= 6):
+            loop = rim[loops == name]
+            places, counts = np.unique(made[loop], return_counts=True)
+            paired = np.count_nonzero(counts == 2)
+            span = np.ptp(self.vertices[loop], axis=0)
+            # Nearly all of its places occur twice, but for its two ends; and it is short and lies across.
+            if paired >= 2 and len(places) - paired <= 4 and span.max() < 0.4 * extent and span[0] > 2 * span[1]:
+                made[loop] = loop
+        return made
+
+    @cached_property
+    def corners(self) -> Indices:
+        """(F, 3) triangles of welded vertices."""
+        return self.welded[self.faces]
+
+    @cached_property
+    def pieces(self) -> Indices:
+        """(V,) a label for each vertex, equal for those that triangles join."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        a, b, c = self.corners.T
+        rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
+        count = len(self.vertices)
+        joined = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count)), False)[1]
+        return np.asarray(joined, np.int64)[self.welded]
+
+    def graph(self, kept: Indices) -> tuple[csr_array, Indices]:
+        """Lengths of edges between welded vertices of some triangles, and the row (V,) of each vertex; -1 for none."""
+        from scipy.sparse import csr_array
+
+        corners = self.corners[kept]
+        used, place = np.unique(corners, return_inverse=True)
+        place = place.reshape(-1, 3)
+        both = np.concatenate([place[:, [0, 1]], place[:, [1, 2]], place[:, [2, 0]]])
+        both = np.unique(np.sort(both, axis=1), axis=0)
+        both = both[both[:, 0] != both[:, 1]]
+        lengths = np.linalg.norm(self.vertices[used[both[:, 0]]] - self.vertices[used[both[:, 1]]], axis=1)
+        lengths = np.maximum(lengths, 1e-12)
+        made = csr_array((lengths, (both[:, 0], both[:, 1])), shape=(len(used),) * 2)
+        rows = np.full(len(self.vertices), -1)
+        rows[used] = np.arange(len(used))
+        return made, rows[self.welded]
+
+    def raster(
+        self, kept: Indices, low: Array, step: float, columns: int, rows: int
+    ) -> tuple[Indices, Array, npt.NDArray[np.float64]]:
+        """The first triangle that each pixel's ray along z meets: its number (R, C), -1 for none, depth and weights."""
+        points = self.vertices[self.faces[kept]]
+        flat = (points[:, :, :2] - low) / step
+        first = np.clip(np.ceil(flat.min(axis=1) - 0.5).astype(int), 0, [columns, rows])
+        last = np.clip(np.floor(flat.max(axis=1) - 0.5).astype(int) + 1, 0, [columns, rows])
+        spans = np.maximum(last - first, 0)
+        counts = spans[:, 0] * spans[:, 1]
+        which = np.repeat(np.arange(len(kept)), counts)
+        inner = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+        width = np.maximum(spans[which, 0], 1)
+        column, row = first[which, 0] + inner % width, first[which, 1] + inner // width
+        a, b, c = (flat[which, k] for k in range(3))
+        p = np.stack([column + 0.5, row + 0.5], 1)
+        area = _cross(b - a, c - a)
+        safe = np.where(np.abs(area) < 1e-12, 1.0, area)
+        wb, wc = _cross(p - a, c - a) / safe, _cross(b - a, p - a) / safe
+        inside = (np.abs(area) >= 1e-12) & (wb >= -1e-9) & (wc >= -1e-9) & (wb + wc <= 1 + 1e-9)
+        which, column, row = which[inside], column[inside], row[inside]
+        wb, wc = wb[inside], wc[inside]
+        weights = np.stack([1 - wb - wc, wb, wc], 1)
+        depth = (weights * points[which, :, 2]).sum(axis=1)
+        order = np.lexsort((which, -depth, row * columns + column))
+        pixel = (row * columns + column)[order]
+        head = np.unique(pixel, return_index=True)[1]
+        best = order[head]
+        number: Indices = np.full(rows * columns, -1, np.int64)
+        deep: Array = np.full(rows * columns, -np.inf)
+        share: Array = np.zeros((rows * columns, 3))
+        number[pixel[head]] = kept[which[best]]
+        deep[pixel[head]] = depth[best]
+        share[pixel[head]] = weights[best]
+        return number.reshape(rows, columns), deep.reshape(rows, columns), share.reshape(rows, columns, 3)
+
+    def within(self, low: Array, high: Array, skin: npt.NDArray[np.bool_] | None = None) -> Indices:
+        """Triangles that reach into a rectangle of x and y."""
+        flat = self.vertices[self.faces][:, :, :2]
+        kept = (flat.max(axis=1) >= low).all(axis=1) & (flat.min(axis=1) <= high).all(axis=1)
+        if skin is not None:
+            kept &= skin[self.faces[:, 0]]
+        return np.flatnonzero(kept)
+
+    def skin_at(self, window: Window) -> npt.NDArray[np.bool_] | None:
+        """(V,) the piece of which a window shows most; None where it shows nothing."""
+        low = np.array([window.x - window.half_width, window.y - window.half_height])
+        high = np.array([window.x + window.half_width, window.y + window.half_height])
+        step = window.half_width / 32
+        number, _, _ = self.raster(self.within(low, high), low, step, 64, max(2, int(2 * window.half_height / step)))
+        seen = number[number >= 0]
+        if not len(seen):
+            return None
+        names, counts = np.unique(self.pieces[self.faces[seen, 0]], return_counts=True)
+        return np.asarray(self.pieces == names[counts.argmax()])
+
+    def opening(self, window: Window, skin: npt.NDArray[np.bool_], highest: float, behind: float) -> Opening | None:
+        """The opening in a window; None if the skin is whole there.
+
+        Args:
+            window: where to look.
+            skin: (V,) the piece to look at.
+            highest: how far apart both sides may stand, as a share of the expected width.
+            behind: what lies this share of the width behind the surface in front of it is inside.
+        """
+        from scipy.ndimage import grey_closing
+
+        low = np.array([window.x - window.half_width, window.y - window.half_height])
+        high = np.array([window.x + window.half_width, window.y + window.half_height])
+        expected = window.expected
+        step = expected / PIXELS
+        columns, rows = int(2 * window.half_width / step), int(2 * window.half_height / step)
+        kept = self.within(low, high, skin)
+        if not len(kept):
+            return None
+        number, depth, weights = self.raster(kept, low, step, columns, rows)
+        number, depth, weights = number[::-1], depth[::-1], weights[::-1]  # from the top down
+        tall = max(3, int(highest * expected / step) | 1)
+        # The inside of an open mouth lies behind the surface that spans the lips.
+        finite = np.where(number >= 0, depth, depth[number >= 0].min() if (number >= 0).any() else 0.0)
+        front = grey_closing(finite, size=(tall + 2, 1))
+        valid = (number >= 0) & (finite > front - behind * expected)
+        pairs = _following(valid, tall)
+        if not len(pairs):
+            return None
+        above, below = number[pairs[:, 0], pairs[:, 2]], number[pairs[:, 1], pairs[:, 2]]
+        a, b = self.corners[above], self.corners[below]
+        apart = ~(a[:, :, None] == b[:, None, :]).any(axis=(1, 2))
+        pairs, above, below, a, b = (part[apart] for part in (pairs, above, below, a, b))
+        if not len(pairs):
+            return None
+        first, second = (self._points(number, weights, pairs[:, [k, 2]]) for k in (0, 1))
+        straight = np.linalg.norm(first - second, axis=1)
+        margin = 0.6 * expected
+        graph, place = self.graph(self.within(low - margin, high + margin, skin))
+        limit = FARTHER * straight + PARTED * expected
+        parted = self._ways_between(graph, place, (first, second), (a, b), limit) > limit
+        # What is seen through a hole lies behind its rims, and the way round the hole may be short.
+        parted |= pairs[:, 1] - pairs[:, 0] > max(2, HOLE * PIXELS)
+        pairs, above, below, first, second = (part[parted] for part in (pairs, above, below, first, second))
+        chosen = _widest(pairs, columns, window, step, low)
+        if chosen is None:
+            return None
+        return self._opening(pairs[chosen], first[chosen], second[chosen], above[chosen], below[chosen])
+
+    def _points(self, number: Indices, weights: Array, at: Indices) -> Array:
+        corners = self.vertices[self.faces[number[at[:, 0], at[:, 1]]]]
+        return np.asarray(np.einsum("nk,nkd->nd", weights[at[:, 0], at[:, 1]], corners))
+
+    def _ways_between(
+        self,
+        graph: csr_array,
+        place: Indices,
+        points: tuple[Array, Array],
+        corners: tuple[Indices, Indices],
+        limit: Array,
+    ) -> Array:
+        """Lengths (N,) of the ways from points by the corners of their triangles to other points, up to a limit."""
+        from scipy.sparse.csgraph import dijkstra
+
+        offsets = [
+            np.linalg.norm(self.vertices[some] - there[:, None], axis=2)
+            for there, some in zip(points, corners, strict=True)
+        ]
+        starts, row = np.unique(place[corners[0]], return_inverse=True)
+        row = row.reshape(-1, 3)
+        found = np.full(len(limit), np.inf)
+        for begin in range(0, len(starts), 256):
+            inside = (row >= begin) & (row < begin + 256)
+            some = np.flatnonzero(inside.any(axis=1))
+            ways = dijkstra(graph, directed=False, indices=starts[begin : begin + 256], limit=float(limit[some].max()))
+            for i in range(3):
+                own = some[inside[some, i]]
+                between = ways[(row[own, i] - begin)[:, None], place[corners[1][own]]]
+                found[own] = np.minimum(found[own], offsets[0][own, i] + (between + offsets[1][own]).min(axis=1))
+        return found
+
+    def _opening(self, pairs: Indices, first: Array, second: Array, above: Indices, below: Indices) -> Opening | None:
+        """Both sides as curves: per column the highest upper and the lowest lower point, smoothed and resampled."""
+        names = np.unique(pairs[:, 2])
+        upper = np.stack([first[pairs[:, 2] == name][pairs[pairs[:, 2] == name, 0].argmin()] for name in names])
+        lower = np.stack([second[pairs[:, 2] == name][pairs[pairs[:, 2] == name, 1].argmax()] for name in names])
+        if len(names) < 5:
+            return None
+        sides = [_resampled(_smoothed(side)) for side in (upper, lower)]
+        return Opening(sides[0], sides[1], np.unique(self.faces[above]), np.unique(self.faces[below]))
+
+    def _ways(self, opening: Opening, limit: float) -> tuple[Array, Array]:
+        """Lengths (V,) of the ways along the surface to the upper and to the lower side; infinite beyond a limit."""
+        margin = limit + opening.width
+        middle = opening.centre[:2]
+        graph, place = self.graph(self.within(middle - margin, middle + margin))
+        found = []
+        for side, seeds in ((opening.upper, opening.upper_seeds), (opening.lower, opening.lower_seeds)):
+            way = _ways_from(graph, place[seeds], _away(self.vertices[seeds], side), limit)
+            found.append(np.where(place >= 0, way[np.maximum(place, 0)], np.inf))
+        return found[0], found[1]
+
+    def completed(self, opening: Opening, expected: float) -> Opening:
+        """The same with its corners: where the ways to both sides, which grow beyond the ends, become equal."""
+        limit = 0.6 * max(opening.width, expected)
+        worst = np.maximum(*self._ways(opening, limit))
+        ends = [np.array([], float).reshape(0, 3)] * 2
+        for k, (sign, place) in enumerate(((-1, 0), (1, -1))):
+            tips = np.stack([opening.upper[place], opening.lower[place]])
+            outside = sign * (self.vertices[:, 0] - (sign * tips[:, 0]).max() * sign) > 0
+            outside &= np.isfinite(worst)
+            if outside.any():
+                # The inside of a corner is as far from both sides; the corner itself is what lies in front.
+                far = np.where(outside, worst + 0.5 * np.abs(self.vertices[:, 2] - tips[:, 2].mean()), np.inf)
+                ends[k] = self.vertices[[far.argmin()]]
+        upper, lower = (_resampled(np.concatenate([ends[0], side, ends[1]])) for side in (opening.upper, opening.lower))
+        return Opening(upper, lower, opening.upper_seeds, opening.lower_seeds)
+
+    def codes(self, openings: list[Opening | None], reach: tuple[float, ...]) -> Indices:
+        """(V,) on which side of which opening each vertex lies that is near to one along the surface."""
+        codes = np.zeros(len(self.vertices), np.int64)
+        least = np.full(len(self.vertices), np.inf)
+        for index, (opening, share) in enumerate(zip(openings, reach, strict=True)):
+            if opening is None:
+                continue
+            limit = share * opening.width
+            up, down = self._ways(opening, 1.5 * limit)
+            nearest = np.minimum(up, down)
+            with np.errstate(invalid="ignore"):
+                # Beyond the corners, and at the back of the mouth, both are about equally far.
+                sure = ~(np.abs(up - down) <= UNSURE[0] * opening.width + UNSURE[1] * nearest)
+            own = (nearest < limit) & (nearest < least) & sure
+            codes[own] = np.where(up[own] < down[own], 1, 2) + 2 * index
+            least[own] = nearest[own]
+        return codes
+
+
+PIXELS = 48  # to the expected width of an opening
+FARTHER, PARTED = 2.5, 0.12
+"""Points are parted if the way between them is longer than so many times the distance and this share of the width."""
+UNSURE = 0.03, 0.35
+"""Ways to both sides that differ by less than this share of the width and of the shorter way tell no side."""
+HOLE = 0.1  # Inside that is seen over this share of the width makes an opening
+
+
+def border_edges(faces: Indices) -> Indices:
+    """Edges (E, 2) of one triangle only."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    names, counts = np.unique(edges, axis=0, return_counts=True)
+    return np.asarray(names[counts == 1])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def _following(valid: npt.NDArray[np.bool_], tall: int) -> Indices:
+    """Pairs (row, next row, column) of valid pixels that follow one another in a column, at most ``tall`` apart."""
+    rows, columns = np.nonzero(valid.T)[::-1]
+    same = (columns[1:] == columns[:-1]) & (rows[1:] - rows[:-1] <= tall)
+    return np.stack([rows[:-1][same], rows[1:][same], columns[1:][same]], axis=1)
+
+
+def _widest(pairs: Indices, columns: int, window: Window, step: float, low: Array) -> Indices | None:
+    """Which pairs are the opening: the chain of neighbouring ones that is widest and nearest to the middle."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    if not len(pairs):
+        return None
+    middle = 0.5 * (pairs[:, 0] + pairs[:, 1])
+    tree = cKDTree(np.stack([pairs[:, 2] * 1.0, 0.75 * middle], 1))
+    near = tree.query_pairs(4.5, output_type="ndarray")
+    count = len(pairs)
+    labels = connected_components(coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(count,) * 2), False)[
+        1
+    ]
+    best, most = None, 0.0
+    for name in np.unique(labels):
+        some = np.flatnonzero(labels == name)
+        wide = len(np.unique(pairs[some, 2])) * step / window.expected
+        if wide < LEAST:
+            continue
+        centre = low[0] + step * pairs[some, 2].mean()
+        worth = min(wide, 1.3) - 1.0 * abs(centre - window.x) / window.expected
+        if worth > most:
+            best, most = some, worth
+    return best
+
+
+LEAST = 0.3  # An opening is at least this share of its expected width
+
+
+def _smoothed(points: Array) -> Array:
+    from scipy.ndimage import gaussian_filter1d, median_filter
+
+    steady = median_filter(points, size=(5, 1), mode="nearest")
+    return np.asarray(gaussian_filter1d(steady, 1.0, axis=0, mode="nearest"))
+
+
+def _resampled(points: Array) -> Array:
+    along = np.concatenate([[0.0], np.cumsum(np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-12))])
+    at = np.linspace(0, along[-1], SAMPLES)
+    return np.stack([np.interp(at, along, points[:, k]) for k in range(3)], 1)
+
+
+def _away(points: Array, curve: Array) -> Array:
+    """Distances (N,) of points to a curve's samples."""
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(curve).query(points)[0])
+
+
+def _ways_from(graph: csr_array, starts: Indices, offsets: Array, limit: float) -> Array:
+    """Lengths (N,) of the shortest ways from any start, each of which begins with an offset."""
+    from scipy.sparse import csr_array, hstack, vstack
+    from scipy.sparse.csgraph import dijkstra
+
+    # One more vertex, joined to every start by an edge as long as its offset, makes one search of many.
+    count = graph.shape[0]
+    least = np.full(count, np.inf)
+    np.minimum.at(least, starts, np.maximum(offsets, 1e-12))
+    names = np.flatnonzero(np.isfinite(least))
+    row = csr_array((least[names], (np.zeros(len(names), np.int64), names)), shape=(1, count))
+    whole = vstack([hstack([graph, csr_array((count, 1))]), hstack([row, csr_array((1, 1))])]).tocsr()
+    return np.asarray(dijkstra(whole, directed=False, indices=count, limit=limit)[:count])
+
+
+MOUTH_REACH, EYE_REACH = 0.8, 0.5
+"""How far from an opening its sides are told apart, as a share of its width."""
+OPEN_MOUTH, OPEN_EYE = (0.35, 0.12), (0.7, 0.35)
+"""How far apart the sides of an opening may stand at rest, and how far behind them its inside begins, as shares of its
+width. A socket is a hollow: what is inside of an eye lies deeper than that."""
+
+
+def find_features(vertices: Array, faces: Indices, expected: Features | Opening | None = None) -> Features | None:
+    """The openings of a face; None if it has no mouth that can open.
+
+    Args:
+        vertices: (V, 3), y up and z to the viewer.
+        faces: (F, 3).
+        expected: features of a face that lies in the same place, or its mouth; searched for everywhere if None.
+    """
+    seen = Seen(vertices, faces)
+    known = expected.mouth if isinstance(expected, Features) else expected
+    if known is None:
+        known = _anywhere(seen)
+        if known is None:
+            return None
+    width = known.width
+    x, y, _ = known.centre
+    skin, mouth = None, None
+    for grown in (1.0, 1.6):
+        window = Window(x, y, 1.1 * width * grown, 0.55 * width * grown, width)
+        skin = seen.skin_at(window)
+        mouth = None if skin is None else seen.opening(window, skin, *OPEN_MOUTH)
+        if mouth is not None:
+            break
+    if mouth is None or skin is None:
+        return None
+    mouth = seen.completed(mouth, width)
+    width = mouth.width
+    x, y, _ = mouth.centre
+    eyes: list[Opening | None] = []
+    for side in (0, 1):
+        place = expected.eyes[side] if isinstance(expected, Features) else None
+        if isinstance(expected, Features) and place is None:
+            eyes.append(None)
+            continue
+        if place is None:
+            sign = 2 * side - 1
+            window = Window(x + 0.62 * sign * width, y + 1.4 * width, 0.5 * width, 0.6 * width, 0.55 * width)
+        else:
+            window = Window(place.centre[0], place.centre[1], 0.85 * place.width, 0.75 * place.width, place.width)
+        eye = seen.opening(window, skin, *OPEN_EYE)
+        eyes.append(None if eye is None else seen.completed(eye, window.expected))
+    codes = seen.codes([mouth, *eyes], (MOUTH_REACH, EYE_REACH, EYE_REACH))
+    return Features(mouth, (eyes[0], eyes[1]), skin, codes)
+
+
+def _anywhere(seen: Seen) -> Opening | None:
+    """The widest opening about the middle of the lower part of what is seen."""
+    used = seen.vertices[np.unique(seen.faces)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    window = Window(middle[0], middle[1], half[0], half[1], 0.3 * float(min(2 * half[0], 2 * half[1])))
+    skin = seen.skin_at(window)
+    found = None if skin is None else seen.opening(window, skin, *OPEN_MOUTH)
+    return None if found is None else seen.completed(found, window.expected)
+
+
+def sides_of_pairs(vertices: Array, faces: Indices, pairs: Indices) -> Array:
+    """(V,) on which side of a mouth vertices lie, given pairs (P, 2) of its lips: 1 first, -1 second, 0 neither.
+
+    The lips may touch; what counts is the way along the surface.
+    """
+    seen = Seen(vertices, faces)
+    points = vertices[pairs.ravel(), :2]
+    margin = float(np.ptp(points, axis=0).max())
+    graph, place = seen.graph(seen.within(points.min(axis=0) - margin, points.max(axis=0) + margin))
+    ways = []
+    for column in (0, 1):
+        starts = place[pairs[:, column]]
+        starts = starts[starts >= 0]
+        if not len(starts):
+            return np.zeros(len(vertices))
+        way = _ways_from(graph, starts, np.zeros(len(starts)), 3 * margin)
+        ways.append(np.where(place >= 0, way[np.maximum(place, 0)], np.inf))
+    return np.where(ways[0] < ways[1], 1.0, np.where(ways[1] < ways[0], -1.0, 0.0))

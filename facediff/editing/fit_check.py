@@ -1,0 +1,228 @@
+"""Whether an animation carried to another mesh can be used: do its lips part, does it fold, does it cover the face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation, metres_per_unit
+from facediff.editing.correspondence import Correspondence
+from facediff.editing.face_features import find_features
+from facediff.editing.surface import Surface, nearest
+from facediff.errors import FaceDiffError
+
+Array = npt.NDArray[np.float64]
+
+FRAMES = 24  # As many frames, evenly spread, and the one with the widest mouth are looked at
+LIP_RATIO = 0.22
+"""Gap at rest over gap at the widest between the lips: at most 0.2 where the mouth works, from 0.23 where lips are
+glued, torn or swapped."""
+SPEAKS = 0.003  # metres: an animation whose lips part by less says nothing of the other mesh's lips
+CLEARLY_OPENS = 0.75  # A mouth of which every third opens by this share is not glued
+OPENS = 0.4  # A third of the mouth must open by this share of what the animation's does
+FOLDED = 0.02  # Share of the moving triangles that may turn over, beyond what the animation's own do
+CROSSED = 0.1  # Share of pairs and frames in which the lips may pass through one another by a millimetre
+COVERED = 0.5  # Share of the animation's motion for which the mesh must have a place
+NEAR = 0.12  # A place is there if the mesh is no further away than this share of the face's size
+LIPS = 15  # places along the lips that are looked at
+TORN = 0.2  # Share of the lips' edges that may move otherwise
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What was measured; None where the animation does not show it.
+
+    Attributes:
+        lip_ratio: gap at rest over gap at the widest between the mesh's own lips; 0 is best.
+        opened: least opening of the mouth's left, middle and right third, as a share of the animation's own.
+        torn: share of the lips' edges that move otherwise than the animation's.
+        folded: share of the moving triangles that turn over in some frame.
+        crossed: share of pairs and frames in which upper and lower lip pass through one another.
+        covered: share of the animation's motion for which the mesh has a place.
+        faults: what is wrong, a clause each; empty if the result can be used.
+    """
+
+    lip_ratio: float | None
+    opened: float | None
+    torn: float | None
+    folded: float
+    crossed: float | None
+    covered: float
+    faults: tuple[str, ...]
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.faults
+
+    @property
+    def summary(self) -> str:
+        """The figures on one line."""
+        words = []
+        if self.lip_ratio is not None and self.opened is not None:
+            words.append(f"lips {self.lip_ratio:.2f} of their widest gap at rest, {self.opened:.0%} as open")
+        words.append(f"{self.folded:.1%} of the triangles fold over")
+        words.append(f"{self.covered:.0%} of the motion is carried")
+        return ", ".join(words)
+
+
+def refuse_poor(source: object, report: FitReport) -> None:
+    """Refuse a result that cannot be used.
+
+    Raises:
+        FaceDiffError: beginning with ``source`` and naming the first fault.
+    """
+    if not report.good:
+        raise FaceDiffError(
+            f"{source}: {report.faults[0]}. Look at it with `facediff retarget --show`, name places that are the same "
+            f"with --landmarks, or write it as it is with --accept-poor"
+        )
+
+
+def check_fit(animation: Animation, made: Animation, found: Correspondence) -> FitReport:
+    """Measure an animation that was carried to another mesh against the original.
+
+    Args:
+        animation: on the source mesh; with triangles.
+        made: the same on the target mesh.
+        found: the correspondence that carried it.
+    """
+    scale = found.similarity.scale
+    up = found.similarity.rotation @ np.array([0.0, 1.0, 0.0])
+    frames = np.unique(np.linspace(0, len(animation.vertices) - 1, min(FRAMES, len(animation.vertices))).astype(int))
+    lip_ratio = opened = torn = crossed = None
+    faults = []
+    source = find_features(found.source_vertices, found.source_faces)
+    if source is not None:
+        pairs = source.lips(found.source_vertices, LIPS)
+        own = _gaps(np.stack([animation.template, *animation.vertices]), pairs)
+        mean = own.mean(axis=1)
+        widest = int(mean[1:].argmax())
+        frames = np.unique(np.append(frames, widest))
+        opening = float(mean[1 + widest] - mean[0])
+        if opening * metres_per_unit(animation.unit) > SPEAKS:
+            laid = found.similarity.inverse().apply(found.target_vertices)
+            target = find_features(laid, found.target_faces, source)
+            if target is None:
+                faults.append(
+                    "no line between its lips was found: triangles close its mouth, or it lies elsewhere; cut a closed "
+                    "mesh along the lips"
+                )
+            else:
+                facing = target.lips(laid, LIPS)
+                gaps = _gaps(np.stack([made.template, made.vertices[widest]]), facing)
+                lip_ratio = float(gaps[0].mean() / max(gaps.mean(axis=1).max(), 1e-12))
+                opened = _opened(gaps[1] - gaps[0], scale * (own[1 + widest] - own[0]))
+                torn = _torn(animation, made, pairs, facing, widest, scale * found.similarity.rotation, scale * opening)
+                crossed = _crossed(animation, made, pairs, facing, frames, up, scale)
+                faults += _lip_faults(
+                    lip_ratio, max(LIP_RATIO, 1.3 * float(mean[0] / mean.max())), opened, torn, crossed
+                )
+    folded = _folded(made, found.target_faces, frames)
+    if folded > FOLDED + _folded(animation, animation.triangles.astype(np.int64), frames):
+        faults.append(f"{folded:.0%} of its moving triangles fold over")
+    covered = _covered(animation, found, frames)
+    if covered < COVERED:
+        faults.append(f"it has a place for {covered:.0%} of the animation's motion only")
+    return FitReport(lip_ratio, opened, torn, folded, crossed, covered, tuple(faults))
+
+
+def _lip_faults(ratio: float, limit: float, opened: float, torn: float, crossed: float) -> list[str]:
+    faults = []
+    # A mouth that stands open at rest has a high ratio too; what it opens by tells it from one whose lips are glued.
+    if ratio > limit and (opened < CLEARLY_OPENS or torn > 0):
+        faults.append(f"its lips do not part as the animation's do: {ratio:.2f} of their widest gap is there at rest")
+    if opened < OPENS:
+        faults.append(f"a part of its mouth opens by {max(opened, 0):.0%} of what the animation's does only")
+    if torn > TORN:
+        faults.append(f"its lips are torn: {torn:.0%} of their edges move otherwise than the animation's")
+    if crossed > CROSSED:
+        faults.append(f"its lips pass through one another in {crossed:.0%} of the places looked at")
+    return faults
+
+
+def _opened(grown: Array, expected: Array) -> float:
+    """Least growth of the gap over the mouth's thirds, as a share of what is expected of them."""
+    return min(
+        float(grown[third].mean() / max(expected[third].mean(), 1e-12))
+        for third in np.array_split(np.arange(len(grown)), 3)
+        if expected[third].mean() > 0.2 * expected.mean()
+    )
+
+
+def _torn(
+    animation: Animation,
+    made: Animation,
+    pairs: npt.NDArray[np.integer],
+    facing: npt.NDArray[np.integer],
+    frame: int,
+    matrix: Array,
+    opening: float,
+) -> float:
+    """Share of the lips' edges whose motion differs by half of the mouth's opening from what is expected there."""
+    own = (np.float64(animation.vertices[frame][pairs]) - animation.template[pairs]) @ matrix.T
+    new = np.float64(made.vertices[frame][facing]) - made.template[facing]
+    return float(np.mean(np.linalg.norm(new - own, axis=2) > 0.5 * opening))
+
+
+def _gaps(frames: npt.NDArray[np.floating], pairs: npt.NDArray[np.integer]) -> Array:
+    """Distances (T, P) of facing vertices."""
+    return np.asarray(np.linalg.norm(np.float64(frames[:, pairs[:, 0]]) - frames[:, pairs[:, 1]], axis=2))
+
+
+def _crossed(
+    animation: Animation,
+    made: Animation,
+    pairs: npt.NDArray[np.integer],
+    facing: npt.NDArray[np.integer],
+    frames: npt.NDArray[np.integer],
+    up: Array,
+    scale: float,
+) -> float:
+    """How often the upper lip is a millimetre further below the lower one than at rest, where the original's is not."""
+
+    def heights(one: Animation, which: npt.NDArray[np.integer], axis: Array) -> tuple[Array, Array]:
+        rest = np.float64(one.template[which[:, 0]]) - one.template[which[:, 1]]
+        moved = np.float64(one.vertices[frames][:, which[:, 0]]) - one.vertices[frames][:, which[:, 1]]
+        return moved @ axis, np.minimum(rest @ axis, 0.0)
+
+    own, own_rest = heights(animation, pairs, np.array([0.0, 1.0, 0.0]))
+    new, new_rest = heights(made, facing, up)
+    slack = 0.001 / metres_per_unit(animation.unit)
+    return float(((new < new_rest - scale * slack) & (own > own_rest - 0.5 * slack)).mean())
+
+
+def _folded(animation: Animation, faces: npt.NDArray[np.integer], frames: npt.NDArray[np.integer]) -> float:
+    """Share of the triangles that move which turn by more than a right angle in some frame."""
+    rest = _normals(np.asarray(animation.template, np.float64), faces)
+    turned, moving = np.zeros(len(faces), bool), np.zeros(len(faces), bool)
+    extent = float(np.ptp(animation.template, axis=0).max())
+    for frame in frames:
+        points = np.asarray(animation.vertices[frame], np.float64)
+        turned |= (_normals(points, faces) * rest).sum(axis=1) < 0
+        moving |= (np.abs(points - animation.template).max(axis=1) > 1e-4 * extent)[faces].any(axis=1)
+    return float((turned & moving).sum() / max(int(moving.sum()), 1))
+
+
+def _normals(points: Array, faces: npt.NDArray[np.integer]) -> Array:
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def _covered(animation: Animation, found: Correspondence, frames: npt.NDArray[np.integer]) -> float:
+    """Share of the animation's motion, summed over its vertices, that has the target's surface nearby."""
+    motion = np.max(
+        [np.linalg.norm(animation.vertices[frame] - animation.template, axis=1) for frame in frames], axis=0
+    )
+    if not motion.any():
+        return 1.0
+    some = np.flatnonzero(motion > 0.05 * motion.max())
+    if len(some) > 400:
+        some = np.sort(np.random.default_rng(0).choice(some, 400, replace=False))
+    laid = Surface(found.similarity.inverse().apply(found.target_vertices), found.target_faces)
+    size = Surface(found.source_vertices, found.source_faces).size
+    points = np.asarray(found.source_vertices[some], np.float64)
+    away = nearest(laid, points, np.zeros_like(points), 0.0).distances
+    return float(motion[some][away < NEAR * size].sum() / motion[some].sum())

@@ -1,0 +1,312 @@
+"""The similarity that aligns two face meshes of unknown unit, axes and vertices, whatever else the meshes show."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.editing.face_features import Features, Seen, find_features
+from facediff.editing.surface import Surface, nearest
+from facediff.mesh import Similarity, align, face_size
+from facediff.mesh.alignment import TUKEY
+from facediff.mesh.flame import rotations
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+SAMPLES = 400  # Vertices of each mesh by which starts are compared
+FINE_SAMPLES = 1500  # Vertices of the moved mesh by which the alignment is refined
+COARSE_ROUNDS, FINE_ROUNDS = 30, 60
+TRIMMED = 0.8  # Share of the nearest pairs that counts, so that a neck or hair that one mesh lacks does not
+CLEARLY = 0.9  # Another start than the meshes' own axes must fit better by this factor
+SETTLED = 1e-10
+
+
+def place(
+    moved: Surface,
+    goal: Surface,
+    start: Similarity | None = None,
+    *,
+    samples: int = FINE_SAMPLES,
+    rounds: int = FINE_ROUNDS,
+) -> Similarity:
+    """The similarity that aligns one surface with another.
+
+    Starts are the 24 rotations of one frame of axes into another and those of principal axes, with sizes made equal;
+    the best by nearest vertices, both ways and trimmed, is refined by nearest points of the surface: Besl and McKay, "A
+    method for registration of 3-D shapes", PAMI 1992, and Chen and Medioni, "Object modelling by registration of
+    multiple range images", IVC 1992 (distances to planes).
+    """
+    random = np.random.default_rng(0)
+    used = np.unique(moved.faces)
+    used = used if len(used) <= samples else np.sort(random.choice(used, samples, replace=False))
+    points, normals, found = moved.vertices[used], moved.normals[used], start or _start(moved, goal)
+    for _ in range(rounds):  # Gauss-Newton on the distances to the planes, with Tukey's biweight
+        laid = found.apply(points)
+        there = nearest(goal, laid, normals @ found.rotation.T, size=0.0)
+        # The weights follow the spread of the distances, so that parts that one mesh lacks lose their influence as the
+        # rest comes closer.
+        spread = max(1.4826 * float(np.median(there.distances)), 1e-9 * goal.size)
+        weights = np.square(np.clip(1.0 - np.square(there.distances / (TUKEY * spread)), 0.0, None))
+        weights *= there.cosines > 0.5
+        if np.count_nonzero(weights) < 20:
+            break
+        step = _towards_planes(laid, there.points, there.normals, weights, goal.size)
+        found = found.then(step)
+        if np.abs(step.apply(laid) - laid).max() < SETTLED * goal.size:
+            break
+    return found
+
+
+def _start(moved: Surface, goal: Surface) -> Similarity:
+    from scipy.spatial.transform import Rotation
+
+    random = np.random.default_rng(0)
+    used = [(surface.vertices, np.unique(surface.faces)) for surface in (moved, goal)]
+    source, target = (points[random.choice(some, min(SAMPLES, len(some)), replace=False)] for points, some in used)
+    axes = [np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2] for points in (source, target)]
+    principal = [axes[1].T @ np.diag(signs) @ axes[0] for signs in itertools.product((1.0, -1.0), repeat=3)]
+    proper = [turn for turn in principal if np.linalg.det(turn) > 0]
+    scale = face_size(target) / face_size(source)
+    trials = []
+    for rotation in (np.eye(3), *Rotation.create_group("O").as_matrix(), *proper):
+        trial = Similarity(rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0), scale)
+        for _ in range(5):
+            trial, apart = _by_vertices(source, target, trial)
+        trials.append((apart, trial))
+    # Five rounds are enough to tell good starts from bad ones; only the best one is continued.
+    own, (least, best) = trials[0], min(trials, key=lambda pair: pair[0])
+    # Faces are nearly symmetric, so that a mirrored start fits almost as well: the meshes' own axes win unless another
+    # start is clearly better.
+    found = best if least < CLEARLY * own[0] else own[1]
+    for _ in range(COARSE_ROUNDS):
+        found, _ = _by_vertices(source, target, found)
+    return found
+
+
+def _by_vertices(source: Array, target: Array, current: Similarity) -> tuple[Similarity, float]:
+    """One round of nearest vertices, both ways; and how far apart the pairs were, as a share of the size."""
+    from scipy.spatial.distance import cdist
+
+    away = cdist(current.apply(source), target)
+    to, back = away.argmin(axis=1), away.argmin(axis=0)
+    pairs = np.concatenate([np.stack([np.arange(len(source)), to]), np.stack([back, np.arange(len(target))])], axis=1)
+    apart = away[pairs[0], pairs[1]]
+    counted = apart <= np.quantile(apart, TRIMMED)
+    found = align(source[pairs[0]], target[pairs[1]], weights=counted.astype(np.float64), scale=True)
+    return found, float(apart[counted].mean() / face_size(target))
+
+
+def _towards_planes(points: Array, goals: Array, normals: Array, weights: Array, size: float) -> Similarity:
+    """The small similarity with the least weighted squared distances to planes, to first order."""
+    centre = points.mean(axis=0)
+    arms = (points - centre) / size
+    # The seven unknowns are rotation and growth about the centre, and translation.
+    rows = np.concatenate([np.cross(arms, normals), normals, (arms * normals).sum(axis=1, keepdims=True)], axis=1)
+    left = ((goals - points) * normals).sum(axis=1) / size
+    weighted = rows * weights[:, None]
+    # Planes leave some directions undetermined (the rotation of a sphere): least squares does not move along them.
+    turn, shift, growth = np.split(np.linalg.lstsq(weighted.T @ rows, weighted.T @ left, rcond=1e-9)[0], [3, 6])
+    rotation = rotations(turn[None])[0]
+    scale = float(np.exp(np.clip(growth[0], -0.5, 0.5)))
+    return Similarity(rotation, centre + size * shift - scale * rotation @ centre, scale)
+
+
+# Where the source's face is known, it alone is searched for: the other mesh may be a mask or a whole figure.
+
+HALF_WIDTH, BELOW, ABOVE = 1.3, 0.8, 2.3
+"""The face about a mouth's middle, in widths of the mouth."""
+PATCH_STEP = 1 / 14  # Distance of the face's points, as a share of the mouth's width
+FEW, MANY = 120, 400  # Points of the face by which starts are compared, and refined
+MOST_GROUPS, LEAST_GROUP = 8, 40
+END = 0.135  # Share of a standing figure's height that its head takes
+CONTINUED = 12  # Starts that are continued
+LOOKED_AT = 5  # Alignments in which the mouth is searched for
+WITH_MOUTH, WITH_EYE = 0.5, 0.85
+"""Factors on the distance of an alignment where these are found."""
+
+
+def place_face(
+    moved: Surface, goal: Surface, features: Features, start: Similarity | None = None
+) -> tuple[Similarity, Features | None]:
+    """The similarity that lays a mesh onto another one's face, and what is seen of the mesh there.
+
+    The goal's visible face is searched for on the moved mesh: from the 24 rotations of one frame of axes into another,
+    in all of the mesh, in each of its larger pieces and at the ends of a long one, by nearest vertices that face the
+    same way. Of the best alignments, one in which a mouth and eyes lie where the goal's are is preferred. Where no
+    mouth is found, 60 further rotations are tried.
+    """
+    from scipy.spatial.transform import Rotation
+
+    points, normals = _face_of(goal, features)
+    if start is not None:
+        fine = place(_near(moved, start, points, features), goal, start, samples=700, rounds=30)
+        return fine, find_features(fine.apply(moved.vertices), moved.faces, features)
+    tried: list[tuple[float, Similarity, Features | None]] = []
+    own = np.eye(3)[None]
+    for turns in (Rotation.create_group("O").as_matrix(), Rotation.create_group("I").as_matrix()):
+        found = _candidates_for(moved, goal, points, normals, np.concatenate([own, turns]), features.mouth.width)
+        least = found[0][0]
+        for apart, start in found[:LOOKED_AT]:
+            if apart > 2.0 * least:
+                break
+            back = start.inverse()
+            seen = find_features(back.apply(moved.vertices), moved.faces, features)
+            worth = apart
+            if seen is not None:
+                worth *= WITH_MOUTH * WITH_EYE ** sum(eye is not None for eye in seen.eyes)
+            tried.append((worth, back, seen))
+            if seen is not None and worth < CLEARLY * WITH_MOUTH * WITH_EYE**2 * apart:
+                break
+        if any(seen is not None for _, _, seen in tried):
+            break
+    _, back, seen = min(tried, key=lambda each: each[0])
+    fine = place(_near(moved, back, points, features), goal, back, samples=700, rounds=30)
+    if seen is not None:
+        seen = find_features(fine.apply(moved.vertices), moved.faces, features) or seen
+    return fine, seen
+
+
+def _near(moved: Surface, back: Similarity, points: Array, features: Features) -> Surface:
+    """The triangles of a mesh that lie about the face."""
+    laid = back.apply(moved.vertices)
+    margin = 0.3 * features.mouth.width
+    low, high = points.min(axis=0) - [margin, margin, 2 * margin], points.max(axis=0) + margin
+    inside = ((laid >= low) & (laid <= high)).all(axis=1)
+    kept = inside[moved.faces].all(axis=1)
+    return Surface(moved.vertices, moved.faces[kept]) if np.count_nonzero(kept) >= 50 else moved
+
+
+def _face_of(surface: Surface, features: Features) -> tuple[Array, Array]:
+    """Points (N, 3), evenly spread in the view from the front, and normals of the skin about the mouth and the eyes."""
+    seen = Seen(surface.vertices, surface.faces)
+    width = features.mouth.width
+    x, y, _ = features.mouth.centre
+    low, high = (
+        np.array([x - HALF_WIDTH * width, y - BELOW * width]),
+        np.array([x + HALF_WIDTH * width, y + ABOVE * width]),
+    )
+    step = PATCH_STEP * width
+    columns, rows = np.ceil((high - low) / step).astype(int)
+    number, _, weights = seen.raster(seen.within(low, high, features.skin), low, step, int(columns), int(rows))
+    hit = number >= 0
+    corners, shares = seen.faces[number[hit]], weights[hit]
+    points = np.einsum("nk,nkd->nd", shares, surface.vertices[corners])
+    normals = np.einsum("nk,nkd->nd", shares, surface.normals[corners])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return points, normals
+
+
+def _candidates_for(
+    moved: Surface, goal: Surface, points: Array, normals: Array, turns: Array, width: float
+) -> list[tuple[float, Similarity]]:
+    """Similarities from the face's points to a mesh, with the distances that they leave; the best ones first."""
+    from scipy.spatial import cKDTree
+
+    random = np.random.default_rng(0)
+    used = np.unique(moved.faces)
+    used = used if len(used) <= 40_000 else np.sort(random.choice(used, 40_000, replace=False))
+    tree, facing = cKDTree(moved.vertices[used]), moved.normals[used]
+    some = random.permutation(len(points))
+    few, many = some[:FEW], some[:MANY]
+    rotation, shift, scale = _starts(moved, goal, points, turns)
+    own = np.abs(rotation - np.eye(3)).max(axis=(1, 2)) < 1e-9
+    state = (rotation, shift, scale)
+    for _ in range(7):
+        state, apart = _round(points[few], normals[few], tree, facing, state, 0.25 * width)
+    apart = np.where(own, CLEARLY * apart, apart)
+    order = np.argsort(apart)[:CONTINUED]
+    state, own = (state[0][order], state[1][order], state[2][order]), own[order]
+    for _ in range(25):
+        state, apart = _round(points[many], normals[many], tree, facing, state, 0.15 * width)
+    apart = np.where(own, CLEARLY * apart, apart)
+    made: list[tuple[float, Similarity]] = []
+    for k in np.argsort(apart):
+        similar = Similarity(state[0][k], state[1][k], float(state[2][k]))
+        laid = similar.apply(points[many])
+        # Several starts end in one place.
+        if all(np.abs(laid - other.apply(points[many])).max() > 0.1 * width * other.scale for _, other in made):
+            made.append((float(apart[k]), similar))
+    return made
+
+
+def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple[Array, Array, Array]:
+    """Rotations (B, 3, 3), translations (B, 3) and scales (B,) from the goal to the moved mesh, to begin with."""
+    whole = goal.vertices[np.unique(goal.faces)]
+    pieces = Seen(moved.vertices, moved.faces).pieces
+    used = np.unique(moved.faces)
+    names, counts = np.unique(pieces[used], return_counts=True)
+    names = names[np.argsort(-counts, kind="stable")][:MOST_GROUPS]
+    groups: list[tuple[Array, Array | None, tuple[float, ...]]] = [(moved.vertices[used], None, (0.75, 1.0, 1.33))]
+    parts = [moved.vertices[used[pieces[used] == name]] for name in names]
+    groups += [(part, None, (1.0,)) for part in parts if LEAST_GROUP <= len(part) < len(used)]
+    for part in (moved.vertices[used], *(part for part in parts if LEAST_GROUP <= len(part) < len(used))):
+        extent = np.ptp(part, axis=0)
+        for axis, sign in itertools.product(range(3), (1, -1)):
+            if extent[axis] < 1.6 * np.sort(extent)[0]:
+                continue
+            along = sign * part[:, axis]
+            for share in (END, 0.4):
+                end = part[along > along.max() - share * extent[axis]]
+                if len(end) >= LEAST_GROUP:
+                    groups.append((end, sign * np.eye(3)[axis], (1.0,)))
+    found = []
+    for end, up, factors in groups:
+        low, high = end.min(axis=0), end.max(axis=0)
+        size = face_size(end)
+        for turn in turns:
+            if up is not None and (turn @ [0, 1, 0]) @ up < 0.5:
+                continue
+            for factor in factors:
+                scale = factor * size / face_size(whole)
+                found.append((turn, end.mean(axis=0) - scale * turn @ whole.mean(axis=0), scale))
+            scale = size / face_size(points)  # a mask shows no more than the face
+            found.append((turn, 0.5 * (low + high) - scale * turn @ (0.5 * (points.min(0) + points.max(0))), scale))
+    return (
+        np.stack([each[0] for each in found]),
+        np.stack([each[1] for each in found]),
+        np.array([each[2] for each in found]),
+    )
+
+
+def _round(
+    points: Array, normals: Array, tree: cKDTree, facing: Array, state: tuple[Array, Array, Array], cap: float
+) -> tuple[tuple[Array, Array, Array], Array]:
+    """One round of nearest vertices that face the same way, for many similarities at once; and the mean distances."""
+    rotation, shift, scale = state
+    laid = scale[:, None, None] * (points @ rotation.swapaxes(1, 2)) + shift[:, None]
+    distance, index = tree.query(laid.reshape(-1, 3))
+    distance, index = distance.reshape(laid.shape[:2]) / scale[:, None], index.reshape(laid.shape[:2])
+    cosine = np.einsum("bnd,bnd->bn", normals @ rotation.swapaxes(1, 2), facing[index])
+    agree = cosine > 0.3
+    apart = np.where(agree, np.minimum(distance / cap, 1.0), 1.0).mean(axis=1)
+    limit = np.quantile(np.where(agree, distance, np.inf), 0.75, axis=1, method="lower")
+    limit = np.where(np.isfinite(limit), limit, cap)
+    weights = (agree & (distance <= np.maximum(limit, 1e-12)[:, None])).astype(np.float64)
+    enough = weights.sum(axis=1) >= 0.2 * len(points)
+    weights[~enough] = 1.0
+    new = _similarities(points, tree.data[index], weights)
+    keep = ~enough
+    for one, old in zip(new, state, strict=True):
+        one[keep] = old[keep]
+    return new, apart
+
+
+def _similarities(points: Array, goals: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """Least squares of points (N, 3) to goals (B, N, 3) with weights (B, N), after Umeyama (1991)."""
+    share = weights / weights.sum(axis=1, keepdims=True)
+    centre, goal = share @ points, np.einsum("bn,bnd->bd", share, goals)
+    away, towards = points[None] - centre[:, None], goals - goal[:, None]
+    u, spread, vt = np.linalg.svd(np.einsum("bn,bnd,bne->bde", share, towards, away))
+    proper = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    u[:, :, 2] *= proper[:, None]
+    rotation = u @ vt
+    variance = np.maximum(np.einsum("bn,bnd->b", share, away**2), 1e-30)
+    scale = np.maximum((spread[:, 0] + spread[:, 1] + proper * spread[:, 2]) / variance, 1e-12)
+    return rotation, goal - scale[:, None] * np.einsum("bde,be->bd", rotation, centre), scale

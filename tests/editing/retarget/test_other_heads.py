@@ -1,0 +1,118 @@
+"""Heads of other people, topologies, units and axes, without landmarks; and results that cannot be used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.animation import Animation, write_archive
+from facediff.cli.app import main
+from facediff.editing.correspondence import Correspondence, correspond
+from facediff.editing.face_features import LOWER_LIP, UPPER_LIP, find_features
+from facediff.editing.fit_check import check_fit
+from facediff.editing.retargeting import carry
+from facediff.mesh import Mesh
+from tests.fakes.heads import FAMILY, Head, talking
+
+
+@pytest.fixture(scope="module")
+def animation() -> Animation:
+    return talking()
+
+
+def carried(animation: Animation, head: Head) -> tuple[Animation, Correspondence]:
+    found = correspond(animation.template, animation.triangles, head.vertices, head.faces)
+    return carry(animation, found, Mesh(head.vertices, head.faces.astype(np.int32))), found
+
+
+QUICK = ("slit mask", "decimated head", "whole avatar")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in FAMILY])
+def test_a_head_from_elsewhere_speaks_or_is_refused(animation: Animation, name: str) -> None:
+    head = FAMILY[name]()
+    made, found = carried(animation, head)
+    report = check_fit(animation, made, found)
+    assert report.good == head.alive, report.faults
+    if not head.alive:
+        return
+    assert report.lip_ratio is not None
+    assert report.lip_ratio <= 0.2
+    assert report.folded < 0.02
+    # The carried pairs of lips say the same without the check's own search for the lips.
+    assert made.inner_lip_pairs is not None
+    one, two = made.inner_lip_pairs.T
+    gaps = np.linalg.norm(made.vertices[:, one] - made.vertices[:, two], axis=2).mean(axis=1)
+    assert gaps[0] <= 0.2 * gaps.max()
+    expected = animation.inner_lip_pairs
+    assert expected is not None
+    own = np.linalg.norm(animation.vertices[3, expected[:, 0]] - animation.vertices[3, expected[:, 1]], axis=1).mean()
+    assert gaps[3] - gaps[0] == pytest.approx(found.similarity.scale * own, rel=0.35)
+
+
+def test_the_lips_of_the_puppet_are_found_without_being_told(animation: Animation) -> None:
+    seen = find_features(np.asarray(animation.template, np.float64), animation.triangles.astype(np.int64))
+    assert seen is not None
+    assert animation.inner_lip_pairs is not None
+    upper, lower = animation.inner_lip_pairs.T
+    assert (seen.codes[upper] == UPPER_LIP).all()
+    assert (seen.codes[lower] == LOWER_LIP).all()
+    assert seen.mouth.width == pytest.approx(0.05, abs=0.003)
+    assert seen.mouth.centre[0] == pytest.approx(0, abs=0.001)
+    assert [eye is not None and eye.centre[:2] == pytest.approx([x, 0.0255], abs=0.003) for eye, x in zip(
+        seen.eyes, (-0.032, 0.032), strict=True
+    )] == [True, True]  # fmt: skip
+
+
+def test_wrecks_are_named(animation: Animation) -> None:
+    """The puppet's own face, on which lips are glued, torn or swapped by hand."""
+    whole = Mesh(animation.template.astype(np.float64), animation.triangles)
+    found = correspond(whole.vertices, whole.faces, whole.vertices, whole.faces)
+    good = carry(animation, found, whole)
+    assert check_fit(animation, good, found).good
+    pairs = animation.inner_lip_pairs
+    assert pairs is not None
+    near = np.linalg.norm(animation.template - animation.template[pairs].mean(axis=(0, 1)), axis=1) < 0.045
+    glued = good.vertices.copy()
+    glued[:, near] = (animation.template + (good.vertices - animation.template)[:, near].mean(axis=1)[:, None])[:, near]
+    torn = good.vertices.copy()
+    seen = find_features(animation.template.astype(np.float64), animation.triangles.astype(np.int64))
+    assert seen is not None
+    side = near & (seen.codes == UPPER_LIP) & (animation.template[:, 0] < 0)
+    down = (good.vertices - animation.template)[:, pairs[6, 1]]
+    torn[:, side] = animation.template[side] + down[:, None]
+    swapped = good.vertices.copy()
+    swapped[:, pairs] = animation.template[pairs] - (swapped[:, pairs] - animation.template[pairs])
+    for vertices in (glued, torn, swapped):
+        report = check_fit(animation, replace(good, vertices=vertices), found)
+        assert not report.good
+    still = replace(animation, vertices=np.repeat(animation.template[None], 3, axis=0))
+    assert check_fit(still, carry(still, found, whole), found).good
+
+
+def test_the_command_refuses_and_accepts(
+    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A puppet without a cut between its lips: refused, drawn, and written where that is asked for."""
+    monkeypatch.chdir(tmp_path)
+    write_archive(tmp_path / "a.npz", animation)
+    _, first, place = np.unique(
+        np.rint(1e6 * animation.template.astype(np.float64)), axis=0, return_index=True, return_inverse=True
+    )
+    faces = first[place.reshape(-1)][animation.triangles] + 1
+    text = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in animation.template] + [f"f {a} {b} {c}" for a, b, c in faces]
+    (tmp_path / "sealed.obj").write_text("\n".join(text) + "\n")
+    words = ["retarget", "a.npz", "--target-mesh", "sealed.obj", "-o", "out.npz", "--correspondence", "map.npz"]
+    assert main([*words, "--show", "p.png"]) == 2
+    said = capsys.readouterr().err
+    assert "sealed.obj" in said
+    assert "lips" in said
+    assert (tmp_path / "p.png").exists()
+    assert not (tmp_path / "out.npz").exists()
+    assert not (tmp_path / "map.npz").exists()
+    assert main([*words, "--accept-poor"]) == 0
+    assert "WARNING" in capsys.readouterr().out
+    assert (tmp_path / "out.npz").exists()

@@ -1,0 +1,298 @@
+"""A family of heads that are not the puppet's: other people, other topologies, other units and axes, made by code.
+
+Each is a different person's puppet head, cut, closed, resampled, warped and completed with parts of its own, as masks,
+registered heads, scans and avatars from elsewhere are. Nothing in them says which vertex was which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import fast_simplification
+import numpy as np
+import trimesh
+
+from facediff.animation import Animation
+from facediff.synthetic.face import EYE_CENTRE, build_face
+from facediff.synthetic.rig import CONTROLS, Shape, build_rig, lip_pairs
+
+Mesh = tuple[np.ndarray, np.ndarray]
+INTERIOR = ("lip_roll", "mouth_bag", "mouth_back")
+TEETH = ("teeth_upper_0", "teeth_upper_1", "teeth_lower_0", "teeth_lower_1")
+
+
+@dataclass
+class Head:
+    """A mesh at rest, and where its parts begin."""
+
+    vertices: np.ndarray  # (V, 3)
+    faces: np.ndarray  # (F, 3)
+    parts: dict[str, np.ndarray] = field(default_factory=dict)  # faces of named parts, in the order of the mesh
+    alive: bool = True  # whether lips can part at all
+
+
+def talking(shape: Shape | None = None) -> Animation:
+    """A face that opens its mouth, rounds and stretches its lips, blinks and raises its brows: (13, 1008, 3)."""
+    rig, mesh = build_rig(shape or Shape()), build_face()
+    weights = np.zeros((13, len(CONTROLS)))
+    for frame, amounts in enumerate(
+        (
+            {},
+            {"jaw_open": 0.3},
+            {"jaw_open": 0.7},
+            {"jaw_open": 1.0},
+            {"jaw_open": 0.4, "pucker": 0.8},
+            {"jaw_open": 0.2, "funnel": 1.0},
+            {"jaw_open": 0.3, "stretch": 0.9},
+            {"upper_lip_raise": 0.8, "lower_lip_drop": 0.8},
+            {"jaw_open": 0.5, "corner_up": 0.8},
+            {"lids_close": 1.0},
+            {"inner_brow_up": 1.0, "outer_brow_up": 1.0},
+            {"brow_frown": 1.0, "nose_wrinkle": 0.8},
+            {},
+        )
+    ):
+        for name, amount in amounts.items():
+            weights[frame, CONTROLS.index(name)] = amount
+    upper, lower = lip_pairs(mesh)
+    return Animation(
+        "talking",
+        rig.pose(weights).astype(np.float32),
+        rig.neutral.astype(np.float32),
+        25.0,
+        faces=np.asarray(mesh.faces, np.int32),
+        colours=mesh.colours,
+        regions={"lips": np.unique(np.concatenate([upper, lower]))},
+        inner_lip_pairs=np.stack([upper, lower], axis=1),
+    )
+
+
+def turned(*degrees: float) -> np.ndarray:
+    """A rotation about x, then y, then z."""
+    made = np.eye(3)
+    for axis, angle in enumerate(np.deg2rad(degrees)):
+        one, two = [k for k in range(3) if k != axis]
+        turn = np.eye(3)
+        turn[one, one] = turn[two, two] = np.cos(angle)
+        turn[one, two], turn[two, one] = -np.sin(angle), np.sin(angle)
+        made = turn @ made
+    return made
+
+
+def person(shape: Shape, *without: str) -> Mesh:
+    """A person's head in metres without the named groups of the puppet's vertices."""
+    mesh = build_face()
+    vertices, faces = build_rig(shape).neutral, np.asarray(mesh.faces)
+    if without:
+        gone = np.zeros(len(vertices), bool)
+        gone[mesh.both(*(name for name in mesh.groups if name.startswith(without)))] = True
+        faces = faces[~gone[faces].any(axis=1)]
+    return cleaned(vertices, faces)
+
+
+def cleaned(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Without vertices that no triangle touches."""
+    used, place = np.unique(faces, return_inverse=True)
+    return vertices[used], place.reshape(-1, 3)
+
+
+def finer(vertices: np.ndarray, faces: np.ndarray, rounds: int = 1) -> Mesh:
+    """Every triangle in four, smoothed as Loop (1987) has it."""
+    return trimesh.remesh.subdivide_loop(vertices, faces, rounds)
+
+
+def coarser(vertices: np.ndarray, faces: np.ndarray, share: float) -> Mesh:
+    """A decimated mesh without that share of its triangles."""
+    points, corners = fast_simplification.simplify(
+        vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32), share
+    )
+    return cleaned(points.astype(np.float64), corners.astype(np.int64))
+
+
+def shuffled(head: Head, seed: int = 3) -> Head:
+    """In an order of its own."""
+    order = np.random.default_rng(seed).permutation(len(head.vertices))
+    return Head(head.vertices[order], np.argsort(order)[head.faces], head.parts, head.alive)
+
+
+def joined(**parts: Mesh) -> Head:
+    """Several meshes as one, which knows which triangles each part has."""
+    points, faces, named, before, first = [], [], {}, 0, 0
+    for name, (vertices, corners) in parts.items():
+        points.append(vertices)
+        faces.append(corners + before)
+        named[name] = np.arange(first, first + len(corners))
+        before, first = before + len(vertices), first + len(corners)
+    return Head(np.concatenate(points), np.concatenate(faces), named)
+
+
+def laid(head: Head, scale: float, rotation: np.ndarray, shift: tuple[float, float, float] = (0, 0, 0)) -> Head:
+    """In another unit, pose and place."""
+    return Head(scale * head.vertices @ rotation.T + shift, head.faces, head.parts, head.alive)
+
+
+def eyeballs(shape: Shape, subdivisions: int = 3) -> dict[str, Mesh]:
+    """Two whole eyeballs of a person."""
+    centre = shape(np.array([EYE_CENTRE, EYE_CENTRE]) * [[1], [1]] / 1000.0)[0]
+    ball = trimesh.creation.icosphere(subdivisions, radius=0.0138)
+    points, faces = np.array(ball.vertices), np.array(ball.faces)
+    return {"eye_l": (points + centre, faces), "eye_r": (points + centre * [-1, 1, 1], faces)}
+
+
+def teeth(shape: Shape) -> dict[str, Mesh]:
+    """Two rows of teeth as bent boxes, and a tongue."""
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    box = box.subdivide().subdivide()
+    made: dict[str, Mesh] = {}
+    for name, centre, size in (
+        ("teeth_upper", (0, -0.0455, 0.070), (0.040, 0.009, 0.006)),
+        ("teeth_lower", (0, -0.0555, 0.067), (0.038, 0.009, 0.006)),
+        ("tongue", (0, -0.0580, 0.050), (0.024, 0.006, 0.034)),
+    ):
+        points = np.array(box.vertices) * size
+        points[:, 2] -= 28 * np.square(points[:, 0]) if name != "tongue" else 0
+        made[name] = (shape(points + centre), np.array(box.faces))
+    return made
+
+
+def patch_eyes(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Holes at the eyes closed by a point in their middle, as scans have them."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    names, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    rim = {tuple(edge) for edge in names[counts == 1]}
+    near = [edge for edge in edges if tuple(np.sort(edge)) in rim and abs(vertices[edge, 1].mean() - 0.0255) < 0.02]
+    near = [
+        edge for edge in near if abs(abs(vertices[edge, 0].mean()) - 0.031) < 0.022 and vertices[edge, 2].min() > 0.03
+    ]
+    for side in (-1, 1):
+        ring = np.array([edge for edge in near if np.sign(vertices[edge, 0].mean()) == side])
+        middle = vertices[ring[:, 0]].mean(axis=0) + [0, 0, 0.004]
+        vertices = np.concatenate([vertices, middle[None]])
+        faces = np.concatenate([faces, [(b, a, len(vertices) - 1) for a, b in ring]])
+    return vertices, faces
+
+
+ROUND = Shape(width=0.6, length=-0.5, lips=0.6, mouth_width=0.5, nose_width=0.5, cheeks=0.6, chin=-0.3, eye_size=0.3)
+LONG = Shape(width=-0.5, length=0.8, lips=-0.5, mouth_width=-0.6, nose_length=0.8, jaw=-0.4, chin=0.7, brow_ridge=0.5)
+STRONG = Shape(
+    width=0.3, length=0.5, jaw=0.9, chin_width=0.8, lips=0.8, mouth_width=0.9, nose_bridge=0.6, forehead=-0.4
+)
+YOUNG = Shape(
+    width=0.2, length=-0.9, lips=0.4, mouth_width=-0.4, nose_length=-0.8, eye_size=0.9, eye_gap=0.6, cheeks=0.8
+)
+
+
+def mask() -> Head:
+    """A registered mask of BIWI's kind: millimetres, open back, slit lips, no mouth behind them, eyes closed over."""
+    vertices, faces = person(ROUND, *INTERIOR, "teeth", "eyeball", "pupil", "lid_inner", "ear")
+    kept = (vertices[:, 2] > 0.018) & (vertices[:, 1] > -0.093) & (vertices[:, 1] < 0.085)
+    vertices, faces = cleaned(vertices, faces[kept[faces].all(axis=1)])
+    vertices, faces = finer(*patch_eyes(vertices, faces), 2)
+    return shuffled(laid(Head(vertices, faces), 1000.0, turned(-6, 4, 0), (12, -30, 55)))
+
+
+def slit_mask() -> Head:
+    """The same idea with fewer triangles and lips that share their places: a cut without a width."""
+    vertices, faces = person(Shape(), *INTERIOR, "teeth", "eyeball", "pupil", "lid_inner", "ear")
+    kept = (vertices[:, 2] > 0.03) & (vertices[:, 1] > -0.09) & (vertices[:, 1] < 0.075)
+    vertices, faces = cleaned(vertices, faces[kept[faces].all(axis=1)])
+    return shuffled(laid(Head(*finer(vertices, faces)), 100.0, np.eye(3)))
+
+
+def registered() -> Head:
+    """A head of FLAME's kind: metres, lips that touch and fold in by a few millimetres, whole eyeballs, open neck."""
+    vertices, faces = person(LONG, "mouth_bag", "mouth_back", "teeth", "eyeball", "pupil")
+    vertices = vertices + 0.006 * np.exp(-np.square((vertices - [0, -0.05, 0.09]) / [0.05, 0.03, 0.06]).sum(1))[
+        :, None
+    ] * [0, 1, 0]
+    head = joined(skin=finer(vertices, faces, 1), **eyeballs(LONG))
+    return shuffled(laid(head, 1.07, turned(0, 0, 0), (0.0, -0.02, -0.03)))
+
+
+def avatar_head() -> Head:
+    """An avatar's head: centimetres, mouth bag, teeth, tongue, eyeballs, lips that touch, stylised proportions."""
+    vertices, faces = person(YOUNG, "teeth", "eyeball", "pupil")
+    head = joined(skin=finer(vertices, faces, 2), **eyeballs(YOUNG), **teeth(YOUNG))
+    head.vertices = head.vertices * [1.12, 0.94, 1.05]
+    return shuffled(laid(head, 100.0, turned(0, 0, 0), (0, 160, 3)))
+
+
+def coarse() -> Head:
+    """Decimated to vertices of its own: about 1500, uneven."""
+    vertices, faces = person(STRONG, "teeth", "eyeball", "pupil")
+    return shuffled(Head(*coarser(*finer(vertices, faces, 2), 0.9)))
+
+
+def remeshed() -> Head:
+    """Re-meshed: cut to short edges, then decimated; lips are ragged, z points up."""
+    vertices, faces = person(LONG, "teeth", "eyeball", "pupil", "ear")
+    vertices, faces = finer(vertices, faces)
+    vertices, faces = trimesh.remesh.subdivide_to_size(vertices, faces, 0.005)
+    vertices, faces = cleaned(vertices, faces)
+    merged = trimesh.Trimesh(vertices, faces, process=False)
+    merged.merge_vertices(digits_vertex=7)
+    made = coarser(np.array(merged.vertices), np.array(merged.faces), 0.6)
+    return shuffled(laid(Head(*made), 1000.0, turned(90, 0, 0)))
+
+
+def scan(*, sealed: bool = False) -> Head:
+    """A scan: crooked, noisy, tilted, with a ragged border and specks; the lips are cut, or sealed."""
+    vertices, faces = person(STRONG, *INTERIOR, "teeth", "eyeball", "pupil", "lid_inner")
+    if sealed:
+        vertices, faces = sealed_lips(vertices, faces)
+    vertices, faces = finer(*patch_eyes(vertices, faces), 2)
+    x, y, z = vertices.T
+    swollen = np.exp(-np.square((vertices - [0.04, -0.03, 0.06]) / 0.03).sum(1))
+    vertices = vertices + np.stack(
+        [0.004 * swollen + 0.03 * y * (y < 0) * 0.5, 0.05 * x * (z > 0.03), 0.006 * swollen], 1
+    )
+    vertices = vertices + np.random.default_rng(0).normal(0, 0.00012, vertices.shape)
+    kept = (vertices[:, 2] > -0.02 + 0.01 * np.sin(90 * vertices[:, 1])) & (vertices[:, 1] > -0.12)
+    vertices, faces = cleaned(vertices, faces[kept[faces].all(axis=1)])
+    speck = np.array([[0.2, 0.1, 0.0], [0.204, 0.1, 0.0], [0.2, 0.104, 0.0], [0.2, 0.1, 0.004]])
+    made = joined(skin=(vertices, faces), speck=(speck, np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])))
+    made = shuffled(laid(made, 1000.0, turned(14, -18, 9), (300, 120, -800)))
+    made.alive = not sealed
+    return made
+
+
+def sealed_lips(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """One skin over the mouth: what upper and lower lip have in one place becomes one vertex."""
+    _, first, place = np.unique(np.rint(1e6 * vertices), axis=0, return_index=True, return_inverse=True)
+    return cleaned(vertices, first[place.reshape(-1)][faces])
+
+
+def whole_avatar() -> Head:
+    """A whole figure in a T-pose of eight parts, centimetres with z up: the face is a twentieth of it."""
+    vertices, faces = person(YOUNG, "teeth", "eyeball", "pupil")
+    hair = trimesh.creation.icosphere(3)
+    shell = np.array(hair.vertices) * [0.083, 0.085, 0.105] + [0, 0.066, -0.018]
+    keep = (shell[:, 2] < 0.055) & (shell[:, 1] > -0.02)
+    torso = trimesh.creation.capsule(height=0.9, radius=0.16, count=[16, 16])
+    arms = trimesh.creation.capsule(height=1.5, radius=0.05, count=[12, 12])
+    body = np.array(torso.vertices) @ turned(90, 0, 0).T * [1, 1, 0.7]
+    body -= [0, body[:, 1].max() + 0.13, 0.02]
+    wide = np.array(arms.vertices) @ turned(0, 90, 0).T
+    wide -= [wide[:, 0].mean(), 0.22, 0.02]
+    head = joined(
+        body=(np.concatenate([body, wide]), np.concatenate([torso.faces, np.array(arms.faces) + len(body)])),
+        head=finer(vertices, faces, 1),
+        **eyeballs(YOUNG, 2),
+        **teeth(YOUNG),
+        hair=cleaned(shell, np.array(hair.faces)[keep[hair.faces].all(axis=1)]),
+    )
+    return laid(head, 100.0, turned(90, 0, 0), (0, 0, 150))
+
+
+FAMILY: dict[str, Callable[[], Head]] = {
+    "mask": mask,
+    "slit mask": slit_mask,
+    "registered head": registered,
+    "avatar head": avatar_head,
+    "decimated head": coarse,
+    "re-meshed head": remeshed,
+    "scan": scan,
+    "whole avatar": whole_avatar,
+    "sealed scan": lambda: scan(sealed=True),
+}
