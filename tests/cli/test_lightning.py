@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -54,7 +56,16 @@ def test_test_takes_everything_from_the_checkpoint(
     monkeypatch.chdir(tmp_path)
     assert main(["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false"]) == 0
     assert "protocol paper" in capsys.readouterr().out
-    assert len(list(tmp_path.glob("runs/test/version_0/test_scores.csv"))) == 1
+    (table,) = tmp_path.glob("runs/test/version_0/test_scores.csv")
+    # Which training run the scores are of: the config's seed, the file, and the decoder that the run was started with.
+    for row in csv.DictReader(table.read_text().splitlines()):
+        assert (row["seed"], row["checkpoint"]) == ("0", hashlib.sha256(checkpoint.read_bytes()).hexdigest())
+        assert "DualPathDiffusion" in row["components"]
+        assert "decoder=gru" in row["components"]
+    report = json.loads((table.parent / "test_report.json").read_text())
+    assert report["provenance"] == json.loads((table.parent / "provenance.json").read_text())
+    assert report["columns"]["lve"] == {"pooling": "frames", "better": "lower"}
+    assert len(report["sequences"]) == 24
 
 
 def test_a_config_of_the_users_is_not_overwritten(
