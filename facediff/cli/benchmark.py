@@ -100,13 +100,14 @@ def benchmark(
             tell(f"{old} cells had failed before; --retry-failed tries them again")
         if all(result.problem for result in results):
             raise FaceDiffError(f"every cell failed, the first: {next(result.problem for result in results)}")
-        write_and_tell(folder, None, RESAMPLES, 0.95, 0)
+        write_and_tell(folder, None, RESAMPLES, 0.95, 0, None)
     return 1 if failed or old else 0
 
 
 def report(
     folders: Annotated[list[Path], Option(metavar="FOLDER", reads=True)],
     *,
+    output: Annotated[Path | None, Option(also="-o", metavar="OUT", writes="folder")] = None,
     baseline: Annotated[str | None, Option(metavar="ROW")] = None,
     bootstrap: Annotated[ranges.Resamples, Option(metavar="N")] = RESAMPLES,
     level: Annotated[ranges.Level, Option(metavar="P")] = 0.95,
@@ -115,7 +116,8 @@ def report(
 ) -> None:
     """Write the tables of benchmarks again: Markdown, LaTeX, CSV, a page for the browser, and plots.
 
-    They are in report/ of each folder. Nothing is trained or tested; cells that are not done yet are named.
+    They are in report/ of each folder, unless --output says otherwise. Nothing is trained or tested; cells that are not
+    done yet are named.
 
     For example:
       facediff benchmark report benchmarks/quick
@@ -123,6 +125,7 @@ def report(
 
     Args:
         folders: folders of benchmarks, such as benchmarks/quick
+        output: folder for the files, whose names begin with the plan's (default: report/ of each folder)
         baseline: the row that all others are compared with (default: the plan's)
         bootstrap: resamples of the sentences for intervals; 0: none
         level: of the intervals; a corrected p below 1 - level is significant
@@ -138,7 +141,7 @@ def report(
         if baseline is not None and baseline not in rows:
             raise FaceDiffError(f"--baseline {baseline}: {folder} has no such row: {choices(baseline, rows)}")
     for folder in folders:
-        found = write_and_tell(folder, baseline, bootstrap, level, seed)
+        found = write_and_tell(folder, baseline, bootstrap, level, seed, output)
         if page is not None:
             from facediff.benchmark.writing import replace_block
 
@@ -181,7 +184,9 @@ def announce(
         tell("no cell of these was ever timed here")
 
 
-def write_and_tell(folder: Path, baseline: str | None, resamples: int, level: float, seed: int) -> BenchmarkReport:
+def write_and_tell(
+    folder: Path, baseline: str | None, resamples: int, level: float, seed: int, output: Path | None
+) -> BenchmarkReport:
     """Make a report from the results on the disk, write it and print it."""
     from facediff.benchmark.outline import read_outline, read_results
     from facediff.benchmark.tables import report_of
@@ -190,7 +195,7 @@ def write_and_tell(folder: Path, baseline: str | None, resamples: int, level: fl
     outline = read_outline(folder)
     results, missing = read_results(folder, outline)
     found = report_of(outline, results, missing, baseline=baseline, resamples=resamples, level=level, seed=seed)
-    files = write_report(found, folder / "report")
+    files = write_report(found, output or folder / "report")
     tell(*text(found).split("\n"), *(f"written: {path}" for path in files))
     return found
 

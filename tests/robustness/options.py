@@ -70,7 +70,7 @@ BASES: dict[str, str] = {
     "yardsticks": "WORLD/model.ckpt --corpus tests.fakes.tiny.Tiny --samples 2 --references 1 --max-clips 1 --quiet",
     "evaluate": "WORLD/ours WORLD/corpus --bootstrap 10 --workers 1 --quiet",
     "benchmark": "WORLD/plan.yaml -o benchmarks --dry-run",
-    "benchmark report": "WORLD/benchmark --bootstrap 20",
+    "benchmark report": "WORLD/benchmark --bootstrap 20 -o reports",
     "figure frames": f"{DRAWN} --times 0.1",
     "figure heatmap": DRAWN,
     "figure error": DRAWN,
