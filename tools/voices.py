@@ -13,7 +13,7 @@ noise and hum by filters in time. The truth stays what it was, so that scores ca
 - *LVE* as in `facediff test`, in mm².
 
     $ python tools/voices.py demo/puppet.ckpt
-    $ python tools/voices.py demo/puppet.ckpt --options voice_gate=off
+    $ python tools/voices.py demo/puppet.ckpt --options voice_gate=off --only pauses
 """
 
 from __future__ import annotations
@@ -358,19 +358,19 @@ def measured(checkpoint: Path, options: dict[str, Any], clips: int | None = None
         checkpoint: the model.
         options: further keywords of `Animator.animate`.
         clips: most clips of a split.
-        only: measure rows whose name contains this.
+        only: measure tables and rows whose name contains this.
     """
     bench = Bench(checkpoint, options, clips)
     found: dict[str, Any] = {}
     for title, rows, measure in (
-        ("voice", VOICES, bench.voice),
+        ("voices", VOICES, bench.voice),
         ("pauses, mm", PAUSES, bench.pause),
         ("nobody speaks, mm", NOTHING, bench.nothing),
     ):
-        scores = {name: measure(change) for name, change in rows.items() if only in name}  # type: ignore[operator]
+        scores = {name: measure(change) for name, change in rows.items() if only in f"{title}: {name}"}  # type: ignore[operator]
         if not scores:
             continue
-        if title == "voice" and not only:
+        if title == "voices" and len(scores) == len(rows):
             strange = list(scores.values())[TRAINED:]
             scores["mean of strange voices"] = {
                 key: float(np.mean([row[key] for row in strange])) for key in strange[0]
@@ -386,7 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--options", nargs="*", default=[], metavar="NAME=VALUE", help="keywords of Animator.animate")
     parser.add_argument("--clips", type=int, help="most clips of a split")
-    parser.add_argument("--only", default="", metavar="WORDS", help="rows whose name contains this")
+    parser.add_argument("--only", default="", metavar="WORDS", help="tables and rows whose name contains this")
     parser.add_argument("--json", type=Path, help="write the scores here too")
     given = parser.parse_args(arguments)
     options = dict(word.split("=", 1) for word in given.options)
