@@ -28,6 +28,7 @@ def retarget(
     landmarks: Annotated[Path | None, Option(metavar="CSV", reads=True)] = None,
     show: Picture = None,
     accept_poor: bool = False,
+    add_to_mesh: bool = False,
     source: SourceOptions,
 ) -> None:
     """Transfer an animation to another mesh. The suffix of OUT chooses the format, as in `facediff export`.
@@ -41,10 +42,13 @@ def retarget(
             other parts of the head
         show: picture of both faces at the most open mouth
         accept_poor: write the animation although its lips, its folds or its coverage are found to be wrong
+        add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
         source: what completes a bare .npy.
     """
     if output.suffix == ".csv":
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
+    if add_to_mesh and (output.suffix != ".glb" or target_mesh.suffix.lower() != ".glb" or output == target_mesh):
+        raise FaceDiffError(f"--add-to-mesh: expected two different .glb, not {target_mesh} and {output}; name them so")
     source.check([animation])
     for option, file in (("--target-mesh", target_mesh), ("--landmarks", landmarks)):
         if file is not None and not file.is_file():
@@ -68,7 +72,13 @@ def retarget(
             refuse_poor(target_mesh, reports[-1])
 
     made, found = transfer(own, target_mesh, correspondence, landmarks, judge=judge)
-    written = write_animations(output, [made], ExportOptions())
+    if add_to_mesh:
+        from facediff.export.glb_added import add_to_glb
+
+        add_to_glb(output, target_mesh, made, ExportOptions().tolerance_mm)
+        written = [output]
+    else:
+        written = write_animations(output, [made], ExportOptions())
     if show is not None:
         written.append(show)
     tell(*written, *remarks(own, made, found, reports[-1]))

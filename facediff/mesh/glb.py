@@ -191,10 +191,10 @@ def read_glb(data: bytes, source: object) -> Mesh:
         FaceDiffError: if it is larger than the budget.
     """
     glb = Glb(data, source)
-    placed = _placed(glb)
+    placed = placed_meshes(glb)
     parts: dict[int, list[tuple[Array, npt.NDArray[np.int64], Any]]] = {}
     points, faces, colours, before, triangles = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [], 0, 0
-    for index, matrix in placed:
+    for index, matrix, _ in placed:
         if index not in parts:
             parts[index] = [_primitive(glb, each) for each in glb.primitives(index)]
         for position, corners, colour in parts[index]:
@@ -225,8 +225,8 @@ def _primitive(glb: Glb, primitive: dict[str, Any]) -> tuple[Array, npt.NDArray[
     return position, glb.triangles(primitive, len(position)), colour
 
 
-def _placed(glb: Glb) -> list[tuple[int, Array | None]]:
-    """The scene's meshes with the (4, 4) matrices that place them; None for one that stays where it is."""
+def placed_meshes(glb: Glb) -> list[tuple[int, Array | None, int]]:
+    """The scene's meshes with the (4, 4) matrices that place them, None for one that stays, and their nodes or -1."""
     scenes, nodes = glb.entries("scenes"), glb.entries("nodes")
     if scenes:
         roots = glb.entry("scenes", glb.content.get("scene", 0)).get("nodes", [])
@@ -234,8 +234,8 @@ def _placed(glb: Glb) -> list[tuple[int, Array | None]]:
         below = {child for node in nodes for child in _list(node.get("children", [])) if type(child) is int}
         roots = [index for index in range(len(nodes)) if index not in below]
     if not nodes:
-        return [(index, None) for index in range(len(glb.entries("meshes")))]
-    placed: list[tuple[int, Array | None]] = []
+        return [(index, None, -1) for index in range(len(glb.entries("meshes")))]
+    placed: list[tuple[int, Array | None, int]] = []
     seen: set[int] = set()
     queue: list[tuple[object, Array | None]] = [(root, None) for root in _list(roots)]
     while queue:
@@ -249,7 +249,7 @@ def _placed(glb: Glb) -> list[tuple[int, Array | None]]:
         matrix = own if parent is None else parent if own is None else parent @ own
         queue += [(child, matrix) for child in _list(node.get("children", []))]
         if "mesh" in node:
-            placed.append((_whole(node, "mesh"), matrix))
+            placed.append((_whole(node, "mesh"), matrix, index))
     return placed
 
 

@@ -1,0 +1,151 @@
+"""An animation added to a .glb: what was in the file stays, field by field, and the vertices move as carried."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from facediff.animation import Animation
+from facediff.errors import FaceDiffError
+from facediff.export.glb_added import add_to_glb
+from facediff.mesh import read_mesh
+from facediff.mesh.glb import Glb
+from tests.fakes.meshes import relief
+
+
+def avatar(path: Path) -> None:
+    """A textured, skinned face with two targets that are animated, below a scaled, turned node; and a second mesh."""
+    points, faces = relief(9, 8)
+    chunks: list[bytes] = []
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+
+    def add(array: np.ndarray, form: str) -> int:
+        data = np.ascontiguousarray(array).tobytes()
+        views.append({"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(data)})
+        chunks.append(data + bytes(-len(data) % 4))
+        kind = {"float32": 5126, "uint16": 5123}[array.dtype.name]
+        accessors.append({"bufferView": len(views) - 1, "componentType": kind, "count": len(array), "type": form})
+        return len(accessors) - 1
+
+    count = len(points)
+    weights = np.zeros((count, 4), np.float32)
+    weights[:, 0] = 1
+    face = {
+        "attributes": {
+            "POSITION": add(points.astype(np.float32), "VEC3"),
+            "TEXCOORD_0": add(points[:, :2].astype(np.float32), "VEC2"),
+            "JOINTS_0": add(np.zeros((count, 4), np.uint16), "VEC4"),
+            "WEIGHTS_0": add(weights, "VEC4"),
+        },
+        "indices": add(faces.astype(np.uint16).ravel(), "SCALAR"),
+        "material": 0,
+        "targets": [{"POSITION": add(np.full((count, 3), 0.1 * k, np.float32), "VEC3")} for k in (1, 2)],
+    }
+    hat = {"attributes": {"POSITION": add((points + [0, 9, 0]).astype(np.float32), "VEC3")}, "indices": face["indices"]}
+    times = add(np.float32([0, 1]), "SCALAR")
+    smile = {"input": times, "output": add(np.float32([0, 0, 1, 0.5]), "SCALAR"), "interpolation": "LINEAR"}
+    content = {
+        "asset": {"version": "2.0", "generator": "elsewhere"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, 2]}],
+        "nodes": [
+            {"name": "root", "scale": [100, 100, 100], "rotation": [0.7071068, 0, 0, 0.7071068], "children": [1, 3]},
+            {"name": "head", "mesh": 0, "skin": 0},
+            {"name": "hat", "mesh": 1},
+            {"name": "joint"},
+        ],
+        "meshes": [
+            {"primitives": [face], "weights": [0.25, 0], "extras": {"targetNames": ["jawOpen", "smile"]}},
+            {"primitives": [hat]},
+        ],
+        "skins": [{"joints": [3]}],
+        "materials": [{"name": "skin", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "textures": [{"source": 0}],
+        "images": [{"uri": "data:image/png;base64,AAAA"}],
+        "animations": [
+            {
+                "name": "smile",
+                "samplers": [smile],
+                "channels": [{"sampler": 0, "target": {"node": 1, "path": "weights"}}],
+            }
+        ],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": sum(map(len, chunks))}],
+        "extensionsUsed": ["KHR_materials_unlit"],
+    }
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    binary = b"".join(chunks)
+    path.write_bytes(
+        struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + binary
+    )
+
+
+def opened(path: Path) -> Glb:
+    return Glb(path.read_bytes(), path)
+
+
+def test_an_animation_is_added_and_everything_else_stays(tmp_path: Path) -> None:
+    avatar(tmp_path / "avatar.glb")
+    mesh = read_mesh(tmp_path / "avatar.glb")
+    count = len(mesh.vertices) // 2
+    head = np.abs(mesh.vertices[:, 1]).argsort()  # the hat has no scale: its vertices are told by their size
+    rest = mesh.vertices.astype(np.float32)
+    moving = np.ptp(mesh.vertices[:count], axis=0).max() > 50
+    first = slice(0, count) if moving else slice(count, 2 * count)
+    assert len(head) == 2 * count
+    vertices = np.repeat(rest[None], 5, axis=0)
+    vertices[:, first] += (np.random.default_rng(0).normal(0, 1, (5, count, 3)) * np.arange(5)[:, None, None]).astype(
+        "f4"
+    )
+    animation = Animation("hello", vertices, rest, 25.0, faces=mesh.faces, unit="mm")
+    add_to_glb(tmp_path / "out.glb", tmp_path / "avatar.glb", animation, 0.001)
+    old, new = opened(tmp_path / "avatar.glb"), opened(tmp_path / "out.glb")
+    for key in ("asset", "scene", "scenes", "nodes", "skins", "materials", "textures", "images", "extensionsUsed"):
+        assert new.content[key] == old.content[key]
+    assert new.content["accessors"][: len(old.content["accessors"])] == old.content["accessors"]
+    assert new.content["bufferViews"][: len(old.content["bufferViews"])] == old.content["bufferViews"]
+    assert new.binary.startswith(old.binary)
+    assert new.content["meshes"][1] == old.content["meshes"][1]
+    one, two = old.content["meshes"][0], new.content["meshes"][0]
+    (before,), (after,) = one["primitives"], two["primitives"]
+    assert {**after, "targets": after["targets"][:2]} == before
+    assert two["extras"]["targetNames"][:2] == ["jawOpen", "smile"]
+    assert two["weights"][:2] == [0.25, 0]
+    assert len(two["weights"]) == len(after["targets"]) == len(two["extras"]["targetNames"])
+    smile, hello = new.content["animations"]
+    total = len(after["targets"])
+    kept = new.numbers(smile["samplers"][smile["channels"][0]["sampler"]]["output"], "SCALAR", ("f4",)).reshape(
+        2, total
+    )
+    assert kept[:, :2].tolist() == [[0, 0], [1, 0.5]]
+    assert not kept[:, 2:].any()
+    (channel,) = hello["channels"]
+    assert channel["target"] == {"node": 1, "path": "weights"}
+    weights = new.numbers(hello["samplers"][0]["output"], "SCALAR", ("f4",)).reshape(5, total)
+    assert weights[:, 0] == pytest.approx(0.25)
+    shapes = np.stack([new.numbers(target["POSITION"], "VEC3", ("f4",)) for target in after["targets"][2:]])
+    local = np.einsum("tk,kvc->tvc", weights[:, 2:], shapes)
+    turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])  # by 90° about x, the root's
+    assert 100 * local @ turn.T == pytest.approx(vertices[:, first] - rest[first], abs=2e-3)
+    assert np.array_equal(read_mesh(tmp_path / "out.glb").vertices, mesh.vertices)
+
+
+def test_another_file_is_refused(tmp_path: Path) -> None:
+    avatar(tmp_path / "avatar.glb")
+    points, faces = relief(5, 5)
+    animation = Animation("x", points[None].astype("f4"), points.astype("f4"), 25.0, faces=faces.astype("i4"))
+    with pytest.raises(FaceDiffError, match=r"avatar\.glb: has 144 vertices"):
+        add_to_glb(tmp_path / "out.glb", tmp_path / "avatar.glb", animation, 0.05)
+    assert not (tmp_path / "out.glb").exists()
