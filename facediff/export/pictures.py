@@ -61,7 +61,7 @@ def draw_correspondence(path: Path, animation: Animation, made: Animation, found
     posed = back.apply(made.vertices[frame])
     source = np.asarray(animation.vertices[frame])
     moved, moves = heat(np.linalg.norm(made.vertices[frame] - made.template, axis=1) * millimetres(made), "motion")
-    apart, distances = heat(found.distances * millimetres(made), "distance of the meshes")
+    apart, distances = heat(found.distances * (found.share > 0) * millimetres(made), "distance of the meshes")
     _draw(
         path,
         [
@@ -70,6 +70,8 @@ def draw_correspondence(path: Path, animation: Animation, made: Animation, found
             Panel(moved, posed, made.triangles, moves),
             Panel(apart, back.apply(made.template), made.triangles, distances),
         ],
+        # A whole figure would show its face in a few pixels.
+        focus=[source, animation.template],
     )
 
 
@@ -79,9 +81,11 @@ def heat(values_mm: npt.NDArray[np.floating], label: str) -> tuple[str, npt.NDAr
     return f"{label}, 0 to {highest:.2g} mm", heat_colours(values_mm, highest)
 
 
-def _draw(path: Path, panels: Sequence[Panel], size: int = 272) -> None:
-    """Draw faces of one unit next to each other at one scale."""
-    camera = Camera.framing([panel.vertices for panel in panels])
+def _draw(
+    path: Path, panels: Sequence[Panel], size: int = 272, *, focus: Sequence[npt.NDArray[np.floating]] | None = None
+) -> None:
+    """Draw faces of one unit next to each other at one scale; the points in ``focus`` are in view, all if None."""
+    camera = Camera.framing(focus or [panel.vertices for panel in panels])
     drawn = [
         Renderer(panel.faces, template=panel.vertices, size=size, camera=camera, colours=panel.colours).render(
             panel.vertices
