@@ -28,7 +28,7 @@ def carried(animation: Animation, head: Head) -> tuple[Animation, Correspondence
     return carry(animation, found, Mesh(head.vertices, head.faces.astype(np.int32))), found
 
 
-QUICK = ("slit mask", "decimated head", "whole avatar")
+QUICK = ("slit mask", "whole avatar")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in FAMILY])
