@@ -18,7 +18,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.study.design import TRUTH, Kind
 from facediff.utils import ranges
 from facediff.utils.limits import check_format, check_number, quoted
-from facediff.utils.plain_files import load_json, write_json
+from facediff.utils.plain_files import load_json, parse_json, write_json
 from facediff.utils.ranges import Range
 
 FORMAT = "facediff study 1"
@@ -177,7 +177,7 @@ class Study:
 
     def as_dict(self) -> dict[str, Any]:
         """The content of the file, without the id."""
-        content: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        content: dict[str, Any] = parse_json(json.dumps(asdict(self)), STUDY_FILE)
         return content
 
     def write(self, folder: Path) -> None:

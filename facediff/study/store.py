@@ -14,6 +14,7 @@ from urllib.parse import quote
 from facediff.errors import FaceDiffError
 from facediff.study.answers import MOST_RATERS, Answer, Rater
 from facediff.study.definition import Study
+from facediff.utils.plain_files import parse_json
 
 WAIT = 30.0
 """Seconds that a writer waits for another one."""
@@ -147,7 +148,7 @@ class Store:
             for rater, trial, given, seconds, plays, at in database.execute(
                 "SELECT rater, trial, answers, seconds, plays, at FROM answers ORDER BY at, trial"
             ):
-                answers.setdefault(rater, {})[trial] = Answer(trial, json.loads(given), seconds, plays, at)
+                answers.setdefault(rater, {})[trial] = Answer(trial, parse_json(given, self.path), seconds, plays, at)
             comments: dict[str, dict[str, str]] = {}
             for rater, question, text in database.execute("SELECT rater, question, text FROM comments"):
                 comments.setdefault(rater, {})[question] = text

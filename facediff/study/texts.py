@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
@@ -12,6 +11,7 @@ from typing import Any
 from facediff.errors import FaceDiffError, choices
 from facediff.study.definition import LANGUAGE, LONGEST_TEXT, NAME, Question, Rule, Texts, make_rule
 from facediff.utils.limits import quoted
+from facediff.utils.plain_files import parse_json
 
 PAPER_QUESTIONS = ("realism", "lip_sync", "style")
 """The questions that are asked by default; the last one needs references."""
@@ -31,7 +31,7 @@ def bundled_texts() -> dict[str, dict[str, Any]]:
     """The words of the page by language: all that ``assets/texts`` holds, English first."""
     folder = resources.files("facediff.study").joinpath("assets", "texts")
     found = {
-        entry.name.removesuffix(".json"): json.loads(entry.read_text(encoding="utf-8"))
+        entry.name.removesuffix(".json"): parse_json(entry.read_bytes(), entry.name)
         for entry in folder.iterdir()
         if entry.name.endswith(".json")
     }

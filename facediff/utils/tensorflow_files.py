@@ -10,6 +10,7 @@ is run, and every size and place that it states is compared with the file before
 from __future__ import annotations
 
 import math
+import mmap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -433,6 +434,14 @@ class Shard:
 # The graph.
 
 
+def mapped(path: Path) -> memoryview:
+    """A file's bytes, read as they are looked at."""
+    if not path.stat().st_size:
+        return memoryview(b"")
+    with path.open("rb") as stream:
+        return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+
+
 def read_graph(path: Path) -> dict[str, Tensor]:
     """The weights of a frozen graph: its constants of one dimension or more that are floating-point numbers, by name.
 
@@ -446,7 +455,7 @@ def read_graph(path: Path) -> dict[str, Tensor]:
     made: dict[str, Tensor] = {}
     with reading(path, GRAPH):
         LIMITS.check("bytes", path.stat().st_size, path)
-        content = memoryview(np.memmap(path, np.uint8, "r").data) if path.stat().st_size else memoryview(b"")
+        content = mapped(path)
         used = 0
         for node in message(content.cast("B")).get(1, []):
             if not isinstance(node, memoryview):
