@@ -95,3 +95,21 @@ def _add_face(stage: Any, path: Any, animation: Animation, space: Space) -> None
             "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
         )
         colour.Set(Vt.Vec3fArray.FromNumpy(linear_colours(animation.colours)))
+        _colour_by_vertices(stage, path, mesh)
+
+
+def _colour_by_vertices(stage: Any, path: Any, mesh: Any) -> None:  # noqa: ANN401
+    """A material that shows the display colours: renderers other than previews ignore colours without one."""
+    from pxr import Sdf, UsdShade
+
+    material = UsdShade.Material.Define(stage, path.AppendChild("skin"))
+    reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("colours"))
+    reader.CreateIdAttr("UsdPrimvarReader_float3")
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
+    surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("surface"))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.7)
+    colours = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colours)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)

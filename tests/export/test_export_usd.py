@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from pxr import Usd, UsdGeom, UsdMedia, UsdValidation
+from pxr import Usd, UsdGeom, UsdMedia, UsdShade, UsdValidation
 
 from facediff.animation import Animation
 from facediff.errors import MissingExtraError
@@ -53,6 +53,9 @@ def test_usd_metadata_colours_and_sound(animation: Animation, tmp_path: Path) ->
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     np.testing.assert_allclose(colour.Get(), linear, atol=1e-6)
     assert colour.GetInterpolation() == "vertex"
+    bound = UsdShade.MaterialBindingAPI(stage.GetDefaultPrim().GetChild("face")).ComputeBoundMaterial()[0]
+    (source,), _ = bound.ComputeSurfaceSource()[0].GetInput("diffuseColor").GetConnectedSources()
+    assert UsdShade.Shader(source.source.GetPrim()).GetInput("varname").Get() == "displayColor"
     sound = UsdMedia.SpatialAudio(stage.GetDefaultPrim().GetChild("speech"))
     assert Path(sound.GetFilePathAttr().Get().resolvedPath) == tmp_path / "a.wav"
     assert (sound.GetStartTimeAttr().Get(), sound.GetAuralModeAttr().Get()) == (0, "nonSpatial")
