@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from facediff.mesh.mesh import triangle_areas
-
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
@@ -101,7 +99,8 @@ class Seen:
 
     def __init__(self, vertices: Array, faces: Indices) -> None:
         self.vertices = vertices
-        self.faces = faces[triangle_areas(vertices, faces) > 0] if len(faces) else faces
+        # Triangles without area stay: they join what lies in one place, and without them it would look like a border.
+        self.faces = faces
 
     @cached_property
     def welded(self) -> Indices:

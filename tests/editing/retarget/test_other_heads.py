@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import fast_simplification
 import numpy as np
 import pytest
+import trimesh
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
@@ -15,6 +17,8 @@ from facediff.editing.face_features import LOWER_LIP, UPPER_LIP, find_features
 from facediff.editing.fit_check import check_fit
 from facediff.editing.retargeting import carry
 from facediff.mesh import Mesh
+from facediff.mesh.mesh import triangle_areas
+from facediff.synthetic.arkit import puppet_shapes
 from tests.fakes.heads import FAMILY, Head, talking
 
 
@@ -116,3 +120,20 @@ def test_the_command_refuses_and_accepts(
     assert main([*words, "--accept-poor"]) == 0
     assert "WARNING" in capsys.readouterr().out
     assert (tmp_path / "out.npz").exists()
+
+
+def test_triangles_without_area_do_not_close_the_mouth() -> None:
+    """Decimation and written digits leave some; without them, lips that touch would look like a texture's seam."""
+    vertices, faces, _ = puppet_shapes("M2")
+    vertices = vertices.round(9)
+    for _ in range(2):
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+    points, corners = fast_simplification.simplify(vertices, faces, 0.6)
+    points, corners = (np.float64(points) * 1000).round(8), np.asarray(corners, np.int64)
+    assert (triangle_areas(points, corners) == 0).sum() > 100
+    found = find_features(points, corners)
+    assert found is not None
+    upper, lower = found.lips(points, 9).T
+    assert (points[upper, 1] >= points[lower, 1] - 0.5).all()
+    assert {UPPER_LIP} == set(found.codes[upper])
+    assert {LOWER_LIP} == set(found.codes[lower])
