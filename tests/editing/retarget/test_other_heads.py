@@ -32,7 +32,7 @@ def carried(animation: Animation, head: Head) -> tuple[Animation, Correspondence
     return carry(animation, found, Mesh(head.vertices, head.faces.astype(np.int32))), found
 
 
-QUICK = ("slit mask", "whole avatar")
+QUICK = ("slit mask",)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in FAMILY])

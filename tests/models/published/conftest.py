@@ -60,9 +60,15 @@ MakeMethod = Callable[..., AnimationModel]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Every method, so that a new one is tested by existing."""
+    """Every method, so that a new one is tested by existing; of what takes seconds for each, two in the quick suite."""
     if "method" in metafunc.fixturenames:
-        metafunc.parametrize("method", METHODS)
+        quick = QUICK if metafunc.definition.get_closest_marker("two_methods") else METHODS
+        metafunc.parametrize(
+            "method", [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in METHODS]
+        )
+
+
+QUICK = ("DiffSpeaker", "FaceFormer")
 
 
 @pytest.fixture(scope="session")

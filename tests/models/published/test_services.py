@@ -115,6 +115,7 @@ def test_speech_features_of_an_encoder_without_a_frozen_part_are_not_kept(
         make_trainer(callbacks=[SpeechFeatureCache(str(tmp_path))]).fit(make_method(method), datamodule=tiny)
 
 
+@pytest.mark.two_methods
 def test_training_in_16_bits_previews_and_every_policy_of_unseen_speakers(
     method: str, make_method: MakeMethod, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
@@ -143,6 +144,7 @@ def test_training_in_16_bits_previews_and_every_policy_of_unseen_speakers(
         trainer.test(model, datamodule=tiny, verbose=False)
 
 
+@pytest.mark.two_methods
 def test_the_command_line_adapts_animates_in_windows_and_exports(
     method: str, make_method: MakeMethod, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
