@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -79,6 +80,20 @@ def test_the_table_has_no_circle() -> None:
     while free := {package for package, packages in left.items() if not packages}:
         left = {package: packages - free for package, packages in left.items() if package not in free}
     assert not left
+
+
+def test_the_drawing_has_every_package_above_what_it_may_import() -> None:
+    drawing = ElementTree.parse(PACKAGE.parent / "docs" / "images" / "architecture.svg")  # noqa: S314 - our own
+    texts = [text for text in drawing.iter("{http://www.w3.org/2000/svg}text") if text.get("font-weight") == "bold"]
+    height = {str(text.text): float(str(text.get("y"))) for text in texts}
+    assert set(height) == set(ALLOWED) - {"__init__", "__main__", "version"}
+    wrong = [
+        f"{package} imports {other}"
+        for package in height
+        for other in ALLOWED[package] & set(height) - BASE
+        if height[package] >= height[other]
+    ]
+    assert not wrong
 
 
 @pytest.mark.parametrize("package", ALLOWED)
