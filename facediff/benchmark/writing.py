@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +16,7 @@ from facediff.errors import FaceDiffError, printable
 from facediff.evaluation.report import Interval
 from facediff.utils.files import atomic
 from facediff.utils.plain_files import write_rows
-from facediff.utils.tables import format_table
+from facediff.utils.tables import format_table, html_table, html_text
 from facediff.utils.tables import latex_text as tex
 
 NONE = "–"
@@ -394,7 +393,7 @@ thead th { border-top: 2px solid; border-bottom: 1px solid; } tbody tr:last-chil
 
 def page(report: BenchmarkReport) -> str:
     """The report as one file that needs no network."""
-    outline, e = report.outline, _escape
+    outline, e = report.outline, html_text
     parts = [f"<h1>{e(outline.title)}</h1>"]
     parts += [f"<p>{e(outline.description)}</p>"] if outline.description else []
     if any(table.synthetic for table in report.tables):
@@ -413,48 +412,33 @@ def page(report: BenchmarkReport) -> str:
     )
 
 
-def _escape(text: object) -> str:
-    return html.escape(printable(text)) if "\n" not in str(text) else html.escape(str(text))
-
-
-def _grid(head: Sequence[str], rows: Sequence[tuple[str, Sequence[tuple[str, str]]]]) -> str:
-    """A table; each row has a class, and cells with a class each."""
-    titles = "".join(f"<th>{_escape(text)}</th>" for text in head)
-    body = "".join(
-        f'<tr class="{kind}">' + "".join(f'<td class="{mark}">{_escape(text)}</td>' for text, mark in cells) + "</tr>\n"
-        for kind, cells in rows
-    )
-    return f'<div class="scroll"><table><thead><tr>{titles}</tr></thead><tbody>\n{body}</tbody></table></div>'
-
-
 def _html_table(table: Table, report: BenchmarkReport) -> Iterator[str]:
     scale = scales(table)
     paper = [column for column in table.columns if any(column in each for each in table.published.scores.values())]
     head = ["", *(head_of(column, scale[column]) + arrow(better) for column, better in table.columns.items())]
     head += [f"{title_of(column)}, printed" for column in paper] + ["runs", *COSTS]
-    rows = []
-    for row in table.rows:
-        cells = [(row.label, "")]
-        for column in table.columns:
-            cells.append((mean_and_deviation(row, column, scale[column]), row.marks.get(column, "")))
+    rows: list[list[str]] = []
+    marks: dict[tuple[int, int], str] = {}
+    for place, row in enumerate(table.rows):
         printed = table.published.scores.get(row.name, {})
-        cells += [(scale[column].number(printed.get(column)), "") for column in paper]
-        cells += [(text, "") for text in [runs_of(row), *cost_cells(row)]]
-        rows.append(("reference" if row.reference else "", cells))
-    yield _grid(head, rows)
+        cells = [mean_and_deviation(row, column, scale[column]) for column in table.columns]
+        cells += [scale[column].number(printed.get(column)) for column in paper]
+        rows.append([row.label, *cells, runs_of(row), *cost_cells(row)])
+        marks |= {(place, number): row.marks.get(column, "") for number, column in enumerate(table.columns, 1)}
+    yield html_table(head, rows, kinds=["reference" if row.reference else "" for row in table.rows], marks=marks)
     yield f"<p>{100 * report.bootstrap.level:.0f} % intervals over sentences (bootstrap)</p>"
     intervals = [
-        ("", [(row.label, ""), *((scale[column].interval(row.intervals.get(column)), "") for column in table.columns)])
+        [row.label, *(scale[column].interval(row.intervals.get(column)) for column in table.columns)]
         for row in table.rows
     ]
-    yield _grid(["", *(head_of(column, scale[column]) for column in table.columns)], intervals)
+    yield html_table(["", *(head_of(column, scale[column]) for column in table.columns)], intervals)
     comparisons = comparison_rows(table, report)
     if comparisons:
-        yield f"<p>Against {_escape(table.row(table.baseline).label)}</p>"
-        yield _grid(COMPARISON, [("", [(text, "") for text in row]) for row in comparisons])
+        yield f"<p>Against {html_text(table.row(table.baseline).label)}</p>"
+        yield html_table(COMPARISON, comparisons)
     notes = [f"{table.frames} frames, {table.sequences} sentences", *table.notes]
     notes += [f"printed figures: {source}" for source in table.published.sources] + list(table.published.reasons)
-    yield f"<ul>{''.join(f'<li>{_escape(note)}</li>' for note in notes)}</ul>"
+    yield f"<ul>{''.join(f'<li>{html_text(note)}</li>' for note in notes)}</ul>"
 
 
 def panels(report: BenchmarkReport) -> dict[str, Panel]:

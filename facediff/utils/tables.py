@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TextIO
 
 from facediff.errors import MissingExtraError, printable
@@ -117,12 +117,50 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
     return "\n".join([shown[0], f"|---|{'---:|' * (len(head) - 1)}", *shown[1:]])
 
 
-def html_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table for a page."""
-    titles = "".join(f'<th scope="col">{html.escape(printable(text))}</th>' for text in head)
-    body = "\n".join(
-        "<tr>" + "".join(f"<td>{html.escape(printable(_cell(cell)))}</td>" for cell in row) + "</tr>" for row in rows
-    )
+def html_text(text: object) -> str:
+    """Text that a page shows as it is; its lines stay lines.
+
+    Example:
+        >>> html_text("a < b")
+        'a &lt; b'
+    """
+    return "\n".join(html.escape(printable(line)) for line in str(text).split("\n"))
+
+
+def html_table(
+    head: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    *,
+    kinds: Sequence[str] = (),
+    marks: Mapping[tuple[int, int], str] | None = None,
+) -> str:
+    """A table for a page.
+
+    Args:
+        head: titles of the columns.
+        rows: cells.
+        kinds: CSS class of each row; none where it is empty.
+        marks: CSS class of single cells, by row and column.
+
+    Example:
+        >>> print(html_table(["", "LVE"], [["ours", 1.5]], marks={(0, 1): "best"}))
+        <div class="scroll"><table><thead><tr><th scope="col"></th><th scope="col">LVE</th></tr></thead><tbody>
+        <tr><td>ours</td><td class="best">1.5</td></tr>
+        </tbody></table></div>
+    """
+
+    def opened(name: str, kind: str) -> str:
+        return f'<{name} class="{html.escape(kind)}">' if kind else f"<{name}>"
+
+    titles = "".join(f'<th scope="col">{html_text(text)}</th>' for text in head)
+    lines = []
+    for place, row in enumerate(rows):
+        cells = (
+            f"{opened('td', (marks or {}).get((place, column), ''))}{html_text(_cell(cell))}</td>"
+            for column, cell in enumerate(row)
+        )
+        lines.append(f"{opened('tr', kinds[place] if place < len(kinds) else '')}{''.join(cells)}</tr>")
+    body = "\n".join(lines)
     return f'<div class="scroll"><table><thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
 
 
