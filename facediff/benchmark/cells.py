@@ -18,6 +18,7 @@ from typing import Any, Literal
 from facediff.benchmark.plan import MOST_CELLS, Before, CorpusEntry, MethodEntry, Options, Plan, Variant, find_config
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.files import describe_files, sha256, short_name
+from facediff.utils.hub import check_model_source, model_hash
 from facediff.utils.yaml_files import load_yaml
 
 Kind = Literal["fit", "checkpoint", "predictions"]
@@ -211,7 +212,13 @@ def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
                 f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name "
                 f"its config, such as configs/data/biwi.yaml, for the clips of its test splits"
             )
-        recipe = {**shared, "kind": kind, "source": _content(source), "test": scoring, "options": dict(method.options)}
+        recipe = {
+            **shared,
+            "kind": kind,
+            "source": _content(kind, source),
+            "test": scoring,
+            "options": dict(method.options),
+        }
         yield Cell(
             *(row.name, corpus.name, given, kind),
             source=source,
@@ -243,15 +250,19 @@ def _source(plan: Plan, kind: Kind, text: str) -> Path:
             raise FaceDiffError(f"{text}: no such folder; expected a method's predictions, .npy files of vertices")
         if not any(path.rglob("*.npy")):
             raise FaceDiffError(f"{text}: holds no predictions; expected .npy files of vertices")
-    elif not path.exists():
-        raise FaceDiffError(f"{text}: no such checkpoint; expected a file of `facediff fit` or import-checkpoint")
+    elif not path.exists():  # a name of the hub, whose content may change, is none of a plan's
+        raise FaceDiffError(
+            f"{text}: no such checkpoint; expected a file of `facediff fit` or import-checkpoint, or a model folder"
+        )
+    else:
+        check_model_source(path)
     return path.resolve()
 
 
-def _content(path: Path) -> dict[str, Any]:
-    """What a checkpoint or a folder of predictions holds."""
-    if path.is_file():
-        return {"sha256": sha256(path)}
+def _content(kind: Kind, path: Path) -> dict[str, Any]:
+    """What a checkpoint, a model folder or a folder of predictions holds."""
+    if kind == "checkpoint":
+        return {"sha256": model_hash(path)}
     return describe_files(path, [file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file()])
 
 

@@ -25,6 +25,7 @@ from facediff.models import AnimationModel
 from facediff.registry import checks_arguments
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import sha256
+from facediff.utils.hub import model_hash
 from facediff.utils.provenance import Provenance, recipe_of
 from facediff.version import __version__
 
@@ -96,7 +97,7 @@ def provenance_of(trainer: Trainer, model: AnimationModel, data: SpeechMotionDat
         recipe=recipe_of({"model": options, "data": trained}),
         seed=int(seed) if seed.isdecimal() else None,
         steps=int(steps) if steps.isdecimal() else None,
-        checkpoint=sha256(path) if path is not None and path.is_file() else "",
+        checkpoint=model_hash(path) if path is not None and path.exists() else "",
         corpus=facts["data/corpus"],
         manifest=facts["data/manifest"],
         parameters=facts["parameters/trainable"] + facts["parameters/frozen"],

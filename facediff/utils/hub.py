@@ -7,6 +7,7 @@ mean to ``huggingface_hub``, through which everything goes.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.files import sha256
 from facediff.utils.limits import LIMITS, brief
 
 CONFIG, WEIGHTS, ASSETS, CARD = "config.json", "model.safetensors", "assets.npz", "README.md"
@@ -102,6 +104,21 @@ def model_files(source: str | os.PathLike[str]) -> list[Path]:
     """
     path = model_path(source)
     return [path / name for name in (CONFIG, WEIGHTS, ASSETS)] if path.is_dir() else [path]
+
+
+def model_hash(source: str | os.PathLike[str]) -> str:
+    """SHA-256 of a model: of the checkpoint's bytes, or over those of a folder's :func:`model_files`.
+
+    A folder's card says what people think of a model, and not what it makes: it does not count.
+
+    Raises:
+        FaceDiffError: as :func:`model_path`, or if a file cannot be read.
+    """
+    path = model_path(source)
+    files = model_files(path)
+    if not path.is_dir():
+        return sha256(path)
+    return hashlib.sha256("".join(f"{sha256(file)}  {file.name}\n" for file in files).encode()).hexdigest()
 
 
 def model_name(source: str | os.PathLike[str]) -> str:

@@ -102,6 +102,18 @@ def test_a_changed_config_runs_its_own_cells_again_and_those_alone(folder: Path)
     assert {cell.seed for cell in run(folder)} == {2}
 
 
+def test_a_changed_model_folder_is_tested_again_but_its_card_may_change(folder: Path) -> None:
+    (folder / "plan.yaml").write_text("corpora: {tiny: {}}\nmethods: {published: {checkpoint: published}}\n")
+    (folder / "published").mkdir()
+    for name in ("config.json", "model.safetensors", "assets.npz", "README.md"):
+        (folder / "published" / name).write_text("first")
+    assert len(run(folder)) == 1
+    (folder / "published" / "README.md").write_text("changed")
+    assert run(folder) == []
+    (folder / "published" / "model.safetensors").write_text("changed")
+    assert len(run(folder)) == 1
+
+
 def test_another_protocol_tests_again_and_trains_nothing(folder: Path) -> None:
     run(folder)
     before = len([each for each in calls(folder) if each["command"] == "fit"])
@@ -208,6 +220,7 @@ WRONG: Sequence[tuple[str, str, str]] = (
     ("one: {config: one.yaml}", "one: {}", "one"),
     ("one: {config: one.yaml}", "one: {config: one.yaml, checkpoint: a.ckpt}", "checkpoint"),
     ("one: {config: one.yaml}", "one: {checkpoint: a.ckpt}", "a.ckpt"),
+    ("one: {config: one.yaml}", "one: {checkpoint: .}", "config.json"),  # a folder that is no model
     ("one: {config: one.yaml}", "one: {predictions: a}", "a"),
     ("one: {config: one.yaml}", "one: {predictions: .}", "."),
     ("one: {config: one.yaml}", "one: {config: one.yaml, options: {--model.dim: 3}}", "--model.dim"),

@@ -12,7 +12,17 @@ from pathlib import Path
 import pytest
 
 from facediff.errors import FaceDiffError
-from facediff.utils.hub import ASSETS, CARD, CONFIG, WEIGHTS, check_model_source, hub_id, model_files, model_name
+from facediff.utils.hub import (
+    ASSETS,
+    CARD,
+    CONFIG,
+    WEIGHTS,
+    check_model_source,
+    hub_id,
+    model_files,
+    model_hash,
+    model_name,
+)
 from tests.fakes.hub import FakeHub, Repository, fake_hub
 
 TRY = """
@@ -163,3 +173,21 @@ def test_a_path_of_this_machine_comes_first(tmp_path: Path, monkeypatch: pytest.
 def test_what_is_not_there_is_named_with_its_option() -> None:
     with pytest.raises(FaceDiffError, match="--checkpoint demo/none.ckpt"):
         check_model_source("demo/none.ckpt", "--checkpoint")
+
+
+def test_a_models_hash_is_of_what_it_makes_and_not_of_its_card(tmp_path: Path) -> None:
+    (tmp_path / "model.ckpt").write_bytes(b"abc")  # the digest of FIPS 180-2, appendix B.1
+    assert model_hash(tmp_path / "model.ckpt").startswith("ba7816bf8f01cfea")
+    folder = tmp_path / "published"
+    folder.mkdir()
+    for name in (CONFIG, WEIGHTS, ASSETS, CARD):
+        (folder / name).write_bytes(name.encode())
+    first = model_hash(folder)
+    assert len(first) == 64
+    (folder / CARD).write_bytes(CARD_TEXT)
+    assert model_hash(folder) == first
+    for name in (CONFIG, WEIGHTS, ASSETS):
+        (folder / name).write_bytes(b"changed")
+        assert model_hash(folder) != first
+        (folder / name).write_bytes(name.encode())
+    assert model_hash(folder) == first
