@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from facediff.benchmark.cells import Cell, Training, hash_of
+from facediff.benchmark.cells import Cell, Training, config_content, hash_of
 from facediff.benchmark.results import Result, cell_file, curve_of, model_result, predictions_result, read_result
 from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
@@ -50,6 +50,7 @@ class Setting:
         clips: split of each clip, by the plan's name of a corpus, where predictions are scored.
         truths: folder, frame stride and so on of the truth, likewise.
         classes: data module of each corpus that is no part of facediff, which a checkpoint may not import by itself.
+        roots: folder of each corpus whose data config names one, for checkpoints that know none, or another machine's.
         launcher: how a facediff command is started.
     """
 
@@ -61,6 +62,7 @@ class Setting:
     clips: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     truths: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     classes: Mapping[str, str] = field(default_factory=dict)
+    roots: Mapping[str, str] = field(default_factory=dict)
     launcher: tuple[str, ...] = (sys.executable, "-m", "facediff.utils.tethered", "facediff")
 
 
@@ -121,11 +123,12 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
     place = folder / f"test-{cell.key[:12]}"
     words = ["test", "--ckpt_path", str(checkpoint), *logger_words(place), *progress_words()]
     metrics = list(dict.fromkeys([*setting.metrics, "real_time_factor"]))
+    root = cell.root or (setting.roots.get(cell.corpus) if cell.kind == "checkpoint" else None)
     options = {
         "model.protocol": setting.protocol,
         "model.metrics": metrics,
         **({"data": setting.classes[cell.corpus]} if cell.corpus in setting.classes else {}),
-        **({} if cell.root is None else {"data.root": str(cell.root)}),
+        **({} if root is None else {"data.root": str(root)}),
         **cell.test_options,
     }
     runner.run(place.name, [*words, *option_words(options)])
@@ -168,6 +171,7 @@ class Runner:
         state = read_json(place / STATE) or {}
         last = place / LAST
         if not state.get("done"):
+            refuse_changed(training, cell)
             words = ["fit", "--config", str(training.config)]
             options = fit_options(training, made, cell)
             # A training that was killed continues with the time that its last saved state had taken.
@@ -227,6 +231,20 @@ def fit_options(training: Training, made: Mapping[str, Path], cell: Cell) -> dic
             value = str(checkpoint) if value == f"{{{step}}}" else value  # noqa: PLW2901
         options[name] = value
     return options
+
+
+def refuse_changed(training: Training, cell: Cell) -> None:
+    """Refuse a config that was edited since the cells were made: its result would bear the hash of what it was.
+
+    Raises:
+        FaceDiffError: naming the config.
+    """
+    (known,) = (each["config"] for each in cell.trained["trainings"] if each["name"] == training.name)
+    if hash_of(config_content(training.config)) != hash_of(known):
+        raise FaceDiffError(
+            f"{cell}: {training.config} was changed while the benchmark ran; run the benchmark again, which takes it "
+            f"as it is now"
+        )
 
 
 def option_words(options: Mapping[str, Any]) -> list[str]:

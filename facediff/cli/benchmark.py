@@ -219,6 +219,8 @@ def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder:
     clips: dict[str, dict[str, str]] = {}
     truths: dict[str, tuple[str, ...]] = {}
     classes: dict[str, str] = {}
+    roots: dict[str, str] = {}
+    kinds: dict[str, type[SpeechMotionDataModule]] = {}
     for cell in left:
         for training in cell.trainings:
             made = {each.name: Path(f"{each.name}.ckpt") for each in cell.trainings}
@@ -234,15 +236,21 @@ def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder:
                 class_path, arguments = parse_fit(words)
                 if not class_path.startswith("facediff."):
                     classes[cell.corpus] = class_path
-                data_of(prepared, class_path, arguments, make=not dry_run)
+                kinds[cell.corpus] = type(data_of(prepared, class_path, arguments, make=not dry_run))
             except FaceDiffError as error:
                 if "--data.root must be given" in str(error):
                     remedy = f"give it with --root {cell.corpus}=FOLDER; docs/data.md says how to obtain it"
                     raise FaceDiffError(f"{plan.file}: the corpus {cell.corpus} has no folder; {remedy}") from error
                 raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
-        if cell.kind == "checkpoint" and str(cell.source) not in seen:
-            seen.add(str(cell.source))
-            check_checkpoint(cell)
+        if cell.kind == "checkpoint" and cell.data is not None:
+            class_path, arguments = read_data(cell.data)
+            kinds[cell.corpus] = data_class(class_path)
+            if not class_path.startswith("facediff.") and "." in class_path:
+                classes[cell.corpus] = class_path
+            if (
+                arguments.get("root") is not None
+            ):  # a published model knows no folder, and another machine's is not here
+                roots[cell.corpus] = str(arguments["root"])
         if cell.kind == "predictions" and cell.corpus not in truths and cell.data is not None:
             try:
                 class_path, arguments = read_data(cell.data)
@@ -252,7 +260,13 @@ def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder:
                     truths[cell.corpus], clips[cell.corpus] = truth_words(data), test_clips(data)
             except FaceDiffError as error:
                 raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
-    return replace(setting, clips=clips, truths=truths, classes=classes)
+    for cell in left:
+        if cell.kind == "checkpoint":
+            try:
+                check_checkpoint(cell, kinds.get(cell.corpus), classes.get(cell.corpus), roots.get(cell.corpus))
+            except FaceDiffError as error:
+                raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
+    return replace(setting, clips=clips, truths=truths, classes=classes, roots=roots)
 
 
 def check_test_options(plan: Plan) -> None:
@@ -266,16 +280,39 @@ def check_test_options(plan: Plan) -> None:
                 raise FaceDiffError(f"{plan.file}: test_options: {name} is none of a test's: {choices(name, free)}")
 
 
-def check_checkpoint(cell: Cell) -> None:
-    """Refuse a checkpoint that cannot be tested, or whose corpus is not here."""
+def check_checkpoint(
+    cell: Cell, kind: type[SpeechMotionDataModule] | None, class_path: str | None, root: str | None
+) -> None:
+    """Refuse a checkpoint that cannot be tested, is of another corpus than the plan's, or whose corpus is not here.
+
+    Args:
+        cell: of a checkpoint.
+        kind: data module of the plan's corpus, where the plan says it.
+        class_path: its name, if it is no part of facediff.
+        root: folder of the corpus that the plan's data config names.
+
+    Raises:
+        FaceDiffError: naming the checkpoint.
+    """
     from facediff.cli.lightning import corpus_and_folder
-    from facediff.models.checkpoint import read_checkpoint
+    from facediff.models.checkpoint import build_model, read_checkpoint
 
     path = Path(str(cell.source))
-    _, options = corpus_and_folder(path, read_checkpoint(path), cell.test_options.get("data"), cell.root)
-    folder = options.get("root")
-    if folder is not None and not Path(str(folder)).expanduser().is_dir():
-        raise FaceDiffError(f"{path}: its corpus {folder} is not there; give it with --root {cell.corpus}=FOLDER")
+    content = read_checkpoint(path)
+    build_model(path, content)
+    chosen = cell.test_options.get("data") or class_path
+    folder = cell.root or (None if root is None else Path(root))
+    module, options = corpus_and_folder(path, content, None if chosen is None else str(chosen), folder)
+    if kind is not None and module.corpus_name != kind.corpus_name:
+        raise FaceDiffError(
+            f"{path}: is of the corpus {module.corpus_name}, and the plan's is {kind.corpus_name}; name with the "
+            f"method's key `corpora` those that it is of"
+        )
+    given = options.get("root")
+    if given is None and module.__name__ != "Puppet":
+        raise FaceDiffError(f"{path}: names no folder of its corpus; give it with --root {cell.corpus}=FOLDER")
+    if given is not None and module.__name__ != "Puppet" and not Path(str(given)).expanduser().is_dir():
+        raise FaceDiffError(f"{path}: its corpus {given} is not there; give it with --root {cell.corpus}=FOLDER")
 
 
 def read_data(path: Path) -> tuple[str, dict[str, Any]]:
@@ -286,6 +323,20 @@ def read_data(path: Path) -> tuple[str, dict[str, Any]]:
     return str(content.get("class_path")), dict(content.get("init_args") or {})
 
 
+def data_class(class_path: str) -> type[SpeechMotionDataModule]:
+    """The data module that a config names.
+
+    Raises:
+        FaceDiffError: if there is none.
+    """
+    from facediff.cli.data import find_own_module
+    from facediff.data.check.layouts import by_name
+
+    if "." in class_path and not class_path.startswith("facediff."):
+        find_own_module(class_path)
+    return by_name(class_path if not class_path.startswith("facediff.data.") else class_path.rpartition(".")[2], None)
+
+
 def data_of(
     known: dict[str, SpeechMotionDataModule], class_path: str, arguments: Mapping[str, Any], *, make: bool
 ) -> SpeechMotionDataModule:
@@ -294,15 +345,10 @@ def data_of(
     Raises:
         FaceDiffError: if the corpus is missing.
     """
-    from facediff.cli.data import find_own_module
-    from facediff.data.check.layouts import by_name
-
     mark = f"{class_path} {sorted((key, str(value)) for key, value in arguments.items())}"
     if mark in known:
         return known[mark]
-    if "." in class_path and not class_path.startswith("facediff."):
-        find_own_module(class_path)
-    module = by_name(class_path if not class_path.startswith("facediff.data.") else class_path.rpartition(".")[2], None)
+    module = data_class(class_path)
     if "root" not in arguments and module.__name__ != "Puppet":
         raise FaceDiffError(
             f"the corpus {module.corpus_name} has no folder; give it with --root {module.corpus_name}=FOLDER"

@@ -114,6 +114,24 @@ def test_a_changed_model_folder_is_tested_again_but_its_card_may_change(folder: 
     assert len(run(folder)) == 1
 
 
+def test_a_config_that_is_edited_in_between_trains_nothing_under_its_old_hash(folder: Path) -> None:
+    cells = cells_of(read_plan(folder / "plan.yaml"))
+    (folder / "part.yaml").write_text("dim: 5\n")  # which one.yaml names, and so does the prior of two
+    problems = [outcome.problem for _, outcome in run_cells(cells, setting(folder), workers=1)]
+    assert len(problems) == 4
+    assert all("one.yaml" in problem for problem in problems)
+    assert not (folder / "calls").exists()
+    assert len(run(folder)) == 4
+
+
+def test_a_checkpoint_is_tested_in_the_folder_that_the_plan_names(folder: Path) -> None:
+    (folder / "plan.yaml").write_text("corpora: {tiny: {}}\nmethods: {old: {checkpoint: old.ckpt}}\n")
+    (folder / "old.ckpt").write_text("old")
+    cells = cells_of(read_plan(folder / "plan.yaml"))
+    list(run_cells(cells, setting(folder, roots={"tiny": "/there"}), workers=1))
+    assert [each["data.root"] for each in calls(folder)] == ["/there"]
+
+
 def test_another_protocol_tests_again_and_trains_nothing(folder: Path) -> None:
     run(folder)
     before = len([each for each in calls(folder) if each["command"] == "fit"])

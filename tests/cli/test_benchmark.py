@@ -1,0 +1,57 @@
+"""What `facediff benchmark` finds wrong with a plan's checkpoints before anything runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from facediff.benchmark import cells_of, read_plan
+from facediff.cli.app import main
+from facediff.cli.benchmark import check_cells
+
+
+@pytest.fixture
+def published(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """A model folder, which knows its corpus but no folder of it."""
+    assert main(["publish", str(checkpoint), str(tmp_path / "published"), "--license", "mit", "--languages", "en"]) == 0
+    capsys.readouterr()
+    return tmp_path / "published"
+
+
+def test_a_model_folder_is_tested_where_the_plans_data_are(published: Path, tiny_root: Path) -> None:
+    folder = published.parent
+    (folder / "data.yaml").write_text(f"class_path: tests.fakes.tiny.Tiny\ninit_args: {{root: {tiny_root}}}\n")
+    (folder / "plan.yaml").write_text("corpora: {tiny: {data: data.yaml}}\nmethods: {a: {checkpoint: published}}\n")
+    plan = read_plan(folder / "plan.yaml")
+    cells = cells_of(plan)
+    found = check_cells(plan, cells, cells, folder / "out", dry_run=True)
+    assert (found.roots, found.classes) == ({"tiny": str(tiny_root)}, {"tiny": "tests.fakes.tiny.Tiny"})
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("corpus", "named"),
+    [
+        ("tiny: {data: data.yaml}", "--root tiny=FOLDER"),
+        ("tiny: {data: data.yaml, root: published}", ""),
+        ("biwi: {data: configs/data/biwi.yaml}", "biwi"),
+        ("puppet: {data: configs/data/puppet.yaml}", "puppet"),
+    ],
+)
+def test_a_checkpoint_of_another_corpus_or_of_none_is_refused(
+    published: Path, capsys: pytest.CaptureFixture[str], corpus: str, named: str
+) -> None:
+    folder = published.parent
+    (folder / "data.yaml").write_text("class_path: tests.fakes.tiny.Tiny\n")
+    plan = f"corpora: {{{corpus}}}\nmethods: {{row_1: {{checkpoint: published}}}}\n"
+    (folder / "plan.yaml").write_text(plan)
+    status = main(["benchmark", str(folder / "plan.yaml"), "-o", str(folder / "out"), "--dry-run"])
+    (line, *more) = [text for text in capsys.readouterr().err.splitlines() if text.startswith("facediff: error")] or [
+        ""
+    ]
+    assert status == (2 if named else 0)
+    assert named in line
+    assert not more
+    assert ("row_1" in line) == bool(named)
+    assert not (folder / "out").exists()
