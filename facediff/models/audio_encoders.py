@@ -20,6 +20,7 @@ from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
 from facediff.models.layers import Frames, Share, Width, frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.limits import quoted
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
@@ -578,7 +579,14 @@ def load_typed(
         )
     network: type[PreTrainedModel] = getattr(transformers, f"{kinds[kind]}{head}")
     if config is not None:
-        return network(known_options(getattr(transformers, f"{kinds[kind]}Config"), config))
+        try:
+            return network(known_options(getattr(transformers, f"{kinds[kind]}Config"), config))
+        except Exception as error:  # transformers' own of a value that it cannot use, and whatever its layers raise
+            reason = quoted(" ".join(str(error).split())) if str(error) else type(error).__name__
+            raise FaceDiffError(
+                f"audio_encoder.config: makes no {what} ({reason}); expected the content of the network's config.json "
+                f"(--audio-config)"
+            ) from error
     return load_pretrained(network, source, what, option)
 
 

@@ -12,6 +12,7 @@ import io
 import math
 import os
 import pickle
+import sys
 import warnings
 import zipfile
 from collections import Counter, OrderedDict
@@ -306,7 +307,8 @@ def read_state_dict(path: Path) -> dict[str, Any]:
     """The tensors of another project's checkpoint by name, on the CPU, without a leading ``module.``.
 
     A state dict may lie in the file as it is, or under ``state_dict`` or ``model``. Files with more than tensors and
-    plain data (optimisers, options of a library) are read too: of these objects nothing is imported or run.
+    plain data (optimisers, options of a library) are read too: of these objects nothing is imported or run. A file that
+    asks for a function to be called is refused, wherever it asks.
 
     Args:
         path: the file.
@@ -379,7 +381,49 @@ class NamedType(NumberType):
     name: str
 
 
-class Foreign:
+MAKERS = {
+    **dict.fromkeys(("collections",), {"Counter", "OrderedDict", "defaultdict", "deque"}),
+    **dict.fromkeys(("copyreg", "copy_reg"), {"_reconstructor", "__newobj__", "__newobj_ex__"}),
+    **dict.fromkeys(("builtins", "__builtin__"), {"bytearray", "bytes", "complex", "frozenset", "range", "slice"}),
+    **dict.fromkeys(("numpy.core.multiarray", "numpy._core.multiarray"), {"_reconstruct", "scalar"}),
+    **dict.fromkeys(("pathlib", "pathlib._local"), {"Path", "PosixPath", "PurePath", "PurePosixPath", "WindowsPath"}),
+    "_codecs": {"encode"},
+    "argparse": {"Namespace"},
+    "datetime": {"date", "datetime", "time", "timedelta", "timezone"},
+    "functools": {"partial"},
+    "numpy": {"dtype", "ndarray"},
+    "torch.serialization": {"_get_layout"},
+    "types": {"SimpleNamespace"},
+}
+"""What a pickle calls to make plain objects, by module."""
+
+
+def may_be_called(module: str, name: str) -> bool:
+    """Whether a pickle of a library's objects calls this: a maker of plain objects, or a class of another package."""
+    if name in MAKERS.get(module, ()) or (module == "torch._utils" and name.startswith("_rebuild_")):
+        return True
+    # Members of enumerations are made by calling their class; functions have small letters.
+    root = module.partition(".")[0]
+    return root not in sys.stdlib_module_names | {"__builtin__", "__main__", "nt"} and name[:1].isupper()
+
+
+class ForeignKind(type):
+    """In place of a class or a function of another package, which is never run; some may not even be called."""
+
+    module = name = ""
+
+    def __call__(cls, *arguments: object, **named: object) -> Any:  # noqa: ANN401
+        """Pass over a call that makes an object.
+
+        Raises:
+            pickle.UnpicklingError: for any other.
+        """
+        if cls.name and not may_be_called(cls.module, cls.name):
+            raise pickle.UnpicklingError(f"it asks to call {quoted(f'{cls.module}.{cls.name}')}, which was not done")
+        return super().__call__(*arguments, **named)
+
+
+class Foreign(metaclass=ForeignKind):
     """In place of an object of another package, of which nothing is kept."""
 
     def __new__(cls, *arguments: object, **named: object) -> Foreign:
@@ -428,7 +472,12 @@ class ForeignReader(OutlineReader):
             return NamedType(STORAGES[name], STORED[name])
         if module == "torch._utils" and name in self._rebuild:
             return self._rebuild[name]
-        return self.names.get((module, name), Foreign)
+        known = self.names.get((module, name))
+        return known if known is not None else ForeignKind("Foreign", (Foreign,), {"module": module, "name": name})
+
+    def _instantiate(self, kind: Any, arguments: Any) -> None:  # noqa: ANN401 - the oldest way to call
+        """Call what a pickle names."""
+        self.append(kind(*arguments))  # type: ignore[attr-defined]
 
     def persistent_load(self, pid: Any) -> Storage:  # noqa: ANN401
         """A storage, once its length agrees with its bytes."""

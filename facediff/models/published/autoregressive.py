@@ -381,7 +381,8 @@ def read_period(weights: Weights, name: str, found: Found) -> int:
     Raises:
         FaceDiffError: if it is another table, or that of another frame rate.
     """
-    table = weights.get(name)[0]
+    weights.shape(name, 3)
+    table = weights.get(name)[0].float()
     same = (table[1:] - table[0]).abs().amax(1) < 1e-6
     period = int(same.int().argmax()) + 1 if bool(same.any()) else len(table)
     expected = periodic_positions(len(table), table.shape[1], period)

@@ -86,7 +86,7 @@ def check_positions(weights: Weights, name: str) -> None:
     if name not in weights:
         return
     *_, width = weights.shape(name, 3)
-    table, expected = weights.get(name).flatten(0, 1), torch.zeros(width)
+    table, expected = weights.get(name).flatten(0, 1).float(), torch.zeros(width)
     expected[1::2] = 1.0
     if not torch.allclose(table[0], expected, rtol=0, atol=1e-5):
         raise FaceDiffError(

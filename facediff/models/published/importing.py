@@ -102,6 +102,7 @@ class Weights:
         self.ignored: dict[str, str] = {}
         self.notes: list[str] = []
         self._used: set[str] = set()
+        self._origins: dict[str, str] = {}
 
     def __contains__(self, name: str) -> bool:
         """Whether there is such a tensor."""
@@ -137,8 +138,34 @@ class Weights:
         return shape
 
     def move(self, old: str, new: str) -> None:
-        """Use a tensor under another name."""
+        """Use a tensor under another name.
+
+        Raises:
+            FaceDiffError: if it is missing, or another one has that name.
+        """
+        if new in self.made:
+            raise FaceDiffError(
+                f"{self.source}: holds {self._origins[new]} and {old}, which are the same tensor; expected one of them"
+            )
         self.made[new] = self.get(old)
+        self._origins[new] = old
+
+    def authors_name(self, new: str) -> str:
+        """What the authors call a tensor; a missing one is called by those next to it, else as the model does.
+
+        >>> weights = Weights({"vertice_map.weight": torch.ones(1)}, "vocaset.pth")
+        >>> weights.move("vertice_map.weight", "network.motion_in.weight")
+        >>> weights.authors_name("network.motion_in.bias")
+        'vertice_map.bias'
+        """
+        if new in self._origins:
+            return self._origins[new]
+        place, _, kind = new.rpartition(".")
+        for there, old in self._origins.items():
+            beside, _, other = there.rpartition(".")
+            if beside == place and old.endswith(other):
+                return f"{old.removesuffix(other)}{kind}"
+        return new
 
     def move_all(self, old: str, new: str, renames: Iterable[tuple[str, str]] = ()) -> None:
         """Use all tensors whose names begin with ``old`` under names that begin with ``new``.
@@ -597,10 +624,20 @@ def chooses_rate(method: str) -> bool:
     return any(entry.method == method and entry.frame_rate is not None for entry in RECOGNISERS)
 
 
+SCIENTIFIC = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
+"""Numbers such as 1e-7, which YAML takes for text unless they have a point."""
+
+
 def read_value(text: object) -> object:
-    """A value from the command line: a number, true, false, null, a list of such, or the text itself."""
+    """A value from the command line: a number, true, false, null, a list of such, or the text itself.
+
+    >>> read_value("1e-7"), read_value("[1, 2]"), read_value("extend")
+    (1e-07, [1, 2], 'extend')
+    """
     if not isinstance(text, str):
         return text
+    if SCIENTIFIC.fullmatch(text):
+        return float(text)
     try:
         value: object = yaml.safe_load(text)
     except yaml.YAMLError:
@@ -697,15 +734,16 @@ def build(weights: Weights, method: Recogniser, found: Found, options: dict[str,
     for name, value in own.items():
         if name not in weights.made:
             raise FaceDiffError(
-                f"{weights.source}: lacks a tensor for {name}; give the checkpoint of the whole model, as its authors "
-                f"distribute it"
+                f"{weights.source}: lacks the tensor {weights.authors_name(name)}; give the checkpoint of the whole "
+                f"model, as its authors distribute it"
             )
         if weights.made[name].shape != value.shape:
             raise FaceDiffError(
-                f"{weights.source}: its tensor for {name} has the shape {tuple(weights.made[name].shape)}, expected "
-                f"{tuple(value.shape)}; it does not fit the other tensors, or an option"
+                f"{weights.source}: its tensor {weights.authors_name(name)} has the shape "
+                f"{tuple(weights.made[name].shape)}, expected {tuple(value.shape)}; it does not fit the other tensors, "
+                f"or an option"
             )
-    if extra := sorted(weights.made.keys() - own.keys()):
+    if extra := [weights.authors_name(name) for name in sorted(weights.made.keys() - own.keys())]:
         raise FaceDiffError(
             f"{weights.source}: {method.method} has no place for {listed(extra)}; it does not fit the other tensors"
         )
@@ -713,7 +751,9 @@ def build(weights: Weights, method: Recogniser, found: Found, options: dict[str,
     model.load_state_dict({name: value.to(own[name].dtype) for name, value in weights.made.items()})
     for name, parameter in model.named_parameters():
         if not parameter.isfinite().all():
-            raise FaceDiffError(f"{weights.source}: its tensor for {name} holds NaN or infinity; the file is damaged")
+            raise FaceDiffError(
+                f"{weights.source}: its tensor {weights.authors_name(name)} holds NaN or infinity; the file is damaged"
+            )
     return model
 
 

@@ -396,7 +396,7 @@ def test_a_second_stage_alone_says_what_to_give(tmp_path: Path) -> None:
 
 
 WRONG: dict[str, tuple[Callable[[State, State], object], str]] = {
-    "half a first stage": (lambda one, two: one.pop("decoder.expander.0.0.weight"), "smooth.weight"),
+    "half a first stage": (lambda one, two: one.pop("decoder.expander.0.0.weight"), "decoder.expander.0.0.weight"),
     "another table of positions": (lambda one, two: one["decoder.decoder_pos_embedding.pe"].add_(1), "decoder_pos"),
     "a table of no rows": (
         lambda one, two: one.update({"encoder.encoder_pos_embedding.pe": torch.tensor(1.0)}),
@@ -407,7 +407,7 @@ WRONG: dict[str, tuple[Callable[[State, State], object], str]] = {
         "gate",
     ),
     "codes that do not fit": (lambda one, two: one.update({"quantize.embedding.weight": torch.ones(4, 3)}), "codes"),
-    "another width": (lambda one, two: two.update({"feat_map.weight": torch.ones(12, 16)}), "out.weight"),
+    "another width": (lambda one, two: two.update({"feat_map.weight": torch.ones(12, 16)}), "feat_map.weight"),
 }
 
 

@@ -176,7 +176,7 @@ CHECKPOINTS: dict[str, tuple[Callable[[voca.Arrays], object], str]] = {
         lambda s: s.update({"VOCA/SpeechEncoder/conv3/weights": np.ones((5, 1, 6, 8), np.float32)}),
         "conv3",
     ),
-    "not finite": (lambda s: s["VOCA/SpeechEncoder/fc1/biases"].fill(np.nan), "dense.bias"),
+    "not finite": (lambda s: s["VOCA/SpeechEncoder/fc1/biases"].fill(np.nan), "fc1/biases"),
 }
 
 
