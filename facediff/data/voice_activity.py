@@ -301,7 +301,7 @@ class Openness:
     Example:
         >>> import numpy as np
         >>> found = Openness(read_gate("energy"), 25.0)
-        >>> np.concatenate([found.feed(np.zeros(16000)), found.finish(25)]).max()
+        >>> float(np.concatenate([found.feed(np.zeros(16000)), found.finish(25)]).max())
         0.0
     """
 

@@ -3,7 +3,7 @@
 Example:
     >>> from facediff.export import FORMATS
     >>> FORMATS[".glb"].help
-    'glTF 2.0 with morph targets: Blender, Unity, three.js, Unreal'
+    'glTF 2.0 with morph targets, exact or under the names of --shapes: Blender, Unity, three.js, Unreal'
 """
 
 from facediff.export.format import ExportOptions, Format

@@ -15,6 +15,7 @@ from facediff.errors import FaceDiffError
 from facediff.export.glb import LIMIT, compress
 from facediff.mesh.glb import Glb, placed_meshes
 from facediff.utils.files import atomic
+from facediff.utils.limits import LIMITS
 
 FLOAT = 5126  # glTF's code of float32
 STILL = 1e-7  # A mesh that moves by less than this share of its size stands still
@@ -37,6 +38,7 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
         FaceDiffError: if the file is no readable .glb, is not the mesh of the animation, or shows one of its moving
             meshes in several places.
     """
+    LIMITS.check("bytes", target.stat().st_size, target)
     data = target.read_bytes()
     try:
         glb = Glb(data, target)
@@ -186,7 +188,7 @@ class _Changed:
             FaceDiffError: if the file would be larger than its header can count.
         """
         self.content["buffers"][0]["byteLength"] = self.length
-        text = json.dumps(self.content, separators=(",", ":")).encode()
+        text = json.dumps(self.content, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         length = 12 + 8 + len(text) + 8 + self.length
         if length > LIMIT:

@@ -279,6 +279,14 @@ def read_targets(path: Path) -> object:
     return read_shape_files(path)
 
 
+def add_motion(path: Path) -> object:
+    from facediff.export.glb_added import add_to_glb
+    from tests.fakes.clicks import clicks
+
+    add_to_glb(path.with_name("added.glb"), path, clicks(), 0.05)
+    return (path.with_name("added.glb")).read_bytes()
+
+
 def head() -> np.ndarray:
     """A small patch with lids, and a face around it."""
     return np.concatenate([0.2 * grid(), grid() + [0, 0.3, 0]])
@@ -788,6 +796,7 @@ READERS = {
     **{suffix: Reader(f".{suffix}", mesh, read_a_mesh) for suffix in ("obj", "ply", "stl", "off", "glb")},
     "shapes, a folder": Reader(".obj", mesh, shape_folder),
     "shapes, glb": Reader(".glb", targets, read_targets),
+    "mesh that an animation is added to, glb": Reader(".glb", targets, add_motion),
     "eyes": Reader(".json", eyes, read_the_eyes),
     "eyes, shapes": Reader(".json", blinks, read_the_eyes),
     "eyes, arrays": Reader(".npz", eyes_arrays, read_the_eyes),
