@@ -244,8 +244,8 @@ def about(report: BenchmarkReport) -> list[str]:
         "p over sentences: permutation test by signs, paired by sentence; p over runs: Welch's t-test between training "
         "runs; the larger of the two is corrected after Holm for the rows of one score",
         f"a star, bold (best) and underlined (second best): corrected p below {alpha:.2g}; best and second best only "
-        f"where they differ so from every row behind them, corrected for those alone; references are never marked; where "
-        f"nothing is marked, the data do not say which is best",
+        f"where they differ so from every row behind them, corrected for those alone; references are never marked; "
+        f"where nothing is marked, the data do not say which is best",
         "still face and mean face never move; shuffled speech is the model given another sentence's speech",
     ]
     factors = [row.cost.factor for table in report.tables for row in table.rows if row.cost.factor is not None]
