@@ -66,6 +66,7 @@ def print_table(
 
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
+_LATEX |= {letter: f"${letter}$" for letter in "<>|"}  # which the usual fonts of text do not have
 _LATEX |= {
     "±": r"$\pm$",
     "−": "$-$",
@@ -81,8 +82,8 @@ def latex_text(text: object) -> str:
     r"""Text that LaTeX shows as it is.
 
     Example:
-        >>> latex_text("50 % of a_b")
-        '50 \\% of a\\_b'
+        >>> latex_text("50 % of a_b < 1")
+        '50 \\% of a\\_b $<$ 1'
     """
     return "".join(_LATEX.get(letter, letter) for letter in printable(text))
 
