@@ -382,7 +382,8 @@ def _csv_rows(table: Table, report: BenchmarkReport) -> Iterator[dict[str, Any]]
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; color: #1a1a1a; }
 table { border-collapse: collapse; margin: 0.6rem 0 1.2rem; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.2rem 0.7rem; text-align: right; } th:first-child, td:first-child { text-align: left; }
+th, td { padding: 0.2rem 0.7rem; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; white-space: normal; }
 thead th { border-top: 2px solid; border-bottom: 1px solid; } tbody tr:last-child td { border-bottom: 2px solid; }
 .best { font-weight: bold; } .second { text-decoration: underline; } .reference { font-style: italic; color: #444; }
 .scroll { overflow-x: auto; } figure { display: inline-block; margin: 0 1rem 1rem 0; } figcaption { font-size: 13px; }
