@@ -29,8 +29,9 @@ def made(small: Path, tmp_path: Path) -> Path:
 def opened(browser: Chromium, url: str, **window: Any) -> Page:  # noqa: ANN401 - passed on
     page = browser.open(url, **window)
     page.wait_for("window.facediffStudy")
-    page.evaluate("localStorage.clear(), location.reload(), null")  # pages of all folders share one storage
-    page.wait_for("window.facediffStudy && facediffStudy.state.started === null")
+    # Pages of all folders share one storage. The mark tells the page that is left from the one that comes.
+    page.evaluate("window.left = true, localStorage.clear(), location.reload(), null")
+    page.wait_for("!window.left && window.facediffStudy && facediffStudy.state.started === null")
     return page
 
 
