@@ -30,8 +30,8 @@ def opened(browser: Chromium, url: str, **window: Any) -> Page:  # noqa: ANN401 
     page = browser.open(url, **window)
     page.wait_for("window.facediffStudy")
     # Pages of all folders share one storage. The mark tells the page that is left from the one that comes.
-    page.evaluate("window.left = true, localStorage.clear(), location.reload(), null")
-    page.wait_for("!window.left && window.facediffStudy && facediffStudy.state.started === null")
+    page.evaluate("window.beforeReload = true, localStorage.clear(), location.reload(), null")
+    page.wait_for("!window.beforeReload && window.facediffStudy && facediffStudy.state.started === null")
     return page
 
 
