@@ -162,8 +162,15 @@ def markdown_body(report: BenchmarkReport) -> list[str]:
 
 
 def cell(text: object) -> str:
-    """Text that Markdown shows as it is."""
-    return re.sub(r"([|<>*_`\[\]])", r"\\\1", printable(text)).replace("\\`", "`")
+    """Text that Markdown shows as it is; what stands between backticks is code, in which only bars are special."""
+    parts = printable(text).split("`")
+    if len(parts) % 2 == 0:
+        parts = ["`".join(parts)]
+    for place in range(0, len(parts), 2):
+        parts[place] = re.sub(r"([|<>*_`\[\]])", r"\\\1", parts[place])
+    for place in range(1, len(parts), 2):
+        parts[place] = parts[place].replace("|", "\\|")
+    return "`".join(parts)
 
 
 def markdown_grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -16,7 +16,7 @@ from facediff.benchmark import report_of
 from facediff.benchmark.outline import read_outline, read_results, write_outline
 from facediff.benchmark.published import published, shown_tables
 from facediff.benchmark.tables import BenchmarkReport
-from facediff.benchmark.writing import BEGIN, END, latex, markdown, page, replace_block, text, write_report
+from facediff.benchmark.writing import BEGIN, END, cell, latex, markdown, page, replace_block, text, write_report
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from tests.fakes.benchmark import outline, results
@@ -167,3 +167,8 @@ def test_the_command_writes_a_report_from_results_alone(tmp_path: Path, capsys: 
     assert "nobody" in capsys.readouterr().err
     assert main(["benchmark", "report", str(tmp_path / "none")]) == 2
     assert str(tmp_path / "none") in capsys.readouterr().err
+
+
+def test_code_in_notes_stays_code() -> None:
+    assert cell("made by `a_b|c` and x_y") == "made by `a_b\\|c` and x\\_y"
+    assert cell("an odd ` and_") == "an odd \\` and\\_"
