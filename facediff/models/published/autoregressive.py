@@ -8,6 +8,7 @@ own for each frame, so the keys and values of earlier frames never change, and m
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from facediff.data import Batch
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import StepRule
+from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.base import LongSpeech, PublishedModel
 from facediff.models.published.importing import Found, Weights
@@ -48,6 +50,7 @@ class AutoregressiveModel(PublishedModel):
     """
 
     table_frames: ClassVar[int | None] = 600
+    network: SpokenDecoder
 
     def __init__(
         self,
@@ -85,6 +88,50 @@ class AutoregressiveModel(PublishedModel):
         rule: StepRule = "features_cut" if self.pairs else "features"
         cached = batch.cached_features or ()
         return self.audio_encoder.at_steps(batch.audio, batch.audio_lengths, steps, rule, *cached)
+
+    def conditions(
+        self, batch: Batch, frames: Int[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, "batch dim"], Float[Tensor, "batch steps dim"]]:
+        """The speaker's style and the speech of so many frames."""
+        memory = self.network.audio_map(self.hear(batch, frames))
+        return self.network.style(self.identity_weights(batch)), memory
+
+
+class OffsetModel(AutoregressiveModel):
+    """Base of those whose decoder gives the offsets themselves, of an :class:`AutoregressiveNetwork`.
+
+    Args:
+        teacher_forcing: train on the true motion of the frame before, in one pass, and not on the generated one; the
+            published training generates.
+        options: those of :class:`AutoregressiveModel`.
+    """
+
+    network: AutoregressiveNetwork
+
+    def __init__(self, *, teacher_forcing: bool = False, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(**options)
+        self.teacher_forcing = teacher_forcing
+
+    def squared_errors(self, batch: Batch) -> tuple[Float[Tensor, "batch frames coordinates"], Int[Tensor, " batch"]]:
+        """Squared errors of all coordinates of scaled motion, and the frames of each clip that are compared."""
+        frames = self.trained_frames(batch)
+        self.check_length(frames, batch.names[0])
+        style, memory = self.conditions(batch, frames)
+        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
+        if self.teacher_forcing:
+            made = self.network.teacher_forced(style, memory, truth)
+        else:
+            made = self.network.generate(style, memory, self.loop)
+        return (made - truth).square(), frames
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """Frame by frame; nothing is random."""
+        self.check_length(frames, batch.names[0])
+        style, memory = self.conditions(batch, frames)
+        made = self.network.generate(style, memory, self.loop)
+        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
 
 
 class KeysValues(NamedTuple):
@@ -297,7 +344,37 @@ def periodic_bias(
     return bias.masked_fill(distance < 0, -torch.inf)
 
 
-class AutoregressiveNetwork(nn.Module):
+class SpokenDecoder(nn.Module):
+    """Maps of speech and of earlier motion into a decoder; what stands behind it is added by a method.
+
+    Attributes:
+        style: weights of the training identities to a vector of the decoder's width; added by a method as well.
+
+    Args:
+        audio_width: channels of the features of speech.
+        n_vertices: vertices V.
+        decoder: the decoder's options.
+    """
+
+    style: nn.Module
+
+    def __init__(self, audio_width: int, n_vertices: int, decoder: dict[str, Any]) -> None:
+        super().__init__()
+        dim = int(decoder["dim"])
+        self.audio_map = nn.Linear(audio_width, dim)
+        self.motion_in = nn.Linear(3 * n_vertices, dim)
+        self.decoder = MotionDecoder(**decoder)
+
+    def after_motion(
+        self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], motion: Tensor
+    ) -> Float[Tensor, "batch frames dim"]:
+        """The decoder's result for every frame from motion (B, T, 3V) of the frame before it, zero before the first."""
+        before = F.pad(motion, (0, 0, 1, 0))[:, :-1]
+        made: Tensor = self.decoder(self.motion_in(before) + style[:, None], memory)
+        return made
+
+
+class AutoregressiveNetwork(SpokenDecoder):
     """Features of speech and a speaker's style to offsets of the vertices, frame by frame.
 
     Args:
@@ -315,12 +392,8 @@ class AutoregressiveNetwork(nn.Module):
         style: nn.Module,
         decoder: dict[str, Any],
     ) -> None:
-        super().__init__()
-        dim = int(decoder["dim"])
-        self.audio_map = nn.Linear(audio_width, dim)
-        self.motion_in = nn.Linear(3 * n_vertices, dim)
-        self.decoder = MotionDecoder(**decoder)
-        self.motion_out = nn.Linear(dim, 3 * n_vertices)
+        super().__init__(audio_width, n_vertices, decoder)
+        self.motion_out = nn.Linear(int(decoder["dim"]), 3 * n_vertices)
         self.style = style
         nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
         nn.init.zeros_(self.motion_out.bias)
@@ -333,8 +406,7 @@ class AutoregressiveNetwork(nn.Module):
         The first frame follows one that does not move, so that it gets the bias of ``motion_in``; a frame that is
         generated does not, as published.
         """
-        before = F.pad(motion, (0, 0, 1, 0))[:, :-1]
-        return self.motion_out(self.decoder(self.motion_in(before) + style[:, None], memory))
+        return self.motion_out(self.after_motion(style, memory, motion))
 
     def generate(
         self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], loop: Loop

@@ -85,6 +85,12 @@ class PublishedModel(AnimationModel):
         chosen = given.get("audio_encoder")
         super().keep_hyperparameters({**given, "audio_encoder": chosen or self.published_encoder})
 
+    @classmethod
+    def encoder_settings(cls) -> dict[str, Any]:
+        """Options of the published encoder but for whose weights it has, for a checkpoint that brings its own."""
+        keywords: dict[str, Any] = cls.published_encoder.keywords  # type: ignore[attr-defined]
+        return {name: value for name, value in keywords.items() if name != "source"}
+
     # What a method adds.
 
     @abstractmethod

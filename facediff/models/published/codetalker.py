@@ -15,7 +15,6 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -26,7 +25,7 @@ from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, Le
 from facediff.models.base import AnimationModel
 from facediff.models.inference import BatchMotion, Motion, Progress, Style
 from facediff.models.layers import Frames, Heads, Layers, Weight, Width, frame_mask
-from facediff.models.published.autoregressive import AutoregressiveModel, MotionDecoder
+from facediff.models.published.autoregressive import AutoregressiveModel, SpokenDecoder
 from facediff.models.published.base import SpeakerTable, masked_mean
 from facediff.models.published.motion_prior import MotionPrior, PriorPositions, PriorScale, perplexity
 from facediff.models.speech_networks import Wav2Vec2Encoder
@@ -87,6 +86,8 @@ class CodeTalker(AutoregressiveModel):
         feature_weight: of the distance from the codes of true motion, in training the predictor.
         options: those of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
     """
+
+    network: Predictor
 
     # wav2vec 2.0 base as transformers had it in 2021; all but the convolutions is trained, with masks and layer drop.
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
@@ -310,13 +311,6 @@ class CodeTalker(AutoregressiveModel):
         """Motion (B, T, 3V) of the codes nearest to features."""
         return self.prior.decode_clips(self.prior.quantise(features).values, frames)
 
-    def conditions(
-        self, batch: Batch, frames: Int[Tensor, " batch"]
-    ) -> tuple[Float[Tensor, "batch dim"], Float[Tensor, "batch steps dim"]]:
-        """The speaker's style and the speech of so many frames."""
-        memory = self.network.audio_map(self.hear(batch, frames))
-        return self.network.style(self.identity_weights(batch)), memory
-
     # Inference.
 
     def generate_frames(
@@ -442,7 +436,7 @@ class NoSpeech(AudioEncoder):
         raise FaceDiffError("CodeTalker's prior alone hears no speech; use the checkpoint of its predictor")
 
 
-class Predictor(nn.Module):
+class Predictor(SpokenDecoder):
     """Features of speech, a speaker's row and earlier motion to features of codes.
 
     Args:
@@ -456,11 +450,8 @@ class Predictor(nn.Module):
     def __init__(
         self, *, audio_width: int, n_vertices: int, width: int, n_identities: int, decoder: dict[str, Any]
     ) -> None:
-        super().__init__()
+        super().__init__(audio_width, n_vertices, decoder)
         dim = int(decoder["dim"])
-        self.audio_map = nn.Linear(audio_width, dim)
-        self.motion_in = nn.Linear(3 * n_vertices, dim)
-        self.decoder = MotionDecoder(**decoder)
         self.out = nn.Linear(dim, width, bias=False)
         self.style = SpeakerTable(n_identities, dim, "embedding")
         nn.init.zeros_(self.out.weight)
@@ -469,8 +460,7 @@ class Predictor(nn.Module):
         self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], motion: Tensor
     ) -> Float[Tensor, "batch frames width"]:
         """Features of every frame from motion (B, T, 3V) of the frame before it, zero before the first."""
-        before = F.pad(motion, (0, 0, 1, 0))[:, :-1]
-        return self.out(self.decoder(self.motion_in(before) + style[:, None], memory))
+        return self.out(self.after_motion(style, memory, motion))
 
 
 def check_sizes(dim: int, heads: int, kernel: int, tokens: int, token_dim: int | None, token_maps: bool) -> None:  # noqa: FBT001

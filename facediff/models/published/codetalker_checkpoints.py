@@ -115,7 +115,7 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         "audio_encoder.",
         kind="wav2vec2",
         request=request,
-        **{name: value for name, value in CodeTalker.published_encoder.keywords.items() if name != "source"},  # type: ignore[attr-defined]
+        **CodeTalker.encoder_settings(),
     )
     for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("feat_map", "out")):
         weights.move_all(f"{old}.", f"network.{new}.")

@@ -462,7 +462,7 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         "audio_encoder.",
         kind="wav2vec2",  # the published code makes this network of HuBERT's weights too
         request=request,
-        **{name: value for name, value in DiffSpeaker.published_encoder.keywords.items() if name != "source"},  # type: ignore[attr-defined]
+        **DiffSpeaker.encoder_settings(),
     )
     for old, new in (
         ("audio_feature_map", "audio_map"),

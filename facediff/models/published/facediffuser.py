@@ -292,12 +292,9 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
             f"{weights.source}: its recurrent layers have {width} channels and its conditions {dim}; expected the "
             f"same, as in every checkpoint of FaceDiffuser for faces"
         )
-    published = FaceDiffuser.published_encoder.keywords  # type: ignore[attr-defined]
-    settings = {name: value for name, value in published.items() if name not in ("source", "frozen_layers")}
     layers = {name.split("encoder.layers.")[1].split(".")[0] for name in weights.names("audio_encoder.encoder.layers.")}
-    encoder = weights.backbone(
-        "audio_encoder.", kind="hubert", request=request, frozen_layers=min(2, len(layers)), **settings
-    )
+    settings = {**FaceDiffuser.encoder_settings(), "frozen_layers": min(2, len(layers))}
+    encoder = weights.backbone("audio_encoder.", kind="hubert", request=request, **settings)
     for old, new in (
         ("cond_projection", "audio_map"),
         ("input_projection.0", "motion_in"),

@@ -6,21 +6,18 @@ a table for each speaker. docs/methods/faceformer.md says what of the published 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.inference import BatchMotion, Progress
 from facediff.models.published.autoregressive import (
-    AutoregressiveModel,
     AutoregressiveNetwork,
+    OffsetModel,
     decoder_sizes,
     read_period,
 )
@@ -30,13 +27,12 @@ from facediff.models.speech_networks import Wav2Vec2Encoder
 
 
 @registry.model.register("FaceFormer")
-class FaceFormer(AutoregressiveModel):
+class FaceFormer(OffsetModel):
     """FaceFormer: an autoregressive Transformer with periodic positions and biased attention.
 
     Args:
-        teacher_forcing: train on the true motion of the frame before, in one pass, and not on the generated one; the
-            published training generates.
-        options: those of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
+        options: those of :class:`OffsetModel`, of the other methods with this decoder, see
+            :class:`AutoregressiveModel`, and of every model.
     """
 
     # wav2vec 2.0 base as transformers had it in 2021; all but the convolutions is trained, with masks and layer drop.
@@ -49,9 +45,8 @@ class FaceFormer(AutoregressiveModel):
         edges=False,
     )
 
-    def __init__(self, *, teacher_forcing: bool = False, **options: Any) -> None:  # noqa: ANN401
+    def __init__(self, **options: Any) -> None:  # noqa: ANN401
         super().__init__(**options)
-        self.teacher_forcing = teacher_forcing
         self.network = AutoregressiveNetwork(
             audio_width=self.audio_width,
             n_vertices=self.n_vertices,
@@ -63,34 +58,11 @@ class FaceFormer(AutoregressiveModel):
         """The table of speakers."""
         return [self.network.style]
 
-    def conditions(
-        self, batch: Batch, frames: Int[Tensor, " batch"]
-    ) -> tuple[Float[Tensor, "batch dim"], Float[Tensor, "batch steps dim"]]:
-        """The speaker's style and the speech of so many frames."""
-        memory = self.network.audio_map(self.hear(batch, frames))
-        return self.network.style(self.identity_weights(batch)), memory
-
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """The mean squared error of all coordinates."""
-        frames = self.trained_frames(batch)
-        self.check_length(frames, batch.names[0])
-        style, memory = self.conditions(batch, frames)
-        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
-        if self.teacher_forcing:
-            made = self.network.teacher_forced(style, memory, truth)
-        else:
-            made = self.network.generate(style, memory, self.loop)
-        error = masked_mean((made - truth).square(), frames)
+        squares, frames = self.squared_errors(batch)
+        error = masked_mean(squares, frames)
         return {"reconstruction": error, "loss": error}
-
-    def generate_frames(
-        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
-    ) -> BatchMotion:
-        """Frame by frame; nothing is random."""
-        self.check_length(frames, batch.names[0])
-        style, memory = self.conditions(batch, frames)
-        made = self.network.generate(style, memory, self.loop)
-        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
 
 
 # The authors' checkpoints.
@@ -117,7 +89,7 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         "audio_encoder.",
         kind="wav2vec2",
         request=request,
-        **{name: value for name, value in FaceFormer.published_encoder.keywords.items() if name != "source"},  # type: ignore[attr-defined]
+        **FaceFormer.encoder_settings(),
     )
     for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("vertice_map_r", "motion_out")):
         weights.move_all(f"{old}.", f"network.{new}.")

@@ -409,12 +409,7 @@ LIP_PARTS = ("text_encoder.", "lip_map.", "transformer.", "lm_head.")
 
 def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
     """SelfTalk's tensors under the names of this file, and its options."""
-    settings = {
-        name: value
-        for name, value in SelfTalk.published_encoder.keywords.items()  # type: ignore[attr-defined]
-        if name != "source"
-    }
-    encoder = weights.backbone("audio_encoder.", kind="wav2vec2", request=request, **settings)
+    encoder = weights.backbone("audio_encoder.", kind="wav2vec2", request=request, **SelfTalk.encoder_settings())
     dim, width = weights.shape("audio_feature_map.weight")
     channels, _ = weights.shape("audio_encoder.feature_projection.projection.weight")
     if "alignment" not in request.options and (width == 2 * channels) != (found.frame_rate == 25.0):

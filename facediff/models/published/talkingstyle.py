@@ -7,7 +7,6 @@ is an option here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -19,11 +18,10 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share
 from facediff.models.published.autoregressive import (
-    AutoregressiveModel,
     AutoregressiveNetwork,
+    OffsetModel,
     decoder_sizes,
     read_period,
 )
@@ -40,13 +38,11 @@ MouthLoss = Literal["flattened", "vertices"]
 
 
 @registry.model.register("TalkingStyle")
-class TalkingStyle(AutoregressiveModel):
+class TalkingStyle(OffsetModel):
     """TalkingStyle: FaceFormer's decoder, deeper, with HuBERT large and a style of its own.
 
     Args:
         num_layers: layers of the decoder.
-        teacher_forcing: train on the true motion of the frame before, in one pass, and not on the generated one; the
-            published training generates.
         mouth_weight: share of the mouth in the loss; the rest is that of all coordinates.
         mouth_loss: what the mouth is there: as published, the numbers of the lips' vertices count the ``flattened``
             coordinates, x, y and z of vertex 0 first, so that other places than the mouth get the weight; or the
@@ -71,14 +67,12 @@ class TalkingStyle(AutoregressiveModel):
         self,
         *,
         num_layers: Layers = 6,
-        teacher_forcing: bool = False,
         mouth_weight: Share = 0.6,
         mouth_loss: MouthLoss = "flattened",
         style_attention: StyleAttention = "one_key",
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(num_layers=num_layers, **options)
-        self.teacher_forcing = teacher_forcing
         self.mouth_weight, self.mouth_loss = mouth_weight, mouth_loss
         self.network = AutoregressiveNetwork(
             audio_width=self.audio_width,
@@ -92,24 +86,9 @@ class TalkingStyle(AutoregressiveModel):
         style: SpeakerStyle = self.network.style  # type: ignore[assignment]
         return [style.first, style.second]
 
-    def conditions(
-        self, batch: Batch, frames: Int[Tensor, " batch"]
-    ) -> tuple[Float[Tensor, "batch dim"], Float[Tensor, "batch steps dim"]]:
-        """The speaker's style and the speech of so many frames."""
-        memory = self.network.audio_map(self.hear(batch, frames))
-        return self.network.style(self.identity_weights(batch)), memory
-
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """The mean squared error of all coordinates and that of the mouth."""
-        frames = self.trained_frames(batch)
-        self.check_length(frames, batch.names[0])
-        style, memory = self.conditions(batch, frames)
-        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
-        if self.teacher_forcing:
-            made = self.network.teacher_forced(style, memory, truth)
-        else:
-            made = self.network.generate(style, memory, self.loop)
-        error = (made - truth).square()
+        error, frames = self.squared_errors(batch)
         whole, mouth = masked_mean(error, frames), masked_mean(error[..., self.mouth_columns()], frames)
         loss = (1.0 - self.mouth_weight) * whole + self.mouth_weight * mouth
         return {"reconstruction": whole, "mouth": mouth, "loss": loss}
@@ -120,15 +99,6 @@ class TalkingStyle(AutoregressiveModel):
         if self.mouth_loss == "flattened":
             return lips
         return (3 * lips[:, None] + torch.arange(3, device=self.device)).flatten()
-
-    def generate_frames(
-        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
-    ) -> BatchMotion:
-        """Frame by frame; nothing is random."""
-        self.check_length(frames, batch.names[0])
-        style, memory = self.conditions(batch, frames)
-        made = self.network.generate(style, memory, self.loop)
-        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
 
 
 class SpeakerStyle(nn.Module):
@@ -182,12 +152,7 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
             f"be compared with it"
         )
     period = read_period(weights, "PPE.pe", found)
-    settings = {
-        name: value
-        for name, value in TalkingStyle.published_encoder.keywords.items()  # type: ignore[attr-defined]
-        if name != "source"
-    }
-    encoder = weights.backbone("audio_encoder.", kind="hubert", request=request, **settings)
+    encoder = weights.backbone("audio_encoder.", kind="hubert", request=request, **TalkingStyle.encoder_settings())
     for old, new in (
         ("audio_feature_map.", "audio_map."),
         ("vertice_encoder.", "motion_in."),
