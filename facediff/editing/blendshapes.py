@@ -234,8 +234,10 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     problem = Problem(0.5 * (matrix + matrix.T), right, coupling, options.lower * scale, options.upper * scale)
     tolerance = options.tolerance * scale
     if options.sparsity > 0:
-        around = Sparse(options.max_iterations, max(1, round(AROUND * animation.frame_rate)))
-        found, converged = minimise_sparse(problem, options.sparsity * scale, tolerance, around)
+        around = max(1, round(AROUND * animation.frame_rate))
+        found, converged = minimise_sparse(
+            problem, options.sparsity * scale, tolerance, options.max_iterations, frames_around=around
+        )
     else:
         found, converged = minimise(problem, tolerance, options.max_iterations)
     values = np.full((len(right), len(shapes.names)), np.clip(0.0, options.lower, options.upper))
@@ -411,7 +413,9 @@ class Problem:
         return np.abs(x - self.clip(x - self.gradient(x)))
 
 
-def minimise_sparse(problem: Problem, cost: Array, tolerance: Array, options: Sparse) -> tuple[Array, bool]:
+def minimise_sparse(
+    problem: Problem, cost: Array, tolerance: Array, max_iterations: int, *, frames_around: int
+) -> tuple[Array, bool]:
     """The box's point of least value with few shapes at work in each frame.
 
     The sum Σ_t Σ_k cost_k |x_tk| is added to the objective, which keeps shapes at 0 that gain less than they cost. It
@@ -421,28 +425,20 @@ def minimise_sparse(problem: Problem, cost: Array, tolerance: Array, options: Sp
     Returns:
         x (T, K), and whether the residual of the second problem meets the tolerance (K,).
     """
-    chosen = _least_sum(problem, cost, tolerance, options)
+    chosen = _least_sum(problem, cost, tolerance, max_iterations)
     # A shape that is at work in a frame is free in those around it, or its curve would begin and end with a jump.
     window = np.lib.stride_tricks.sliding_window_view
-    reach = np.pad(np.abs(chosen) > ACTIVE * cost, ((options.frames_around, options.frames_around), (0, 0)))
-    active = window(reach, 2 * options.frames_around + 1, axis=0).any(axis=-1)
+    reach = np.pad(np.abs(chosen) > ACTIVE * cost, ((frames_around, frames_around), (0, 0)))
+    active = window(reach, 2 * frames_around + 1, axis=0).any(axis=-1)
     lower = np.where(active, problem.lower, np.clip(0.0, problem.lower, problem.upper))
     upper = np.where(active, problem.upper, np.clip(0.0, problem.lower, problem.upper))
-    return minimise(replace(problem, lower=lower, upper=upper), tolerance, options.max_iterations)
+    return minimise(replace(problem, lower=lower, upper=upper), tolerance, max_iterations)
 
 
-@dataclass(frozen=True)
-class Sparse:
-    """Options of :func:`minimise_sparse`."""
-
-    max_iterations: int
-    frames_around: int  # before and after a frame in which a shape is at work
-
-
-def _least_sum(problem: Problem, cost: Array, tolerance: Array, options: Sparse) -> Array:
+def _least_sum(problem: Problem, cost: Array, tolerance: Array, max_iterations: int) -> Array:
     """The solution with Σ_t Σ_k cost_k |x_tk| added to the objective, (T, K)."""
     if (problem.lower >= 0).all():
-        return minimise(replace(problem, right=problem.right - cost), tolerance, options.max_iterations)[0]
+        return minimise(replace(problem, right=problem.right - cost), tolerance, max_iterations)[0]
     # Where weights have both signs, each is a positive part less a negative one, whose sum is its size.
     parts = Problem(
         np.block([[problem.matrix, -problem.matrix], [-problem.matrix, problem.matrix]]),
@@ -451,7 +447,7 @@ def _least_sum(problem: Problem, cost: Array, tolerance: Array, options: Sparse)
         np.maximum(np.concatenate([problem.lower, -problem.upper]), 0.0),
         np.maximum(np.concatenate([problem.upper, -problem.lower]), 0.0),
     )
-    found, _ = minimise(parts, np.concatenate([tolerance, tolerance]), options.max_iterations)
+    found, _ = minimise(parts, np.concatenate([tolerance, tolerance]), max_iterations)
     positive, negative = np.split(found, 2, axis=1)
     return positive - negative
 

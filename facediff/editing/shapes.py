@@ -15,7 +15,7 @@ import numpy.typing as npt
 from facediff.animation import metres_per_unit
 from facediff.errors import FaceDiffError
 from facediff.mesh import face_size, read_mesh, robust_align
-from facediff.mesh.glb import POSITIONS, TRIANGLES, Glb
+from facediff.mesh.glb import POSITIONS, TRIANGLES, Glb, open_glb
 from facediff.mesh.mesh import check_coordinates
 from facediff.utils.limits import LIMITS, check_array
 
@@ -326,14 +326,16 @@ def read_shape_files(path: Path) -> ShapeFiles:
 def _built_in(template: Array | None) -> ShapeFiles:
     """The built-in shapes: of the speaker with the face nearest to a template (V, 3) in metres, or the common ones."""
     from facediff.synthetic.arkit import puppet_shapes
+    from facediff.synthetic.face import build_face
     from facediff.synthetic.speakers import SPEAKERS
 
-    neutral, faces, shapes = puppet_shapes()
-    if template is not None and template.shape == neutral.shape:
-        speakers: list[str | None] = [None, *SPEAKERS]
-        faces_at_rest = [puppet_shapes(speaker)[0] for speaker in speakers]
-        apart = [np.square((face - face.mean(0)) - (template - template.mean(0))).sum() for face in faces_at_rest]
-        neutral, faces, shapes = puppet_shapes(speakers[int(np.argmin(apart))])
+    common, nearest = build_face().vertices, None
+    if template is not None and template.shape == common.shape:
+        at_rest: dict[str | None, Array] = {name: speaker.shape(common) for name, speaker in SPEAKERS.items()}
+        at_rest[None] = common
+        centred = template - template.mean(0)
+        nearest = min(at_rest, key=lambda name: np.square(at_rest[name] - at_rest[name].mean(0) - centred).sum())
+    neutral, faces, shapes = puppet_shapes(nearest)
     points = np.stack(list(shapes.values()))
     path = Path(BUILT_IN)
     return ShapeFiles(path, path, tuple(shapes), points, neutral, faces, metric=True, rest=BUILT_IN)
@@ -346,12 +348,7 @@ def _built_in(template: Array | None) -> ShapeFiles:
 def _read_glb(path: Path) -> ShapeFiles:
     """Read the mesh with the most targets, its primitives one after the other; nodes' transforms are not applied."""
     try:
-        LIMITS.check("bytes", path.stat().st_size, path)
-        data = path.read_bytes()
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a .glb file") from error
-    try:
-        names, neutral, deltas, faces = _targets(Glb(data, path))
+        names, neutral, deltas, faces = _targets(open_glb(path))
     except ValueError as error:
         raise FaceDiffError(f"{path}: not a readable glb with shapes ({error}); export it again") from error
     return ShapeFiles(path, path, names, neutral + deltas, neutral, faces, metric=True, rest=path.name)

@@ -13,9 +13,8 @@ import numpy.typing as npt
 from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError
 from facediff.export.glb import LIMIT, compress
-from facediff.mesh.glb import Glb, placed_meshes
+from facediff.mesh.glb import Glb, open_glb, placed_meshes
 from facediff.utils.files import atomic
-from facediff.utils.limits import LIMITS
 
 FLOAT = 5126  # glTF's code of float32
 STILL = 1e-7  # A mesh that moves by less than this share of its size stands still
@@ -38,10 +37,8 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
         FaceDiffError: if the file is no readable .glb, is not the mesh of the animation, or shows one of its moving
             meshes in several places.
     """
-    LIMITS.check("bytes", target.stat().st_size, target)
-    data = target.read_bytes()
     try:
-        glb = Glb(data, target)
+        glb = open_glb(target)
         changed = _Changed(glb)
         moved = [part for part in _parts(glb) if part.count]
         total = sum(part.count for part in moved)

@@ -7,11 +7,13 @@ accessors), 3.7.2 (meshes) and 4.4 (GLB). Images, materials and extensions are n
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import Array, Mesh
 from facediff.utils.limits import LIMITS
 from facediff.utils.plain_files import parse_json
@@ -181,6 +183,21 @@ def _whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:
     if type(value) is not int or value < 0:
         raise ValueError(f"has the {key} {str(value)[:20]}, a negative or broken number")
     return value
+
+
+def open_glb(path: Path) -> Glb:
+    """A file from elsewhere, within the budget.
+
+    Raises:
+        FaceDiffError: if it cannot be read, or needs more than the budget.
+        ValueError: saying what is wrong with its content.
+    """
+    try:
+        LIMITS.check("bytes", path.stat().st_size, path)
+        data = path.read_bytes()
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a .glb file") from error
+    return Glb(data, path)
 
 
 def read_glb(data: bytes, source: object) -> Mesh:
