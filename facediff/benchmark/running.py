@@ -26,7 +26,7 @@ from facediff.metrics import device_name
 from facediff.utils.batch import Outcome, run_batch
 from facediff.utils.files import cache_dir, discard
 from facediff.utils.jobs import THREAD_VARIABLES
-from facediff.utils.plain_files import load_json, parse_json, read_json, write_json
+from facediff.utils.plain_files import load_json, read_json, write_json
 
 RUNS, LOGS = "runs", "logs"
 STATE = "state.json"
@@ -356,8 +356,9 @@ def timings_file() -> Path:
 
 def timing_key(cell: Cell) -> str:
     """What decides how long a cell takes: its recipe but for the seed."""
-    recipe = parse_json(json.dumps(dict(cell.recipe), default=str), "a recipe")
-    recipe.get("trained", {}).pop("seed", None)
+    recipe = dict(cell.recipe)
+    if "trained" in recipe:
+        recipe["trained"] = {name: value for name, value in recipe["trained"].items() if name != "seed"}
     return hash_of(recipe)[:24]
 
 

@@ -13,7 +13,8 @@ import threading
 import urllib.error
 import urllib.request
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from traceback import walk_tb
 from typing import Annotated, Any, NoReturn
@@ -54,27 +55,18 @@ def run_lightning_cli(name: str, words: Sequence[str], experiment: str) -> FaceD
         words: its options.
         experiment: what runs are called unless the option ``name`` says otherwise.
     """
-    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
-    guard_configs("omegaconf+")
-    # In place of ${name}, which jsonargparse makes relative to the file that it stands in, and then does not find.
-    OmegaConf.register_resolver("experiment_name", lambda *, _root_: _root_[name]["name"], replace=True)
     options = {"save_dir": "runs", "name": "${experiment_name:}"}
     logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": options}
-    # Lightning starts the other processes of a distributed run with the words of this one.
-    argv, sys.argv = sys.argv, [sys.argv[0], name, *words]
     try:
-        with warnings.catch_warnings():
+        with (
+            parsing([name, *words], lambda *, _root_: _root_[name]["name"]),
+            warnings.catch_warnings(),
+        ):
             for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, *RESUME_WARNINGS):
                 warnings.filterwarnings("ignore", message)
             return FaceDiffCLI(
-                AnimationModel,
-                SpeechMotionDataModule,
-                subclass_mode_model=True,
-                subclass_mode_data=True,
-                auto_configure_optimizers=False,
+                **PARSED,
                 trainer_defaults={"callbacks": built_in_callbacks(name), "logger": logger},
-                parser_class=Parser,
-                parser_kwargs={"parser_mode": "omegaconf+"},
                 save_config_callback=RunConfig,
                 save_config_kwargs={"overwrite": True},
                 experiment=experiment,
@@ -106,6 +98,19 @@ def run_lightning_cli(name: str, words: Sequence[str], experiment: str) -> FaceD
         if ours is None or ours is error:
             raise
         raise ours from error
+
+
+@contextmanager
+def parsing(words: Sequence[str], experiment: Callable[..., str]) -> Iterator[None]:
+    """Have Lightning parse some words; ``experiment`` is what a config's ``${experiment_name:}`` stands for."""
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    guard_configs("omegaconf+")
+    # In place of ${name}, which jsonargparse makes relative to the file that it stands in, and then does not find.
+    OmegaConf.register_resolver("experiment_name", experiment, replace=True)
+    # Lightning starts the other processes of a distributed run with the words of this one.
+    argv, sys.argv = sys.argv, [sys.argv[0], *words]
+    try:
+        yield
     finally:
         sys.argv = argv
 
@@ -116,32 +121,15 @@ def parse_lightning_cli(words: Sequence[str]) -> tuple[str, dict[str, Any]]:
     Raises:
         FaceDiffError: in one sentence, where an option, a name or a value is wrong.
     """
-    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
-    guard_configs("omegaconf+")
-    OmegaConf.register_resolver("experiment_name", lambda *, _root_: "benchmark", replace=True)
-    argv, sys.argv = sys.argv, [sys.argv[0], *words]
     try:
-        with warnings.catch_warnings():
+        with parsing(words, lambda *, _root_: "benchmark"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            parsed = ParsedCLI(
-                AnimationModel,
-                SpeechMotionDataModule,
-                subclass_mode_model=True,
-                subclass_mode_data=True,
-                auto_configure_optimizers=False,
-                parser_class=Parser,
-                parser_kwargs={"parser_mode": "omegaconf+"},
-                save_config_callback=None,
-                experiment="benchmark",
-                run=False,
-            )
+            parsed = ParsedCLI(**PARSED, save_config_callback=None, experiment="benchmark", run=False)
     except Exception as error:
         ours = next((cause for cause in causes(error) if isinstance(cause, FaceDiffError)), None)
         if ours is None or ours is error:
             raise
         raise ours from error
-    finally:
-        sys.argv = argv
     data = parsed.config["data"]
     return str(data["class_path"]), dict(data.get("init_args") or {})
 
@@ -263,6 +251,18 @@ def subclasses(base: type) -> list[str]:
         found += [] if getattr(cls, "__abstractmethods__", None) else [cls.__name__]
         found += subclasses(cls)
     return found
+
+
+PARSED: dict[str, Any] = {
+    "model_class": AnimationModel,
+    "datamodule_class": SpeechMotionDataModule,
+    "subclass_mode_model": True,
+    "subclass_mode_data": True,
+    "auto_configure_optimizers": False,
+    "parser_class": Parser,
+    "parser_kwargs": {"parser_mode": "omegaconf+"},
+}
+"""How words are parsed, whether they are run or not."""
 
 
 class FaceDiffCLI(LightningCLI):
