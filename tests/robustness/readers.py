@@ -316,6 +316,18 @@ def read_the_eyes(path: Path) -> object:
     return read_eyes(path, head())
 
 
+def direction(path: Path) -> None:
+    from facediff.editing.direction import Direction, Key
+
+    Direction([Key(0, "style", "F1_e03"), Key(1.5, "head.pitch", -2.5, "linear", 0.5), Key(2, "sway", 3)]).save(path)
+
+
+def read_the_direction(path: Path) -> object:
+    from facediff.editing.direction import read_direction
+
+    return read_direction(path).at([0.0, 1.0])
+
+
 # Animations, styles, weights
 
 
@@ -800,6 +812,7 @@ READERS = {
     "eyes": Reader(".json", eyes, read_the_eyes),
     "eyes, shapes": Reader(".json", blinks, read_the_eyes),
     "eyes, arrays": Reader(".npz", eyes_arrays, read_the_eyes),
+    **{f"direction, {suffix}": Reader(f".{suffix}", direction, read_the_direction) for suffix in ("json", "csv")},
     "animation": Reader(".npz", animation, read_an_animation),
     "style, archive": Reader(".npz", animation, read_a_style),
     "style, array": Reader(".npy", vertices, read_a_style),
