@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import struct
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,15 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError
-from facediff.export.glb import LIMIT, compress
-from facediff.mesh.glb import Glb, open_glb, placed_meshes
+from facediff.export.glb import ARRAY_BUFFER, LIMIT, Morphs, compress, normal_shapes
+from facediff.mesh.glb import Glb, attributes, open_glb
+from facediff.mesh.glb_scene import Placed, placed_parts
 from facediff.utils.files import atomic
 
 FLOAT = 5126  # glTF's code of float32
-STILL = 1e-7  # A mesh that moves by less than this share of its size stands still
+WELD = 1e-6  # Vertices nearer than this share of the mesh's size share a normal's turn: seams of textures stay closed
+
+Array = npt.NDArray[np.float64]
 
 
 def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: float) -> None:
@@ -25,134 +30,217 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
 
     The parts of the file that move get further morph targets after their own, whose default weights stay, and one
     animation drives them. Texture coordinates, materials, images, skins, nodes, extensions and other animations
-    are written as they are; an animation of a moving mesh's own weights gets zeros for the new targets.
+    are written as they are; an animation of a moving mesh's own weights gets zeros for the new targets, and a mesh that
+    several nodes show becomes one of its own for each node that moves. Where a part has normals, they turn with it.
 
     Args:
         path: the file to write.
         target: the .glb that the animation's mesh was read from.
         animation: on that mesh, vertex by vertex.
-        tolerance_mm: largest distance of a vertex from the animation's, in millimetres.
+        tolerance_mm: largest distance of a vertex from the animation's, in millimetres. A part that moves by less
+            stands still.
 
     Raises:
-        FaceDiffError: if the file is no readable .glb, is not the mesh of the animation, or shows one of its moving
-            meshes in several places.
+        FaceDiffError: if the file is no readable .glb, or not the mesh of the animation.
     """
     try:
         glb = open_glb(target)
         changed = _Changed(glb)
-        moved = [part for part in _parts(glb) if part.count]
-        total = sum(part.count for part in moved)
+        parts = list(placed_parts(glb))
+        total = sum(len(part.local) for part in parts)
         if total != len(animation.template):
             raise FaceDiffError(
                 f"{target}: has {total} vertices and the animation {len(animation.template)}; give the file that the "
                 f"animation was carried to"
             )
-        rest = np.asarray(animation.template, np.float64)
-        offsets = np.stack([np.asarray(frame, np.float64) - rest for frame in animation.frames()]).astype(np.float32)
-        morphs = compress(offsets, tolerance_mm / 1000 / metres_per_unit(animation.unit))
-        _animate(glb, changed, moved, np.asarray(morphs.shapes, np.float64), morphs.weights, animation)
+        _animate(changed, parts, animation, tolerance_mm / 1000 / metres_per_unit(animation.unit))
     except (ValueError, IndexError, KeyError, TypeError) as error:
         raise FaceDiffError(f"{target}: not a readable GLB mesh ({error}); export it again") from error
     changed.write(path)
 
 
-class _Part:
-    """One primitive of a mesh where a node places it."""
-
-    def __init__(
-        self, mesh: int, node: int, primitive: dict[str, Any], count: int, turn: npt.NDArray[np.float64]
-    ) -> None:
-        self.mesh, self.node, self.primitive, self.count, self.turn = mesh, node, primitive, count, turn
-
-
-def _parts(glb: Glb) -> list[_Part]:
-    """All primitives in the order in which `read_mesh` joins them; the count of those without triangles is 0."""
-    found = []
-    for mesh, matrix, node in placed_meshes(glb):
-        turn = np.eye(3) if matrix is None else matrix[:3, :3]
-        for primitive in glb.primitives(mesh):
-            count = len(glb.positions(primitive))
-            count = count if len(glb.triangles(primitive, count)) else 0
-            found.append(_Part(mesh, node, primitive, count, turn))
-    return found
-
-
-def _animate(
-    glb: Glb,
-    changed: _Changed,
-    parts: list[_Part],
-    shapes: npt.NDArray[np.float64],
-    weights: npt.NDArray[np.float32],
-    animation: Animation,
-) -> None:
-    times = changed.add((np.arange(len(weights)) / animation.frame_rate).astype(np.float32), "SCALAR", bounds=True)
-    own: dict[str, Any] = {"name": animation.name, "samplers": [], "channels": []}
-    begins = np.cumsum([0, *(part.count for part in parts)])
-    size = float(np.ptp(animation.template, axis=0).max())
-    moving = {
-        part.mesh
+def _animate(changed: _Changed, parts: list[Placed], animation: Animation, tolerance: float) -> None:
+    glb = changed.glb
+    begins = np.cumsum([0, *(len(part.local) for part in parts)])
+    rest = np.asarray(animation.template, np.float64)
+    furthest = np.zeros(len(rest))
+    for frame in animation.frames():
+        np.maximum(furthest, np.linalg.norm(frame - rest, axis=1), out=furthest)
+    moving = [
+        (part, np.arange(first, first + len(part.local)))
         for part, first in zip(parts, begins, strict=False)
-        if np.abs(shapes[:, first : first + part.count]).max(initial=0) > STILL * size
-    }
-    for mesh in sorted(moving):
-        nodes = sorted({part.node for part in parts if part.mesh == mesh})
-        if len(nodes) > 1:
-            raise ValueError(f"its mesh {mesh} moves and is shown by {len(nodes)} nodes: make it a mesh of each")
-        entry = glb.entry("meshes", mesh)
-        before = max(len(glb.entries("targets", primitive)) for primitive in glb.primitives(mesh))
-        done = {}
-        for part, first in zip(parts, begins, strict=False):
-            if part.mesh == mesh:
-                back = np.linalg.inv(part.turn).T
-                done[id(part.primitive)] = [
-                    changed.add((shape @ back).astype(np.float32), "VEC3", bounds=True)
-                    for shape in shapes[:, first : first + part.count]
-                ]
-        for primitive in glb.primitives(mesh):
-            count = len(glb.positions(primitive))
-            numbers = done.get(id(primitive)) or [
-                changed.add(np.zeros((count, 3), np.float32), "VEC3", bounds=True) for _ in shapes
+        if furthest[first : first + len(part.local)].max(initial=0) > tolerance
+    ]
+    if not moving:
+        return
+    used = np.concatenate([some for _, some in moving])
+    offsets = np.stack([np.asarray(frame, np.float64)[used] - rest[used] for frame in animation.frames()])
+    morphs = compress(offsets.astype(np.float32), tolerance)
+    turns = _Turns(
+        rest, np.concatenate([part.faces + k for part, k in zip(parts, begins, strict=False)]), used, offsets
+    )
+    times = changed.add((np.arange(len(offsets)) / animation.frame_rate).astype(np.float32), "SCALAR", bounds=True)
+    own: dict[str, Any] = {"name": animation.name, "samplers": [], "channels": []}
+    by_node: dict[int, list[tuple[Placed, npt.NDArray[np.int64]]]] = defaultdict(list)
+    for part, some in moving:
+        by_node[part.node].append((part, some))
+    shown = [entry.get("mesh") for entry in glb.entries("nodes")]
+    for node, own_parts in sorted(by_node.items()):
+        entry, mesh = glb.entry("nodes", node), own_parts[0][0].mesh
+        if shown.count(mesh) > 1:  # the other nodes keep theirs
+            original = glb.primitives(mesh)
+            glb.content["meshes"].append(copy.deepcopy(glb.entry("meshes", mesh)))
+            entry["mesh"] = shown[node] = len(glb.content["meshes"]) - 1
+            primitives = [
+                next(
+                    new for old, new in zip(original, glb.primitives(entry["mesh"]), strict=True) if old is p.primitive
+                )
+                for p, _ in own_parts
             ]
-            primitive["targets"] = [*glb.entries("targets", primitive), *({"POSITION": each} for each in numbers)]
-        default = [float(each) for each in entry.get("weights", [0.0] * before)]
-        entry["weights"] = [*default, *[0.0] * len(shapes)]
-        node = glb.entry("nodes", nodes[0])
-        if "weights" in node:
-            default = [float(each) for each in node["weights"]]
-            node["weights"] = [*default, *[0.0] * len(shapes)]
-        extras = entry.setdefault("extras", {})
-        names = list(extras.get("targetNames", [f"target_{k}" for k in range(before)]))
-        extras["targetNames"] = [*names, *(f"facediff_{k:04d}" for k in range(len(shapes)))]
-        _pad_others(glb, changed, nodes[0], before, len(shapes))
-        rows = np.concatenate([np.tile(np.array(default, np.float32), (len(weights), 1)), weights], axis=1)
+        else:
+            primitives = [part.primitive for part, _ in own_parts]
+        targets = {
+            id(primitive): _targets(changed, part, primitive, morphs, np.searchsorted(used, some), turns, offsets)
+            for primitive, (part, some) in zip(primitives, own_parts, strict=True)
+        }
+        default, before = _append(changed, node, targets, len(morphs.shapes))
+        _pad_others(changed, node, before, len(morphs.shapes))
+        rows = np.concatenate(
+            [np.tile(np.array(default, np.float32), (len(offsets), 1)), morphs.weights], axis=1, dtype=np.float32
+        )
         own["samplers"].append(
             {"input": times, "output": changed.add(rows.ravel(), "SCALAR"), "interpolation": "LINEAR"}
         )
-        own["channels"].append({"sampler": len(own["samplers"]) - 1, "target": {"node": nodes[0], "path": "weights"}})
-    if own["channels"]:
-        glb.content["animations"] = [*glb.entries("animations"), own]
+        own["channels"].append({"sampler": len(own["samplers"]) - 1, "target": {"node": node, "path": "weights"}})
+    glb.content["animations"] = [*glb.entries("animations"), own]
 
 
-def _pad_others(glb: Glb, changed: _Changed, node: int, before: int, more: int) -> None:
+def _append(
+    changed: _Changed, node: int, targets: dict[int, list[dict[str, int]]], count: int
+) -> tuple[list[float], int]:
+    """Add targets to the mesh of a node: the default weights of its own ones, and how many those are."""
+    glb = changed.glb
+    entry = glb.entry("nodes", node)
+    mesh = glb.entry("meshes", entry["mesh"])
+    primitives = glb.primitives(entry["mesh"])
+    before = max(len(glb.entries("targets", primitive)) for primitive in primitives)
+    for primitive in primitives:
+        new = targets.get(id(primitive))
+        if new is None:  # all primitives of a mesh have as many targets
+            still = changed.add(np.zeros((len(glb.positions(primitive)), 3), np.float32), "VEC3", vertices=True)
+            new = [{"POSITION": still} for _ in range(count)]
+        primitive["targets"] = [*glb.entries("targets", primitive), *new]
+    default = [float(each) for each in mesh.get("weights", [0.0] * before)]
+    mesh["weights"] = [*default, *[0.0] * count]
+    if "weights" in entry:
+        default = [float(each) for each in entry["weights"]]
+        entry["weights"] = [*default, *[0.0] * count]
+    extras = mesh.setdefault("extras", {})
+    names = list(extras.get("targetNames", [f"target_{k}" for k in range(before)]))
+    extras["targetNames"] = [*names, *(f"facediff_{k:04d}" for k in range(count))]
+    return default, before
+
+
+def _targets(
+    changed: _Changed,
+    part: Placed,
+    primitive: dict[str, Any],
+    morphs: Morphs,
+    rows: npt.NDArray[np.int64],
+    turns: _Turns,
+    offsets: Array,
+) -> list[dict[str, int]]:
+    """Accessors of the new targets of a primitive, whose vertices are some rows of those that move."""
+    places = part.returned(np.asarray(morphs.shapes[:, rows], np.float64)).astype(np.float32)
+    made = [{"POSITION": changed.add(place, "VEC3", vertices=True)} for place in places]
+    normal = attributes(primitive).get("NORMAL")
+    if normal is not None:
+        local = changed.glb.numbers(normal, "VEC3", ("f4", "i1", "i2"), len(part.local)).astype(np.float64)
+        shown = _unit(local @ np.linalg.inv(part.turn))  # normals turn by the inverse transpose
+        turned = (_unit((turns.at(offset, rows, shown)[:, None] @ part.turn)[:, 0]) for offset in offsets)
+        shapes = normal_shapes(morphs.weights, local.astype(np.float32), (each.astype(np.float32) for each in turned))
+        for target, shape in zip(made, shapes, strict=True):
+            target["NORMAL"] = changed.add(shape, "VEC3", vertices=True)
+    return made
+
+
+class _Turns:
+    """How the normals of the moving vertices turn from rest: as those do that follow from the triangles.
+
+    The file's own normals may be anybody's, sharp at some edges and smooth at others; they keep that.
+    """
+
+    def __init__(self, rest: Array, faces: npt.NDArray[np.int64], used: npt.NDArray[np.int64], offsets: Array) -> None:
+        size = max(float(np.ptp(rest, axis=0).max()), np.finfo(float).tiny)
+        self.rest = rest
+        # Lips that touch at rest are in one place too, and part: a sum of all frames tells them from a seam.
+        moved = np.zeros_like(rest)
+        moved[used] = np.tensordot(np.random.default_rng(0).normal(size=len(offsets)), offsets, axes=1)
+        places = np.rint(np.concatenate([rest, moved], axis=1) / (WELD * size))
+        first, place = np.unique(places, axis=0, return_index=True, return_inverse=True)[1:]
+        welded = place.reshape(-1)  # NumPy 2.0 returns it with a second axis
+        near = np.zeros(len(rest), bool)
+        near[used] = True
+        corners = welded[faces[near[faces].any(axis=1)]]
+        self.names = np.unique(np.concatenate([corners.ravel(), welded[used]]))
+        self.points = first[self.names]
+        self.corners = np.searchsorted(self.names, corners)
+        self.place = np.searchsorted(self.names, welded[used])
+        self.moved = np.full(len(rest), -1)
+        self.moved[used] = np.arange(len(used))
+        self.before = self._normals(rest[self.points])
+
+    def _normals(self, points: Array) -> Array:
+        a, b, c = (points[self.corners[:, k]] for k in range(3))
+        # The cross product is as long as twice the area, by which triangles count.
+        across = np.cross(b - a, c - a)
+        sums = [
+            np.bincount(self.corners.ravel(), np.repeat(across[:, k], 3), len(self.names)).astype(np.float64)
+            for k in range(3)
+        ]
+        return _unit(np.stack(sums, axis=1))[self.place]
+
+    def at(self, offset: Array, rows: npt.NDArray[np.int64], normals: Array) -> Array:
+        """Normals (N, 3) of some of the moving vertices, turned as the frame with these offsets (M, 3) has it."""
+        rows_of = self.moved[self.points]
+        points = self.rest[self.points] + np.where(rows_of[:, None] >= 0, offset[rows_of], 0.0)
+        one, two = self.before[rows], self._normals(points)[rows]
+        # The least rotation of one vector onto another, after Rodrigues.
+        axis, cosine = np.cross(one, two), np.einsum("nd,nd->n", one, two)
+        across = np.cross(axis, normals)
+        return normals + across + np.cross(axis, across) / np.maximum(1.0 + cosine, 1e-3)[:, None]
+
+
+def _unit(vectors: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0))
+
+
+def _pad_others(changed: _Changed, node: int, before: int, more: int) -> None:
     """Give the file's own animations of a node's weights zeros for the new targets."""
+    glb = changed.glb
     for animation in glb.entries("animations"):
-        samplers = glb.entries("samplers", animation)
-        for channel in glb.entries("channels", animation):
+        samplers, channels = glb.entries("samplers", animation), glb.entries("channels", animation)
+        for channel in channels:
             goal = channel.get("target", {})
             if goal.get("node") == node and goal.get("path") == "weights" and before:
-                sampler = dict(samplers[channel["sampler"]])
+                number = channel["sampler"]
+                sampler = dict(samplers[number])
                 values = glb.numbers(sampler["output"], "SCALAR", ("f4", "i1", "u1", "i2", "u2")).reshape(-1, before)
                 padded = np.pad(values.astype(np.float32), ((0, 0), (0, more)))
                 sampler["output"] = changed.add(padded.ravel(), "SCALAR")
-                samplers.append(sampler)
-                channel["sampler"] = len(samplers) - 1
+                if sum(each.get("sampler") == number for each in channels) == 1:
+                    samplers[number] = sampler
+                else:
+                    samplers.append(sampler)
+                    channel["sampler"] = len(samplers) - 1
 
 
 class _Changed:
     """A file's content with arrays added to its binary chunk."""
 
     def __init__(self, glb: Glb) -> None:
-        self.content = glb.content
+        self.glb, self.content = glb, glb.content
         self.parts = [glb.binary, bytes(-len(glb.binary) % 4)]
         self.length = len(glb.binary) + len(self.parts[1])
         if not glb.entries("buffers"):
@@ -160,17 +248,18 @@ class _Changed:
         for kind in ("bufferViews", "accessors"):
             self.content[kind] = glb.entries(kind)
 
-    def add(self, array: npt.NDArray[np.float32], form: str, *, bounds: bool = False) -> int:
-        """Append an array and return its accessor's number."""
+    def add(self, array: npt.NDArray[np.float32], form: str, *, bounds: bool = False, vertices: bool = False) -> int:
+        """Append an array, of times with their bounds or of a target's vertices; return its accessor's number."""
         data = np.ascontiguousarray(array, "<f4").tobytes()
-        self.content["bufferViews"].append({"buffer": 0, "byteOffset": self.length, "byteLength": len(data)})
+        view = {"buffer": 0, "byteOffset": self.length, "byteLength": len(data)}
+        self.content["bufferViews"].append(view | ({"target": ARRAY_BUFFER} if vertices else {}))
         accessor: dict[str, Any] = {
             "bufferView": len(self.content["bufferViews"]) - 1,
             "componentType": FLOAT,
             "count": len(array),
             "type": form,
         }
-        if bounds:
+        if bounds or vertices:
             columns = array.reshape(len(array), -1)
             accessor |= {"min": columns.min(0).tolist(), "max": columns.max(0).tolist()}
         self.content["accessors"].append(accessor)

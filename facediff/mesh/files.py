@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.mesh.glb import read_glb
+from facediff.mesh.glb_scene import read_glb
 from facediff.mesh.mesh import Array, Mesh, check_coordinates
 from facediff.utils.limits import LIMITS
 

@@ -1,7 +1,7 @@
-"""Binary glTF 2.0 files from elsewhere: their data, checked before it is believed, and the mesh that they show.
+"""Binary glTF 2.0 files from elsewhere: their data, checked before it is believed.
 
-Khronos Group, "glTF 2.0 Specification": sections 3.5 (scenes, nodes, transforms), 3.6 (binary data, accessors, sparse
-accessors), 3.7.2 (meshes) and 4.4 (GLB). Images, materials and extensions are not read, and no other file is opened.
+Khronos Group, "glTF 2.0 Specification": sections 3.6 (binary data, accessors, sparse accessors), 3.7.2 (meshes) and 4.4
+(GLB). What a file shows is in :mod:`facediff.mesh.glb_scene`. Extensions are not read, and no other file is opened.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.mesh.mesh import Array, Mesh
+from facediff.mesh.mesh import Array
 from facediff.utils.limits import LIMITS
 from facediff.utils.plain_files import parse_json
 
@@ -26,7 +26,7 @@ TYPES: dict[int, np.dtype[Any]] = {
     5125: np.dtype("<u4"),
     5126: np.dtype("<f4"),
 }
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 INDICES = ("u1", "u2", "u4")
 POSITIONS = ("f4", "i1", "u1", "i2", "u2")  # whole numbers by the extension KHR_mesh_quantization
 TRIANGLES, STRIP, FAN = 4, 5, 6
@@ -86,12 +86,12 @@ class Glb:
 
         Args:
             index: number of the accessor.
-            form: ``VEC3``, ``VEC4`` or ``SCALAR``.
+            form: ``VEC3``, ``VEC4``, ``MAT4`` or ``SCALAR``.
             kinds: the types of number that are allowed.
             count: how many there must be. A sparse accessor without data states no size that could be trusted.
         """
         accessor = self.entry("accessors", index)
-        kind, stated, width = TYPES.get(_whole(accessor, "componentType")), _whole(accessor, "count"), WIDTHS[form]
+        kind, stated, width = TYPES.get(whole(accessor, "componentType")), whole(accessor, "count"), WIDTHS[form]
         if kind is None or kind.str[1:] not in kinds or accessor.get("type") != form:
             raise ValueError("holds positions or indices of an unknown type: export it without compression")
         if count is not None and stated != count:
@@ -109,11 +109,11 @@ class Glb:
         if sparse is not None:
             if not isinstance(sparse, dict):
                 raise ValueError("has a broken sparse accessor")
-            changed = _whole(sparse, "count")
+            changed = whole(sparse, "count")
             at, new = sparse.get("indices"), sparse.get("values")
             if not isinstance(at, dict) or not isinstance(new, dict):
                 raise ValueError("has a broken sparse accessor")
-            type_of_places = TYPES.get(_whole(at, "componentType"))
+            type_of_places = TYPES.get(whole(at, "componentType"))
             if type_of_places is None or type_of_places.str[1:] not in INDICES:
                 raise ValueError("has a broken sparse accessor")
             places = self._slab(at, type_of_places, changed, 1)[:, 0]
@@ -127,11 +127,11 @@ class Glb:
     def _slab(self, at: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> npt.NDArray[Any]:
         """Numbers (count, width) from the buffer view and offset that an object names."""
         view = self.entry("bufferViews", at.get("bufferView"))
-        if _whole(view, "buffer", 0) != 0 or "uri" in self.entry("buffers", 0):
+        if whole(view, "buffer", 0) != 0 or "uri" in self.entry("buffers", 0):
             raise ValueError("keeps its data in another file")
         row = kind.itemsize * width
-        start, offset, length = _whole(view, "byteOffset", 0), _whole(at, "byteOffset", 0), _whole(view, "byteLength")
-        stride = _whole(view, "byteStride", row)
+        start, offset, length = whole(view, "byteOffset", 0), whole(at, "byteOffset", 0), whole(view, "byteLength")
+        stride = whole(view, "byteStride", row)
         if stride < row:
             raise ValueError("has a negative or broken offset")
         if not count:
@@ -150,7 +150,7 @@ class Glb:
 
     def triangles(self, primitive: dict[str, Any], n_vertices: int) -> npt.NDArray[np.int64]:
         """Triangles (F, 3) of a primitive: a list, a strip or a fan of them."""
-        mode = _whole(primitive, "mode", TRIANGLES)
+        mode = whole(primitive, "mode", TRIANGLES)
         if primitive.get("indices") is None:
             corners = np.arange(n_vertices, dtype=np.int64)
         else:
@@ -178,7 +178,8 @@ def attributes(primitive: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:
+def whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:
+    """A whole number that is not negative, of an object."""
     value = holder.get(key, default)
     if type(value) is not int or value < 0:
         raise ValueError(f"has the {key} {str(value)[:20]}, a negative or broken number")
@@ -198,105 +199,3 @@ def open_glb(path: Path) -> Glb:
     except OSError as error:
         raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a .glb file") from error
     return Glb(data, path)
-
-
-def read_glb(data: bytes, source: object) -> Mesh:
-    """All meshes of a file's scene as one, each where its nodes place it.
-
-    Raises:
-        ValueError: if the file is damaged.
-        FaceDiffError: if it is larger than the budget.
-    """
-    glb = Glb(data, source)
-    placed = placed_meshes(glb)
-    parts: dict[int, list[tuple[Array, npt.NDArray[np.int64], Any]]] = {}
-    points, faces, colours, before, triangles = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [], 0, 0
-    for index, matrix, _ in placed:
-        if index not in parts:
-            parts[index] = [_primitive(glb, each) for each in glb.primitives(index)]
-        for position, corners, colour in parts[index]:
-            if not len(corners):
-                continue  # points and lines
-            LIMITS.check("vertices", before + len(position), source)
-            LIMITS.check("vertices", triangles + len(corners), source)
-            points.append(position if matrix is None else position @ matrix[:3, :3].T + matrix[:3, 3])
-            mirrored = matrix is not None and np.linalg.det(matrix[:3, :3]) < 0
-            faces.append((corners[:, ::-1] if mirrored else corners) + before)
-            colours.append(colour)
-            before += len(position)
-            triangles += len(corners)
-    coloured = bool(colours) and all(colour is not None for colour in colours)
-    return Mesh(
-        np.concatenate(points), np.concatenate(faces).astype(np.int32), np.concatenate(colours) if coloured else None
-    )
-
-
-def _primitive(glb: Glb, primitive: dict[str, Any]) -> tuple[Array, npt.NDArray[np.int64], Any]:
-    position = glb.positions(primitive)
-    color, colour = attributes(primitive).get("COLOR_0"), None
-    if color is not None and "material" not in primitive:  # a material tints the colours, which then are not the face's
-        form = "VEC4" if glb.entry("accessors", color).get("type") == "VEC4" else "VEC3"
-        values = glb.numbers(color, form, ("f4", "u1", "u2"), len(position))[:, :3]
-        scale = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
-        colour = np.rint(255 * np.clip(np.nan_to_num(values / scale), 0, 1)).astype(np.uint8)
-    return position, glb.triangles(primitive, len(position)), colour
-
-
-def placed_meshes(glb: Glb) -> list[tuple[int, Array | None, int]]:
-    """The scene's meshes with the (4, 4) matrices that place them, None for one that stays, and their nodes or -1."""
-    scenes, nodes = glb.entries("scenes"), glb.entries("nodes")
-    if scenes:
-        roots = glb.entry("scenes", glb.content.get("scene", 0)).get("nodes", [])
-    else:
-        below = {child for node in nodes for child in _list(node.get("children", [])) if type(child) is int}
-        roots = [index for index in range(len(nodes)) if index not in below]
-    if not nodes:
-        return [(index, None, -1) for index in range(len(glb.entries("meshes")))]
-    placed: list[tuple[int, Array | None, int]] = []
-    seen: set[int] = set()
-    queue: list[tuple[object, Array | None]] = [(root, None) for root in _list(roots)]
-    while queue:
-        index, parent = queue.pop()
-        node = glb.entry("nodes", index)
-        assert isinstance(index, int)  # noqa: S101 - for type checkers: glb.entry refuses anything else
-        if index in seen:
-            raise ValueError(f"its node {index} is below two others, or below itself")
-        seen.add(index)
-        own = _matrix(node)
-        matrix = own if parent is None else parent if own is None else parent @ own
-        queue += [(child, matrix) for child in _list(node.get("children", []))]
-        if "mesh" in node:
-            placed.append((_whole(node, "mesh"), matrix, index))
-    return placed
-
-
-def _list(value: object) -> list[Any]:
-    if not isinstance(value, list):
-        raise ValueError("has a list of nodes that is none")
-    return value
-
-
-def _matrix(node: dict[str, Any]) -> Array | None:
-    """A node's transform (4, 4); None if it has none."""
-    if not {"matrix", "translation", "rotation", "scale"} & node.keys():
-        return None
-
-    def given(key: str, default: list[float]) -> Array:
-        values = node.get(key, default)
-        if not isinstance(values, list) or len(values) != len(default):
-            raise ValueError(f"a node's {key} has not {len(default)} numbers")
-        if not all(type(value) in (int, float) for value in values):
-            raise ValueError(f"a node's {key} holds no numbers")
-        return np.array(values, np.float64)
-
-    matrix = given("matrix", np.eye(4).ravel().tolist()).reshape(4, 4).T.copy()
-    rotation = given("rotation", [0, 0, 0, 1])
-    x, y, z, w = rotation / max(float(np.linalg.norm(rotation)), 1e-30)
-    turn = np.eye(4)
-    turn[:3, :3] = np.eye(3) + 2 * np.array(
-        [[-y * y - z * z, x * y - z * w, x * z + y * w], [x * y + z * w, -x * x - z * z, y * z - x * w],
-         [x * z - y * w, y * z + x * w, -x * x - y * y]]
-    )  # fmt: skip
-    move = np.eye(4)
-    move[:3, 3] = given("translation", [0, 0, 0])
-    return np.asarray(matrix @ move @ turn @ np.diag([*given("scale", [1, 1, 1]), 1.0]))

@@ -285,7 +285,8 @@ def test_data_that_is_used_often_counts_as_often(grow: Callable[[dict[str, Any]]
     (tmp_path / "a.glb").write_bytes(glb(content))
     assert len(read_mesh(tmp_path / "a.glb").vertices) >= 39 * 4
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("facediff.mesh.glb.LIMITS", Limits(vertices=100))
+        for module in ("glb", "glb_scene"):
+            patch.setattr(f"facediff.mesh.{module}.LIMITS", Limits(vertices=100))
         with pytest.raises(FaceDiffError, match="vertices"):
             read_mesh(tmp_path / "a.glb")
 

@@ -1,0 +1,236 @@
+"""What a binary glTF 2.0 file shows: its scene's meshes where nodes and skins put them, part by part.
+
+Khronos Group, "glTF 2.0 Specification": sections 3.5 (scenes, nodes, transforms) and 3.7.3 (skins). Images and
+extensions are not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.mesh.glb import Glb, attributes, whole
+from facediff.mesh.mesh import Array, Mesh
+from facediff.utils.limits import LIMITS
+
+ALIKE = 1e-5
+"""Matrices of a skin that differ by less than this share are one: it is in the pose that it was bound in."""
+JOINTS, WEIGHTS = ("u1", "u2"), ("f4", "u1", "u2")
+MOST_SETS = 8  # of four joints a vertex
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A primitive with triangles where a node shows it.
+
+    Attributes:
+        mesh: number of its mesh.
+        node: number of the node; -1 in a file without nodes.
+        primitive: its description in the file, which may be changed.
+        names: those of the node, the mesh and the material, where they have one.
+        local: (V, 3) vertices as the file has them.
+        matrix: (4, 4) or (V, 4, 4) what places them; None if they stay.
+        faces: (F, 3) triangles, counter-clockwise seen from outside once they are placed.
+    """
+
+    mesh: int
+    node: int
+    primitive: dict[str, Any]
+    names: tuple[str, ...]
+    local: Array
+    matrix: Array | None
+    faces: npt.NDArray[np.int64]
+
+    @property
+    def turn(self) -> Array:
+        """(3, 3) or (V, 3, 3) what turns and scales displacements."""
+        return np.eye(3) if self.matrix is None else self.matrix[..., :3, :3]
+
+    @property
+    def points(self) -> Array:
+        """(V, 3) vertices where they are shown."""
+        if self.matrix is None:
+            return self.local
+        return self.turned(self.local) + self.matrix[..., :3, 3]
+
+    def turned(self, moves: Array) -> Array:
+        """Displacements (…, V, 3) of the file's vertices as those of the shown ones."""
+        return np.asarray((self.turn @ moves[..., None])[..., 0])
+
+    def returned(self, moves: Array) -> Array:
+        """Displacements (…, V, 3) of the shown vertices as those of the file's."""
+        return np.asarray((np.linalg.inv(self.turn) @ moves[..., None])[..., 0])
+
+
+def placed_parts(glb: Glb) -> Iterator[Placed]:
+    """The primitives with triangles of a file's scene, in the order in which :func:`read_glb` joins them.
+
+    Raises:
+        ValueError: if the file is damaged.
+        FaceDiffError: if it is larger than the budget.
+    """
+    materials, nodes = glb.entries("materials"), _placed_nodes(glb)
+    read: dict[int, list[tuple[dict[str, Any], Array, npt.NDArray[np.int64]]]] = {}  # several nodes may show a mesh
+    skins: dict[int, Array] = {}
+    before, triangles = 0, 0
+    for mesh, node in _shown(glb, nodes):
+        entry = {} if node < 0 else glb.entry("nodes", node)
+        if mesh not in read:
+            read[mesh] = [
+                (primitive, local := glb.positions(primitive), glb.triangles(primitive, len(local)))
+                for primitive in glb.primitives(mesh)
+            ]
+        for primitive, local, faces in read[mesh]:
+            if not len(faces):
+                continue  # points and lines
+            before, triangles = before + len(local), triangles + len(faces)
+            LIMITS.check("vertices", before, glb.source)
+            LIMITS.check("vertices", triangles, glb.source)
+            matrix = nodes.get(node)
+            if "skin" in entry and "JOINTS_0" in attributes(primitive):
+                number = whole(entry, "skin")
+                if number not in skins:
+                    skins[number] = _stands(glb, number, nodes)
+                if len(skins[number]):
+                    matrix = _skinned(glb, skins[number], primitive, len(local))
+            mirrored = matrix is not None and np.linalg.det(matrix[..., :3, :3].reshape(-1, 3, 3).mean(axis=0)) < 0
+            material = primitive.get("material")
+            holders = [entry, glb.entry("meshes", mesh)]
+            holders += [materials[material]] if type(material) is int and 0 <= material < len(materials) else []
+            names = tuple(dict.fromkeys(n for each in holders if isinstance(n := each.get("name"), str) and n))
+            yield Placed(mesh, node, primitive, names, local, matrix, faces[:, ::-1] if mirrored else faces)
+
+
+def read_glb(data: bytes, source: object) -> Mesh:
+    """All meshes of a file's scene as one, each where its nodes and skins place it.
+
+    Raises:
+        ValueError: if the file is damaged.
+        FaceDiffError: if it is larger than the budget.
+    """
+    glb = Glb(data, source)
+    points, faces, colours, before = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [], 0
+    for part in placed_parts(glb):
+        points.append(part.points)
+        faces.append(part.faces + before)
+        colours.append(_colours(glb, part))
+        before += len(part.local)
+    coloured = bool(colours) and all(colour is not None for colour in colours)
+    return Mesh(
+        np.concatenate(points), np.concatenate(faces).astype(np.int32), np.concatenate(colours) if coloured else None
+    )
+
+
+def _colours(glb: Glb, part: Placed) -> Any:  # noqa: ANN401 - bytes (V, 3), or None
+    color = attributes(part.primitive).get("COLOR_0")
+    if color is None or "material" in part.primitive:  # a material tints the colours, which then are not the face's
+        return None
+    form = "VEC4" if glb.entry("accessors", color).get("type") == "VEC4" else "VEC3"
+    values = glb.numbers(color, form, ("f4", "u1", "u2"), len(part.local))[:, :3]
+    scale = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
+    return np.rint(255 * np.clip(np.nan_to_num(values / scale), 0, 1)).astype(np.uint8)
+
+
+def _shown(glb: Glb, nodes: dict[int, Array | None]) -> list[tuple[int, int]]:
+    """The scene's meshes with the nodes that show them, -1 in a file without nodes."""
+    if not glb.entries("nodes"):
+        return [(index, -1) for index in range(len(glb.entries("meshes")))]
+    return [(whole(entry, "mesh"), index) for index in nodes if "mesh" in (entry := glb.entry("nodes", index))]
+
+
+def _placed_nodes(glb: Glb) -> dict[int, Array | None]:
+    """The scene's nodes, and the matrices (4, 4) that place them, None for one that stays."""
+    scenes, nodes = glb.entries("scenes"), glb.entries("nodes")
+    if scenes:
+        roots = glb.entry("scenes", glb.content.get("scene", 0)).get("nodes", [])
+    else:
+        below = {child for node in nodes for child in _list(node.get("children", [])) if type(child) is int}
+        roots = [index for index in range(len(nodes)) if index not in below]
+    if not nodes:
+        return {}
+    placed: dict[int, Array | None] = {}
+    queue: list[tuple[object, Array | None]] = [(root, None) for root in _list(roots)]
+    while queue:
+        index, parent = queue.pop()
+        node = glb.entry("nodes", index)
+        assert isinstance(index, int)  # noqa: S101 - for type checkers: glb.entry refuses anything else
+        if index in placed:
+            raise ValueError(f"its node {index} is below two others, or below itself")
+        own = _matrix(node)
+        placed[index] = own if parent is None else parent if own is None else parent @ own
+        queue += [(child, placed[index]) for child in _list(node.get("children", []))]
+    return placed
+
+
+def _stands(glb: Glb, index: int, nodes: dict[int, Array | None]) -> Array:
+    """(J, 4, 4) where the joints of a skin put its vertices; (0, 4, 4) if they are not in the scene."""
+    skin = glb.entry("skins", index)
+    joints = _list(skin.get("joints", []))
+    if not joints or not all(type(joint) is int and joint in nodes for joint in joints):
+        return np.zeros((0, 4, 4))
+    placed = np.stack([np.eye(4) if (own := nodes[joint]) is None else own for joint in joints])
+    if "inverseBindMatrices" not in skin:
+        return placed
+    binds = glb.numbers(skin["inverseBindMatrices"], "MAT4", ("f4",))
+    if len(binds) < len(joints):
+        raise ValueError("has a skin with fewer matrices than joints")
+    # glTF stores matrices column by column.
+    return placed @ binds[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
+
+
+def _skinned(glb: Glb, stands: Array, primitive: dict[str, Any], count: int) -> Array | None:
+    """What places the vertices of a skinned primitive, whose own node does not: (4, 4), (V, 4, 4), or None."""
+    mean = stands.mean(axis=0)
+    if np.abs(stands - mean).max() <= ALIKE * np.abs(mean).max():
+        return None if np.abs(mean - np.eye(4)).max() <= ALIKE else mean
+    own = attributes(primitive)
+    placed, total = np.zeros((count, 4, 4)), np.zeros(count)
+    for k in range(MOST_SETS):
+        if f"JOINTS_{k}" not in own:
+            break
+        slots = glb.numbers(own[f"JOINTS_{k}"], "VEC4", JOINTS, count).astype(np.int64)
+        shares = glb.numbers(own.get(f"WEIGHTS_{k}"), "VEC4", WEIGHTS, count).astype(np.float64)
+        if slots.max(initial=0) >= len(stands):
+            raise ValueError("has vertices that name a joint which does not exist")
+        for slot, share in zip(slots.T, shares.T, strict=True):
+            placed += share[:, None, None] * stands[slot]
+            total += share
+    lost = ~(total > 0)
+    placed[lost], total[lost] = stands[0], 1.0
+    return np.asarray(placed / total[:, None, None])
+
+
+def _list(value: object) -> list[Any]:
+    if not isinstance(value, list):
+        raise ValueError("has a list of nodes that is none")
+    return value
+
+
+def _matrix(node: dict[str, Any]) -> Array | None:
+    """A node's transform (4, 4); None if it has none."""
+    if not {"matrix", "translation", "rotation", "scale"} & node.keys():
+        return None
+
+    def given(key: str, default: list[float]) -> Array:
+        values = node.get(key, default)
+        if not isinstance(values, list) or len(values) != len(default):
+            raise ValueError(f"a node's {key} has not {len(default)} numbers")
+        if not all(type(value) in (int, float) for value in values):
+            raise ValueError(f"a node's {key} holds no numbers")
+        return np.array(values, np.float64)
+
+    matrix = given("matrix", np.eye(4).ravel().tolist()).reshape(4, 4).T.copy()
+    rotation = given("rotation", [0, 0, 0, 1])
+    x, y, z, w = rotation / max(float(np.linalg.norm(rotation)), 1e-30)
+    turn = np.eye(4)
+    turn[:3, :3] = np.eye(3) + 2 * np.array(
+        [[-y * y - z * z, x * y - z * w, x * z + y * w], [x * y + z * w, -x * x - z * z, y * z - x * w],
+         [x * z - y * w, y * z + x * w, -x * x - y * y]]
+    )  # fmt: skip
+    move = np.eye(4)
+    move[:3, 3] = given("translation", [0, 0, 0])
+    return np.asarray(matrix @ move @ turn @ np.diag([*given("scale", [1, 1, 1]), 1.0]))
