@@ -30,7 +30,10 @@ from facediff.utils.pages import fill, hash_source, script_data
 
 FORMAT = "facediff page 1"
 MOST_ANIMATIONS = 4
-SCRIPTS = ("motion", "surface", "clock", "camera", "scene", "curve", "dialogs", "panels", "player")
+SCRIPTS = (
+    *("motion", "surface", "clock", "camera", "scene"),
+    *("plot", "curve", "waveform", "dialogs", "panels", "compare", "player"),
+)
 """Parts of the script; each uses only the parts before it."""
 
 

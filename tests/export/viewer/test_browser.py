@@ -18,12 +18,12 @@ from tools.browser.chromium import Chromium, Page
 Show = Callable[..., Page]
 HOSTILE = '</script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 1">'
 
-# Colour in the middle of the first panel, read in the moment in which it was drawn.
+# Colour in the middle of the first face's place, read in the moment in which it was drawn.
 PIXEL = """
 window.pixel = () => {
   const gl = document.getElementById("view").getContext("webgl2"), colour = new Uint8Array(4);
-  const all = view.getBoundingClientRect(), box = document.querySelector(".panel").getBoundingClientRect();
-  const x = (box.left + box.width / 2 - all.left) / all.width, y = (box.top + box.height / 2 - all.top) / all.height;
+  const { place: [left, top, width, height], inset: [above, below] } = facediff.views[0];
+  const x = left + width / 2, y = top + (height * (1 + above - below)) / 2;
   const [wide, high] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
   gl.readPixels(Math.floor(x * wide), Math.floor((1 - y) * high), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, colour);
   return [...colour];
@@ -48,6 +48,60 @@ HALVES = """(async () => {
     sums[side] = (31 * sums[side] + all[i] + all[i + 3]) % 1000003;
   }
   return sums;
+})()"""
+# The contrast of every word on the page with its ground, and of the plots' colours with theirs: [ratio, what]. Colours are
+# laid over one another by the browser itself; behind what stands over the faces may be any colour, so that the worse of
+# black and white counts.
+CONTRASTS = """(() => {
+  const pen = Object.assign(document.createElement("canvas"), { width: 1, height: 1 }).getContext("2d");
+  const style = getComputedStyle(document.body), named = (name) => style.getPropertyValue(name);
+  const mixed = (colours) => {
+    for (const colour of colours) (pen.fillStyle = colour), pen.fillRect(0, 0, 1, 1);
+    const [r, g, b] = [...pen.getImageData(0, 0, 1, 1).data].map((each) => {
+      each /= 255;
+      return each <= 0.04045 ? each / 12.92 : ((each + 0.055) / 1.055) ** 2.4;
+    });
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const ratio = (under, colour) => {
+    const [low, high] = [mixed(under), mixed([...under, colour])].sort((a, b) => a - b);
+    return (high + 0.05) / (low + 0.05);
+  };
+  const found = ["--quiet", "--wave", "--line-1", "--line-2", "--line-3", "--line-4", "--accent"].map((name) => [
+    ratio([named("--ground")], named(name)), name]);
+  for (const ground of ["--ground", "--raised"]) found.push([ratio([named(ground)], named("--edge")) * 1.5, "--edge: 3:1"]);
+  for (const element of document.querySelectorAll("body *")) {
+    if (![...element.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim())) continue;
+    if (!element.checkVisibility({ visibilityProperty: true }) || element.closest("select option, noscript")) continue;
+    const grounds = [];
+    for (let each = element; each; each = each.parentElement) grounds.unshift(getComputedStyle(each).backgroundColor);
+    const bases = element.closest("#stage") ? ["#000", "#fff"] : ["#fff"];
+    const ink = getComputedStyle(element).color;
+    for (const base of bases) {
+      const under = element.closest("#stage") ? [base, ...grounds.slice(3)] : [base, ...grounds];
+      found.push([ratio(under, ink), `${element.tagName} ${element.className} ${element.textContent}`]);
+    }
+  }
+  return found;
+})()"""
+# How many points of a face are drawn behind the words, and how wide the face of the first panel is, in pixels of the page.
+COVERED = """(async () => {
+  facediff.turn(0, 0);
+  await new Promise(requestAnimationFrame);
+  const gl = view.getContext("webgl2"), { width, height } = view, all = new Uint8Array(4 * width * height);
+  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, all);
+  const stage = view.getBoundingClientRect(), scale = width / stage.width;
+  const drawn = (box) => {
+    const columns = new Set();
+    let count = 0;
+    for (let y = Math.round((box.top - stage.top) * scale); y < Math.round((box.bottom - stage.top) * scale); y++)
+      for (let x = Math.round((box.left - stage.left) * scale); x < Math.round((box.right - stage.left) * scale); x++)
+        if (all[4 * ((height - 1 - y) * width + x) + 3]) (count += 1), columns.add(x);
+    return [count, columns.size / scale];
+  };
+  const words = [...document.querySelectorAll(".name, .words, .error, .mark")].filter((each) => each.offsetParent);
+  return [words.reduce((sum, each) => sum + drawn(each.getBoundingClientRect())[0], 0),
+    drawn(document.querySelector(".panel").getBoundingClientRect())[1]];
 })()"""
 # Notes at every picture the clock before and after the player's own work, the frame it shows, and the colour.
 NOTES = """
@@ -234,7 +288,7 @@ def test_the_heat_map_is_the_distance_from_the_truth(show: Show) -> None:
     assert alone.evaluate("heat.hidden")
 
 
-@pytest.mark.parametrize(("width", "height", "dark"), [(1280, 800, True), (390, 844, False), (900, 420, False)])
+@pytest.mark.parametrize(("width", "height", "dark"), [(1280, 800, True), (375, 740, False), (900, 420, False)])
 def test_wide_and_narrow_windows_light_and_dark(show: Show, width: int, height: int, dark: bool) -> None:
     page = show([clicks(), clicks(name="other")], truth=0, width=width, height=height, dark=dark)
     page.evaluate("(facediff.heat(true), facediff.seek(0))")
@@ -251,10 +305,13 @@ def test_wide_and_narrow_windows_light_and_dark(show: Show, width: int, height: 
     )
     assert facts["over"] <= 0
     assert facts["below"] <= 0
-    first, second = facts["panels"]
-    assert (first["top"] == second["top"]) == (width > height)
-    assert (first["left"] == second["left"]) == (width < height)
-    assert first["height"] > 120
+    assert facts["panels"][0]["height"] > 120
+    covered, wide = page.evaluate(COVERED)
+    assert covered == 0
+    assert wide > 75
+    contrasts = page.evaluate(CONTRASTS)
+    assert len(contrasts) > 20
+    assert min(contrasts)[0] >= 4.5, min(contrasts)
     for box in facts["buttons"]:
         assert box["left"] >= 0
         assert box["right"] <= width

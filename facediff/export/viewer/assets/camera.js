@@ -76,9 +76,12 @@ class Camera {
    * The matrices of one panel, column by column: `view` turns the face (mm) before the camera, `project` makes the
    * picture.
    *
-   * Args: centre and half extents of the face, and width / height of the panel.
+   * Args: centre and half extents of the face, width / height of the panel, and the shares of its height above and below
+   * that the face leaves free.
    */
-  matrices(centre, extent, aspect) {
+  matrices(centre, extent, panelAspect, [above, below] = [0, 0]) {
+    const tallness = 1 - above - below;
+    const aspect = panelAspect / tallness;
     const slope = Math.tan(FIELD_OF_VIEW / 2);
     const [halfWidth, halfHeight, halfDepth] = extent;
     const distance = 1.08 * Math.max(halfHeight, Math.max(halfWidth, 0.75 * halfDepth) / aspect) / slope + halfDepth;
@@ -97,8 +100,8 @@ class Camera {
         this.panX * tall - dot(right), -this.panY * tall - dot(up), -distance - dot(back), 1,
       ]),
       project: new Float32Array([
-        this.zoom / slope / aspect, 0, 0, 0, 0, this.zoom / slope, 0, 0,
-        0, 0, (near + far) / (near - far), -1, 0, 0, (2 * near * far) / (near - far), 0,
+        this.zoom / slope / aspect, 0, 0, 0, 0, (tallness * this.zoom) / slope, 0, 0,
+        0, above - below, (near + far) / (near - far), -1, 0, 0, (2 * near * far) / (near - far), 0,
       ]),
     };
   }

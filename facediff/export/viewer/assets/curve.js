@@ -1,6 +1,6 @@
-// The mouth's opening over time, one line for each animation that knows it, with a cursor at the shown frame.
+// The mouth's opening over time, one line for each animation that knows it.
 
-const MARGIN = { left: 46, right: 14, top: 10, bottom: 22 };
+const TOP = 10, BOTTOM = 22; // above the highest line, and below the lowest, where the seconds stand
 
 /** Round numbers from 0 to an end, about as many as wanted. */
 function ticks(end, wanted) {
@@ -11,51 +11,25 @@ function ticks(end, wanted) {
   return Array.from({ length: count + 1 }, (_, i) => ({ value: i * step, text: +(i * step).toPrecision(6) + "" }));
 }
 
-class Curve {
+class Curve extends Plot {
   /** Lines are {values, number}: openings in mm by frame, and the number of the animation. */
   constructor(canvas, cursor, lines, facts, onSeek) {
-    Object.assign(this, { canvas, cursor, lines, facts });
-    this.seconds = facts.frames / facts.frameRate;
+    super(canvas, cursor, facts, onSeek);
+    this.lines = lines;
     this.highest = 1.08 * lines.reduce((most, line) => line.values.reduce((a, b) => Math.max(a, b), most), 0.5);
-    const seek = (event) => {
-      const box = canvas.getBoundingClientRect();
-      const share = (event.clientX - box.left - MARGIN.left) / this.width;
-      onSeek(Math.max(0, Math.min(facts.frames - 1, Math.floor(share * facts.frames))));
-    };
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      seek(event);
-    });
-    canvas.addEventListener("pointermove", (event) => event.buttons & 1 && seek(event));
-    new ResizeObserver(() => this.draw()).observe(canvas);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
-  }
-
-  get width() {
-    return Math.max(1, this.canvas.clientWidth - MARGIN.left - MARGIN.right);
-  }
-
-  x(time) {
-    return MARGIN.left + (time / this.seconds) * this.width;
   }
 
   draw() {
-    const { clientWidth: wide, clientHeight: high } = this.canvas;
-    const scale = devicePixelRatio || 1;
-    Object.assign(this.canvas, { width: Math.round(wide * scale), height: Math.round(high * scale) });
-    const pen = this.canvas.getContext("2d");
-    pen.scale(scale, scale);
-    const style = getComputedStyle(this.canvas);
-    const colour = (name) => style.getPropertyValue(name).trim();
-    const bottom = high - MARGIN.bottom;
-    const y = (value) => bottom - (value / this.highest) * (bottom - MARGIN.top);
-    pen.font = `11px ${style.fontFamily}`;
+    const pen = this.pen();
+    const { wide, high, colour } = pen;
+    const bottom = high - BOTTOM;
+    const y = (value) => bottom - (value / this.highest) * (bottom - TOP);
     pen.fillStyle = colour("--quiet");
     pen.strokeStyle = colour("--line");
     pen.lineWidth = 1;
     pen.textBaseline = "middle";
     pen.textAlign = "right";
-    for (const { value, text } of ticks(this.highest, (bottom - MARGIN.top) / 28)) {
+    for (const { value, text } of ticks(this.highest, (bottom - TOP) / 28)) {
       const level = Math.round(y(value)) + 0.5;
       pen.beginPath();
       pen.moveTo(MARGIN.left, level);
@@ -79,11 +53,5 @@ class Curve {
       pen.stroke();
     }
     this.point(this.shown ?? 0);
-  }
-
-  /** Move the cursor to a frame. */
-  point(frame) {
-    this.shown = frame;
-    this.cursor.style.transform = `translateX(${this.x((frame + 0.5) / this.facts.frameRate)}px)`;
   }
 }

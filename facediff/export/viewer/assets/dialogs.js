@@ -43,7 +43,7 @@ function captions(animation) {
   const marks = [];
   if (/synthetic/i.test(corpus ?? "")) marks.push(`corpus: ${corpus}`);
   if (procedural) marks.push(`procedural: ${procedural}`);
-  return { words: words.join("\n"), marks };
+  return { words, marks };
 }
 
 /** Buttons that open and close dialogs. */

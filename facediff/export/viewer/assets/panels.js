@@ -1,13 +1,17 @@
-// The controls, the labels over the faces, and where on the stage each face goes.
+// The controls, and the labels over the faces.
 
 const seconds = (value) => `${Math.floor(value / 60)}:${(value % 60).toFixed(2).padStart(5, "0")}`;
+
+/** Pixels that a panel's words need: across beside the face, or above and below it together. */
+const WORDS = { across: 150, upright: 90 };
 
 /** Columns of the grid in which `count` faces, a little taller than wide, become largest. */
 function columnsFor(count, width, height) {
   let best = 1, most = 0;
   for (let columns = 1; columns <= count; columns++) {
-    const rows = Math.ceil(count / columns);
-    const size = Math.min(width / columns, (0.8 * height) / rows);
+    const wide = width / columns, high = height / Math.ceil(count / columns);
+    const beside = Math.min(wide - 2 * WORDS.across, 0.8 * high);
+    const size = Math.max(beside, Math.min(wide, 0.8 * (high - WORDS.upright)));
     if (size > most * 1.001) [best, most] = [columns, size];
   }
   return best;
@@ -28,24 +32,18 @@ class Panels {
   label(animation, number) {
     const box = make("div", "panel");
     const head = make("div", "name");
-    head.append(make("i", `swatch line-${number + 1}`), make("b", "", animation.name));
+    const letter = make("span", "letter"); // A or B, where two are compared
+    head.append(make("i", `swatch line-${number + 1}`), letter, make("b", "", animation.name));
     if (number === this.facts.truth && animation.name.toLowerCase() !== "truth") head.append(make("span", "mark", "truth"));
     const { words, marks } = captions(animation);
     const error = make("p", "error");
     const foot = make("div", "marks"); // below the face, where the marks hide nothing
     foot.append(...marks.map((mark) => make("p", "mark", mark)));
-    box.append(head, make("p", "words", words), error, foot);
+    const about = make("p", "words");
+    about.append(...words.map((each) => make("span", "", each)));
+    box.append(head, about, error, foot);
     const opening = make("span", "value");
-    return { box, error, opening };
-  }
-
-  /** Left, top, width and height of each panel, in shares of the stage. */
-  rectangles() {
-    const stage = find("stage").getBoundingClientRect();
-    return this.boxes.map(({ box }) => {
-      const { left, top, width, height } = box.getBoundingClientRect();
-      return [(left - stage.left) / stage.width, (top - stage.top) / stage.height, width / stage.width, height / stage.height];
-    });
+    return { box, letter, error, opening, over: [head, about, error], foot };
   }
 
   /** Give the controls something to control. */
@@ -62,6 +60,7 @@ class Panels {
     click("loop", () => this.press("loop", (player.clock.loop = !this.pressed("loop"))));
     click("mute", () => this.press("mute", (find("sound").muted = !this.pressed("mute"))));
     click("heat", () => player.setHeat(!player.heat));
+    click("wireframe", () => player.setEdges(!player.edges));
     click("reset", () => player.camera.reset());
     find("speed").addEventListener("change", () => (player.clock.speed = Number(find("speed").value)));
     find("mute").hidden = facts.sound === null;
@@ -111,6 +110,8 @@ class Panels {
       s: () => player.camera.turn(0, -0.1),
       l: () => find("loop").click(),
       h: () => find("heat").click(),
+      e: () => find("wireframe").click(),
+      x: () => player.comparison.swap(),
       m: () => find("mute").click(),
       r: () => find("reset").click(),
       i: () => find("information").showModal(),

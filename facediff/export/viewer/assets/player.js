@@ -36,12 +36,13 @@ async function readFace(facts, animation) {
 const STILL_MS = 200;
 
 class Player {
-  constructor(facts, faces, ramp) {
+  constructor(facts, faces, ramp, wav) {
     Object.assign(this, { facts, faces });
     this.wanted = 0;
     this.shown = -1;
     this.dirty = true;
     this.heat = false;
+    this.edges = false;
     this.highest = facts.heat ? facts.heat.highest : 0;
     this.waiting = [];
     this.stats = { shown: 0, late: 0, workMs: 0 };
@@ -54,21 +55,25 @@ class Player {
       this.movedAt = performance.now();
     });
     this.panels = new Panels(facts, () => (this.dirty = true));
+    this.comparison = new Comparison(facts, this.panels.boxes, () => (this.dirty = true));
     const lines = faces.flatMap(({ opening }, number) => (opening ? [{ values: opening, number }] : []));
     find("opening").hidden = !lines.length;
-    this.curve = lines.length ? new Curve(find("curve"), find("cursor"), lines, facts, (f) => this.seek(f)) : null;
+    const toFrame = (frame) => this.seek(frame);
+    this.plots = lines.length ? [new Curve(find("curve"), find("cursor"), lines, facts, toFrame)] : [];
+    find("voice").hidden = !wav;
+    if (wav) this.plots.push(new Waveform(find("waveform"), find("voice-cursor"), facts, readWav(wav), toFrame));
   }
 
   /** Let an audio element be the clock; without it, or if it cannot be played, the machine's clock serves. */
-  async connectSound() {
-    if (this.facts.sound === null) return;
+  connectSound(wav) {
+    if (!wav) return;
     const audio = find("sound");
     audio.addEventListener("error", () => {
       report("this browser cannot play the page's sound; the picture goes on without");
       this.clock = new SilentClock(this.facts.frames / this.facts.frameRate);
     });
     audio.addEventListener("ended", () => (this.wanted = this.facts.frames - 1));
-    audio.src = URL.createObjectURL(new Blob([await readBlob(this.facts.sound)], { type: "audio/wav" }));
+    audio.src = URL.createObjectURL(new Blob([wav], { type: "audio/wav" }));
     this.clock = new SoundClock(audio, this.facts.frameRate);
   }
 
@@ -114,6 +119,13 @@ class Player {
     this.panels.showHeat(this.heat, this.highest);
   }
 
+  /** Show the edges of the triangles, or not. */
+  setEdges(on) {
+    this.edges = on;
+    this.dirty = true;
+    this.panels.press("wireframe", on);
+  }
+
   tick() {
     requestAnimationFrame(() => this.tick());
     const started = performance.now();
@@ -127,7 +139,7 @@ class Player {
     const changed = this.wanted !== this.shown && this.prepare(this.wanted);
     if (changed || this.dirty) {
       this.scene.resize(still ? this.scene.finest : playing ? this.pace.sharpness : 1);
-      this.scene.draw(this.panels.rectangles(), this.camera, this.extent, this.heat ? this.highest : 0);
+      this.scene.draw(this.comparison.views(), this.camera, this.extent, this.heat ? this.highest : 0, this.edges);
       this.dirty = false;
     }
     if (changed) {
@@ -162,7 +174,7 @@ class Player {
     });
     this.shown = frame;
     this.scene.fresh = false;
-    if (this.curve) this.curve.point(frame);
+    for (const plot of this.plots) plot.point(frame);
     return true;
   }
 }
@@ -186,6 +198,10 @@ async function start() {
     pause: () => player.current.pause(),
     seek: (frame) => player.current.seek(frame),
     heat: (on) => player.current.setHeat(on),
+    wireframe: (on) => player.current.setEdges(on),
+    compare: (layout) => player.current.comparison.arrange(layout),
+    swap: () => player.current.comparison.swap(),
+    get views() { return player.current.comparison.views(); },
     turn: (yaw, pitch) => player.current.camera.turn(yaw, pitch),
     positions: (number) => player.current.faces[number].positions,
     distances: (number) => player.current.faces[number].distances,
@@ -197,9 +213,10 @@ async function start() {
   }
   const faces = await Promise.all(facts.animations.map((animation) => readFace(facts, animation)));
   const ramp = facts.heat ? new Uint8Array(await readBlob(facts.heat.ramp)) : null;
-  player.current = new Player(facts, faces, ramp);
+  const wav = facts.sound === null ? null : await readBlob(facts.sound);
+  player.current = new Player(facts, faces, ramp, wav);
   player.current.panels.connect(player.current, ramp);
-  await player.current.connectSound();
+  player.current.connectSound(wav);
   const drawn = player.current.seek(0);
   player.current.tick();
   await drawn;

@@ -22,6 +22,7 @@ precision highp float;
 centroid in vec3 facing, albedo;
 centroid in float heat;
 uniform float highest;
+uniform vec4 ink; // of edges, already multiplied by its opacity; clear for a surface
 uniform sampler2D ramp;
 out vec4 colour;
 
@@ -32,6 +33,10 @@ vec3 lamp(float cosine, vec3 strength, vec3 wrap) {
 }
 
 void main() {
+  if (ink.a > 0.0) {
+    colour = ink;
+    return;
+  }
   vec3 normal = normalize(gl_FrontFacing ? facing : -facing);
   if (highest > 0.0) {
     float shade = 0.6 + 0.4 * max(dot(normal, vec3(-0.199, 0.448, 0.871)), 0.0);
@@ -55,6 +60,8 @@ void main() {
 }`;
 
 const SKIN = [0.9, 0.745, 0.66];
+/** Edges over their own surface: red, green, blue and opacity. */
+const EDGE = [0.05, 0.06, 0.1, 0.55];
 /** Pixels of the screen for one of the page, at most: more are not visible in motion, and slow a laptop down. */
 const SHARPEST = 2;
 const COARSEST = 0.4;
@@ -91,7 +98,7 @@ class Scene {
     const gl = this.gl;
     this.program = link(gl);
     this.places = {};
-    for (const name of ["view", "project", "ramp", "highest"]) {
+    for (const name of ["view", "project", "ramp", "highest", "ink"]) {
       this.places[name] = gl.getUniformLocation(this.program, name);
     }
     this.meshes = this.faces.map((face) => buildMesh(gl, face));
@@ -126,12 +133,17 @@ class Scene {
   }
 
   /**
-   * Draw all animations.
+   * Draw animations, each into its place. A view is
+   *   number: of the animation;
+   *   place: left, top, width, height, in shares of the canvas;
+   *   inset: shares of the place's height above and below the face that are kept free for words;
+   *   part: the part of the place that is drawn, from and to, in shares of its width; all of it if absent;
+   *   ink: to draw only the edges, in this colour (4), over what was drawn there before; the surface if absent.
    *
-   * Args: rectangles in shares of the canvas (left, top, width, height), one for each animation; the camera; the extent that all
-   * share, so that they appear at one scale; the heat map's end in mm, or 0 for none.
+   * Args: the views in the order of drawing; the camera; the extent that all share, so that they appear at one scale; the
+   * heat map's end in mm, or 0 for none; whether surfaces show their edges.
    */
-  draw(rectangles, camera, extent, highest) {
+  draw(views, camera, extent, highest, edges = false) {
     const gl = this.gl;
     if (gl.isContextLost()) return;
     gl.useProgram(this.program);
@@ -139,25 +151,55 @@ class Scene {
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
+    gl.depthFunc(gl.LEQUAL);
     gl.enable(gl.SCISSOR_TEST);
+    gl.polygonOffset(1, 1); // edges lie in front of their own surface
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.uniform1i(this.places.ramp, 0);
-    this.faces.forEach((face, number) => {
-      const [left, top, width, height] = rectangles[number];
+    for (const { number, place, inset = [0, 0], part = [0, 1], ink = null } of views) {
+      const face = this.faces[number];
+      const [left, top, width, height] = place;
       const x = Math.round(left * this.canvas.width), w = Math.round(width * this.canvas.width);
       const h = Math.round(height * this.canvas.height), y = this.canvas.height - Math.round(top * this.canvas.height) - h;
-      if (w < 1 || h < 1) return;
+      if (w < 1 || h < 1) continue;
+      const from = Math.round(part[0] * w), to = Math.round(part[1] * w);
       gl.viewport(x, y, w, h);
-      gl.scissor(x, y, w, h);
-      const { view, project } = camera.matrices(face.centre, extent, w / h);
+      gl.scissor(x + from, y, to - from, h);
+      const { view, project } = camera.matrices(face.centre, extent, w / h, inset);
       gl.uniformMatrix4fv(this.places.view, false, view);
       gl.uniformMatrix4fv(this.places.project, false, project);
       gl.uniform1f(this.places.highest, face.distances ? highest : 0);
+      gl.uniform4f(this.places.ink, 0, 0, 0, 0);
       gl.bindVertexArray(this.meshes[number].array);
       gl.vertexAttrib3f(2, ...SKIN);
       gl.vertexAttrib1f(3, 0);
+      if (ink) gl.clear(gl.DEPTH_BUFFER_BIT); // of the part alone: what hides these edges is their own surface
+      if (ink || edges) gl.enable(gl.POLYGON_OFFSET_FILL);
+      gl.colorMask(!ink, !ink, !ink, !ink);
       gl.drawElements(gl.TRIANGLES, face.faces.length, gl.UNSIGNED_INT, 0);
-    });
+      gl.colorMask(true, true, true, true);
+      gl.disable(gl.POLYGON_OFFSET_FILL);
+      if (ink || edges) this.drawEdges(number, ink ?? EDGE);
+    }
     gl.disable(gl.SCISSOR_TEST);
+  }
+
+  /** Draw an animation's edges; they are found when they are shown for the first time. */
+  drawEdges(number, [red, green, blue, opacity]) {
+    const gl = this.gl;
+    const face = this.faces[number], mesh = this.meshes[number];
+    face.edges ??= edgesOf(face.faces, face.positions.length / 3);
+    if (mesh.edges) {
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.edges);
+    } else {
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, (mesh.edges = gl.createBuffer()));
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.edges, gl.STATIC_DRAW);
+    }
+    gl.enable(gl.BLEND);
+    gl.uniform4f(this.places.ink, red * opacity, green * opacity, blue * opacity, opacity);
+    gl.drawElements(gl.LINES, face.edges.length, gl.UNSIGNED_INT, 0);
+    gl.disable(gl.BLEND);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.faces); // the vertex array remembers it
   }
 }
 
@@ -219,7 +261,7 @@ function buildMesh(gl, face) {
   mesh.normals = attribute(1, 3, gl.FLOAT, false, face.normals, gl.DYNAMIC_DRAW);
   if (face.colours) attribute(2, 3, gl.UNSIGNED_BYTE, true, face.colours, gl.STATIC_DRAW);
   if (face.distances) mesh.distances = attribute(3, 1, gl.FLOAT, false, face.distances, gl.DYNAMIC_DRAW);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, (mesh.faces = gl.createBuffer()));
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.faces, gl.STATIC_DRAW);
   gl.bindVertexArray(null);
   return mesh;

@@ -39,3 +39,16 @@ function compare(distances, positions, truth) {
   }
   return { mean: sum / distances.length, largest };
 }
+
+/** The two ends of every edge (2 E), each edge once. */
+function edgesOf(faces, vertices) {
+  const seen = new Set(), ends = [];
+  for (let i = 0; i < faces.length; i++) {
+    const a = faces[i], b = faces[i % 3 === 2 ? i - 2 : i + 1];
+    const edge = Math.min(a, b) * vertices + Math.max(a, b);
+    if (seen.has(edge)) continue;
+    seen.add(edge);
+    ends.push(a, b);
+  }
+  return new Uint32Array(ends);
+}

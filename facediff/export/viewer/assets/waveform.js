@@ -1,0 +1,48 @@
+// The speech under the timeline: for each pixel the lowest and the highest sample in its time.
+
+/** Samples (S, −1 to 1) and their rate, of a mono WAV file of 16 bits, as the page holds it. */
+function readWav(buffer) {
+  const view = new DataView(buffer);
+  const name = (at) => String.fromCharCode(...new Uint8Array(buffer, at, 4));
+  let rate = 0;
+  for (let at = 12; at + 8 <= buffer.byteLength; at += 8 + view.getUint32(at + 4, true)) {
+    if (name(at) === "fmt ") rate = view.getUint32(at + 12, true);
+    if (name(at) !== "data") continue;
+    const samples = new Int16Array(buffer.slice(at + 8, at + 8 + (view.getUint32(at + 4, true) & ~1)));
+    return { rate, samples: Float32Array.from(samples, (value) => value / 32768) };
+  }
+  throw new Error("the page's sound holds no samples; write the page again");
+}
+
+class Waveform extends Plot {
+  constructor(canvas, cursor, facts, wav, onSeek) {
+    super(canvas, cursor, facts, onSeek);
+    this.wav = wav;
+    this.loudest = wav.samples.reduce((most, value) => Math.max(most, Math.abs(value)), 1e-3);
+  }
+
+  draw() {
+    const pen = this.pen();
+    const { samples, rate } = this.wav;
+    const middle = pen.high / 2, reach = middle - 2;
+    pen.fillStyle = pen.colour("--line");
+    pen.fillRect(MARGIN.left, middle - 0.5, this.width, 1);
+    pen.fillStyle = pen.colour("--quiet");
+    pen.textBaseline = "middle";
+    pen.textAlign = "right";
+    pen.fillText("voice", MARGIN.left - 8, middle);
+    pen.fillStyle = pen.colour("--wave");
+    for (let pixel = 0; pixel < this.width; pixel++) {
+      const start = Math.floor((pixel / this.width) * this.seconds * rate);
+      const end = Math.min(samples.length, Math.max(start + 1, Math.floor(((pixel + 1) / this.width) * this.seconds * rate)));
+      let low = 0, high = 0;
+      for (let i = start; i < end; i++) {
+        if (samples[i] < low) low = samples[i];
+        else if (samples[i] > high) high = samples[i];
+      }
+      const top = middle - (high / this.loudest) * reach, bottom = middle - (low / this.loudest) * reach;
+      pen.fillRect(MARGIN.left + pixel, top, 1, Math.max(1, bottom - top));
+    }
+    this.point(this.shown ?? 0);
+  }
+}
