@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.options import Map, Output, Picture, SourceOptions, check_picture_path
+from facediff.cli.options import File, Map, Output, Picture, SourceOptions, check_picture_path
 from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
@@ -25,7 +25,7 @@ def retarget(
     target_mesh: Annotated[Path, Option(metavar="FILE", reads=True)],
     output: Output,
     correspondence: Map = None,
-    landmarks: Annotated[Path | None, Option(metavar="CSV", reads=True)] = None,
+    landmarks: File = None,
     show: Picture = None,
     accept_poor: bool = False,
     add_to_mesh: bool = False,
@@ -38,8 +38,8 @@ def retarget(
         target_mesh: the other face at rest: .obj, .ply, .glb …
         output: file to write
         correspondence: .npz to use if it exists, else to write for other animations
-        landmarks: pairs of vertices that are one place, `source,target` a line, counted from 0: for meshes that show
-            other parts of the head
+        landmarks: places that are the same: .csv with a pair of vertices a line, counted from 0, or a name for a
+            vertex, such as `nose_tip,4034`; or the .json that was picked
         show: picture of both faces at the most open mouth
         accept_poor: write the animation although its lips, its folds or its coverage are found to be wrong
         add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
@@ -72,6 +72,7 @@ def retarget(
             refuse_poor(target_mesh, reports[-1])
 
     made, found = transfer(own, target_mesh, correspondence, landmarks, judge=judge)
+    notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
     if add_to_mesh:
         from facediff.export.glb_added import add_to_glb
 
@@ -81,7 +82,7 @@ def retarget(
         written = write_animations(output, [made], ExportOptions())
     if show is not None:
         written.append(show)
-    tell(*written, *remarks(own, made, found, reports[-1]))
+    tell(*written, *remarks(own, made, found, reports[-1]), *notes)
 
 
 def remarks(animation: Animation, made: Animation, found: Correspondence, report: FitReport) -> list[str]:

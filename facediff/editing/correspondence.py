@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.editing.face_features import OPPOSITE, Features, find_features
+from facediff.editing.landmarks import Landmarks
 from facediff.editing.placing import place, place_face
 from facediff.editing.surface import Nearest, Surface, nearest
 from facediff.errors import FaceDiffError
@@ -61,7 +62,7 @@ def correspond(
     target_vertices: npt.NDArray[np.floating],
     target_faces: npt.NDArray[np.integer],
     *,
-    landmarks: npt.NDArray[np.integer] | None = None,
+    landmarks: Landmarks | npt.NDArray[np.integer] | None = None,
 ) -> Correspondence:
     """Find the place on a source mesh of every vertex of a target mesh.
 
@@ -75,8 +76,8 @@ def correspond(
         source_faces: (Fs, 3).
         target_vertices: (Vt, 3) neutral face that shall move.
         target_faces: (Ft, 3).
-        landmarks: (L, 2) pairs of a source and a target vertex that are the same place; three or more also begin the
-            alignment, for meshes that show other parts of the head.
+        landmarks: pairs of places that are the same, or (L, 2) pairs of a source and a target vertex; three or more
+            also begin the alignment, for meshes that show other parts of the head.
 
     Raises:
         FaceDiffError: if a mesh is broken, or a landmark names a vertex that does not exist.
@@ -89,30 +90,20 @@ def correspond(
     """
     source = _checked("source mesh", source_vertices, source_faces)
     target = _checked("target mesh", target_vertices, target_faces)
-    pairs: Indices = np.zeros((0, 2), np.int64) if landmarks is None else np.asarray(landmarks, np.int64).reshape(-1, 2)
-    for column, (name, count) in enumerate((("source", len(source.vertices)), ("target", len(target.vertices)))):
-        if len(pairs) and not 0 <= pairs[:, column].min() <= pairs[:, column].max() < count:
-            raise FaceDiffError(
-                f"landmarks: name {name} vertex {int(pairs[:, column].max())} of {count}; count vertices from 0"
-            )
+    marks = landmarks if isinstance(landmarks, Landmarks) or landmarks is None else Landmarks.of_vertices(landmarks)
+    if marks is not None:
+        marks.check(len(source.vertices), len(target.vertices))
     if source.vertices.shape == target.vertices.shape and np.array_equal(source.faces, target.faces):
         return _vertex_by_vertex(source, target)
     if _volume(target) * _volume(source) < 0:  # triangles that run the other way round turn a mesh inside out
         target = Surface(target.vertices, np.ascontiguousarray(target.faces[:, ::-1]))
-    start = None
-    if len(pairs) >= 3:
-        start = align(target.vertices[pairs[:, 1]], source.vertices[pairs[:, 0]], scale=True)
-    features = find_features(source.vertices, source.faces)
-    if features is None:
-        back, seen = place(target, source, start), None
-    else:
-        back, seen = place_face(target, source, features, start)
+    back, features, seen = placed(source, target, marks)
     known = None if features is None or seen is None else (features, seen)
     laid = Surface(back.apply(target.vertices), target.faces)
     if known is not None and _one_surface(source, laid):
         known = None  # what lies on the other mesh already need not be bent, and is exact to rounding
     places = partners(source, laid, known)
-    bent = _bent(source, laid, places, pairs, known)
+    bent = _bent(source, laid, places, marks, known)
     found = places.nearest(bent.vertices, bent.normals)
     # Bending decides which place belongs to a vertex. The distance of the meshes is measured before bending, and the
     # trust in a place by the distance that is left after it.
@@ -138,6 +129,26 @@ def correspond(
         target_vertices=target.vertices,
         target_faces=np.ascontiguousarray(target_faces, np.int64),
     )
+
+
+def placed(
+    source: Surface, target: Surface, marks: Landmarks | None = None
+) -> tuple[Similarity, Features | None, Features | None]:
+    """The similarity that lays a target onto a source, and what is seen of the source and there of the target.
+
+    Args:
+        source: the animation's mesh at rest, y up and z to the viewer.
+        target: the other one.
+        marks: pairs that begin the alignment, if there are three or more.
+    """
+    start = None
+    if marks is not None and len(marks) >= 3:
+        start = align(marks.target.points(target.vertices), marks.source.points(source.vertices), scale=True)
+    features = find_features(source.vertices, source.faces)
+    if features is None:
+        return place(target, source, start), None, None
+    back, seen = place_face(target, source, features, start)
+    return back, features, seen
 
 
 def _checked(name: str, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Surface:
@@ -349,12 +360,17 @@ WARP = 0.5, 1.2
 
 
 def _bent(
-    source: Surface, laid: Surface, places: Partners, pairs: Indices, known: tuple[Features, Features] | None
+    source: Surface,
+    laid: Surface,
+    places: Partners,
+    marks: Landmarks | None,
+    known: tuple[Features, Features] | None,
 ) -> Surface:
     """The target, bent onto the source."""
     edges = edges_of(laid.faces)
     base = laid if known is None else Surface(laid.vertices + _warp(laid.vertices, *known), laid.faces)
     rim, rim_pull = (np.zeros(0, np.int64), np.zeros((0, 3))) if known is None else _rims(base.vertices, laid, *known)
+    held, held_pull, held_trust = _held(source, base, marks)
     bent = base
     for stiffness in STIFFNESSES:
         # Nearest points of a mesh that is still far away are often wrong: they count less the less the surfaces face
@@ -364,11 +380,27 @@ def _bent(
         trust *= np.clip((FAR - there.distances / source.size) / (FAR - CLOSE), 0.0, 1.0)
         pull = there.points - base.vertices
         pull[rim], trust[rim] = rim_pull, RIM_TRUST
-        if len(pairs):
-            pull[pairs[:, 1]] = source.vertices[pairs[:, 0]] - base.vertices[pairs[:, 1]]
-            trust[pairs[:, 1]] = LANDMARK_TRUST
+        pull[held], trust[held] = held_pull, held_trust
         bent = Surface(base.vertices + smooth_field(pull, trust, edges, stiffness), laid.faces)
     return bent
+
+
+def _held(source: Surface, base: Surface, marks: Landmarks | None) -> tuple[Indices, Array, Array]:
+    """Vertices of the target that landmarks hold, displacements (N, 3) that lay these on the source's, and trust (N,).
+
+    A landmark within a triangle moves all of its corners as it shall move itself, each as firmly as it weighs.
+    """
+    if marks is None:
+        return np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0)
+    steps = marks.source.points(source.vertices) - marks.target.points(base.vertices)
+    weights = marks.target.weights
+    held, place_in = np.unique(marks.target.corners, return_inverse=True)
+    place_in = place_in.reshape(weights.shape)  # NumPy 2.0 returns it with one axis or two
+    total, pull = np.zeros(len(held)), np.zeros((len(held), 3))
+    np.add.at(total, place_in, weights)
+    np.add.at(pull, place_in, weights[:, :, None] * steps[:, None])
+    some = total > 1e-9
+    return held[some], pull[some] / total[some, None], LANDMARK_TRUST * np.minimum(total[some], 1.0)
 
 
 def _sides(known: tuple[Features, Features]) -> list[tuple[int, Array, Array, Indices, float]]:

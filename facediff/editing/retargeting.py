@@ -20,6 +20,7 @@ from facediff.editing.correspondence import (
     refuse_other_mesh,
 )
 from facediff.editing.face_features import sides_of_pairs
+from facediff.editing.landmarks import Landmarks, common_landmarks, known_topology, read_landmarks
 from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError
@@ -27,7 +28,6 @@ from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.limits import check_format
-from facediff.utils.plain_files import read_table
 
 ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20
@@ -48,8 +48,9 @@ def retarget(
         animation: with triangles.
         mesh_path: the other face at rest.
         correspondence_path: used if it exists, else written; None for neither.
-        landmarks_path: CSV of vertex pairs, for a correspondence that does not exist yet.
-        judge: called with the result before a new correspondence is written; raises where it should not be.
+        landmarks_path: CSV or JSON of landmarks, for a correspondence that does not exist yet.
+        judge: called with the result before a new correspondence is written; raises where it should not be. Where it
+            raises and both meshes are of known topologies, their named landmarks are tried.
 
     Raises:
         FaceDiffError: if a file is unreadable, or a mesh is not the correspondence's or has its vertices in another
@@ -74,14 +75,28 @@ def retarget(
             raise FaceDiffError(f"--correspondence {correspondence_path}: expected a name that ends in .npz")
         check_writable(correspondence_path)
     # Everything that can be wrong with the options is found before the meshes are compared, which takes seconds.
-    landmarks = None if landmarks_path is None else read_landmarks(landmarks_path)
+    landmarks = None
+    if landmarks_path is not None:
+        both = known_topology(animation.template), known_topology(mesh.vertices)
+        landmarks = read_landmarks(landmarks_path, *both)
+
+    def attempt(marks: Landmarks | None) -> tuple[Animation, Correspondence]:
+        try:
+            found = correspond(animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks)
+        except FaceDiffError as error:
+            raise FaceDiffError(f"{mesh_path}: {error}") from error
+        made = carry(animation, found, mesh)
+        if judge is not None:
+            judge(made, found)
+        return made, found
+
     try:
-        found = correspond(animation.template, triangles, mesh.vertices, mesh.faces, landmarks=landmarks)
-    except FaceDiffError as error:
-        raise FaceDiffError(f"{mesh_path}: {error}") from error
-    made = carry(animation, found, mesh)
-    if judge is not None:
-        judge(made, found)
+        made, found = attempt(landmarks)
+    except FaceDiffError:
+        named = common_landmarks(animation.template, mesh.vertices) if landmarks is None else None
+        if named is None or judge is None:
+            raise
+        made, found = attempt(named)
     if correspondence_path is not None:
         save_correspondence(correspondence_path, found)
     return made, found
@@ -240,7 +255,7 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
     return fitted(moved, animation.template, animation.unit)
 
 
-# Correspondences and landmarks on disk.
+# Correspondences on disk.
 
 FORMAT = "facediff correspondence 1"
 ARRAYS = {
@@ -318,27 +333,3 @@ def _consistent(made: Correspondence) -> bool:
             for faces, count in ((made.source_faces, sources), (made.corners, sources), (made.target_faces, targets))
         )
     )
-
-
-DIGITS = 18  # of a whole number that fits into 64 bits
-
-
-def read_landmarks(path: Path) -> npt.NDArray[np.int64]:
-    """Pairs (L, 2) of a source and a target vertex from a CSV of two columns, with or without a header.
-
-    Raises:
-        FaceDiffError: if the file is missing, or a line does not hold two numbers.
-    """
-    pairs = []
-    for number, line in enumerate(read_table(path, remedy="expected a CSV of vertex pairs"), 1):
-        words = [word.strip() for word in line if word.strip()]
-        if not words or (number == 1 and not words[0].isdecimal()):
-            continue
-        if len(words) != 2 or not all(word.isdecimal() and len(word) <= DIGITS for word in words):
-            raise FaceDiffError(
-                f"{path}: line {number} is {','.join(line)}; expected two vertices, source and target, counted from 0"
-            )
-        pairs.append([int(word) for word in words])
-    if not pairs:
-        raise FaceDiffError(f"{path}: holds no pairs; expected lines `source vertex,target vertex`")
-    return np.array(pairs, np.int64)

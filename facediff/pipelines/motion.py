@@ -150,7 +150,7 @@ class Animation(finished.Animation):
         Args:
             target_mesh: the other face at rest: .obj, .ply, .glb …
             correspondence: .npz to use if it exists, else to write for other animations.
-            landmarks: .csv of pairs of vertices that are one place.
+            landmarks: .csv of pairs of vertices that are one place, or the .json of `facediff retarget --pick`.
 
         Raises:
             FaceDiffError: if a file cannot be read, or the mesh does not fit.

@@ -369,7 +369,7 @@ def landmarks(path: Path) -> None:
 
 
 def read_the_landmarks(path: Path) -> object:
-    from facediff.editing.retargeting import read_landmarks
+    from facediff.editing.landmarks import read_landmarks
 
     return read_landmarks(path)
 

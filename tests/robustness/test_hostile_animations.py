@@ -13,7 +13,8 @@ import trimesh
 from facediff.animation import metres_per_unit, read_animation, write_archive
 from facediff.cli.app import main
 from facediff.editing.correspondence import correspond
-from facediff.editing.retargeting import load_correspondence, read_landmarks, save_correspondence
+from facediff.editing.landmarks import read_landmarks
+from facediff.editing.retargeting import load_correspondence, save_correspondence
 from facediff.errors import FaceDiffError
 from tests.fakes.clicks import clicks
 

@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 from facediff.editing.correspondence import Correspondence, correspond
-from facediff.editing.retargeting import load_correspondence, read_landmarks, save_correspondence
+from facediff.editing.landmarks import read_landmarks
+from facediff.editing.retargeting import load_correspondence, save_correspondence
 from facediff.errors import FaceDiffError
 
 
@@ -70,7 +71,7 @@ def test_damaged_correspondences_are_refused(found: Correspondence, tmp_path: Pa
 @pytest.mark.parametrize("text", ["1,2\n3,4\n", "source,target\n1,2\n\n3, 4\n", "\ufeff1,2\r\n3,4\r\n"])
 def test_landmarks(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.csv").write_text(text, encoding="utf-8")
-    assert read_landmarks(tmp_path / "a.csv").tolist() == [[1, 2], [3, 4]]
+    assert read_landmarks(tmp_path / "a.csv").nearest_vertices.tolist() == [[1, 2], [3, 4]]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,461 @@
+"""Named places of a face: of known topologies by their vertices, of other meshes by their shape, and pairs on disk.
+
+One set of names serves every mesh: "left" is the face's own left. Landmarks are places of a surface, a vertex or a
+point within a triangle, and a pair says where one place is on the source and on the target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.editing.face_features import Features, Opening, find_features
+from facediff.errors import FaceDiffError, choices
+from facediff.synthetic.face import N_VERTICES, build_face
+from facediff.utils.limits import check_format
+from facediff.utils.plain_files import load_json, read_table, write_json
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+NAMES: dict[str, str] = {
+    "nose_tip": "where the nose reaches furthest forward",
+    "chin": "where the chin reaches furthest forward, in the middle",
+    "mouth_corner_left": "where the borders of both lips meet",
+    "mouth_corner_right": "where the borders of both lips meet",
+    "eye_outer_left": "the outer corner of the eye",
+    "eye_outer_right": "the outer corner of the eye",
+    "eye_inner_left": "the inner corner of the eye, next to the nose",
+    "eye_inner_right": "the inner corner of the eye, next to the nose",
+    "nose_bridge": "between the inner corners of the eyes, on the nose",
+    "nose_base": "where the nose meets the upper lip, in the middle",
+    "upper_lip_top": "the upper border of the upper lip, in the middle",
+    "lower_lip_bottom": "the lower border of the lower lip, in the middle",
+    "upper_lip_middle": "the edge of the upper lip, in the middle, just above the line between the lips",
+    "lower_lip_middle": "the edge of the lower lip, in the middle, just below the line between the lips",
+}
+"""Every name and the place that it stands for, in the order in which the places are best picked."""
+LEFT, RIGHT = "_left", "_right"
+
+FLAME_VERTICES = 5023
+FLAME: dict[str, int] = {
+    "nose_tip": 3564,
+    "chin": 3487,
+    "mouth_corner_left": 1703,
+    "mouth_corner_right": 2820,
+    "eye_outer_left": 1154,
+    "eye_outer_right": 2428,
+    "eye_inner_left": 3832,
+    "eye_inner_right": 3631,
+    "nose_bridge": 3516,
+    "nose_base": 3556,
+    "upper_lip_top": 3543,
+    "lower_lip_bottom": 3503,
+    "upper_lip_middle": 3531,
+    "lower_lip_middle": 3504,
+}
+"""Vertices of FLAME's topology (VOCASET, 3DMEAD and others of 5023 vertices).
+
+All but two are the vertices that SAiD publishes for the 68 landmarks of iBUG 300-W (github.com/yunik1004/SAiD,
+``data/FLAME_landmarks.txt``; numbers 30, 54, 48, 45, 36, 42, 39, 33, 51, 57, 62 and 66 from 0). The chin and the bridge
+of the nose are vertices of the middle of the published template (github.com/yfeng95/DECA, ``data/head_template.obj``):
+the one that reaches furthest forward below the mouth, and the one at the height of the inner corners of the eyes. In
+that template left and right are mirror images of one another, and the others lie in its middle.
+"""
+
+UNPUBLISHED = {23370: "BIWI", 6172: "Multiface"}
+"""Topologies by their vertices for which no list of landmarks is published; Multiface's authors say that there is none
+(github.com/facebookresearch/multiface, issue 21). What their shape shows is found (:func:`landmarks_by_shape`)."""
+
+
+def puppet_landmarks() -> dict[str, int]:
+    """Vertices of the built-in face.
+
+    Example:
+        >>> puppet_landmarks()["nose_tip"]
+        124
+    """
+    face = build_face()
+    middle = np.flatnonzero(face.mirror == np.arange(len(face.vertices)))
+    # Of the skin in front: without the crown, the teeth and the inside of the mouth.
+    middle = middle[np.isin(middle, face.groups["skin"]) & (face.vertices[middle, 2] > 0.03)]
+    height, depth = face.vertices[middle, 1], face.vertices[middle, 2]
+    border, front, eye = face.groups["mouth_0"], face.groups["lip_front"], face.groups["eye_0"]
+    lowest, level = face.vertices[border[-1], 1], face.vertices[eye[0], 1]
+    nose = face.groups["nose"][np.isin(face.groups["nose"], middle)]
+    left = {"mouth_corner": border[7], "eye_outer": eye[8], "eye_inner": eye[0]}
+    found = {
+        "nose_tip": middle[depth.argmax()],
+        "chin": middle[np.where(height < lowest - 0.01, depth, -1.0).argmax()],
+        "nose_bridge": nose[np.abs(face.vertices[nose, 1] - level).argmin()],
+        "nose_base": nose[face.vertices[nose, 1].argmin()],
+        "upper_lip_top": border[0],
+        "lower_lip_bottom": border[-1],
+        "upper_lip_middle": front[0],
+        "lower_lip_middle": front[-1],
+        **{name + LEFT: vertex for name, vertex in left.items()},
+        **{name + RIGHT: face.mirror[vertex] for name, vertex in left.items()},
+    }
+    return {name: int(found[name]) for name in NAMES}
+
+
+@dataclass(frozen=True)
+class Known:
+    """The named places of a mesh.
+
+    Attributes:
+        topology: puppet or FLAME; None where the places were found by the mesh's shape.
+        vertices: vertex of each name, in the order of :data:`NAMES`; names that are not known are absent.
+    """
+
+    topology: str | None
+    vertices: dict[str, int]
+
+    @property
+    def missing(self) -> list[str]:
+        """The names that are not known on this mesh."""
+        return [name for name in NAMES if name not in self.vertices]
+
+
+def known_landmarks(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Known:
+    """The named places of a mesh: those of its topology, or those that its shape shows.
+
+    A topology is recognised by the number of its vertices, and by its landmarks: left and right must lie as mirror
+    images of one another do, and the others between them, so that a mesh whose vertices were reordered is not taken
+    for one whose were not.
+
+    Args:
+        vertices: (V, 3); where the topology is not known, y up and z to the viewer, as animations are.
+        faces: (F, 3).
+
+    Example:
+        >>> face = build_face()
+        >>> known_landmarks(1000 * face.vertices, face.faces).topology
+        'puppet'
+    """
+    found = known_topology(vertices)
+    if found is not None:
+        return found
+    return Known(None, landmarks_by_shape(np.asarray(vertices, np.float64), np.asarray(faces, np.int64)))
+
+
+def known_topology(vertices: npt.NDArray[np.floating]) -> Known | None:
+    """The named places of a mesh of a known topology; None of another one."""
+    points = np.asarray(vertices, np.float64)
+    for topology, count, table in (("puppet", N_VERTICES, puppet_landmarks), ("FLAME", FLAME_VERTICES, FLAME.copy)):
+        if len(points) == count and _lie_as_on_a_face(points, found := table()):
+            return Known(topology, found)
+    return None
+
+
+PARALLEL = 0.95  # Cosine of the angle between the ways from right to left, of mirror images 1
+MIDDLE = 0.12  # So far from the middle, as a share of the distance of the eyes, the others may lie
+
+
+def _lie_as_on_a_face(points: Array, found: Mapping[str, int]) -> bool:
+    """Whether the places of all names lie as they do on a face, in whatever unit and orientation."""
+    at = {name: points[vertex] for name, vertex in found.items()}
+    bases = [name.removesuffix(LEFT) for name in found if name.endswith(LEFT)]
+    across = np.stack([at[base + LEFT] - at[base + RIGHT] for base in bases])
+    lengths = np.linalg.norm(across, axis=1)
+    if not (lengths > 0).all():
+        return False
+    axis = across.sum(axis=0) / np.linalg.norm(across.sum(axis=0))
+    if (across @ axis < PARALLEL * lengths).any():
+        return False
+    centres = np.stack([0.5 * (at[base + LEFT] + at[base + RIGHT]) for base in bases])
+    middle = np.concatenate([centres, [at[name] for name in found if not name.endswith((LEFT, RIGHT))]])
+    size = float(np.linalg.norm(at["eye_outer_left"] - at["eye_outer_right"]))
+    if np.ptp(middle @ axis) > 2 * MIDDLE * size:
+        return False
+    eyes, mouth = (0.5 * (at[f"{base}_left"] + at[f"{base}_right"]) for base in ("eye_outer", "mouth_corner"))
+    down = mouth - eyes
+    order = [float(down @ (at[name] - eyes)) for name in ("nose_bridge", "nose_tip", "nose_base", "chin")]
+    return order == sorted(order) and order[-1] > float(down @ down) > 0.05 * size**2
+
+
+def landmarks_by_shape(vertices: Array, faces: Indices, features: Features | None = None) -> dict[str, int]:
+    """Vertices of the names that a mesh's openings show: corners and middle of the mouth, corners of the eyes, nose.
+
+    Args:
+        vertices: (V, 3), y up and z to the viewer.
+        faces: (F, 3).
+        features: of this mesh; found if None.
+    """
+    features = features or find_features(vertices, faces)
+    if features is None:
+        return {}
+    found: dict[str, int] = {}
+
+    def nearest(points: Array, to: Array, allowed: Indices) -> int:
+        return int(allowed[np.linalg.norm(points[allowed] - to, axis=1).argmin()])
+
+    skin = np.unique(faces[features.skin[faces].all(axis=1)])
+    mouth = features.mouth
+    middle = len(mouth.upper) // 2
+    # The larger x is the face's left.
+    found["mouth_corner_right"], found["mouth_corner_left"] = (
+        nearest(vertices, 0.5 * (mouth.upper[end] + mouth.lower[end]), skin) for end in (0, -1)
+    )
+    found["upper_lip_middle"] = nearest(vertices, mouth.upper[middle], mouth.upper_seeds)
+    found["lower_lip_middle"] = nearest(vertices, mouth.lower[middle], mouth.lower_seeds)
+    for side, eye, inner in ((RIGHT, features.eyes[0], -1), (LEFT, features.eyes[1], 0)):
+        if eye is not None:
+            found["eye_inner" + side] = nearest(vertices, _end(eye, inner), skin)
+            found["eye_outer" + side] = nearest(vertices, _end(eye, -1 - inner), skin)
+    eyes = [eye for eye in features.eyes if eye is not None]
+    if len(eyes) == 2:
+        x, y = mouth.centre[:2]
+        level = 0.5 * (eyes[0].centre[1] + eyes[1].centre[1])
+        points = vertices[skin]
+        # Of what lies between the mouth and the eyes, in the middle, the tip of the nose is furthest forward.
+        between = (np.abs(points[:, 0] - x) < 0.25 * mouth.width) & (
+            np.abs(points[:, 1] - 0.5 * (y + level)) < 0.35 * (level - y)
+        )
+        if between.any():
+            found["nose_tip"] = int(skin[np.where(between, points[:, 2], -np.inf).argmax()])
+    return {name: found[name] for name in NAMES if name in found}
+
+
+def _end(opening: Opening, end: int) -> Array:
+    return np.asarray(0.5 * (opening.upper[end] + opening.lower[end]))
+
+
+# Pairs of places, in memory and on disk.
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """L places of a surface: corners (L, 3) of triangles and their weights (L, 3), of a vertex 1, 0 and 0."""
+
+    corners: Indices
+    weights: Array
+
+    @classmethod
+    def of_vertices(cls, indices: npt.NDArray[np.integer]) -> Places:
+        """The places of vertices (L,)."""
+        corners = np.repeat(np.asarray(indices, np.int64).reshape(-1, 1), 3, axis=1)
+        return cls(corners, np.tile([1.0, 0.0, 0.0], (len(corners), 1)))
+
+    def points(self, vertices: Array) -> Array:
+        """Where they are (L, 3) on a mesh (V, 3)."""
+        return np.asarray(np.einsum("lk,lkd->ld", self.weights, vertices[self.corners]))
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """L pairs of places that are the same on a source and on a target."""
+
+    names: tuple[str, ...]  # of each pair; empty where it has none
+    source: Places
+    target: Places
+
+    @classmethod
+    def of_vertices(cls, pairs: npt.NDArray[np.integer], names: Sequence[str] = ()) -> Landmarks:
+        """Pairs (L, 2) of a source and a target vertex."""
+        both = np.asarray(pairs, np.int64).reshape(-1, 2)
+        return cls(tuple(names) or ("",) * len(both), Places.of_vertices(both[:, 0]), Places.of_vertices(both[:, 1]))
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.names)
+
+    @property
+    def nearest_vertices(self) -> Indices:
+        """(L, 2) the vertices of both meshes that weigh most in each place."""
+        both = [places.corners[np.arange(len(self)), places.weights.argmax(axis=1)] for places in self._sides]
+        return np.stack(both, axis=1)
+
+    @property
+    def _sides(self) -> tuple[Places, Places]:
+        return self.source, self.target
+
+    def check(self, source_vertices: int, target_vertices: int) -> None:
+        """Refuse vertices that do not exist.
+
+        Raises:
+            FaceDiffError: naming the mesh and the vertex.
+        """
+        for name, places, count in zip(
+            ("source", "target"), self._sides, (source_vertices, target_vertices), strict=True
+        ):
+            if len(self) and not 0 <= places.corners.min() <= places.corners.max() < count:
+                raise FaceDiffError(
+                    f"landmarks: name {name} vertex {int(places.corners.max())} of {count}; count vertices from 0"
+                )
+
+
+def common_landmarks(source: npt.NDArray[np.floating], target: npt.NDArray[np.floating]) -> Landmarks | None:
+    """The named pairs of two meshes (V, 3) of known topologies; None if one of them is another one."""
+    both = [known_topology(points) for points in (source, target)]
+    if both[0] is None or both[1] is None:
+        return None
+    names = [name for name in both[0].vertices if name in both[1].vertices]
+    pairs = np.array([[known.vertices[name] for known in both if known is not None] for name in names])
+    return Landmarks.of_vertices(pairs, names)
+
+
+FORMAT = "facediff landmarks 1"
+MOST, LONGEST_NAME = 1000, 60
+DIGITS = 18  # of a whole number that fits into 64 bits
+EXAMPLE = "`source vertex,target vertex`, counted from 0, or a name of both such as `nose_tip,4034`"
+
+
+def read_landmarks(path: Path, source: Known | None = None, target: Known | None = None) -> Landmarks:
+    """Pairs of places from a file: a CSV of two columns, or JSON as :func:`write_landmarks` writes it.
+
+    Args:
+        path: CSV with or without a header, or .json. A name stands for the place of that name, as far as it is known
+            on the mesh; the other side may be a vertex or the same name.
+        source: named places of the source; None for none.
+        target: of the target.
+
+    Raises:
+        FaceDiffError: if the file is missing or damaged, or a name is not known on the mesh.
+    """
+    if path.suffix.lower() == ".json":
+        content = load_json(
+            path, remedy=f"expected landmarks, as `facediff retarget --pick` saves them, or CSV lines {EXAMPLE}"
+        )
+        return parse_landmarks(content, path, source, target)
+    names, found = [], []
+    for number, line in enumerate(read_table(path, remedy="expected a CSV of vertex pairs"), 1):
+        words = [word.strip() for word in line if word.strip()]
+        named = any(word in NAMES for word in words)
+        if not words or (number == 1 and not named and not any(word.isdecimal() for word in words)):
+            continue
+        if len(words) == 1 and named:
+            words = words * 2
+        if len(words) != 2 or not all(word in NAMES or _whole(word) for word in words):
+            raise FaceDiffError(f"{path}: line {number} is {','.join(line)}; expected {EXAMPLE}")
+        row = [
+            int(word) if _whole(word) else _vertex_of(word, known, side, path)
+            for word, known, side in zip(words, (source, target), ("source", "target"), strict=True)
+        ]
+        found.append(row)
+        names.append(next((word for word in words if word in NAMES), ""))
+    if not found:
+        raise FaceDiffError(f"{path}: holds no pairs; expected lines {EXAMPLE}")
+    return Landmarks.of_vertices(np.array(found, np.int64), names)
+
+
+def _whole(word: str) -> bool:
+    return word.isascii() and word.isdecimal() and len(word) <= DIGITS
+
+
+def _vertex_of(name: str, known: Known | None, side: str, where: object) -> int:
+    if known is None or name not in known.vertices:
+        have = list(known.vertices) if known is not None else []
+        remedy = f"{choices(name, have)}, or a vertex" if have else "give its vertex"
+        raise FaceDiffError(f"{where}: {name} is not known on the {side} mesh; {remedy}")
+    return known.vertices[name]
+
+
+def parse_landmarks(
+    content: Any,  # noqa: ANN401 - of a JSON file
+    where: object,
+    source: Known | None = None,
+    target: Known | None = None,
+    counts: tuple[int, int] | None = None,
+) -> Landmarks:
+    """Pairs of places from what a JSON file or a page holds.
+
+    Args:
+        content: plain data.
+        where: what messages call it.
+        source: named places of the source; None for none.
+        target: of the target.
+        counts: vertices of both meshes, where the places are checked against them.
+
+    Raises:
+        FaceDiffError: naming what is wrong.
+    """
+    if not isinstance(content, dict) or not isinstance(content.get("format"), str):
+        raise FaceDiffError(f"{where}: is no file of landmarks; expected one that `facediff retarget --pick` saved")
+    check_format(where, content["format"], FORMAT)
+    rows = content.get("landmarks")
+    if not isinstance(rows, list) or not 0 < len(rows) <= MOST:
+        raise FaceDiffError(f"{where}: its landmarks are no list of 1 to {MOST} places; pick them again")
+    names, sides = [], ([], [])  # type: tuple[list[str], tuple[list[Any], list[Any]]]
+    for number, row in enumerate(rows, 1):
+        name = row.get("name") if isinstance(row, dict) else None
+        if not isinstance(row, dict) or not isinstance(name, str) or len(name) > LONGEST_NAME:
+            raise FaceDiffError(
+                f"{where}: landmark {number} has no name; expected a text of up to {LONGEST_NAME} letters"
+            )
+        names.append(name)
+        for key, known, made in zip(("source", "target"), (source, target), sides, strict=True):
+            made.append(_place(row.get(key), f"{where}: landmark {number}, {key}", name, known, key))
+    places = [
+        Places(np.array([corners for corners, _ in made], np.int64), np.array([weights for _, weights in made]))
+        for made in sides
+    ]
+    found = Landmarks(tuple(names), places[0], places[1])
+    for key, places_of, position in (("source", places[0], 0), ("target", places[1], 1)):
+        count = content.get(f"{key}_vertices")
+        expected = None if counts is None else counts[position]
+        if count is not None and expected is not None and count != expected:
+            raise FaceDiffError(
+                f"{where}: was picked on a {key} mesh of {count} vertices, not {expected}; give that mesh"
+            )
+        if places_of.corners.min() < 0 or (expected is not None and places_of.corners.max() >= expected):
+            raise FaceDiffError(f"{where}: names {key} vertices that do not exist; pick the landmarks again")
+    return found
+
+
+def _place(value: object, where: str, name: str, known: Known | None, side: str) -> tuple[list[int], list[float]]:
+    """Corners and weights of one place."""
+    if value is None and name in NAMES:
+        value = _vertex_of(name, known, side, where)
+    if _is_index(value):
+        return [int(value)] * 3, [1.0, 0.0, 0.0]  # type: ignore[call-overload]
+    if isinstance(value, dict):
+        corners, weights = value.get("corners"), value.get("weights")
+        if (
+            isinstance(corners, list)
+            and isinstance(weights, list)
+            and len(corners) == len(weights) == 3
+            and all(_is_index(corner) for corner in corners)
+            and all(isinstance(weight, int | float) and not isinstance(weight, bool) for weight in weights)
+            and all(-1e-6 <= weight <= 1 + 1e-6 for weight in weights)
+            and abs(sum(weights) - 1) < 1e-3
+        ):
+            total = sum(max(weight, 0.0) for weight in weights)
+            return [int(corner) for corner in corners], [max(weight, 0.0) / total for weight in weights]
+    raise FaceDiffError(f"{where}: is no place; expected a vertex, or three corners with weights whose sum is 1")
+
+
+def _is_index(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
+
+
+def write_landmarks(path: Path, landmarks: Landmarks, source_vertices: int, target_vertices: int) -> None:
+    """Write pairs of places as JSON, whole or not at all.
+
+    Args:
+        path: the .json file.
+        landmarks: the pairs.
+        source_vertices: of the source mesh.
+        target_vertices: of the target mesh.
+    """
+    rows = []
+    for number, name in enumerate(landmarks.names):
+        row: dict[str, Any] = {"name": name}
+        for key, places in (("source", landmarks.source), ("target", landmarks.target)):
+            corners, weights = places.corners[number].tolist(), places.weights[number].tolist()
+            row[key] = corners[0] if weights[0] == 1.0 else {"corners": corners, "weights": weights}
+        rows.append(row)
+    write_json(
+        path,
+        {
+            "format": FORMAT,
+            "source_vertices": source_vertices,
+            "target_vertices": target_vertices,
+            "landmarks": rows,
+        },
+    )

@@ -1,0 +1,251 @@
+"""Named places of faces, pairs of places on disk, and what they do for a correspondence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from trimesh.creation import icosphere
+
+from facediff.editing import retargeting
+from facediff.editing.correspondence import correspond
+from facediff.editing.landmarks import (
+    FLAME,
+    FLAME_VERTICES,
+    NAMES,
+    Landmarks,
+    Places,
+    common_landmarks,
+    known_landmarks,
+    known_topology,
+    landmarks_by_shape,
+    puppet_landmarks,
+    read_landmarks,
+    write_landmarks,
+)
+from facediff.editing.surface import Surface, nearest
+from facediff.editing.symmetry import Plane, symmetry_plane
+from facediff.errors import FaceDiffError
+from facediff.synthetic.face import build_face
+from facediff.synthetic.rig import Shape, build_rig, lip_pairs
+from tests.fakes.heads import LONG, ROUND, STRONG, YOUNG, talking, turned
+
+FACE = build_face()
+
+
+def test_names_are_pairs_of_mirror_images_or_lie_in_the_middle() -> None:
+    found = puppet_landmarks()
+    assert list(found) == list(NAMES)
+    assert len(set(found.values())) == len(NAMES)
+    for name, vertex in found.items():
+        if name.endswith("_left"):
+            assert FACE.mirror[vertex] == found[name.removesuffix("_left") + "_right"]
+            assert FACE.vertices[vertex, 0] > 0
+        elif not name.endswith("_right"):
+            assert FACE.mirror[vertex] == vertex
+
+
+def test_names_of_the_built_in_face_are_where_they_say() -> None:
+    found, points = puppet_landmarks(), FACE.vertices
+    skin = FACE.both("skin")
+    assert found["nose_tip"] == skin[points[skin, 2].argmax()]
+    below = skin[points[skin, 1] < points[found["lower_lip_bottom"], 1] - 0.01]
+    assert points[found["chin"], 2] == points[below, 2].max()
+    for name, edge in (("eye_outer_left", max), ("eye_inner_left", min)):
+        opening = FACE.groups["eye_0"]
+        assert points[found[name], 0] == edge(points[opening, 0])
+    middle = points[[found[name] for name in NAMES if not name.endswith(("_left", "_right"))]]
+    heights = dict(zip((name for name in NAMES if not name.endswith(("_left", "_right"))), middle[:, 1], strict=True))
+    down = ["nose_bridge", "nose_tip", "nose_base", "upper_lip_top", "upper_lip_middle"]
+    down += ["lower_lip_middle", "lower_lip_bottom", "chin"]
+    assert sorted(heights, key=lambda name: -heights[name]) == down
+
+
+def test_the_lips_middles_are_next_to_the_middle_pair_of_the_lips() -> None:
+    upper, lower = lip_pairs(FACE)
+    edges = {
+        tuple(sorted(pair)) for face in FACE.faces.tolist() for pair in zip(face, face[1:] + face[:1], strict=True)
+    }
+    for name, lip in (("upper_lip_middle", upper), ("lower_lip_middle", lower)):
+        middle = lip[FACE.vertices[lip, 0] == 0.0][0]
+        assert tuple(sorted((puppet_landmarks()[name], int(middle)))) in edges
+
+
+def test_flame_has_every_name_once() -> None:
+    assert list(FLAME) == list(NAMES)
+    assert len(set(FLAME.values())) == len(NAMES)
+    assert max(FLAME.values()) < FLAME_VERTICES
+
+
+@pytest.mark.parametrize("shape", [Shape(), ROUND, LONG, STRONG, YOUNG])
+def test_a_topology_is_known_in_every_unit_and_pose_and_not_in_another_order(shape: Shape) -> None:
+    points = build_rig(shape).neutral
+    found = known_topology(1000 * points @ turned(90, 30, 200).T + 7)
+    assert found is not None
+    assert (found.topology, found.missing) == ("puppet", [])
+    assert known_topology(np.random.default_rng(0).permutation(points)) is None
+    assert known_topology(points[:-1]) is None
+
+
+def flame_like() -> np.ndarray:
+    """A mesh with FLAME's number of vertices, in which FLAME's landmarks are where the puppet's are."""
+    points = np.random.default_rng(1).normal(0, 0.05, (FLAME_VERTICES, 3))
+    for name, vertex in puppet_landmarks().items():
+        points[FLAME[name]] = FACE.vertices[vertex]
+    return points
+
+
+def test_meshes_of_two_topologies_have_common_landmarks() -> None:
+    found = common_landmarks(FACE.vertices, flame_like())
+    assert found is not None
+    assert found.names == tuple(NAMES)
+    assert found.nearest_vertices.tolist() == [[puppet_landmarks()[name], FLAME[name]] for name in NAMES]
+    assert common_landmarks(FACE.vertices, np.random.default_rng(2).normal(size=(FLAME_VERTICES, 3))) is None
+
+
+def test_shape_alone_shows_the_mouth_the_eyes_and_the_nose() -> None:
+    found = landmarks_by_shape(FACE.vertices, FACE.faces)
+    truth = puppet_landmarks()
+    assert set(found) == {name for name in NAMES if name.startswith(("eye", "mouth")) or name in SEEN}
+    away = {name: np.linalg.norm(FACE.vertices[vertex] - FACE.vertices[truth[name]]) for name, vertex in found.items()}
+    assert max(away.values()) < 0.006  # metres
+    assert away["nose_tip"] == 0.0
+    order = np.random.default_rng(0).permutation(len(FACE.vertices))
+    known = known_landmarks(FACE.vertices[order], np.argsort(order)[FACE.faces])
+    assert known.topology is None
+    assert {name: int(order[vertex]) for name, vertex in known.vertices.items()} == found
+    ball = icosphere(2)
+    assert landmarks_by_shape(np.array(ball.vertices), np.array(ball.faces)) == {}
+
+
+SEEN = ("nose_tip", "upper_lip_middle", "lower_lip_middle")
+
+
+# On disk.
+
+
+def some() -> Landmarks:
+    inside = Places(np.array([[4, 4, 4], [1, 2, 3]]), np.array([[1.0, 0.0, 0.0], [0.25, 0.5, 0.25]]))
+    return Landmarks(("nose_tip", "mole"), Places.of_vertices(np.array([124, 7])), inside)
+
+
+def test_landmarks_come_back_as_they_were(tmp_path: Path) -> None:
+    path = tmp_path / "marks.json"
+    write_landmarks(path, some(), 1008, 42)
+    found = read_landmarks(path)
+    assert found.names == ("nose_tip", "mole")
+    assert found.nearest_vertices.tolist() == [[124, 4], [7, 2]]
+    for one, other in ((found.source, some().source), (found.target, some().target)):
+        assert np.array_equal(one.weights, other.weights)
+        assert np.array_equal(one.corners, other.corners)
+    write_landmarks(tmp_path / "again.json", found, 1008, 42)
+    assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
+
+
+def test_names_stand_for_vertices_where_the_topology_is_known(tmp_path: Path) -> None:
+    known = known_topology(FACE.vertices)
+    path = tmp_path / "a.csv"
+    path.write_text("animation,mine\nnose_tip,4034\n7,chin\neye_outer_left\n")
+    found = read_landmarks(path, known, known)
+    assert found.nearest_vertices.tolist() == [[124, 4034], [7, 159], [53, 53]]
+    assert found.names == ("nose_tip", "chin", "eye_outer_left")
+    path.write_text("nose_tip,4034\n")  # a name is no header
+    assert len(read_landmarks(path, known)) == 1
+    with pytest.raises(FaceDiffError, match="nose_tip is not known on the source"):
+        read_landmarks(path)
+    bare = {"format": "facediff landmarks 1", "landmarks": [{"name": "nose_tip", "target": 4034}]}
+    (tmp_path / "a.json").write_text(json.dumps(bare))
+    assert read_landmarks(tmp_path / "a.json", known).nearest_vertices.tolist() == [[124, 4034]]
+
+
+WRONG = {
+    "no object": [1],
+    "no format": {"landmarks": []},
+    "a later format": {"format": "facediff landmarks 2", "landmarks": []},
+    "no landmarks": {"format": "facediff landmarks 1"},
+    "none of them": {"format": "facediff landmarks 1", "landmarks": []},
+    "no name": {"format": "facediff landmarks 1", "landmarks": [{"source": 1, "target": 2}]},
+    **{
+        words: {"format": "facediff landmarks 1", "landmarks": [{"name": "a", "source": 1, "target": place}]}
+        for words, place in {
+            "a negative vertex": -1,
+            "half a vertex": 0.5,
+            "yes": True,
+            "no place": None,
+            "two corners": {"corners": [1, 2], "weights": [0.5, 0.5]},
+            "weights beyond the triangle": {"corners": [1, 2, 3], "weights": [2.0, -0.5, -0.5]},
+            "weights of another sum": {"corners": [1, 2, 3], "weights": [0.1, 0.1, 0.1]},
+        }.items()
+    },
+}
+
+
+@pytest.mark.parametrize("content", WRONG.values(), ids=WRONG.keys())
+def test_damaged_landmarks_are_refused(content: object, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(FaceDiffError, match=r"a\.json"):
+        read_landmarks(tmp_path / "a.json")
+
+
+# What they do.
+
+
+def test_a_landmark_within_a_triangle_is_held_as_a_vertex_is() -> None:
+    """On a ball, whose shape says nothing of where its places are, the landmarks alone do."""
+    ball, other = icosphere(2), icosphere(3)
+    points, faces = np.array(ball.vertices), np.array(ball.faces)
+    targets, corners = np.array(other.vertices), np.array(other.faces)
+    random = np.random.default_rng(0)
+    some_faces = random.choice(len(corners), 12, replace=False)
+    weights = random.dirichlet([2, 2, 2], 12)
+    target = Places(corners[some_faces], weights)
+    turn = turned(25, -10, 40)
+    # The same places, turned, as points of triangles of the source.
+    wanted = target.points(targets) @ turn.T
+    there = nearest(Surface(points, faces), wanted, np.zeros_like(wanted), 0.0)
+    marks = Landmarks(("",) * 12, Places(there.corners, there.weights), target)
+    found = correspond(points, faces, 3 * targets, corners, landmarks=marks)
+    places = np.einsum("vk,vkd->vd", found.weights, points[found.corners])  # of the target's vertices on the source
+    away = np.linalg.norm(target.points(places) - marks.source.points(points), axis=1)
+    assert away.max() < 0.02  # of a radius of 1; the alignment alone is off by 0.1
+    with pytest.raises(FaceDiffError, match="target vertex 5000"):
+        correspond(points, faces, targets, corners, landmarks=np.array([[0, 5000]]))
+
+
+def test_the_plane_of_symmetry_is_that_of_the_pose() -> None:
+    turn = turned(10, -15, 8)
+    points = 100 * build_rig(STRONG).neutral @ turn.T + [3, 4, 5]
+    found = symmetry_plane(points, Plane(np.array([1.0, 0.0, 0.0]), float(np.median(points[:, 0]))))
+    assert np.allclose(found.normal, turn[:, 0], atol=1e-6)
+    assert np.allclose(found.mirror(points), points[FACE.mirror], atol=1e-4)
+
+
+def test_named_landmarks_of_both_topologies_are_tried_where_the_result_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[Landmarks | None] = []
+
+    def refused(*_: object, landmarks: Landmarks | None) -> None:
+        given.append(landmarks)
+        raise FaceDiffError(f"attempt {len(given)}")
+
+    monkeypatch.setattr(retargeting, "correspond", refused)
+    animation = talking()
+    target = tmp_path / "other.ply"
+    mesh = trimesh.Trimesh(build_rig(LONG).neutral, FACE.faces[::-1], process=False)
+    mesh.export(target)
+    with pytest.raises(FaceDiffError, match="attempt 2"):
+        retargeting.retarget(animation, target, judge=lambda *_: None)
+    first, second = given
+    assert first is None
+    assert second is not None
+    assert second.nearest_vertices.tolist() == [[vertex, vertex] for vertex in puppet_landmarks().values()]
+    given.clear()
+    (tmp_path / "own.csv").write_text("nose_tip,5\n")
+    with pytest.raises(FaceDiffError, match="attempt 1"):  # a person's own landmarks are the last word
+        retargeting.retarget(animation, target, None, tmp_path / "own.csv", judge=lambda *_: None)
+    assert given[0] is not None
+    assert given[0].nearest_vertices.tolist() == [[124, 5]]
