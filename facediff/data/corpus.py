@@ -6,6 +6,7 @@ a mesh file with the faces, and optionally ``clips.csv`` with further columns pe
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,28 +18,24 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from facediff.data.audio import read_stretch, samples_for
+from facediff.data.audio import samples_for
 from facediff.data.manifest import LONGEST
 from facediff.data.manifest import read_manifest as read_manifest
+from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
+from facediff.data.storage import ClipFolder, ClipMotion, ClipStorage
 from facediff.errors import FaceDiffError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
-from facediff.utils.arrays import ArrayStore, in_range, open_vertices
-from facediff.utils.files import cache_dir
+from facediff.utils.arrays import ArrayStore
+from facediff.utils.files import cache_dir, sha256
 from facediff.utils.limits import COORDINATE, LIMITS, quoted
 from facediff.utils.pickles import load_pickle
 from facediff.utils.plain_files import read_table
 
-MOTION_FOLDERS = ("vertices_npy", "vertex")
-"""Where projects keep absolute vertices; the second is ProbTalk3D's."""
-
 LIP_PAIRS, EYELID_PAIRS = "regions/inner_lip_pairs.txt", "regions/eyelid_pairs.txt"
 """Where a corpus lists pairs of an upper and a lower vertex of the inner lips, and of the eyelids."""
-
-CHUNK = 8
-"""Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
 
 WIDEST = 1000
 """Most columns of ``clips.csv``."""
@@ -98,16 +95,17 @@ def parse_name(name: str) -> Clip:
 
 
 class Corpus:
-    """Read access to a corpus folder. Motion is memory-mapped; only the templates are kept in memory.
+    """Read access to a corpus: a folder, or a packed corpus. Only the templates are kept in memory.
 
     Args:
-        root: the folder.
+        root: the folder; of a packed corpus the one that holds its small files.
         n_vertices: vertices of its meshes.
         frame_rate: frames per second of the motion that is returned.
         stored_frame_rate: frames per second of the motion on disk, a whole multiple of ``frame_rate``, of which every
             second (third …) frame is read; ``manifest.json`` overrides it.
         parse: finds identity and sentence in a clip's name.
         people: folders of further speakers with the same topology, as ``facediff data import-person`` writes them.
+        storage: where motion and speech of the clips lie; the folder itself if None.
     """
 
     def __init__(
@@ -119,6 +117,7 @@ class Corpus:
         stored_frame_rate: float | None = None,
         parse: NameParser = parse_name,
         people: Sequence[Path] = (),
+        storage: ClipStorage | None = None,
     ) -> None:
         self.root = root
         self.n_vertices = n_vertices
@@ -131,8 +130,11 @@ class Corpus:
                 raise FaceDiffError(
                     f"{folder}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl"
                 )
+        self._storages: dict[Path, ClipStorage] = {folder: ClipFolder(folder, n_vertices) for folder in people}
+        self._storages[root] = storage or ClipFolder(root, n_vertices)
         stored = stored_frame_rate or frame_rate
         self._strides = {folder: self._stride(folder, stored) for folder in (root, *people)}
+        self._frames: dict[str, int] = {}
 
     def _stride(self, root: Path, default: float) -> int:
         if (root / "prepare.json").is_file() and not (root / "manifest.json").is_file():
@@ -164,14 +166,11 @@ class Corpus:
             clips |= more
         return clips
 
-    @staticmethod
-    def _clips_of(root: Path, parse: NameParser) -> dict[str, Clip]:
+    def _clips_of(self, root: Path, parse: NameParser) -> dict[str, Clip]:
         rows = read_clip_table(root)
         clips = {}
-        for name in sorted(path.stem for path in (root / "wav").glob("*.wav")):
-            if not name.isprintable():
-                raise FaceDiffError(f"{root / 'wav'}: has a file {quoted(name)}; rename it, its name cannot be printed")
-            clip = parse(name) if motion_path(root, name).is_file() else None
+        for name in self._storages[root].names():
+            clip = parse(name)
             if clip is not None:
                 attributes = {**rows.get(name, {}), **clip.attributes}
                 clips[name] = Clip(name, clip.identity, clip.sentence, attributes, root)
@@ -202,40 +201,54 @@ class Corpus:
             )
         return self.templates[clip.identity]
 
-    def open_vertices(self, clip: Clip) -> npt.NDArray[np.floating]:
-        """A clip's absolute vertices (T, V, 3) at the corpus's frame rate, memory-mapped."""
-        return open_vertices(motion_path(clip.root, clip.name), self.n_vertices)[:: self._strides[clip.root]]
-
     def frames(self, clip: Clip) -> int:
-        """Number of motion frames of a clip."""
-        return len(self.open_vertices(clip))
+        """Number of motion frames of a clip at the corpus's frame rate; looked up once."""
+        if clip.name not in self._frames:
+            self._open(clip)
+        return self._frames[clip.name]
+
+    def _open(self, clip: Clip) -> ClipMotion:
+        opened = self._storages[clip.root].open(clip.name)
+        self._frames[clip.name] = -(-opened.frames // self._strides[clip.root])
+        return opened
 
     def read_motion(self, clip: Clip, start: int = 0, stop: int | None = None) -> Tensor:
         """Offsets from the template (T, V, 3), float32; only frames ``start`` to ``stop`` are read."""
-        template = self.template(clip).numpy()
-        stored = self.open_vertices(clip)[start:stop]
-        motion = np.empty(stored.shape, np.float32)
-        # Conversion, check and subtraction go over each chunk while it is in the processor's cache: done one after the
-        # other over the whole clip, each would wait for main memory.
-        for first in range(0, len(stored), CHUNK):
-            chunk = motion[first : first + CHUNK]
-            with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
-                np.copyto(chunk, stored[first : first + CHUNK], casting="same_kind")
-            if not in_range(chunk):
-                bad = int(np.argmax(~(np.abs(chunk) <= COORDINATE).all((1, 2))))
-                raise FaceDiffError(
-                    f"{motion_path(clip.root, clip.name)}: frame {(start + first + bad) * self._strides[clip.root]} "
-                    f"holds NaN, infinity or a coordinate beyond {COORDINATE:g} (counted from 0); remove the clip"
-                )
-            chunk -= template
-        return torch.from_numpy(motion)
+        opened, stride = self._open(clip), self._strides[clip.root]
+        numbers = range(self._frames[clip.name])[start:stop]
+        picks = range(numbers.start * stride, numbers.stop * stride, stride)
+        return torch.from_numpy(opened.offsets(picks, self.template(clip).numpy()))
+
+    def read_spread(self, clip: Clip, count: int) -> Tensor:
+        """Offsets from the template (at most ``count``, V, 3), float32, of evenly spread frames.
+
+        The clip is opened once.
+        """
+        opened, stride = self._open(clip), self._strides[clip.root]
+        frames = self._frames[clip.name]
+        picks = [number * stride for number in torch.linspace(0, frames - 1, min(frames, count)).long().tolist()]
+        return torch.from_numpy(opened.offsets(picks, self.template(clip).numpy()))
 
     def read_audio(self, clip: Clip, start: int, stop: int) -> Tensor:
         """Speech that spans motion frames ``start`` to ``stop``, 16 kHz, filled with zeros past its end."""
         first = samples_for(start, self.frame_rate)
         length = samples_for(stop - start, self.frame_rate)
-        path = clip.root / "wav" / f"{clip.name}.wav"
-        return torch.from_numpy(read_stretch(path, first, length, self.store))
+        return torch.from_numpy(self._storages[clip.root].speech(clip.name, first, length, self.store))
+
+    def fingerprint(self, clips: Sequence[Clip]) -> str:
+        """Changes when the motion of these clips, or a template, changes; nothing is opened but what is small.
+
+        It is made of each folder's ``manifest.json``, which holds the checksums of a prepared corpus, and, since not
+        every folder has one, of the sizes and times of its files.
+        """
+        told: list[object] = [clip.name for clip in clips]
+        for root in sorted({clip.root for clip in clips}):
+            own = self._storages[root]
+            manifest = root / "manifest.json"
+            told += [sha256(manifest) if manifest.is_file() else "", self._strides[root]]
+            told += [sha256(root / "templates.pkl")]
+            told += [own.version(clip.name) for clip in clips if clip.root == root]
+        return hashlib.sha256("\0".join(map(str, told)).encode()).hexdigest()
 
     def read_mesh(self, files: Sequence[str]) -> Mesh | None:
         """The first mesh file that exists, in the folder itself or in ``templates/``; None if there is none."""
@@ -263,13 +276,7 @@ class Corpus:
         return pairs
 
 
-# The readers, one for each kind of file; motion is read by facediff.utils.arrays.open_vertices.
-
-
-def motion_path(root: Path, name: str) -> Path:
-    """Where a clip's vertices lie; the usual place if they are nowhere."""
-    paths = [root / folder / f"{name}.npy" for folder in MOTION_FOLDERS]
-    return next((path for path in paths if path.is_file()), paths[0])
+# The readers, one for each kind of file; motion and speech are read by facediff.data.storage.
 
 
 def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tensor]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -33,18 +32,13 @@ from facediff.data.dataset import (
     ReferencePolicy,
     ResumableLoader,
 )
+from facediff.data.measuring import measure_components, measure_scale
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.registry import defaults, keeps_arguments, plain
 from facediff.utils.licences import Commercial, Licence, merged, read_licences
 from facediff.utils.plain_options import read_options
 from facediff.utils.ranges import Range
 from facediff.utils.torch_files import load_tensors, open_checkpoint
-
-FRAMES = 16
-"""Frames of each training clip, evenly spread, from which size and principal components of motion are measured."""
-
-PRINCIPAL_NUMBERS = 30_000_000
-"""Coordinates from which principal components are computed, about; bounds the memory (8 bytes each, twice)."""
 
 Count = Annotated[int, Range(1, 10**9)]
 """Clips or frames."""
@@ -456,7 +450,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             raise FaceDiffError(f"data.eyelid_pairs: {self.root / file}: no such file; expected pairs of vertices")
         return found
 
-    # What is measured on the training motion before training.
+    # What is measured on the training motion before training: see facediff.data.measuring.
 
     def motion_scale(self) -> float:
         """Factor that gives the training motion unit variance: one over the root mean square of its coordinates.
@@ -466,13 +460,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         Raises:
             FaceDiffError: if the training clips hold no motion at all.
         """
-        total, count = 0.0, 0
-        for motion in self._spread_frames(self.clips("train"), FRAMES):
-            total += float(motion.double().square().sum())
-            count += motion.numel()
-        if not total:
-            raise FaceDiffError(f"{self.root}: the training split holds no motion at all; check vertices_npy/")
-        return float((count / total) ** 0.5)
+        return measure_scale(self)
 
     def principal_motion(self, count: int, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Mean and principal components of the training motion, in the corpus's unit.
@@ -485,30 +473,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             the mean (3V,), and components (at most ``count``, 3V), each as long as its standard deviation, the largest
             first.
         """
-        clips = self.clips("train")
-        most = max(2, PRINCIPAL_NUMBERS // (3 * self.n_vertices * max(1, len(clips))))
-        frames = torch.cat([motion.flatten(1) for motion in self._spread_frames(clips, min(most, FRAMES))]).double()
-        mean = frames.mean(0)
-        frames -= mean
-        if weights is not None:
-            frames *= weights
-        # The eigenvectors of the frames' products with one another give the same components as those of the
-        # covariance, which for a large mesh would not fit into memory. The smaller of the two is decomposed.
-        few = len(frames) <= frames.shape[1]
-        values, vectors = torch.linalg.eigh(frames @ frames.T if few else frames.T @ frames)
-        kept = [i for i in reversed(range(len(values))) if values[i] > 1e-10 * values[-1]][:count]
-        if few:
-            shapes = vectors[:, kept].T @ frames / len(frames) ** 0.5
-        else:
-            shapes = vectors[:, kept].T * (values[kept, None] / len(frames)).sqrt()
-        return mean.float(), shapes.float()
-
-    def _spread_frames(self, clips: list[Clip], count: int) -> Iterator[Tensor]:
-        """At most ``count`` evenly spread frames of every clip, one at a time (1, V, 3)."""
-        for clip in clips:
-            frames = self.corpus.frames(clip)
-            for index in torch.linspace(0, frames - 1, min(frames, count)).long().tolist():
-                yield self.corpus.read_motion(clip, index, index + 1)
+        return measure_components(self, count, weights)
 
     # The loaders.
 

@@ -1,0 +1,166 @@
+"""Where the motion and the speech of clips lie: in a folder of files here, in a packed corpus elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.audio import read_stretch
+from facediff.errors import FaceDiffError
+from facediff.utils.arrays import ArrayStore, in_range, open_vertices
+from facediff.utils.limits import COORDINATE, quoted
+
+MOTION_FOLDERS = ("vertices_npy", "vertex")
+"""Where projects keep absolute vertices; the second is ProbTalk3D's."""
+
+CHUNK = 8
+"""Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
+
+
+class ClipMotion(Protocol):
+    """The motion of one clip, opened."""
+
+    @property
+    def frames(self) -> int:
+        """Stored frames, before any is left out."""
+
+    def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Offsets from the template (len(picks), V, 3) of stored frames; numbers past the end are left out."""
+
+
+class ClipStorage(Protocol):
+    """Motion and speech of clips, by name."""
+
+    def names(self) -> list[str]:
+        """The clips that have both motion and speech, sorted."""
+
+    def open(self, name: str) -> ClipMotion:
+        """Open the motion of a clip."""
+
+    def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
+        """Samples of a clip's speech at 16 kHz (length,), filled with zeros past its end."""
+
+    def version(self, name: str) -> object:
+        """Changes when the clip's motion changes."""
+
+
+class ClipFolder:
+    """Clips as files of a folder, ``wav/<clip>.wav`` and ``vertices_npy/<clip>.npy``, which are memory-mapped.
+
+    Args:
+        root: the folder.
+        n_vertices: vertices of its meshes.
+    """
+
+    def __init__(self, root: Path, n_vertices: int) -> None:
+        self.root = root
+        self.n_vertices = n_vertices
+
+    def names(self) -> list[str]:
+        """The clips that have both files, sorted.
+
+        Raises:
+            FaceDiffError: if a name cannot be printed.
+        """
+        found = []
+        for name in sorted(path.stem for path in (self.root / "wav").glob("*.wav")):
+            if not name.isprintable():
+                raise FaceDiffError(
+                    f"{self.root / 'wav'}: has a file {quoted(name)}; rename it, its name cannot be printed"
+                )
+            if motion_path(self.root, name).is_file():
+                found.append(name)
+        return found
+
+    def open(self, name: str) -> MotionFile:
+        """Map a clip's file into memory.
+
+        Raises:
+            FaceDiffError: if it is unreadable, of another shape, or empty.
+        """
+        return MotionFile(motion_path(self.root, name), self.n_vertices)
+
+    def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
+        """Samples of the clip's .wav file; see :func:`~facediff.data.audio.read_stretch`."""
+        return read_stretch(self.root / "wav" / f"{name}.wav", first, length, store)
+
+    def version(self, name: str) -> object:
+        """Size and time of the clip's motion file."""
+        facts = motion_path(self.root, name).stat()
+        return facts.st_size, facts.st_mtime_ns
+
+
+class MotionFile:
+    """Absolute vertices of a clip in a ``.npy`` file.
+
+    Args:
+        path: the file.
+        n_vertices: vertices of its mesh.
+    """
+
+    def __init__(self, path: Path, n_vertices: int) -> None:
+        self.path = path
+        self.vertices = open_vertices(path, n_vertices)
+
+    @property
+    def frames(self) -> int:
+        """Frames in the file."""
+        return len(self.vertices)
+
+    def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Offsets from the template of some frames; only these are read.
+
+        Raises:
+            FaceDiffError: if a frame holds what no vertex can be.
+        """
+        picks = within(picks, self.frames)
+        if isinstance(picks, range):
+            stored = self.vertices[picks.start : picks.stop : picks.step]
+        else:
+            stored = self.vertices[np.array(picks, np.intp)]
+        motion = np.empty(stored.shape, np.float32)
+        # Conversion, check and subtraction go over each chunk while it is in the processor's cache: done one after the
+        # other over the whole clip, each would wait for main memory.
+        for first in range(0, len(stored), CHUNK):
+            chunk = motion[first : first + CHUNK]
+            with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+                np.copyto(chunk, stored[first : first + CHUNK], casting="same_kind")
+            refuse_out_of_range(chunk, picks[first : first + CHUNK], self.path)
+            chunk -= template
+        return motion
+
+
+def within(picks: Sequence[int], frames: int) -> Sequence[int]:
+    """The numbers that are below ``frames``; of a range (upwards) a range."""
+    if isinstance(picks, range):
+        return range(picks.start, min(picks.stop, frames), picks.step)
+    return [pick for pick in picks if pick < frames]
+
+
+def refuse_out_of_range(vertices: npt.NDArray[np.float32], numbers: Sequence[int], source: object) -> None:
+    """Refuse absolute vertices (T, V, 3) that are no numbers, or so large that squares of them are infinite.
+
+    Args:
+        vertices: the frames.
+        numbers: the frames' numbers in the clip, for the message.
+        source: the clip's file.
+
+    Raises:
+        FaceDiffError: naming the first such frame.
+    """
+    if not in_range(vertices):
+        bad = int(np.argmax(~(np.abs(vertices) <= COORDINATE).all((1, 2))))
+        raise FaceDiffError(
+            f"{source}: frame {numbers[bad]} holds NaN, infinity or a coordinate beyond {COORDINATE:g} (counted from "
+            f"0); remove the clip"
+        )
+
+
+def motion_path(root: Path, name: str) -> Path:
+    """Where a clip's vertices lie; the usual place if they are nowhere."""
+    paths = [root / folder / f"{name}.npy" for folder in MOTION_FOLDERS]
+    return next((path for path in paths if path.is_file()), paths[0])
