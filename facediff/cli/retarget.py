@@ -26,6 +26,7 @@ def retarget(
     output: Output,
     correspondence: Map = None,
     landmarks: File = None,
+    part: Annotated[list[str] | None, Option(metavar="NAME", many=True)] = None,
     show: Picture = None,
     accept_poor: bool = False,
     add_to_mesh: bool = False,
@@ -40,6 +41,8 @@ def retarget(
         correspondence: .npz to use if it exists, else to write for other animations
         landmarks: places that are the same: .csv with a pair of vertices a line, counted from 0, or a name for a
             vertex, such as `nose_tip,4034`; or the .json that was picked
+        part: names of the parts that show the face, by node, mesh, group or material; `*` stands for any letters
+            (default: it is searched for in all parts). Teeth and tongue follow the jaw, other parts stand still
         show: picture of both faces at the most open mouth
         accept_poor: write the animation although its lips, its folds or its coverage are found to be wrong
         add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
@@ -71,7 +74,7 @@ def retarget(
         if not accept_poor:
             refuse_poor(target_mesh, reports[-1])
 
-    made, found = transfer(own, target_mesh, correspondence, landmarks, judge=judge)
+    made, found = transfer(own, target_mesh, correspondence, landmarks, parts=part or (), judge=judge)
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
     if add_to_mesh:
         from facediff.export.glb_added import add_to_glb

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from facediff.editing.face_features import OPPOSITE, Features, find_features
 from facediff.editing.landmarks import Landmarks
+from facediff.editing.loose_pieces import loose_pieces
 from facediff.editing.placing import place, place_face
 from facediff.editing.surface import Nearest, Surface, nearest
 from facediff.errors import FaceDiffError
@@ -63,6 +64,7 @@ def correspond(
     target_faces: npt.NDArray[np.integer],
     *,
     landmarks: Landmarks | npt.NDArray[np.integer] | None = None,
+    shown: npt.NDArray[np.integer] | None = None,
 ) -> Correspondence:
     """Find the place on a source mesh of every vertex of a target mesh.
 
@@ -78,6 +80,8 @@ def correspond(
         target_faces: (Ft, 3).
         landmarks: pairs of places that are the same, or (L, 2) pairs of a source and a target vertex; three or more
             also begin the alignment, for meshes that show other parts of the head.
+        shown: numbers of the target's triangles that the face is searched for in; all if None. Teeth and a tongue among
+            the others follow the jaw, and the rest of them stands still.
 
     Raises:
         FaceDiffError: if a mesh is broken, or a landmark names a vertex that does not exist.
@@ -97,10 +101,11 @@ def correspond(
         return _vertex_by_vertex(source, target)
     if _volume(target) * _volume(source) < 0:  # triangles that run the other way round turn a mesh inside out
         target = Surface(target.vertices, np.ascontiguousarray(target.faces[:, ::-1]))
-    back, features, seen = placed(source, target, marks)
-    known = None if features is None or seen is None else (features, seen)
+    face = target if shown is None else Surface(target.vertices, target.faces[np.asarray(shown, np.int64)])
+    back, features, seen = placed(source, face, marks)
+    both = known = None if features is None or seen is None else (features, seen)
     laid = Surface(back.apply(target.vertices), target.faces)
-    if known is not None and _one_surface(source, laid):
+    if known is not None and _one_surface(source, Surface(laid.vertices, face.faces)):
         known = None  # what lies on the other mesh already need not be bent, and is exact to rounding
     places = partners(source, laid, known)
     bent = _bent(source, laid, places, marks, known)
@@ -116,7 +121,14 @@ def correspond(
         # Which side of an opening a vertex belongs to is known there: no neighbour on the other side is asked.
         sided = (known[1].codes > 0) & (left < FAR)
         trust[sided] = np.maximum(trust[sided], 1.0 - left[sided] / FAR)
-        _hold_pieces(source, laid, known, places, corners, weights, trust, share)
+    if both is not None:
+        loose = loose_pieces(source, laid, *both, places.alone)
+        corners[loose.jaw], weights[loose.jaw], share[loose.jaw] = loose.place.corners[0], loose.place.weights[0], 1.0
+        share[loose.still] = 0.0
+        trust[loose.jaw] = trust[loose.still] = 1.0
+    elif shown is not None:
+        others = np.setdiff1d(np.arange(len(target.vertices)), face.faces)
+        share[others], trust[others] = 0.0, 1.0
     return Correspondence(
         corners=corners,
         weights=weights,
@@ -302,14 +314,15 @@ def partners(source: Surface, laid: Surface, known: tuple[Features, Features] | 
         rest = Surface(source.vertices, source.faces[known[0].skin[source.faces[:, 0]]])
     # Every piece may also stay without a partner, which costs as much as a partner at the limit.
     cost = np.concatenate([cost, np.ones((len(goals),) * 2)], axis=1)
-    parts, left, alone = [], np.ones(len(laid.vertices), bool), []
+    parts, left = [], np.ones(len(laid.vertices), bool)
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
         some = np.flatnonzero(labels[1] == others[row])
         if column < len(kept):
             parts.append((some, Surface(source.vertices, source.faces[labels[0][source.faces[:, 0]] == kept[column]])))
             left[some] = False
-        elif known is None or not is_skin[1][row]:
-            alone.append(some)
+    alone = np.flatnonzero(left)
+    alone = alone[np.argsort(labels[1][alone], kind="stable")]
+    cuts = np.flatnonzero(np.diff(labels[1][alone])) + 1
     if known is not None:
         codes, sides = known[1].codes, known[0].codes[rest.faces]
         for code in np.unique(codes[left & (codes > 0)]):
@@ -319,7 +332,7 @@ def partners(source: Surface, laid: Surface, known: tuple[Features, Features] | 
             left[some] = False
     if left.any():
         parts.append((np.flatnonzero(left), rest))
-    return Partners(parts, source.size, alone)
+    return Partners(parts, source.size, np.split(alone, cuts))
 
 
 def pieces(surface: Surface) -> Indices:
@@ -448,51 +461,6 @@ def _rims(base: Array, laid: Surface, features: Features, seen: Features) -> tup
     rim = np.concatenate([np.zeros(0, np.int64), *names])
     rim, first = np.unique(rim, return_index=True)
     return rim, np.concatenate([np.zeros((0, 3)), *pulls])[first]
-
-
-ORAL = 0.9  # Pieces whose middle is so near to the mouth's, in its widths, are teeth or a tongue
-SMALL = 1.6  # and are no larger than this
-
-
-def _hold_pieces(
-    source: Surface,
-    laid: Surface,
-    known: tuple[Features, Features],
-    places: Partners,
-    corners: Indices,
-    weights: Array,
-    trust: Array,
-    share: Array,
-) -> None:
-    """Let pieces inside the head that the source lacks move as a whole: lower teeth with the jaw, others not at all.
-
-    What lies in front of the skin, such as brows, lashes and beards, follows the skin.
-    """
-    from scipy.spatial import cKDTree
-
-    features, seen = known
-    mouth, width = features.mouth.centre, features.mouth.width
-    skin = cKDTree(laid.vertices[seen.skin])
-    normals = laid.normals[seen.skin]
-    jaw = nearest(
-        Surface(source.vertices, source.faces[features.skin[source.faces[:, 0]]]),
-        mouth[None] - [[0.0, 0.45 * width, 0.0]],
-        np.array([[0.0, 0.0, 1.0]]),
-    )
-    for some in places.alone:
-        points = laid.vertices[some]
-        near = skin.query(points)[1]
-        behind = np.einsum("nd,nd->n", points - laid.vertices[seen.skin][near], normals[near])
-        oral = (
-            np.linalg.norm(points.mean(axis=0) - mouth) < ORAL * width and np.ptp(points, axis=0).max() < SMALL * width
-        )
-        if np.ptp(points, axis=0).max() > 2.0 * width or (not oral and np.mean(behind < 0) < 0.7):
-            continue
-        if oral and points[:, 1].mean() < mouth[1]:
-            corners[some], weights[some], share[some] = jaw.corners[0], jaw.weights[0], 1.0
-        else:
-            share[some] = 0.0
-        trust[some] = 1.0
 
 
 def edges_of(faces: Indices) -> Indices:

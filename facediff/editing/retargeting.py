@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity, read_mesh
+from facediff.mesh.parts import named_triangles
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.limits import check_format
@@ -40,6 +41,7 @@ def retarget(
     correspondence_path: Path | None = None,
     landmarks_path: Path | None = None,
     *,
+    parts: Sequence[str] = (),
     judge: Callable[[Animation, Correspondence], object] | None = None,
 ) -> tuple[Animation, Correspondence]:
     """An animation on the mesh in a file, and the correspondence between both meshes.
@@ -49,6 +51,8 @@ def retarget(
         mesh_path: the other face at rest.
         correspondence_path: used if it exists, else written; None for neither.
         landmarks_path: CSV or JSON of landmarks, for a correspondence that does not exist yet.
+        parts: names of the parts of the file that show the face, see :func:`facediff.mesh.parts.named_triangles`; it is
+            searched for in all of them if there are none.
         judge: called with the result before a new correspondence is written; raises where it should not be. Where it
             raises and both meshes are of known topologies, their named landmarks are tried.
 
@@ -63,6 +67,11 @@ def retarget(
             raise FaceDiffError(
                 f"--landmarks {landmarks_path}: {correspondence_path} exists and would be used without them; remove "
                 f"it, or omit the landmarks"
+            )
+        if parts:
+            raise FaceDiffError(
+                f"--part {parts[0]}: {correspondence_path} exists and would be used without it; remove that file, or "
+                f"omit the part"
             )
         found = load_correspondence(correspondence_path)
         refuse_other_mesh(str(mesh_path), mesh.vertices, mesh.faces, found.target_vertices, found.target_faces)
@@ -79,10 +88,11 @@ def retarget(
     if landmarks_path is not None:
         both = known_topology(animation.template), known_topology(mesh.vertices)
         landmarks = read_landmarks(landmarks_path, *both)
+    shown = named_triangles(mesh_path, parts) if parts else None
 
     def attempt(marks: Landmarks | None) -> tuple[Animation, Correspondence]:
         try:
-            found = correspond(animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks)
+            found = correspond(animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks, shown=shown)
         except FaceDiffError as error:
             raise FaceDiffError(f"{mesh_path}: {error}") from error
         made = carry(animation, found, mesh)

@@ -42,8 +42,20 @@ NO_PATHS = {
     ),
     *("host", "identities", "option"),
     *("identity", "kind", "labels", "languages", "license", "push"),
-    *("metric", "name", "output_unit", "pattern", "phonemes", "protocol", "region", "sampler", "scalar", "split"),
-    "splits",
+    *(
+        "metric",
+        "name",
+        "output_unit",
+        "part",
+        "pattern",
+        "phonemes",
+        "protocol",
+        "region",
+        "sampler",
+        "scalar",
+        "split",
+    ),
+    *("part", "splits"),
     *("subjects", "suffix", "topology", "truth_pattern", "unit"),
 }
 """Texts that are no paths; a new option of type text either joins them or declares that it is read or written."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,7 @@ class AvatarPart:
 SPEAKER = "M2"
 
 
+@lru_cache(maxsize=2)
 def avatar_parts(speaker: str = SPEAKER, *, rounds: int = 1) -> dict[str, AvatarPart]:
     """Body, head, eyes, teeth, tongue and hair of a figure 1.7 m tall whose head has ARKit's shapes."""
     mesh, shape = build_face(), SPEAKERS[speaker].shape

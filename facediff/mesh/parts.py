@@ -1,0 +1,97 @@
+"""The named parts of a mesh file: nodes, meshes and materials of a .glb; objects, groups and materials of an OBJ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError, choices
+from facediff.mesh.glb import open_glb
+from facediff.mesh.glb_scene import placed_parts
+
+NAMING = {b"o": 0, b"g": 1, b"usemtl": 2}
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Triangles that have names in common."""
+
+    names: tuple[str, ...]
+    triangles: npt.NDArray[np.int64]  # numbers of the triangles of the mesh that `read_mesh` reads
+
+
+def mesh_parts(path: Path) -> list[MeshPart]:
+    """The parts of a file that :func:`facediff.mesh.read_mesh` reads; none for formats that have no names.
+
+    Raises:
+        FaceDiffError: if the file cannot be read.
+    """
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".glb":
+            named = [(part.names, len(part.faces)) for part in placed_parts(open_glb(path))]
+        elif suffix == ".obj":
+            named = _obj_parts(path.read_bytes())
+        else:
+            named = []
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); expected a mesh") from error
+    except ValueError as error:
+        raise FaceDiffError(f"{path}: not a readable {suffix[1:].upper()} mesh ({error}); export it again") from error
+    parts, before = [], 0
+    for names, count in named:
+        parts.append(MeshPart(names, np.arange(before, before + count)))
+        before += count
+    return parts
+
+
+def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
+    r"""Which triangles of a file's mesh are in the parts that are named so; ``*`` stands for any letters.
+
+    Raises:
+        FaceDiffError: if the file cannot be read, has no names, or none of its parts is named so.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "two.obj"
+        >>> _ = path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\no Head\nf 1 2 3\no Hat\nf 1 3 4\n")
+        >>> named_triangles(path, ["Hat"])
+        array([1])
+    """
+    parts = mesh_parts(path)
+    known = list(dict.fromkeys(name for part in parts for name in part.names))
+    if not known:
+        raise FaceDiffError(f"{path}: its parts have no names; expected a .glb or .obj with named parts, or no --part")
+    chosen = []
+    for wanted in names:
+        for fold in (str, str.casefold):  # another case counts only where nothing is written so
+            found = [part for part in parts if any(fnmatchcase(fold(name), fold(wanted)) for name in part.names)]
+            if found:
+                break
+        else:
+            raise FaceDiffError(f'{path}: has no part "{wanted}"; {choices(wanted, known)}')
+        chosen += [part.triangles for part in found]
+    return np.unique(np.concatenate(chosen))
+
+
+def _obj_parts(data: bytes) -> list[tuple[tuple[str, ...], int]]:
+    """Names and number of triangles of each run of faces."""
+    made: list[tuple[tuple[str, ...], int]] = []
+    current = ["", "", ""]
+    for line in data.splitlines():
+        words = line.split()
+        if not words:
+            continue
+        if words[0] in NAMING:
+            current[NAMING[words[0]]] = b" ".join(words[1:]).decode("utf-8", "replace")
+        elif words[0] == b"f":
+            names = tuple(dict.fromkeys(name for name in current if name))
+            if not made or made[-1][0] != names:
+                made.append((names, 0))
+            made[-1] = (names, made[-1][1] + len(words) - 3)
+    return made

@@ -1,0 +1,145 @@
+"""Files of several parts: names, the parts that show the face, and what eyes, teeth, tongue, hair and a body do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.animation import Animation, read_archive, write_archive
+from facediff.cli.app import main
+from facediff.editing.face_features import find_features
+from facediff.editing.loose_pieces import loose_pieces
+from facediff.editing.surface import Surface
+from facediff.errors import FaceDiffError
+from facediff.mesh import read_mesh
+from facediff.mesh.glb_scene import placed_parts
+from facediff.mesh.parts import mesh_parts, named_triangles
+from tests.editing.retarget.test_avatar_round_trip import opened
+from tests.fakes.avatar import avatar_parts, write_avatar
+from tests.fakes.heads import joined, talking
+
+OBJ = """v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+o Head
+g Skin
+usemtl Beige
+f 1/1 2/2 3/3 4/4
+g Lips
+f 1 2 3
+o Hat
+g
+usemtl Felt
+f 2 3 4
+"""
+
+
+@pytest.fixture(scope="module")
+def animation() -> Animation:
+    return talking()
+
+
+def test_names_of_an_obj(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(OBJ)
+    found = {part.names: part.triangles.tolist() for part in mesh_parts(tmp_path / "a.obj")}
+    assert found == {("Head", "Skin", "Beige"): [0, 1], ("Head", "Lips", "Beige"): [2], ("Hat", "Felt"): [3]}
+    assert len(read_mesh(tmp_path / "a.obj").faces) == 4
+    for names, triangles in ((["Head"], [0, 1, 2]), (["hat", "Lips"], [2, 3]), (["H*"], [0, 1, 2, 3])):
+        assert named_triangles(tmp_path / "a.obj", names).tolist() == triangles
+    with pytest.raises(FaceDiffError, match="Heat") as caught:
+        named_triangles(tmp_path / "a.obj", ["Head", "Heat"])
+    assert all(name in str(caught.value) for name in ("Head", "Skin", "Lips", "Hat", "Felt"))
+    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
+    with pytest.raises(FaceDiffError, match="no names"):
+        named_triangles(tmp_path / "b.obj", ["Head"])
+
+
+def test_names_of_a_glb_are_those_of_nodes_meshes_and_materials(tmp_path: Path) -> None:
+    parts = avatar_parts(rounds=0)
+    write_avatar(tmp_path / "a.glb", parts)
+    mesh = read_mesh(tmp_path / "a.glb")
+    for name in ("Teeth", "TeethMesh", "TeethMaterial"):
+        faces = mesh.faces[named_triangles(tmp_path / "a.glb", [name])]
+        assert mesh.vertices[np.unique(faces)] == pytest.approx(parts["Teeth"].vertices, abs=2e-6)
+
+
+def test_pieces_of_a_head_are_told_by_their_place(animation: Animation) -> None:
+    """Single teeth overlap the line between the lips; hair, a beard, glasses and lashes are no teeth."""
+    vertices, faces = np.float64(animation.template), animation.triangles.astype(np.int64)
+    features = find_features(vertices, faces)
+    assert features is not None
+    box = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    hull = np.array(
+        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+         [1, 5, 7], [1, 7, 3]]
+    )  # fmt: skip
+    x, y, z = features.mouth.centre
+    wanted = {"skin": (vertices, faces)}
+
+    def add(name: str, centre: tuple[float, float, float], size: tuple[float, float, float]) -> None:
+        wanted[name] = (box * np.array(size) / 2 + np.array(centre), hull)
+
+    for k in range(-3, 4):
+        # The upper row reaches below the line between the lips, as people's do.
+        add(f"upper {k}", (x + 0.005 * k, y - 0.002, z - 0.008), (0.004, 0.008, 0.004))
+        add(f"lower {k}", (x + 0.005 * k, y - 0.011, z - 0.009), (0.004, 0.006, 0.004))
+    add("tongue", (x, y - 0.014, z - 0.03), (0.02, 0.006, 0.03))
+    add("palate", (x, y + 0.012, z - 0.03), (0.03, 0.004, 0.03))
+    add("moustache", (x, y + 0.013, z + 0.008), (0.03, 0.004, 0.002))
+    add("hair", (0, 0.09, -0.05), (0.2, 0.1, 0.15))
+    add("glasses", (0, 0.026, 0.09), (0.15, 0.03, 0.01))
+    add("body", (0, -0.5, -0.02), (0.4, 0.6, 0.2))
+    add("beard", (0, y - 0.03, z + 0.005), (0.11, 0.03, 0.01))
+    head = joined(**wanted)
+    begins = dict(zip(wanted, np.cumsum([0, *(len(points) for points, _ in wanted.values())]), strict=False))
+    whole = Surface(head.vertices, head.faces)
+    seen = find_features(head.vertices, head.faces, features)
+    assert seen is not None
+    alone = [np.arange(8) + first for name, first in begins.items() if name != "skin"]
+    loose = loose_pieces(Surface(vertices, faces), whole, features, seen, alone)
+    kinds = {
+        name: "jaw" if first in loose.jaw else "still" if first in loose.still else "skin"
+        for name, first in begins.items()
+    }
+    assert {name for name, kind in kinds.items() if kind == "jaw"} == {
+        "tongue", *(f"lower {k}" for k in range(-3, 4))
+    }  # fmt: skip
+    assert {name for name, kind in kinds.items() if kind == "skin"} == {"skin", "moustache", "beard"}
+
+
+@pytest.mark.parametrize("words", [["--part", "Head"], pytest.param([], marks=pytest.mark.slow)])
+def test_a_whole_avatar_talks(
+    words: list[str],
+    animation: Animation,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_archive(tmp_path / "a.npz", animation)
+    parts = avatar_parts(rounds=0)
+    write_avatar(tmp_path / "avatar.glb", parts)
+    told = ["retarget", "a.npz", "--target-mesh", "avatar.glb", "-o"]
+    assert main([*told, "o.npz", "--part", "Haed"]) == 2
+    said = capsys.readouterr().err
+    assert all(name in said for name in ("Haed", "Head", "Teeth", "TongueMesh", "HairMaterial"))
+    assert not (tmp_path / "o.npz").exists()
+    assert main([*told, "o.npz", *words]) == 0
+    made = read_archive(tmp_path / "o.npz")
+    assert len(made.template) == sum(len(part.vertices) for part in parts.values())
+    moved, first = {}, 0
+    for placed in placed_parts(opened(tmp_path / "avatar.glb")):
+        name = next(name for name in parts if f"{name}Material" in placed.names)
+        moved[name] = (made.vertices[3] - made.template)[first : first + len(placed.local)]
+        first += len(placed.local)
+    for name in ("Body", "Hair", "EyeLeft", "EyeRight"):
+        assert not moved[name].any()
+    assert np.linalg.norm(moved["Head"], axis=1).max() > 0.008
+    upper, lower = np.split(moved["Teeth"], 2)
+    assert not upper.any()
+    assert np.ptp(lower, axis=0) == pytest.approx(0, abs=1e-6)
+    assert np.linalg.norm(lower[0]) > 0.006
+    assert moved["Tongue"] == pytest.approx(np.tile(lower[0], (len(moved["Tongue"]), 1)), abs=1e-6)
