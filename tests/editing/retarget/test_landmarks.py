@@ -228,7 +228,7 @@ def test_named_landmarks_of_both_topologies_are_tried_where_the_result_is_refuse
 ) -> None:
     given: list[Landmarks | None] = []
 
-    def refused(*_: object, landmarks: Landmarks | None) -> None:
+    def refused(*_: object, landmarks: Landmarks | None, shown: object) -> None:
         given.append(landmarks)
         raise FaceDiffError(f"attempt {len(given)}")
 
