@@ -22,11 +22,12 @@ from torch import Tensor, nn
 
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, pad
+from facediff.data.windows import WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
-from facediff.models.inference import Inference, Prediction, Style, WindowPlan
+from facediff.models.inference import Inference, Prediction, Style
 from facediff.models.layers import frame_mask
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.principal import PrincipalComponents

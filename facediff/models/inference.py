@@ -7,7 +7,6 @@ samples needs for that: noise that belongs to a clip or a window, and the blend 
 
 from __future__ import annotations
 
-import math
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,12 +14,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, collate
 from facediff.data.audio import samples_for
+from facediff.data.windows import SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.utils import SAMPLE_RATE
@@ -184,7 +186,7 @@ class Inference(ABC):
         if self.windows.in_one_pass(frames, self.frame_rate):
             return self.generate_samples(clip, seeds, progress=progress)
         stream = SpeechStream(self, clip, seeds=seeds)
-        return torch.cat(list(stream.parts(clip.audio[0], frames=frames, progress=progress)), 1)
+        return torch.cat(list(stream.parts(clip.audio[0].cpu().numpy(), frames=frames, progress=progress)), 1)
 
     @torch.inference_mode()
     def stream(
@@ -255,7 +257,7 @@ class Inference(ABC):
                 clip, start = batch.select([i]), 0
                 speech = clip.audio[0, : int(clip.audio_lengths[0])]
                 stream = SpeechStream(self, clip, seeds=[seed])
-                for part in stream.parts(speech, frames=lengths[i], progress=progress):
+                for part in stream.parts(speech.cpu().numpy(), frames=lengths[i], progress=progress):
                     motion[i, start : start + part.shape[1]] = part[0]
                     start += part.shape[1]
         return motion
@@ -498,168 +500,20 @@ class Inference(ABC):
         """
 
 
-# Sliding windows: how long speech is cut, in seconds and in frames.
-
-
-@dataclass(frozen=True)
-class WindowPlan:
-    """How long speech is cut into windows; lengths in seconds.
-
-    Models of this field learn from sentences of three to five seconds, so they are at their best with windows of that
-    length. One that was trained on longer clips may do better with longer windows, and must cope with speech up to
-    ``above``.
-
-    Attributes:
-        seconds: length of a window.
-        overlap: how much of it the next one shares; at most half of it.
-        before: speech before the window that the model hears too.
-        after: speech after the window that the model hears too.
-        above: speech that lasts longer than this is animated by windows; shorter speech in one pass. Infinite: always
-            in one pass.
-
-    Raises:
-        FaceDiffError: if a length is impossible.
-
-    Example:
-        >>> plan = WindowPlan(seconds=2.0, overlap=0.5)
-        >>> plan.in_frames(25.0)
-        FramePlan(frames=50, overlap=12, before=50, after=12)
-        >>> plan.look_ahead
-        2.5
-    """
-
-    seconds: float = 4.0
-    overlap: float = 1.0
-    before: float = 2.0
-    after: float = 0.5
-    above: float = 10.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.seconds <= 600:
-            raise FaceDiffError(f"window: {self.seconds:g} s is impossible; choose e.g. 4")
-        if not 0 < self.overlap <= self.seconds / 2:
-            raise FaceDiffError(
-                f"overlap: {self.overlap:g} s is impossible with windows of {self.seconds:g} s; choose more than 0, at "
-                f"most half of a window"
-            )
-        if not (0 <= self.before < math.inf and 0 <= self.after < math.inf and self.above >= 0):
-            raise FaceDiffError("window: the speech before and after a window must last 0 s or more, and end")
-
-    def in_frames(self, frame_rate: float) -> FramePlan:
-        """The same in whole frames.
-
-        Raises:
-            FaceDiffError: if windows are too short for frames.
-        """
-        frames = round(self.seconds * frame_rate)
-        # Half of a window may be rounded up where the window is rounded down.
-        overlap = max(1, min(round(self.overlap * frame_rate), frames // 2))
-        if frames < 4:
-            raise FaceDiffError(
-                f"window: {self.seconds:g} s with an overlap of {self.overlap:g} s are too few frames at "
-                f"{frame_rate:g} a second; choose longer windows"
-            )
-        return FramePlan(frames, overlap, round(self.before * frame_rate), round(self.after * frame_rate))
-
-    def in_one_pass(self, frames: int, frame_rate: float) -> bool:
-        """Whether so many frames are few enough to be animated in one pass."""
-        return frames <= self.above * frame_rate
-
-    @property
-    def look_ahead(self) -> float:
-        """Seconds of speech, at most, that must be heard after an instant before its frame is certain.
-
-        The first frame of a window waits for the whole window and for the speech after it.
-        """
-        return self.seconds + self.after
-
-
-@dataclass(frozen=True)
-class FramePlan:
-    """A :class:`WindowPlan` in frames.
-
-    Attributes:
-        frames: of a window.
-        overlap: shared by neighbours.
-        before: heard before a window.
-        after: heard after it.
-    """
-
-    frames: int
-    overlap: int
-    before: int
-    after: int
-
-    @property
-    def hop(self) -> int:
-        """Frames from the start of a window to that of the next."""
-        return self.frames - self.overlap
-
-
-@dataclass(frozen=True)
-class Window:
-    """One window of long speech.
-
-    Attributes:
-        plan: the lengths of full windows.
-        index: how many windows come before it.
-        frames: frames of this window, fewer than usual for the last one.
-    """
-
-    plan: FramePlan
-    index: int
-    frames: int
-
-    @property
-    def start(self) -> int:
-        """Its first frame, counted from the start of the speech."""
-        return self.index * self.plan.hop
-
-    @property
-    def end(self) -> int:
-        """The frame after its last one."""
-        return self.start + self.frames
-
-    @property
-    def context(self) -> int:
-        """Frames before the window whose speech the model hears, but which it does not animate."""
-        return min(self.plan.before, self.start)
-
-    @property
-    def shared(self) -> int:
-        """Its first frames, which belong to the window before it as well; 0 for the first window."""
-        return self.plan.overlap if self.index else 0
-
-    @property
-    def kept(self) -> int:
-        """Its last frames, which belong to the next window as well."""
-        return self.plan.overlap
-
-
 # Streams: speech of any length, window by window while it arrives.
 
-QUIETEST = 0.003
-"""Standard deviation below which speech is not amplified further: noise of a microphone, not speech."""
 
+class SpeechStream(SpeechWindows[Motion]):
+    """Animates one clip from speech that arrives in pieces, as :class:`~facediff.data.windows.SpeechWindows` says.
 
-class SpeechStream:
-    """Animates one clip from speech that arrives in pieces; memory does not grow with its length.
-
-    A frame is certain once its window, but for the frames that this window shares with the next, and the speech after
-    that window have been heard: :attr:`WindowPlan.look_ahead` seconds later at most. The result depends on the speech,
-    the plan and the seeds only, not on how the speech was cut into pieces, and not on what comes after the look-ahead:
-    it is the same for a file and for a microphone. It keeps the expressivity that the model has when it is made.
-
-    Each window's speech is standardised by mean and deviation of all speech heard up to the end of that window.
+    The result depends on the speech, the plan and the seeds only. It keeps the expressivity that the model has when it
+    is made.
 
     Args:
         model: the animating model.
         clip: one clip; its identity and style are used, its speech and its motion are not looked at.
         seeds: one for each sample.
         plan: the windows; the model's own if None.
-
-    Attributes:
-        frames: how many have been given out so far.
 
     Raises:
         FaceDiffError: if the plan does not fit the frame rate.
@@ -668,157 +522,41 @@ class SpeechStream:
     def __init__(
         self, model: Inference, clip: Batch, *, seeds: Sequence[int] = (0,), plan: WindowPlan | None = None
     ) -> None:
+        super().__init__((plan or model.windows).in_frames(model.frame_rate), model.frame_rate)
         self.model = model
         self.seeds = list(seeds)
         self.expressivity = model.expressivity
-        self.plan = (plan or model.windows).in_frames(model.frame_rate)
-        self.frames = 0
         with torch.inference_mode():
             # Encoded once for all windows: the style does not change during a recording.
             style = model.encode_style(clip.reference, clip.reference_mask) if clip.style is None else clip.style
             self.clip = replace(clip, style=style, features=None, feature_lengths=None)
-        self._speech = clip.audio.new_zeros(0)
-        self._dropped = 0  # samples before these, which no window will hear again
-        self._level = Level()
-        self._window = Window(self.plan, 0, self.plan.frames)  # the next one to generate, if the speech lasts
         self._tail: list[Tensor] | None = None  # what the latest window hands over to the next
-        self._held: Tensor | None = None  # the latest window's frames that the next one shares
-        self._finished = False
 
-    @torch.inference_mode()
-    def feed(self, samples: Float[Tensor, " samples"]) -> Motion:
+    def feed(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32]) -> Motion:
         """Hear more speech at 16 kHz, and give the motion that has become certain; it may have no frames.
 
         Raises:
             FaceDiffError: if the stream was finished.
         """
-        self._refuse_finished()
-        self._speech = torch.cat([self._speech, samples.to(self._speech)])
-        parts = []
-        # A window is generated once the speech after it has been heard too. Its last frames are held back: the next
-        # window blends into them.
-        while self._heard >= self._sample(self._window.end + self.plan.after):
-            parts.append(self._next_window(self._window.end + self.plan.after))
-        return self._joined(parts)
+        return super().feed(samples.float().cpu().numpy() if isinstance(samples, Tensor) else samples)
 
     @torch.inference_mode()
-    def finish(self, frames: int | None = None) -> Motion:
-        """Give the motion that is left.
-
-        Args:
-            frames: how many frames the speech lasts in all; as many as fit its length if None.
-
-        Raises:
-            FaceDiffError: if the speech was shorter than a frame, more frames than wanted were given out already, or
-                the stream was finished.
-        """
-        self._refuse_finished()
-        self._finished = True
-        total = round(self._heard * self.model.frame_rate / SAMPLE_RATE) if frames is None else frames
-        if total < 1:
-            raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.model.frame_rate:.3f} s)")
-        if total < self.frames:
-            raise FaceDiffError(f"frames: {total} are fewer than the {self.frames} that have been given out already")
-        self._speech = torch.nn.functional.pad(self._speech, (0, max(0, self._sample(total) - self._heard)))
-        parts = []
-        while self._window.end < total:
-            parts.append(self._next_window(min(total, self._window.end + self.plan.after)))
-        # The rest lies within the last window. If it is no longer than what the window before has animated already, its
-        # frames are certain now, since no later window will blend into them.
-        left = total - self._window.start
-        if self._held is not None and left <= self.plan.overlap:
-            parts.append(self._held[:, :left])
-        else:
-            parts.append(self._generate(replace(self._window, frames=left), total))
-        return self._joined(parts)
-
-    def parts(
-        self, speech: Float[Tensor, " samples"], *, frames: int | None = None, progress: Progress | None = None
-    ) -> Iterator[Motion]:
-        """All motion for a recording, part by part.
-
-        Args:
-            speech: at 16 kHz.
-            frames: how many frames it lasts; as many as fit its length if None.
-            progress: wraps the iteration over its seconds.
-        """
-        # Fed by the second, as from a microphone, so that memory does not grow with the recording.
-        last = max(0, math.ceil(len(speech) / SAMPLE_RATE) - 1)
-        seconds = range(last + 1)
-        for second in progress(seconds) if progress is not None else seconds:
-            parts = [self.feed(speech[second * SAMPLE_RATE : (second + 1) * SAMPLE_RATE])]
-            parts += [self.finish(frames)] if second == last else []
-            yield from (part for part in parts if part.shape[1])
-
-    @property
-    def _heard(self) -> int:
-        return self._dropped + len(self._speech)
-
-    def _sample(self, frame: int) -> int:
-        return samples_for(frame, self.model.frame_rate)
-
-    def _next_window(self, heard: int) -> Tensor:
-        """The window's frames before its overlap with the next, given speech up to frame ``heard``; then advance."""
-        motion = self._generate(self._window, heard)
-        self._window = Window(self.plan, self._window.index + 1, self.plan.frames)
-        # Speech before the next window's context will not be heard again, unless the level has not counted it yet.
-        needed = self._sample(self._window.start - self._window.context)
-        drop = max(0, min(needed, self._level.count) - self._dropped)
-        self._speech = self._speech[drop:]
-        self._dropped += drop
-        return motion[:, : self.plan.hop]
-
-    def _generate(self, window: Window, heard: int) -> Tensor:
-        """Motion of a window, with speech up to frame ``heard``."""
-        # Places in the whole recording; the kept speech starts at sample ``_dropped`` of it. Windows overlap, so the
-        # level counts only what it has not counted yet.
-        start = window.start - window.context
-        first, last = self._sample(start), self._sample(heard)
-        self._level.hear(self._speech[max(0, self._level.count - self._dropped) : last - self._dropped])
-        speech = self._speech[first - self._dropped : last - self._dropped]
-        clip = with_speech(self.clip, speech, heard - start)
-        # A window that is mostly a pause, standardised by itself, would turn its noise into loud speech.
-        level = self.model.speech_encoder.at_level(self._level.mean, max(self._level.deviation, QUIETEST))
+    def generate(
+        self, window: Window, speech: npt.NDArray[np.float32], frames: int, mean: float, deviation: float
+    ) -> Motion:
+        """By the model, at the level of all speech so far."""
+        clip = with_speech(self.clip, torch.from_numpy(speech).to(self.clip.audio), frames)
+        level = self.model.speech_encoder.at_level(mean, deviation)
         with level, self.model.expressed(self.expressivity):
             motion, self._tail = self.model.generate_window(clip, window, self.seeds, self._tail)
-        self._held = motion[:, -self.plan.overlap :]
         return motion
 
-    def _joined(self, parts: list[Tensor]) -> Tensor:
+    @torch.inference_mode()
+    def joined(self, parts: Sequence[Motion]) -> Motion:
+        """On the model's device."""
         if not parts:
             return self.clip.motion.new_zeros(len(self.seeds), 0, *self.clip.template.shape[1:])
-        self.frames += sum(part.shape[1] for part in parts)
-        return torch.cat(parts, 1)
-
-    def _refuse_finished(self) -> None:
-        if self._finished:
-            raise FaceDiffError("the stream is finished; start another one for more speech")
-
-
-class Level:
-    """Mean and standard deviation of all samples so far; both are 0 before there is a sample."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._sum = 0.0
-        self._squares = 0.0
-
-    def hear(self, samples: Float[Tensor, " samples"]) -> None:
-        """Count more samples in."""
-        wide = samples.cpu().double()  # not every accelerator knows float64
-        self.count += len(samples)
-        self._sum += float(wide.sum())
-        self._squares += float(wide.square().sum())
-
-    @property
-    def mean(self) -> float:
-        """Mean."""
-        return self._sum / max(self.count, 1)
-
-    @property
-    def deviation(self) -> float:
-        """Population standard deviation."""
-        return math.sqrt(max(0.0, self._squares / max(self.count, 1) - self.mean**2))
+        return torch.cat(list(parts), 1)
 
 
 def with_speech(clip: Batch, speech: Float[Tensor, " samples"], frames: int) -> Batch:

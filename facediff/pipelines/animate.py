@@ -143,8 +143,8 @@ class AnimationPipeline:
         model: AnimationModel | None = None,
         style: StyleLike | None = None,
     ) -> None:
+        from facediff.data.windows import WindowPlan
         from facediff.models import load_model
-        from facediff.models.inference import WindowPlan
         from facediff.models.styles import style_from
 
         self.options = options
@@ -360,8 +360,6 @@ class AnimationPipeline:
         self, speech: npt.NDArray[np.float32], seeds: Sequence[int], folder: Path
     ) -> tuple[list[npt.NDArray[np.float32]], str]:
         """Memory maps (T, V, 3) of the samples, whose windows go to disk as they are made, and the style's name."""
-        import torch
-
         from facediff.animation.files import MotionWriter
         from facediff.utils.arrays import open_array
 
@@ -372,7 +370,7 @@ class AnimationPipeline:
         template = self.model.assets.template(self.identity)
         writers = [MotionWriter(folder / f"{seed}.npy", tuple(template.shape)) for seed in seeds]
         opened, done = self.openness(speech, self.model.frames_of(len(speech))), 0
-        for part in stream.parts(torch.from_numpy(speech).to(self.model.device), progress=progress):
+        for part in stream.parts(speech, progress=progress):
             now = None if opened is None else opened[done : done + part.shape[1]]
             done += part.shape[1]
             for writer, motion in zip(writers, part, strict=True):

@@ -31,9 +31,10 @@ from sampling_tables import processor
 
 from facediff.data import Batch, collate
 from facediff.data.audio import SAMPLE_RATE, samples_for
+from facediff.data.windows import Window, WindowPlan
 from facediff.models import AnimationModel, load_model
 from facediff.models.checkpoint import corpus_class
-from facediff.models.inference import SpeechStream, Window, WindowPlan
+from facediff.models.inference import SpeechStream
 
 Array = npt.NDArray[np.float64]
 

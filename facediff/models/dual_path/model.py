@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
+from facediff.data.windows import Window
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
@@ -29,7 +30,7 @@ from facediff.models.folding import (
     unchanged,
 )
 from facediff.models.fusions import BidirectionalCrossAttention, FusionFactory
-from facediff.models.inference import ClipNoise, Expressivity, Progress, Window, WindowNoise, WindowOverlap
+from facediff.models.inference import ClipNoise, Expressivity, Progress, WindowNoise, WindowOverlap
 from facediff.models.invented_speakers import InventedSpeakers
 from facediff.models.layers import Share, Weight, Width
 from facediff.models.losses import preconditioned_losses, style_contrast, style_identity_loss

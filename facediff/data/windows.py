@@ -1,0 +1,349 @@
+"""Long speech: how it is cut into sliding windows, and the loop that animates window by window while it arrives.
+
+Nothing here knows a model or PyTorch: :class:`SpeechWindows` is the loop of a model's
+:class:`~facediff.models.inference.SpeechStream` and of the runtime's stream.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.audio import samples_for
+from facediff.errors import FaceDiffError
+from facediff.utils import SAMPLE_RATE
+
+Speech = npt.NDArray[np.float32]
+"""Samples at 16 kHz, mono, (S,)."""
+
+M = TypeVar("M")
+"""Motion of one or several samples: an array or a tensor (seeds, frames, …)."""
+
+QUIETEST = 0.003
+"""Standard deviation below which speech is not amplified further: noise of a microphone, not speech."""
+
+
+@dataclass(frozen=True)
+class WindowPlan:
+    """How long speech is cut into windows; lengths in seconds.
+
+    Models of this field learn from sentences of three to five seconds, so they are at their best with windows of that
+    length. One that was trained on longer clips may do better with longer windows, and must cope with speech up to
+    ``above``.
+
+    Attributes:
+        seconds: length of a window.
+        overlap: how much of it the next one shares; at most half of it.
+        before: speech before the window that the model hears too.
+        after: speech after the window that the model hears too.
+        above: speech that lasts longer than this is animated by windows; shorter speech in one pass. Infinite: always
+            in one pass.
+
+    Raises:
+        FaceDiffError: if a length is impossible.
+
+    Example:
+        >>> plan = WindowPlan(seconds=2.0, overlap=0.5)
+        >>> plan.in_frames(25.0)
+        FramePlan(frames=50, overlap=12, before=50, after=12)
+        >>> plan.look_ahead
+        2.5
+    """
+
+    seconds: float = 4.0
+    overlap: float = 1.0
+    before: float = 2.0
+    after: float = 0.5
+    above: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.seconds <= 600:
+            raise FaceDiffError(f"window: {self.seconds:g} s is impossible; choose e.g. 4")
+        if not 0 < self.overlap <= self.seconds / 2:
+            raise FaceDiffError(
+                f"overlap: {self.overlap:g} s is impossible with windows of {self.seconds:g} s; choose more than 0, at "
+                f"most half of a window"
+            )
+        if not (0 <= self.before < math.inf and 0 <= self.after < math.inf and self.above >= 0):
+            raise FaceDiffError("window: the speech before and after a window must last 0 s or more, and end")
+
+    def in_frames(self, frame_rate: float) -> FramePlan:
+        """The same in whole frames.
+
+        Raises:
+            FaceDiffError: if windows are too short for frames.
+        """
+        frames = round(self.seconds * frame_rate)
+        # Half of a window may be rounded up where the window is rounded down.
+        overlap = max(1, min(round(self.overlap * frame_rate), frames // 2))
+        if frames < 4:
+            raise FaceDiffError(
+                f"window: {self.seconds:g} s with an overlap of {self.overlap:g} s are too few frames at "
+                f"{frame_rate:g} a second; choose longer windows"
+            )
+        return FramePlan(frames, overlap, round(self.before * frame_rate), round(self.after * frame_rate))
+
+    def in_one_pass(self, frames: int, frame_rate: float) -> bool:
+        """Whether so many frames are few enough to be animated in one pass."""
+        return frames <= self.above * frame_rate
+
+    @property
+    def look_ahead(self) -> float:
+        """Seconds of speech, at most, that must be heard after an instant before its frame is certain.
+
+        The first frame of a window waits for the whole window and for the speech after it.
+        """
+        return self.seconds + self.after
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """A :class:`WindowPlan` in frames.
+
+    Attributes:
+        frames: of a window.
+        overlap: shared by neighbours.
+        before: heard before a window.
+        after: heard after it.
+    """
+
+    frames: int
+    overlap: int
+    before: int
+    after: int
+
+    @property
+    def hop(self) -> int:
+        """Frames from the start of a window to that of the next."""
+        return self.frames - self.overlap
+
+
+@dataclass(frozen=True)
+class Window:
+    """One window of long speech.
+
+    Attributes:
+        plan: the lengths of full windows.
+        index: how many windows come before it.
+        frames: frames of this window, fewer than usual for the last one.
+    """
+
+    plan: FramePlan
+    index: int
+    frames: int
+
+    @property
+    def start(self) -> int:
+        """Its first frame, counted from the start of the speech."""
+        return self.index * self.plan.hop
+
+    @property
+    def end(self) -> int:
+        """The frame after its last one."""
+        return self.start + self.frames
+
+    @property
+    def context(self) -> int:
+        """Frames before the window whose speech the model hears, but which it does not animate."""
+        return min(self.plan.before, self.start)
+
+    @property
+    def shared(self) -> int:
+        """Its first frames, which belong to the window before it as well; 0 for the first window."""
+        return self.plan.overlap if self.index else 0
+
+    @property
+    def kept(self) -> int:
+        """Its last frames, which belong to the next window as well."""
+        return self.plan.overlap
+
+
+class SpeechWindows(ABC, Generic[M]):
+    """Animates speech that arrives in pieces, window by window; memory does not grow with its length.
+
+    A frame is certain once its window, but for the frames that this window shares with the next, and the speech after
+    that window have been heard: :attr:`WindowPlan.look_ahead` seconds later at most. The result depends on the speech
+    and the plan only, not on how the speech was cut into pieces, and not on what comes after the look-ahead: it is the
+    same for a file and for a microphone.
+
+    Each window's speech is standardised by mean and deviation of all speech heard up to the end of that window.
+
+    Args:
+        plan: the windows.
+        frame_rate: of the motion.
+
+    Attributes:
+        frames: how many have been given out so far.
+    """
+
+    def __init__(self, plan: FramePlan, frame_rate: float) -> None:
+        self.plan = plan
+        self.frame_rate = frame_rate
+        self.frames = 0
+        self._speech: Speech = np.zeros(0, np.float32)
+        self._dropped = 0  # samples before these, which no window will hear again
+        self._level = Level()
+        self._window = Window(plan, 0, plan.frames)  # the next one to generate, if the speech lasts
+        self._held: Any = None  # the latest window's frames that the next one shares
+        self._finished = False
+
+    @abstractmethod
+    def generate(self, window: Window, speech: Speech, frames: int, mean: float, deviation: float) -> M:
+        """Motion of a window, which continues the one before it.
+
+        Args:
+            window: which one.
+            speech: that of the window, with some before and after it.
+            frames: how many this speech lasts.
+            mean: of all speech so far.
+            deviation: likewise.
+        """
+
+    @abstractmethod
+    def joined(self, parts: Sequence[M]) -> M:
+        """Motion of consecutive frames in one piece; there may be no parts."""
+
+    def feed(self, samples: Speech) -> M:
+        """Hear more speech at 16 kHz, and give the motion that has become certain; it may have no frames.
+
+        Raises:
+            FaceDiffError: if the stream was finished.
+        """
+        self._refuse_finished()
+        self._speech = np.concatenate([self._speech, np.asarray(samples, np.float32)])
+        parts = []
+        # A window is generated once the speech after it has been heard too. Its last frames are held back: the next
+        # window blends into them.
+        while self._heard >= self._sample(self._window.end + self.plan.after):
+            parts.append(self._next_window(self._window.end + self.plan.after))
+        return self._counted(parts)
+
+    def finish(self, frames: int | None = None) -> M:
+        """Give the motion that is left.
+
+        Args:
+            frames: how many frames the speech lasts in all; as many as fit its length if None.
+
+        Raises:
+            FaceDiffError: if the speech was shorter than a frame, more frames than wanted were given out already, or
+                the stream was finished.
+        """
+        self._refuse_finished()
+        self._finished = True
+        total = round(self._heard * self.frame_rate / SAMPLE_RATE) if frames is None else frames
+        if total < 1:
+            raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s)")
+        if total < self.frames:
+            raise FaceDiffError(f"frames: {total} are fewer than the {self.frames} that have been given out already")
+        self._speech = np.pad(self._speech, (0, max(0, self._sample(total) - self._heard)))
+        parts = []
+        while self._window.end < total:
+            parts.append(self._next_window(min(total, self._window.end + self.plan.after)))
+        # The rest lies within the last window. If it is no longer than what the window before has animated already, its
+        # frames are certain now, since no later window will blend into them.
+        left = total - self._window.start
+        if self._held is not None and left <= self.plan.overlap:
+            parts.append(self._held[:, :left])
+        else:
+            parts.append(self._generate(replace(self._window, frames=left), total))
+        return self._counted(parts)
+
+    def parts(
+        self,
+        speech: Speech,
+        *,
+        frames: int | None = None,
+        progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
+    ) -> Iterator[M]:
+        """All motion for a recording, part by part.
+
+        Args:
+            speech: at 16 kHz.
+            frames: how many frames it lasts; as many as fit its length if None.
+            progress: wraps the iteration over its seconds.
+        """
+        # Fed by the second, as from a microphone, so that memory does not grow with the recording.
+        last = max(0, math.ceil(len(speech) / SAMPLE_RATE) - 1)
+        seconds = range(last + 1)
+        for second in progress(seconds) if progress is not None else seconds:
+            before = self.frames
+            part = self.feed(speech[second * SAMPLE_RATE : (second + 1) * SAMPLE_RATE])
+            if self.frames > before:
+                yield part
+            if second == last:
+                before = self.frames
+                part = self.finish(frames)
+                if self.frames > before:
+                    yield part
+
+    @property
+    def _heard(self) -> int:
+        return self._dropped + len(self._speech)
+
+    def _sample(self, frame: int) -> int:
+        return samples_for(frame, self.frame_rate)
+
+    def _next_window(self, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
+        """The window's frames before its overlap with the next, given speech up to frame ``heard``; then advance."""
+        motion = self._generate(self._window, heard)
+        self._window = Window(self.plan, self._window.index + 1, self.plan.frames)
+        # Speech before the next window's context will not be heard again, unless the level has not counted it yet.
+        needed = self._sample(self._window.start - self._window.context)
+        drop = max(0, min(needed, self._level.count) - self._dropped)
+        self._speech = self._speech[drop:]
+        self._dropped += drop
+        return motion[:, : self.plan.hop]
+
+    def _generate(self, window: Window, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
+        """Motion of a window, with speech up to frame ``heard``."""
+        # Places in the whole recording; the kept speech starts at sample ``_dropped`` of it. Windows overlap, so the
+        # level counts only what it has not counted yet.
+        start = window.start - window.context
+        first, last = self._sample(start), self._sample(heard)
+        self._level.hear(self._speech[max(0, self._level.count - self._dropped) : last - self._dropped])
+        speech = self._speech[first - self._dropped : last - self._dropped]
+        # A window that is mostly a pause, standardised by itself, would turn its noise into loud speech.
+        deviation = max(self._level.deviation, QUIETEST)
+        motion: Any = self.generate(window, speech, heard - start, self._level.mean, deviation)
+        self._held = motion[:, -self.plan.overlap :]
+        return motion
+
+    def _counted(self, parts: Sequence[Any]) -> M:
+        self.frames += sum(part.shape[1] for part in parts)
+        return self.joined(parts)
+
+    def _refuse_finished(self) -> None:
+        if self._finished:
+            raise FaceDiffError("the stream is finished; start another one for more speech")
+
+
+class Level:
+    """Mean and standard deviation of all samples so far; both are 0 before there is a sample."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._sum = 0.0
+        self._squares = 0.0
+
+    def hear(self, samples: Speech) -> None:
+        """Count more samples in."""
+        wide = np.asarray(samples, np.float64)
+        self.count += len(wide)
+        self._sum += float(wide.sum())
+        self._squares += float(np.square(wide).sum())
+
+    @property
+    def mean(self) -> float:
+        """Mean."""
+        return self._sum / max(self.count, 1)
+
+    @property
+    def deviation(self) -> float:
+        """Population standard deviation."""
+        return math.sqrt(max(0.0, self._squares / max(self.count, 1) - self.mean**2))
