@@ -49,7 +49,7 @@ HALVES = """(async () => {
   }
   return sums;
 })()"""
-# The contrast of every word on the page with its ground, and of the plots' colours with theirs: [ratio, what]. Colours are
+# Contrasts of every word with its ground, and of the plots' colours with theirs: [ratio, what]. Colours are
 # laid over one another by the browser itself; behind what stands over the faces may be any colour, so that the worse of
 # black and white counts.
 CONTRASTS = """(() => {
@@ -69,7 +69,9 @@ CONTRASTS = """(() => {
   };
   const found = ["--quiet", "--wave", "--line-1", "--line-2", "--line-3", "--line-4", "--accent"].map((name) => [
     ratio([named("--ground")], named(name)), name]);
-  for (const ground of ["--ground", "--raised"]) found.push([ratio([named(ground)], named("--edge")) * 1.5, "--edge: 3:1"]);
+  for (const ground of ["--ground", "--raised"]) { // borders of controls: 3:1 is enough
+    found.push([ratio([named(ground)], named("--edge")) * 1.5, "--edge"]);
+  }
   for (const element of document.querySelectorAll("body *")) {
     if (![...element.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim())) continue;
     if (!element.checkVisibility({ visibilityProperty: true }) || element.closest("select option, noscript")) continue;
@@ -84,7 +86,7 @@ CONTRASTS = """(() => {
   }
   return found;
 })()"""
-# How many points of a face are drawn behind the words, and how wide the face of the first panel is, in pixels of the page.
+# How many points of a face are drawn behind the words, and how wide the first panel's face is, in pixels of the page.
 COVERED = """(async () => {
   facediff.turn(0, 0);
   await new Promise(requestAnimationFrame);
