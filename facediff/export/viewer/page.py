@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import resources
@@ -12,6 +13,10 @@ from typing import Any
 import numpy as np
 
 from facediff.animation import Animation
+from facediff.animation.files import FORMAT as ARCHIVE
+from facediff.editing import direction
+from facediff.editing.expressiveness import ALL, region_factors
+from facediff.editing.procedural import neck
 from facediff.errors import FaceDiffError
 from facediff.export.format import ExportOptions, Format, check_animation, outward, speech_wav
 from facediff.export.viewer.packing import (
@@ -32,9 +37,17 @@ FORMAT = "facediff page 1"
 MOST_ANIMATIONS = 4
 SCRIPTS = (
     *("motion", "surface", "clock", "camera", "scene"),
-    *("plot", "curve", "waveform", "dialogs", "panels", "compare", "player"),
+    *("plot", "curve", "waveform", "dialogs", "panels", "compare"),
+    *("direction", "lanes", "preview", "takes", "editor", "player"),
 )
 """Parts of the script; each uses only the parts before it."""
+
+UNITS = {"brows": "mm", "blinks": "a minute", "gaze": "degrees", "sway": "degrees", "head": "degrees"}
+"""What channels of keys are measured in, where it is no plain factor."""
+REST = {"expressivity": 1.0, "guidance": 1.0, "expressiveness": 1.0, "acting": 1.0}
+"""Where a channel stays without keys, and gets its first one; 0 for the others."""
+PREVIEWED = ("expressiveness", "head")
+"""Channels whose effect the page shows without the model."""
 
 
 @export_format.register("html")
@@ -159,14 +172,59 @@ def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs
         "sound": None if sound is None else blobs.add(sound),
         "truth": truth,
         "heat": heat,
+        "archive": ARCHIVE,
+        "direction": _direction_facts(),
         "animations": [_animation_facts(each, number in compared, blobs) for number, each in enumerate(animations)],
     }
+
+
+def _direction_facts() -> dict[str, Any]:
+    """What the editor of keys must know of their file and of the channels."""
+    channels: dict[str, dict[str, Any]] = {}
+    for name, channel in direction.CHANNELS.items():
+        limits = channel.range
+        rest = min(max(REST.get(name, 0.0), limits.least), limits.most) if limits else ""
+        facts = {
+            "range": [limits.least, limits.most] if limits else None,
+            "rest": rest,
+            "unit": UNITS.get(name, ""),
+            "regions": channel.regions,
+            "preview": name in PREVIEWED,
+        }
+        channels |= {f"{name}.{part}": facts for part in channel.parts} or {name: facts}
+    return {
+        "format": direction.FORMAT,
+        "version": direction.VERSION,
+        "stepSeconds": direction.STEP_SECONDS,
+        "channels": channels,
+    }
+
+
+def _keys_of(animation: Animation) -> list[dict[str, Any]] | None:
+    """The keys that an animation was made with, as rows; None without any, or if its metadata hold something else."""
+    text = animation.metadata.get(direction.METADATA)
+    if text is None:
+        return None
+    try:
+        return list(direction.Direction.parse(text, animation.name, animation.frame_rate).rows())
+    except FaceDiffError:
+        return None  # the page shows it as it shows other metadata
+
+
+def _weights_of(animation: Animation, blobs: Blobs) -> dict[str, int]:
+    """How much each vertex belongs to each region, in 255ths: what the preview of expressiveness needs."""
+    found = {}
+    for name in animation.regions:
+        weights = region_factors(animation.template, animation.regions, {name: 1.0, ALL: 0.0})
+        found[name] = blobs.add(np.rint(255 * weights).astype(np.uint8).tobytes())
+    return found
 
 
 def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict[str, Any]:
     """One animation: its arrays in mm among the blobs, and its names and numbers."""
     centre, extent = bounds(animation)
     opening = mouth_opening(animation)
+    pairs = animation.inner_lip_pairs
     template = np.asarray(animation.template, np.float64) * millimetres(animation)
     return {
         "name": animation.name,
@@ -181,14 +239,19 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
         "centre": centre,
         "extent": extent,
         "compared": compared,
+        "pairs": None if pairs is None or not len(pairs) else blobs.add(pairs.astype("<i4").tobytes()),
+        "regions": {name: blobs.add(np.asarray(each, "<i4").tobytes()) for name, each in animation.regions.items()},
+        "weights": _weights_of(animation, blobs),
+        "neck": (neck(animation.template) * millimetres(animation)).round(3).tolist(),
+        "direction": _keys_of(animation),
         "metadata": {str(key): str(value) for key, value in animation.metadata.items()},
     }
 
 
 def _page_parts(facts: dict[str, Any], blobs: Blobs) -> list[str]:
     """The text of the page in pieces, in order."""
-    style = _asset("style.css")
-    script = "(() => {\n" + "\n".join(_asset(f"{name}.js") for name in SCRIPTS) + "\n})();\n"
+    style = _without_comments(_asset("style.css"))
+    script = "(() => {\n" + "\n".join(_without_comments(_asset(f"{name}.js")) for name in SCRIPTS) + "\n})();\n"
     values = {
         "title": html.escape(" · ".join(animation["name"] for animation in facts["animations"])),
         # Lets this script and this style run, and nothing be loaded.
@@ -201,6 +264,12 @@ def _page_parts(facts: dict[str, Any], blobs: Blobs) -> list[str]:
     before, after = (fill(part, values) for part in _asset("page.html").split("{{blobs}}"))
     texts = enumerate(blobs.texts)
     return [before, *(f'<script type="text/plain" id="blob-{n}">{text}</script>\n' for n, text in texts), after]
+
+
+def _without_comments(source: str) -> str:
+    """A script or style without indentation and without comments that have lines of their own: three quarters of it."""
+    source = re.sub(r"^[ \t]*/\*(?:(?!\*/)[\s\S])*\*/[ \t]*\n", "", source, flags=re.MULTILINE)
+    return re.sub(r"^[ \t]*(//.*)?\n|^[ \t]+", "", source, flags=re.MULTILINE)
 
 
 def _asset(name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,17 +18,6 @@ from tools.browser.chromium import Chromium, Page
 Show = Callable[..., Page]
 HOSTILE = '</script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 1">'
 
-# Colour in the middle of the first face's place, read in the moment in which it was drawn.
-PIXEL = """
-window.pixel = () => {
-  const gl = document.getElementById("view").getContext("webgl2"), colour = new Uint8Array(4);
-  const { place: [left, top, width, height], inset: [above, below] } = facediff.views[0];
-  const x = left + width / 2, y = top + (height * (1 + above - below)) / 2;
-  const [wide, high] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
-  gl.readPixels(Math.floor(x * wide), Math.floor((1 - y) * high), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, colour);
-  return [...colour];
-};
-"""
 # Goes to a frame; gives the frame that is shown, the colour, and the sound's time.
 SEEK = """(async (frame) => {
   await facediff.seek(frame);
@@ -116,36 +105,6 @@ window.requestAnimationFrame = (work) => natural((now) => {
   notes.push([before, sound.currentTime, facediff.frame, pixel(), facediff.playing]);
 });
 """
-
-
-@pytest.fixture
-def show(browser: Chromium, tmp_path: Path) -> Iterator[Show]:
-    """Writes a page, opens it and waits until it is ready; at the end nothing may have gone wrong in it."""
-    pages: list[Page] = []
-
-    def shown(
-        animations: list[Animation],
-        *,
-        truth: int | None = None,
-        width: int = 1280,
-        height: int = 800,
-        dark: bool = False,
-    ) -> Page:
-        path = tmp_path / f"page {len(pages)}.html"
-        write_page(path, animations, truth=truth)
-        page = browser.open(path.as_uri(), width=width, height=height, dark=dark)
-        pages.append(page)
-        page.wait_for("window.facediff && facediff.ready")
-        page.evaluate(PIXEL)
-        return page
-
-    yield shown
-    for page in pages:
-        assert page.problems == []
-        assert page.evaluate("facediff.errors") == []
-        assert {url.split(":")[0] for url in page.requests} <= {"file", "blob", "data"}
-        assert len([url for url in page.requests if url.startswith("file")]) == 1
-        page.close()
 
 
 def is_open(colour: list[int]) -> bool:

@@ -93,7 +93,7 @@ class Panels {
   key(event) {
     const { player } = this;
     if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
-    if (event.target.closest("select, input[type=number]")) return;
+    if (event.target.closest("select, input:not([type=range])")) return;
     if (event.key === " " && event.target.closest("button")) return; // the button's own key
     const leap = event.shiftKey ? Math.round(this.facts.frameRate) : 1;
     const actions = {
@@ -111,6 +111,7 @@ class Panels {
       l: () => find("loop").click(),
       h: () => find("heat").click(),
       e: () => find("wireframe").click(),
+      k: () => find("directing").click(),
       x: () => player.comparison.swap(),
       m: () => find("mute").click(),
       r: () => find("reset").click(),

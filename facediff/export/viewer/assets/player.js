@@ -55,13 +55,17 @@ class Player {
       this.movedAt = performance.now();
     });
     this.panels = new Panels(facts, () => (this.dirty = true));
+    this.wav = wav ? readWav(wav) : null;
     this.comparison = new Comparison(facts, this.panels.boxes, () => (this.dirty = true));
     const lines = faces.flatMap(({ opening }, number) => (opening ? [{ values: opening, number }] : []));
     find("opening").hidden = !lines.length;
     const toFrame = (frame) => this.seek(frame);
     this.plots = lines.length ? [new Curve(find("curve"), find("cursor"), lines, facts, toFrame)] : [];
     find("voice").hidden = !wav;
-    if (wav) this.plots.push(new Waveform(find("waveform"), find("voice-cursor"), facts, readWav(wav), toFrame));
+    if (wav) this.plots.push(new Waveform(find("waveform"), find("voice-cursor"), facts, this.wav, toFrame));
+    this.editor = new Editor(this);
+    this.takes = new Takes(this);
+    this.plots.push(this.editor);
   }
 
   /** Let an audio element be the clock; without it, or if it cannot be played, the machine's clock serves. */
@@ -126,6 +130,11 @@ class Player {
     this.panels.press("wireframe", on);
   }
 
+  /** Make the shown frame again. */
+  redraw() {
+    this.shown = -1;
+  }
+
   tick() {
     requestAnimationFrame(() => this.tick());
     const started = performance.now();
@@ -163,6 +172,7 @@ class Player {
     }
     this.faces.forEach((face, number) => {
       place(face.positions, face.template, steps[number], this.facts.step);
+      this.editor.preview(number, face, frame);
       orient(face.normals, face.positions, face.faces);
     });
     this.faces.forEach((face, number) => {
@@ -202,6 +212,10 @@ async function start() {
     compare: (layout) => player.current.comparison.arrange(layout),
     swap: () => player.current.comparison.swap(),
     get views() { return player.current.comparison.views(); },
+    get direction() { return player.current.editor.direction.text(); },
+    directed: (name, time, easing) => player.current.editor.direction.value(name, time, easing),
+    openKeys: (text) => player.current.editor.direction.open(text),
+    direct: (on) => player.current.editor.show(on),
     turn: (yaw, pitch) => player.current.camera.turn(yaw, pitch),
     positions: (number) => player.current.faces[number].positions,
     distances: (number) => player.current.faces[number].distances,
@@ -217,6 +231,7 @@ async function start() {
   player.current = new Player(facts, faces, ramp, wav);
   player.current.panels.connect(player.current, ramp);
   player.current.connectSound(wav);
+  await player.current.editor.readPreviews(faces);
   const drawn = player.current.seek(0);
   player.current.tick();
   await drawn;

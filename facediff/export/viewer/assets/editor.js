@@ -1,0 +1,259 @@
+// The editor of a direction: lanes, the fields of the chosen key, undo, files, and the command that animates again.
+
+/** A word as a shell takes it. */
+const quoted = (word) => (/^[\w./:=,+@-]+$/.test(word) ? word : `'${word.replaceAll("'", `'\\''`)}'`);
+
+/** A name as a file may have it. */
+const fileName = (name) => name.replace(/[^\p{L}\p{N}._ -]+/gu, "_").trim() || "take";
+
+class Editor {
+  constructor(player) {
+    this.player = player;
+    this.facts = player.facts;
+    this.number = Math.max(0, this.facts.animations.findIndex(({ direction }) => direction));
+    this.directions = this.facts.animations.map(
+      ({ direction }) => new Direction(this.facts.direction, direction ?? [], () => this.changed())
+    );
+    this.lanes = [];
+    this.selected = null;
+    this.connect();
+    this.show(this.facts.animations.some(({ direction }) => direction));
+    this.direct(this.number);
+  }
+
+  get direction() {
+    return this.directions[this.number];
+  }
+
+  /** Time of the shown frame in s. */
+  get time() {
+    return Math.max(0, this.player.shown) / this.facts.frameRate;
+  }
+
+  get snaps() {
+    return find("snap").checked;
+  }
+
+  /** A time on the nearest frame, if the page snaps; free is what asks for an exception. */
+  snapped(time, free = false) {
+    const { frames, frameRate } = this.facts;
+    return this.snaps && !free ? Math.min(frames - 1, Math.round(time * frameRate)) / frameRate : Number(time.toFixed(4));
+  }
+
+  connect() {
+    const click = (id, action) => find(id).addEventListener("click", action);
+    click("directing", () => this.show(find("direction").hidden));
+    click("undo", () => this.direction.undo());
+    click("redo", () => this.direction.redo());
+    click("delete-key", () => this.removeKey());
+    click("save-keys", () => this.save());
+    click("open-keys", () => find("keys-file").click());
+    find("keys-file").addEventListener("change", () => this.open(find("keys-file")));
+    click("copy", () => this.copy());
+    find("preview").addEventListener("change", () => this.player.redraw());
+    find("directed").append(...this.facts.animations.map(({ name }, number) => new Option(name, number)));
+    find("directed").hidden = this.facts.animations.length < 2;
+    find("directed").addEventListener("change", () => this.direct(Number(find("directed").value)));
+    find("add-channel").addEventListener("change", () => {
+      const name = find("add-channel").value;
+      if (name) this.addLane(name).canvas.focus();
+      this.changed();
+    });
+    const field = (id, changes) =>
+      find(id).addEventListener("change", () => {
+        const words = find(id).value.trim();
+        if (this.selected && (words || id === "key-slope")) this.select(this.direction.change(this.selected, changes(words)));
+        this.showFields();
+      });
+    field("key-time", (words) => ({ time: Number(words) }));
+    field("key-value", (words) => ({ value: this.direction.channel(this.selected.channel).range ? Number(words) : words }));
+    field("key-kind", (words) => ({ interpolation: words }));
+    field("key-slope", (words) => ({ slope: words === "" ? undefined : Number(words) }));
+    addEventListener("keydown", (event) => this.type(event));
+    addEventListener("beforeunload", (event) => {
+      if (this.directions.some(({ unsaved }) => unsaved)) event.preventDefault();
+    });
+  }
+
+  type(event) {
+    if (find("direction").hidden || !(event.ctrlKey || event.metaKey) || event.altKey) return;
+    if (event.target.closest?.("input[type=text], input[type=number]")) return; // its own history
+    const key = event.key.toLowerCase();
+    if (key !== "z" && key !== "y") return;
+    event.preventDefault();
+    if (key === "y" || event.shiftKey) this.direction.redo();
+    else this.direction.undo();
+  }
+
+  /** Show in a frame's positions what changed keys do to it. */
+  async readPreviews(faces) {
+    this.previews = await Promise.all(faces.map(async ({ animation }, number) => {
+      const entries = Object.entries(animation.weights).map(async ([name, blob]) => [
+        name, Float32Array.from(new Uint8Array(await readBlob(blob)), (weight) => weight / 255)]);
+      const made = new Direction(this.facts.direction, [], () => {});
+      made.keys = this.directions[number].keys;
+      return new Preview(this.facts, animation, Object.fromEntries(await Promise.all(entries)), made);
+    }));
+  }
+
+  preview(number, face, frame) {
+    if (!find("preview").checked || !this.previews) return;
+    this.previews[number].apply(face.positions, face.template, frame / this.facts.frameRate, this.directions[number]);
+  }
+
+  /** Open the editor, or close it. */
+  show(on) {
+    find("direction").hidden = !on;
+    document.body.classList.toggle("directed", on);
+    find("directing").setAttribute("aria-pressed", String(on));
+  }
+
+  /** Edit the direction of another animation. */
+  direct(number) {
+    this.number = number;
+    find("directed").value = number;
+    for (const lane of this.lanes) lane.element.remove();
+    this.lanes = [];
+    this.selected = null;
+    this.changed();
+  }
+
+  addLane(name) {
+    const there = this.lanes.find((lane) => lane.name === name);
+    if (there) return there;
+    const lane = new Lane(this, name);
+    this.lanes.push(lane);
+    find("lanes").append(lane.element);
+    return lane;
+  }
+
+  removeLane(lane) {
+    this.lanes = this.lanes.filter((each) => each !== lane);
+    lane.element.remove();
+    this.direction.removeChannel(lane.name);
+    this.changed();
+  }
+
+  /** Choose a key, or none. */
+  select(key, lane) {
+    this.selected = key;
+    if (lane && document.activeElement !== lane.canvas) lane.canvas.focus({ preventScroll: true });
+    this.showFields();
+    for (const each of this.lanes) each.draw();
+    if (key) find("direction-said").textContent = `${key.channel}: ${sayKey(key)}`;
+  }
+
+  /** The focus has come to a lane: keys of another one are no longer chosen. */
+  enter(lane) {
+    if (this.selected && this.selected.channel !== lane.name) this.select(null);
+  }
+
+  removeKey() {
+    const key = this.selected;
+    if (!key) return;
+    this.selected = null;
+    this.direction.remove(key);
+    find("direction-said").textContent = `${key.channel}: removed the key at ${short(key.time)} s`;
+  }
+
+  /** Bring the page up to date after a change of the keys. */
+  changed() {
+    const { direction } = this;
+    if (this.selected && !direction.keys.includes(this.selected)) {
+      this.selected = direction.at(this.selected.channel, this.selected.time) ?? null;
+    }
+    for (const name of direction.channels) this.addLane(name);
+    for (const lane of this.lanes) lane.draw();
+    find("undo").disabled = !direction.past.length;
+    find("redo").disabled = !direction.future.length;
+    find("save-keys").disabled = !direction.keys.length;
+    find("no-lanes").hidden = this.lanes.length > 0;
+    this.offerChannels();
+    this.showFields();
+    this.showCommand();
+    this.showTime();
+    this.player.redraw();
+  }
+
+  /** The channels that have no lane yet. */
+  offerChannels() {
+    const { regions } = this.facts.animations[this.number];
+    const names = Object.entries(this.facts.direction.channels).flatMap(([name, channel]) =>
+      channel.regions ? [name, ...Object.keys(regions).map((region) => `${name}.${region}`)] : [name]
+    );
+    const left = names.filter((name) => !this.lanes.some((lane) => lane.name === name));
+    find("add-channel").replaceChildren(new Option("Add a channel…", ""), ...left.map((name) => new Option(name, name)));
+  }
+
+  showFields() {
+    const key = this.selected;
+    find("key-fields").hidden = !key;
+    if (!key) return;
+    const { range } = this.direction.channel(key.channel);
+    const value = find("key-value");
+    find("key-channel").textContent = key.channel;
+    find("key-time").value = short(key.time);
+    find("key-time").step = this.snaps ? 1 / this.facts.frameRate : "any";
+    value.type = range ? "number" : "text";
+    if (range) Object.assign(value, { min: range[0], max: range[1], step: "any" });
+    value.value = range ? short(key.value) : key.value;
+    find("key-kind").value = key.interpolation;
+    find("key-slope").value = key.slope ?? "";
+    find("key-slope").parentElement.hidden = !range || key.interpolation !== "smooth";
+  }
+
+  showTime() {
+    for (const lane of this.lanes) lane.show(this.time);
+  }
+
+  /** What changes from frame to frame. */
+  point(frame) {
+    for (const lane of this.lanes) lane.point(frame);
+    this.showTime();
+  }
+
+  // Files and commands.
+
+  fileOf(number) {
+    return `${fileName(this.facts.animations[number].name)}_keys.json`;
+  }
+
+  /** The command that animates again with the keys. Only what the page knows is in it. */
+  showCommand() {
+    const { metadata } = this.facts.animations[this.number];
+    const words = ["facediff", "animate", "SPEECH.wav", "--checkpoint", quoted(metadata.checkpoint ?? "CHECKPOINT")];
+    for (const name of ["identity", "seed"]) if (metadata[name]) words.push(`--${name}`, quoted(metadata[name]));
+    words.push("--direction", quoted(this.fileOf(this.number)), "-o", "take.html");
+    find("command").textContent = words.join(" ");
+  }
+
+  save(number = this.number) {
+    const direction = this.directions[number];
+    download(this.fileOf(number), "application/json", [direction.text()]);
+    direction.saved = direction.keys;
+    find("direction-said").textContent = `saved ${this.fileOf(number)}; the command below animates again with it`;
+  }
+
+  async open(input) {
+    const [file] = input.files;
+    input.value = ""; // the same file can be opened again
+    if (!file) return;
+    try {
+      this.direction.open(await file.text());
+      find("direction-said").textContent = `opened ${file.name}: ${this.direction.keys.length} keys`;
+    } catch (error) {
+      find("direction-said").textContent = `${file.name}: ${error.message}; nothing was changed`;
+    }
+  }
+
+  async copy() {
+    const text = find("command").textContent;
+    try {
+      await navigator.clipboard.writeText(text);
+      find("direction-said").textContent = "copied the command";
+    } catch { // no clipboard for pages of this kind: select it, so that a key press copies
+      getSelection().selectAllChildren(find("command"));
+      find("direction-said").textContent = "the command is selected: copy it with Ctrl+C";
+    }
+  }
+}

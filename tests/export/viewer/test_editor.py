@@ -1,0 +1,279 @@
+"""The page's editor of keys, its preview, its comparison of takes and its downloads, in a real browser.
+
+What the page computes is compared with what Python computes from the same keys, and what it writes is read by the readers
+of the command line.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.animation import Animation, read_archive
+from facediff.editing.direction import METADATA, STEP_SECONDS, Direction, Key, curve, read_direction
+from facediff.editing.expressiveness import region_factors
+from facediff.editing.procedural import neck
+from facediff.mesh.flame import rotations
+from tests.fakes.clicks import FRAMES, RATE, SAMPLE_RATE, clicks
+from tools.browser.chromium import Page
+
+Show = Callable[..., Page]
+HOSTILE = "</script><img src=x onerror='window.hacked = 1'>"
+LOW = "low <img src=x onerror='window.hacked = 1'>"
+KEYS = Direction(
+    [
+        Key(0.2, "expressiveness", 1.0),
+        Key(0.6, "expressiveness", 2.5, "linear"),
+        Key(1.0, "expressiveness", 1.5, "step"),
+        Key(1.4, "expressiveness", 3.0, slope=4.0),
+        Key(1.8, "expressiveness", 3.25),
+        Key(2.4, "expressiveness", 0.5),
+        Key(0.1, "head.yaw", -10.0, "linear"),
+        Key(2.0, "head.yaw", 20.0),
+        Key(0.5, "style", HOSTILE, "step"),
+    ]
+)
+
+
+def directed(keys: Direction = KEYS, **changes: object) -> Animation:
+    """The face of clicks, with two regions, made with keys."""
+    regions = {"lips": np.arange(4, 8), LOW: np.arange(8, 12)}
+    made = clicks()
+    return replace(made, regions=regions, metadata={**made.metadata, METADATA: keys.text()}, **changes)  # type: ignore[arg-type]
+
+
+def keys_in(page: Page) -> Direction:
+    return Direction.parse(page.evaluate("facediff.direction"), "page")
+
+
+def lane(page: Page, name: str) -> tuple[float, float, float, float]:
+    """Left, top, width and height of the part of a channel's lane in which keys lie."""
+    found = page.evaluate(
+        f"(() => {{ const canvas = [...document.querySelectorAll('.lane')].find((each) => each.textContent.startsWith("
+        f"'{name}')).querySelector('canvas'); canvas.scrollIntoView({{ block: 'nearest' }}); canvas.focus();"
+        f" const box = canvas.getBoundingClientRect(); return [box.left, box.top, box.width, box.height]; }})()"
+    )
+    left, top, width, height = found
+    return left + 46, top + 9, width - 60, height - 18
+
+
+def at(page: Page, name: str, seconds: float, share: float) -> tuple[float, float]:
+    """A point of a lane, by time and by share of the channel's range."""
+    left, top, width, height = lane(page, name)
+    return left + width * seconds * RATE / FRAMES, top + (1 - share) * height
+
+
+def double_click(page: Page, point: tuple[float, float]) -> None:
+    for count in (1, 2):
+        for kind in ("mousePressed", "mouseReleased"):
+            x, y = point
+            page.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=count)
+
+
+def press(page: Page, key: str, modifiers: int = 0) -> None:
+    """Press a key: modifiers are 2 for Ctrl and 8 for Shift."""
+    for kind in ("keyDown", "keyUp"):
+        page.send("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers)
+
+
+def downloaded(page: Page, folder: Path, action: Callable[[], object]) -> Path:
+    """The file that an action makes the page give its reader."""
+    folder.mkdir()
+    page.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
+    action()
+    end = time.monotonic() + 20
+    while not (found := [each for each in folder.iterdir() if each.suffix in (".json", ".npz", ".wav")]):
+        assert time.monotonic() < end, list(folder.iterdir())
+        time.sleep(0.02)
+    return found[0]
+
+
+def test_keys_come_back_as_they_were_and_their_curves_are_those_of_python(show: Show) -> None:
+    page = show([directed(), clicks(name="other")])
+    assert keys_in(page).rows() == KEYS.rows()
+    times = np.linspace(-0.1, 3.1, 161)
+    for name, easing, eased in (
+        ("expressiveness", 0, False),
+        ("expressiveness", STEP_SECONDS, True),
+        ("head.yaw", 0, False),
+    ):
+        expected = curve(KEYS.channels[name], times, eased=eased)
+        found = page.evaluate(f"{times.tolist()}.map((time) => facediff.directed('{name}', time, {easing}))")
+        assert np.allclose(found, expected, atol=1e-9)
+    assert page.evaluate("[direction.hidden, document.querySelectorAll('.lane').length]") == [False, 3]
+    offered = page.evaluate("[...document.getElementById('add-channel').options].map(({ value }) => value)")
+    assert {"acting", "head.pitch", "expressiveness.lips", f"expressivity.{LOW}"} < set(offered)
+    assert "head" not in offered
+    assert page.evaluate("window.hacked") is None
+
+
+def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp_path: Path) -> None:
+    page = show([directed(Direction([Key(1.0, "expressiveness", 2.0)]))], width=900, height=900)
+    before = page.evaluate("facediff.direction")
+    double_click(page, at(page, "expressiveness", 1.611, 0.75))
+    after_adding = keys_in(page).channels["expressiveness"]
+    assert [key.time for key in after_adding] == [1.0, 1.6]  # the nearest frame
+    assert after_adding[1].value == pytest.approx(3.0, abs=0.1)
+    # A drag is one step of the history, and stays between the neighbours.
+    start, end = at(page, "expressiveness", 1.6, after_adding[1].value / 4), at(page, "expressiveness", 2.207, 0.25)
+    page.drag(start, end)
+    moved = keys_in(page).channels["expressiveness"][1]
+    assert moved.time == pytest.approx(2.2)
+    assert moved.value == pytest.approx(1.0, abs=0.1)
+    press(page, "z", 2)
+    assert keys_in(page).channels["expressiveness"] == after_adding
+    press(page, "z", 2 + 8)
+    assert keys_in(page).channels["expressiveness"][1] == moved
+    # By keyboard alone: choose, move, raise, bend, add at the shown frame, remove.
+    page.evaluate("facediff.seek(20)")
+    lane(page, "expressiveness")
+    for key, modifiers in (("Escape", 0), ("ArrowRight", 0), ("ArrowRight", 8), ("ArrowUp", 0), ("2", 0)):
+        press(page, key, modifiers)
+    first = keys_in(page).channels["expressiveness"][0]
+    assert first == Key(26 / RATE, "expressiveness", 2.1, "linear")
+    page.evaluate("facediff.seek(20)")
+    press(page, "Enter")
+    assert [key.time for key in keys_in(page).keys] == [20 / RATE, 26 / RATE, moved.time]
+    press(page, "Delete")
+    # A channel without keys yet, and numbers that are typed.
+    add = "document.getElementById('add-channel')"
+    page.evaluate(f"{add}.value = 'head.pitch', {add}.dispatchEvent(new Event('change'))")
+    lane(page, "head.pitch")
+    press(page, "Enter")
+    for name, words in (("value", "99"), ("kind", "step"), ("time", "0.333")):
+        field = f"document.getElementById('key-{name}')"
+        page.evaluate(f"{field}.value = '{words}', {field}.dispatchEvent(new Event('change'))")
+    assert keys_in(page).channels["head.pitch"] == (Key(0.333, "head.pitch", 30.0, "step"),)
+    wanted = keys_in(page)
+    saved = downloaded(page, tmp_path / "saved", lambda: page.evaluate("document.getElementById('save-keys').click()"))
+    assert saved.name == "clicks_keys.json"
+    assert read_direction(saved).rows() == wanted.rows()
+    command = page.evaluate("document.getElementById('command').textContent")
+    assert "--identity nobody" in command
+    assert "--direction clicks_keys.json" in command
+    for _ in range(12):
+        press(page, "z", 2)
+    assert page.evaluate("facediff.direction") == before
+    # The file comes back by the page's own button, and a wrong one changes nothing.
+    open_file = (
+        "(async (text) => { const given = new DataTransfer(), input = document.getElementById('keys-file');"
+        " given.items.add(new File([text], 'keys.json')); input.files = given.files;"
+        " input.dispatchEvent(new Event('change')); await new Promise((done) => setTimeout(done, 100));"
+        " return document.getElementById('direction-said').textContent; })"
+    )
+    page.evaluate(f"{open_file}({json.dumps(saved.read_text())})")
+    assert keys_in(page).rows() == wanted.rows()
+    for wrong, words in (
+        ('{"keys": [{"time": 1, "channel": "brow", "value": 1}]}', "row 1: channel"),
+        ('{"keys": [{"time": 1, "channel": "expressiveness", "value": 5}]}', "row 1: value"),
+        ('{"keys": [{"time": "1 s", "channel": "expressiveness", "value": 1}]}', "row 1: time"),
+        ("{", "nothing was changed"),
+    ):
+        assert words in page.evaluate(f"{open_file}({json.dumps(wrong)})")
+        assert keys_in(page).rows() == wanted.rows()
+
+
+def test_preview_scales_about_the_neutral_face_and_turns_the_head(show: Show) -> None:
+    animation = directed(Direction([Key(0.0, "expressiveness", 2.0)]))
+    page = show([animation])
+    frame = "(async (frame) => { await facediff.seek(frame); return [...facediff.positions(0)]; })"
+    as_made = np.reshape(page.evaluate(f"{frame}(7)"), (-1, 3))
+    assert np.allclose(as_made, animation.vertices[7], atol=0.03)
+    new = [Key(0.0, "expressiveness", 0.5), Key(0, "expressiveness.lips", 3.0), Key(0, "head.yaw", 25.0)]
+    text = json.dumps({"keys": Direction(new).rows()})
+    page.evaluate(f"facediff.openKeys({json.dumps(text)})")
+    factors = region_factors(animation.template, animation.regions, {"all": 0.5, "lips": 3.0}) / 2.0
+    scaled = animation.template + factors[:, None] * (animation.vertices[7] - animation.template)
+    pivot = neck(animation.template)
+    expected = (scaled - pivot) @ rotations(np.deg2rad([[0.0, 25.0, 0.0]]))[0].T + pivot
+    found = np.reshape(page.evaluate(f"{frame}(7)"), (-1, 3))
+    assert np.allclose(found, expected, atol=0.2)  # weights in 255ths of up to 60 mm
+    page.evaluate("document.getElementById('preview').click()")
+    assert np.array_equal(np.reshape(page.evaluate(f"{frame}(7)"), (-1, 3)), as_made)
+
+
+def test_takes_are_compared_in_one_panel(show: Show) -> None:
+    green = np.repeat(np.array([[20, 20, 220], [20, 220, 20], [20, 220, 20]], np.uint8), 4, axis=0)
+    page = show([clicks(name="A"), clicks(name="a"), replace(clicks(name="B"), colours=green)], width=900, height=700)
+    page.evaluate("second.value = '2', second.dispatchEvent(new Event('change')), facediff.seek(1)")
+    see = """(async (x) => {
+      facediff.turn(0, 0);
+      await new Promise(requestAnimationFrame);
+      const gl = view.getContext("webgl2"), colour = new Uint8Array(4);
+      const [wide, high] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+      gl.readPixels(Math.floor(x * wide), Math.floor(0.45 * high), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, colour);
+      return colour[0] > colour[1] ? "A" : "B";
+    })"""
+
+    def seen() -> list[str]:
+        return [page.evaluate(f"{see}({x})") for x in (0.45, 0.55)]
+
+    found = {}
+    for layout in ("switch", "wipe", "overlay"):
+        page.evaluate(f"facediff.compare('{layout}')")
+        before = seen()
+        page.press("x")
+        found[layout] = (before, seen())
+        page.press("x")
+    assert found == {
+        "switch": (["A", "A"], ["B", "B"]),
+        "wipe": (["A", "B"], ["B", "A"]),
+        "overlay": (["A", "A"], ["B", "B"]),
+    }
+    assert page.evaluate("[...document.querySelectorAll('.letter')].map((each) => each.textContent)")[::2] == ["A", "B"]
+    page.evaluate("(facediff.compare('wipe'), divider.focus())")
+    press(page, "End")
+    assert page.evaluate("divider.ariaValueNow") == "100"
+    assert seen() == ["A", "A"]
+    page.evaluate("facediff.compare('blink')")
+    page.wait_for("facediff.views[0].number === 2")
+    page.wait_for("facediff.views[0].number === 0")
+    page.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "reduce"}])
+    page.wait_for("layout.value === 'switch'")
+    page.evaluate("facediff.compare('blink')")
+    assert page.evaluate("[layout.value, layout.querySelector('[value=blink]').disabled]") == ["switch", True]
+    still = page.evaluate("getComputedStyle(view).transitionDuration")
+    assert still == "0s"
+    count = """(async () => {
+      facediff.turn(0, 0);
+      await new Promise(requestAnimationFrame);
+      const gl = view.getContext("webgl2"), { width, height } = view, all = new Uint8Array(4 * width * height);
+      gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, all);
+      return all.reduce((sum, value) => sum + value, 0);
+    })()"""
+    plain = page.evaluate(count)
+    page.press("e")
+    assert page.evaluate(count) != plain
+    page.press("e")
+    assert page.evaluate(count) == plain
+
+
+def test_a_take_is_downloaded_as_an_archive_that_the_command_line_reads(show: Show, tmp_path: Path) -> None:
+    animation = replace(directed(name="wäre/es: so?"), unit="cm")
+    page = show([clicks(), animation])
+    page.evaluate("(downloads.click(), taken.value = '1')")
+    click = "document.getElementById('take-motion').click()"
+    path = downloaded(page, tmp_path / "taken", lambda: page.evaluate(click))
+    assert path.name == "wäre_es_ so_.npz"
+    found = read_archive(path)
+    assert (found.name, found.frame_rate, found.unit, found.sample_rate) == (animation.name, RATE, "mm", SAMPLE_RATE)
+    off = np.linalg.norm(found.vertices - 10 * animation.vertices, axis=2)
+    assert off.max() <= 0.05 * 3**0.5 / 2 + 1e-3
+    assert np.allclose(found.template, 10 * animation.template)
+    assert np.array_equal(found.triangles, animation.triangles)
+    for name in ("colours", "inner_lip_pairs"):
+        assert np.array_equal(getattr(found, name), getattr(animation, name))
+    assert {name: each.tolist() for name, each in found.regions.items()} == {
+        name: each.tolist() for name, each in animation.regions.items()
+    }
+    assert found.speech is not None
+    assert animation.speech is not None
+    assert np.abs(found.speech - animation.speech).max() < 1e-4
+    assert {**animation.metadata, **found.metadata} == found.metadata
+    assert read_direction(path).rows() == KEYS.rows()
