@@ -358,8 +358,8 @@ class Page:
         title = html.escape(" · ".join(animation.name for animation in self.animations))
         # In a frame of its own origin, the page's script can do nothing to the notebook; and it may load nothing.
         return (
-            f'<iframe srcdoc="{html.escape(text)}" title="{title}" sandbox="allow-scripts" allow="autoplay" '
-            f'style="width: 100%; height: {INLINE_HEIGHT}px; border: 0"></iframe>{note}'
+            f'<iframe srcdoc="{html.escape(text)}" title="{title}" sandbox="allow-scripts allow-downloads" '
+            f'allow="autoplay" style="width: 100%; height: {INLINE_HEIGHT}px; border: 0"></iframe>{note}'
         )
 
     def __repr__(self) -> str:

@@ -1,7 +1,7 @@
 """The page's editor of keys, its preview, its comparison of takes and its downloads, in a real browser.
 
-What the page computes is compared with what Python computes from the same keys, and what it writes is read by the readers
-of the command line.
+What the page computes is compared with what Python computes from the same keys, and what it writes is read by the
+readers of the command line.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from facediff.editing.expressiveness import region_factors
 from facediff.editing.procedural import neck
 from facediff.mesh.flame import rotations
 from tests.fakes.clicks import FRAMES, RATE, SAMPLE_RATE, clicks
+from tests.fakes.contrasts import CONTRASTS
 from tools.browser.chromium import Page
 
 Show = Callable[..., Page]
@@ -150,6 +151,7 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
         field = f"document.getElementById('key-{name}')"
         page.evaluate(f"{field}.value = '{words}', {field}.dispatchEvent(new Event('change'))")
     assert keys_in(page).channels["head.pitch"] == (Key(0.333, "head.pitch", 30.0, "step"),)
+    assert min(page.evaluate(CONTRASTS))[0] >= 4.5
     wanted = keys_in(page)
     saved = downloaded(page, tmp_path / "saved", lambda: page.evaluate("document.getElementById('save-keys').click()"))
     assert saved.name == "clicks_keys.json"

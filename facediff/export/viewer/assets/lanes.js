@@ -242,6 +242,12 @@ class Lane extends Plot {
     this.canvas.setAttribute("aria-label", `${this.name}, ${words}`);
   }
 
+  /** Keys have the time at which a frame begins to be shown: here the cursor stands there. */
+  point(frame) {
+    this.shown = frame;
+    this.cursor.style.transform = `translateX(${this.x(frame / this.facts.frameRate)}px)`;
+  }
+
   /** What changes from frame to frame. */
   show(time) {
     const value = this.editor.direction.value(this.name, time);

@@ -33,6 +33,7 @@ class Panels {
     const box = make("div", "panel");
     const head = make("div", "name");
     const letter = make("span", "letter"); // A or B, where two are compared
+    letter.hidden = true;
     head.append(make("i", `swatch line-${number + 1}`), letter, make("b", "", animation.name));
     if (number === this.facts.truth && animation.name.toLowerCase() !== "truth") head.append(make("span", "mark", "truth"));
     const { words, marks } = captions(animation);
