@@ -23,7 +23,7 @@ ALLOWED: dict[str, set[str]] = {
     "version": set(),
     "errors": set(),
     "registry": {"utils", "errors"},  # of utils, only what is light: see the tests of what importing loads
-    "utils": {"errors"},
+    "utils": {"version", "errors"},
     "metrics": {"registry", "errors"},
     "mesh": BASE,
     "synthetic": BASE,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -31,6 +32,8 @@ from facediff.utils.plain_files import load_json, read_json, write_json
 RUNS, LOGS = "runs", "logs"
 STATE = "state.json"
 """In the folder of a training run: how far it has come, and how long that took."""
+PAUSE = 0.05
+"""Seconds between two looks at whether a process has ended."""
 LOGGER = "lightning.pytorch.loggers.CSVLogger"
 LAST = Path("version_0", "checkpoints", "last.ckpt")
 BEST = Path("version_0", "checkpoints", "best.ckpt")
@@ -76,8 +79,16 @@ def pending(cells: Sequence[Cell], folder: Path, *, retry_failed: bool) -> list[
     return found
 
 
-def run_cells(cells: Sequence[Cell], setting: Setting, *, workers: int) -> Generator[tuple[Cell, Outcome[Result]]]:
+def run_cells(
+    cells: Sequence[Cell], setting: Setting, *, workers: int | None, scheduler: str | None = ""
+) -> Generator[tuple[Cell, Outcome[Result]]]:
     """Run cells, several at a time; each gets its file when it is done, also when it fails.
+
+    Args:
+        cells: what to run.
+        setting: what they share.
+        workers: cells at a time; if None, as many as processors, or workers of a cluster.
+        scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
 
     Yields:
         a cell and what became of it, as soon as it is done.
@@ -87,8 +98,24 @@ def run_cells(cells: Sequence[Cell], setting: Setting, *, workers: int) -> Gener
     """
     work = partial(run_cell, setting)
     record = partial(record_failure, setting.folder)
-    with closing(run_batch(work, cells, workers=workers, record=record, survive_bugs=True)) as outcomes:
+    outcomes = run_batch(
+        work,
+        cells,
+        workers=workers,
+        scheduler=scheduler,
+        writes=setting.folder,
+        reads=dict.fromkeys(path for cell in cells for path in files_of(cell)),
+        record=record,
+        survive_bugs=True,
+    )
+    with closing(outcomes):
         yield from outcomes
+
+
+def files_of(cell: Cell) -> list[Path]:
+    """The files and folders that a cell is made of, except those that other cells make."""
+    named = [cell.root, cell.data, cell.source, *(training.config for training in cell.trainings)]
+    return [path for path in named if isinstance(path, Path) and path.exists()]
 
 
 def record_failure(folder: Path, cell: Cell, problem: str) -> None:
@@ -209,7 +236,9 @@ class Runner:
             stream.write(f"\n$ facediff {' '.join(words)}\n".encode(errors="surrogateescape"))
             stream.flush()
             place = stream.tell()
-            status, memory = run_process([*self.setting.launcher, *words], environment, stream)
+            program, *module = self.setting.launcher
+            program = program if shutil.which(program) else sys.executable  # a cluster's may lie somewhere else
+            status, memory = run_process([program, *module, *words], environment, stream)
         self.measured[step] = {"seconds": time.monotonic() - started, "memory": memory}
         if status:
             raise FaceDiffError(f"{self.cell}: {words[0]} {reason_of(log, place, status)}")
@@ -279,7 +308,10 @@ def run_process(words: Sequence[str], environment: Mapping[str, str], log: IO[by
     memory: float | None = None
     try:
         if hasattr(os, "wait4"):
-            _, status, usage = os.wait4(process.pid, 0)
+            ended = 0
+            while not ended:  # a thread is stopped between two looks
+                ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+                time.sleep(0 if ended else PAUSE)
             process.returncode = os.waitstatus_to_exitcode(status)
             memory = float(usage.ru_maxrss) * (1 if sys.platform == "darwin" else 1024)
         else:

@@ -13,6 +13,7 @@ from facediff.cli.options import (
     Identity,
     Map,
     OutputOptions,
+    Scheduler,
     Seed,
     Workers,
     confirm_cost,
@@ -22,6 +23,7 @@ from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.hub import check_model_source
+from facediff.utils.jobs import check_scheduler
 
 
 @dataclass(frozen=True)
@@ -69,12 +71,14 @@ class BatchOptions:
 
     Attributes:
         suffix: format of the batch's outputs
-        workers: processes (default: one for each processor)
+        workers: recordings at a time (default: one for each processor)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         retry_failed: try recordings again that failed before
     """
 
     suffix: Annotated[str, Option(metavar="SUFFIX")] = ".mp4"
     workers: Workers = None
+    scheduler: Scheduler = None
     retry_failed: bool = False
 
 
@@ -169,6 +173,7 @@ def animate(
     if not streamed and len(speech) == 1 and not speech[0].exists():
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
     check_model_source(checkpoint)
+    check_scheduler(batch.scheduler)
     from facediff.data.voice_activity import speech_problems
     from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, read_recording
 
@@ -217,6 +222,7 @@ def animate(
             seed=seed,
             max_seconds=windows.max_seconds,
             workers=batch.workers,
+            scheduler=batch.scheduler,
             retry_failed=batch.retry_failed,
         )
     options.check(output)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from facediff.cli.options import OutputFolder, Seed, Workers
+from facediff.cli.options import OutputFolder, Scheduler, Seed, Workers
 from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices
@@ -29,6 +29,7 @@ def benchmark(
     output: OutputFolder = Path("benchmarks"),
     root: Annotated[list[str] | None, Option(metavar="CORPUS=FOLDER", reads=True)] = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     retry_failed: bool = False,
     dry_run: bool = False,
 ) -> int:
@@ -48,11 +49,14 @@ def benchmark(
         output: folder for benchmarks; each plan gets one of its name below it
         root: folder of one of the plan's corpora; repeatable
         workers: cells at a time (default: the plan's, or as many as processors allow)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         retry_failed: try cells again that failed
         dry_run: say what would run, and for how long by the last timings
     """
     from facediff.benchmark.plan import find_plan, read_plan
+    from facediff.utils.jobs import check_scheduler, is_cluster, processors
 
+    check_scheduler(scheduler)
     found = read_plan(find_plan(plan), corpus_folders(root or []))
     from facediff.benchmark.cells import cells_of
     from facediff.benchmark.outline import outline_of, read_results, write_outline
@@ -61,7 +65,6 @@ def benchmark(
     from facediff.evaluation.evaluator import find_protocols
     from facediff.metrics.by_name import parse_all
     from facediff.utils.files import locked
-    from facediff.utils.jobs import processors
 
     try:
         (protocol,) = find_protocols([found.protocol])
@@ -76,7 +79,7 @@ def benchmark(
     cells = cells_of(found)
     folder = output / found.name
     left = pending(cells, folder, retry_failed=retry_failed)
-    count = workers or found.workers or max(1, processors() // found.threads)
+    count = workers or found.workers or (None if is_cluster(scheduler) else max(1, processors() // found.threads))
     setting = check_cells(found, cells, left, folder, dry_run=dry_run)
     seconds = estimate(left, folder)
     announce(found, cells, left, seconds, count)
@@ -87,7 +90,7 @@ def benchmark(
     with locked(folder / "benchmark.lock", "facediff benchmark"):
         outline = outline_of(found, cells, command)
         write_outline(folder, outline)
-        with closing(run_cells(left, setting, workers=count)) as outcomes:
+        with closing(run_cells(left, setting, workers=count, scheduler=scheduler)) as outcomes:
             for number, (cell, outcome) in enumerate(outcomes, 1):
                 failed += bool(outcome.problem)
                 what = outcome.problem or f"{cell}: {outcome.seconds:.0f} s"
@@ -163,12 +166,13 @@ def corpus_folders(words: Sequence[str]) -> dict[str, Path]:
 
 
 def announce(
-    plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], seconds: Mapping[Cell, float | None], workers: int
+    plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], seconds: Mapping[Cell, float | None], workers: int | None
 ) -> None:
     """Say what will run, and for how long."""
     from facediff.utils.tables import format_table
 
-    tell(f"{plan.title}: {len(cells)} cells, {len(cells) - len(left)} done, {len(left)} to run, {workers} at a time")
+    at_a_time = f"{workers} at a time" if workers else "one on each worker at a time"
+    tell(f"{plan.title}: {len(cells)} cells, {len(cells) - len(left)} done, {len(left)} to run, {at_a_time}")
     if not left:
         return
     rows = [[str(cell), cell.kind, None if seconds[cell] is None else f"{seconds[cell]:.0f} s"] for cell in left]
@@ -177,9 +181,10 @@ def announce(
     missing = len(left) - len(known)
     if known:
         # With one worker the times add up; several share them, and the longest cell is the least that it takes.
-        total = max(sum(known) / workers, max(known))
+        total = max(sum(known) / (workers or 1), max(known))
         unknown = f", and {missing} cells that were never timed" if missing else ""
-        tell(f"about {total / 60:.0f} minutes by the last timings{unknown}")
+        one = "" if workers else " on one worker"
+        tell(f"about {total / 60:.0f} minutes{one} by the last timings{unknown}")
     else:
         tell("no cell of these was ever timed here")
 

@@ -12,11 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Size, Workers
+from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Scheduler, Size, Workers
 from facediff.cli.parsing import Group, Option, Parameter, Parameters, parameters_of, parse
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices, printable
 from facediff.utils import ranges
+from facediff.utils.jobs import check_scheduler
 
 if TYPE_CHECKING:
     from facediff.data.prepare.runner import Plan, Report
@@ -34,6 +35,7 @@ def check(
     quick: bool = False,
     json: bool = False,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     quiet: bool = False,
 ) -> int:
     """Report what a corpus folder is, what is there, what is missing and what is wrong in it.
@@ -46,7 +48,8 @@ def check(
         split: totals of one way to split the corpus only (3DMEAD: sentence, identity)
         quick: read headers only, and compare files by size
         json: machine-readable: one object
-        workers: processes (default: as many as processors if there is much to read)
+        workers: clips at a time (default: as many as processors if there is much to read)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         quiet: no progress bar
 
     Returns:
@@ -54,11 +57,20 @@ def check(
     """
     if not root.is_dir():
         raise FaceDiffError(f"{root}: no such folder; expected a corpus folder")
+    check_scheduler(scheduler)
     from facediff.data.check import check as check_folder
     from facediff.data.check import text
 
     find_own_module(corpus)
-    report = check_folder(root, corpus, split=split, quick=quick, workers=workers, progress=not (json or quiet))
+    report = check_folder(
+        root,
+        corpus,
+        split=split,
+        quick=quick,
+        workers=workers,
+        scheduler=scheduler,
+        progress=not (json or quiet),
+    )
     if json:
         tell(*json_format.dumps(report.state(), indent=2, allow_nan=False).split("\n"))
     else:
@@ -118,31 +130,47 @@ def options_of(plan: Callable[..., Plan]) -> Parameters:
     """The options of ``facediff data prepare`` for a corpus."""
 
     def common(
-        raw: Root, out: Annotated[Path, Option(writes="folder")], *, workers: Workers = None, quiet: bool = False
+        raw: Root,
+        out: Annotated[Path, Option(writes="folder")],
+        *,
+        workers: Workers = None,
+        scheduler: Scheduler = None,
+        quiet: bool = False,
     ) -> None:
         """Prepare.
 
         Args:
             raw: the raw data set, unpacked
             out: folder to write: a new one, or one that this command has begun
-            workers: processes (default: as many as processors)
+            workers: clips at a time (default: as many as processors)
+            scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm
+                (docs/cluster.md)
             quiet: no progress bars
         """
 
     return {**parameters_of(common), **plan_options(plan)}
 
 
-def prepare(make_plan: Callable[[Path], Plan], *, raw: Path, out: Path, workers: int | None, quiet: bool) -> int:
+def prepare(
+    make_plan: Callable[[Path], Plan],
+    *,
+    raw: Path,
+    out: Path,
+    workers: int | None,
+    scheduler: str | None = None,
+    quiet: bool,
+) -> int:
     """Prepare a data set and print what came of it."""
     from facediff.data.prepare.runner import prepare as carry_out
 
+    check_scheduler(scheduler)
     source, target = raw.resolve(), out.resolve()
     if target == source or source in target.parents:  # the next run would find what is written as raw data
         raise FaceDiffError(f"{out}: lies in the raw folder {raw}; choose a folder outside it to write to")
     if not raw.is_dir():
         raise FaceDiffError(f"{raw}: no such folder; expected the raw data set, unpacked")
     try:
-        report = carry_out(make_plan(raw), out, workers=workers, quiet=quiet)
+        report = carry_out(make_plan(raw), out, workers=workers, scheduler=scheduler, reads=[raw], quiet=quiet)
     except KeyboardInterrupt:
         print(f"\nstopped; the same command continues where {printable(out)} was left", file=sys.stderr)
         raise

@@ -11,6 +11,7 @@ from facediff.cli.options import (
     FileOrList,
     Folder,
     FrameRate,
+    Scheduler,
     Seed,
     Workers,
     check_folders,
@@ -21,6 +22,7 @@ from facediff.cli.parsing import Option, refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.jobs import check_scheduler
 
 LEVEL = 0.95
 DRAW_SECONDS = 4e-8  # What a resample takes for each clip
@@ -51,6 +53,7 @@ def evaluate(
     level: Annotated[ranges.Level, Option(metavar="P")] = LEVEL,
     seed: Seed = 0,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     json: Annotated[str | None, Option(metavar="FILE", writes="file", dash=True)] = None,
     csv: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
     quiet: bool = False,
@@ -86,6 +89,7 @@ def evaluate(
         level: of the intervals
         seed: of the resamples
         workers: clips scored at a time (default: as many as processors)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         json: write everything as JSON; - prints it instead of the table
         csv: write one row for each sequence and method
         quiet: no progress bar
@@ -104,6 +108,7 @@ def evaluate(
     check_folders(methods)
     if not truth.is_dir():
         raise FaceDiffError(f"{truth}: no such folder; expected truths, or a corpus folder")
+    check_scheduler(scheduler)
     from facediff.utils.files import atomic
     from facediff.utils.plain_files import json_text, write_rows
 
@@ -151,6 +156,7 @@ def evaluate(
         level=level,
         seed=seed,
         workers=workers,
+        scheduler=scheduler,
         progress=not quiet,
     )
     everything = json_text(f"--json {json}", report.as_dict(), indent=2, ensure_ascii=True)

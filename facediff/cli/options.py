@@ -36,6 +36,7 @@ Seed = Annotated[ranges.Seed, Option(metavar="N")]
 Size = Annotated[ranges.Pixels, Option(metavar="PIXELS")]
 View = Literal["front", "three_quarter", "side"]
 Workers = Annotated[ranges.Workers | None, Option(metavar="N")]
+Scheduler = Annotated[str | None, Option(metavar="WHERE")]
 
 
 @dataclass(frozen=True)

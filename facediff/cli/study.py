@@ -11,6 +11,7 @@ from facediff.cli.options import (
     Folder,
     FrameRate,
     OutputFolder,
+    Scheduler,
     Seed,
     Size,
     View,
@@ -23,6 +24,7 @@ from facediff.cli.parsing import Option, refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.jobs import check_scheduler
 from facediff.utils.ranges import Range
 
 Controls = Annotated[int, Range(0, 50)]
@@ -54,6 +56,7 @@ def make(
     view: View = "front",
     video: Literal["mp4", "webm"] = "mp4",
     workers: Workers = None,
+    scheduler: Scheduler = None,
     quiet: bool = False,
     yes: bool = False,
 ) -> None:
@@ -91,9 +94,11 @@ def make(
         view: camera
         video: format; webm (VP9) for browsers without H.264
         workers: videos drawn at a time (default: as many as processors)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         quiet: no progress bar
         yes: start without a question, however long it takes
     """
+    check_scheduler(scheduler)
     folders = named_folders(methods)
     check_folders(folders)
     if truth is not None and not truth.is_dir() and str(truth) != "puppet":
@@ -130,7 +135,7 @@ def make(
     for note in plan.notes:
         tell(f"note: {note}")
     confirm_cost(yes, "--max-clips or --size", seconds=plan.seconds / 2)
-    drawn = plan.make(output, workers=workers, progress=not quiet)
+    drawn = plan.make(output, workers=workers, scheduler=scheduler, progress=not quiet)
     study = plan.study
     trials = study.trials_of(0)
     controls = sum(trial.kind != "pair" for trial in trials)

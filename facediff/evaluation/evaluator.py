@@ -59,6 +59,7 @@ def evaluate(
     level: ranges.Level = 0.95,
     seed: ranges.Seed = 0,
     workers: ranges.Workers | None = None,
+    scheduler: str | None = "",
     progress: bool = False,
 ) -> Report:
     """Score the files of one or several methods against the truth.
@@ -93,6 +94,7 @@ def evaluate(
         level: share of the resamples inside an interval.
         seed: of the resamples.
         workers: clips that are scored at a time; as many as processors if None. Digits do not depend on it.
+        scheduler: where clips are scored; see :func:`facediff.utils.jobs.run_tasks`. Nor on this.
         progress: whether to show a progress bar on standard error, if it is a terminal.
 
     Raises:
@@ -136,7 +138,8 @@ def evaluate(
         pairs, missing = pair_up(files, truths, identity)
         paired[method] = pairs, replace(missing, unnamed=unnamed)
     jobs = [(method, pair) for method, (pairs, _) in paired.items() for pair in pairs]
-    found = score_all(scorer, jobs, workers, progress=progress)
+    reads = [Path(truth), *map(Path, methods.values()), *([] if corpus is None else [corpus])]
+    found = score_all(scorer, jobs, workers, scheduler=scheduler, reads=reads, progress=progress)
     tables = [
         MethodTable(method, str(methods[method]), pairs, missing, found.get(method, {}), scorer.columns)
         for method, (pairs, missing) in paired.items()

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,7 +29,7 @@ from facediff.metrics import (
 from facediff.metrics.base import Clips, LengthRule, Pooling, align
 from facediff.metrics.one_pass import one_pass
 from facediff.utils.arrays import in_range, open_vertices
-from facediff.utils.jobs import run_tasks
+from facediff.utils.jobs import WorkerDied, run_tasks
 from facediff.utils.limits import COORDINATE
 
 METRICS = "metrics"  # Stands in place of a protocol's name where metrics were chosen by name
@@ -294,17 +295,25 @@ def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
 
 
 def score_all(
-    scorer: Scorer, jobs: Sequence[tuple[str, Pair]], workers: int | None, *, progress: bool = False
+    scorer: Scorer,
+    jobs: Sequence[tuple[str, Pair]],
+    workers: int | None,
+    *,
+    scheduler: str | None = "",
+    reads: Sequence[Path] = (),
+    progress: bool = False,
 ) -> dict[str, dict[str, ClipScores | str]]:
     """What the scorer says of every job, by method and clip.
 
-    The workers are threads: nearly all of the time is spent in torch, which lets other threads run, and a thread
-    starts immediately where a process would take seconds, and a hundred megabytes, to import torch.
+    On one machine, the workers are threads: nearly all of the time is spent in torch, which lets other threads
+    run, and a thread starts immediately where a process would take seconds, and a hundred megabytes, to import torch.
 
     Args:
         scorer: scores a clip.
         jobs: method and clip.
         workers: clips that are scored at a time; as many as processors if None.
+        scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
+        reads: the folders of the clips, which workers of a cluster must see.
         progress: whether to show a bar.
 
     Raises:
@@ -312,9 +321,21 @@ def score_all(
     """
     found: dict[str, dict[str, ClipScores | str]] = {method: {} for method, _ in jobs}
     results = run_tasks(
-        lambda job: scorer.score(job[1]), jobs, workers=workers, mode="threads", progress="clips" if progress else ""
+        partial(_score_job, scorer),
+        jobs,
+        workers=workers,
+        mode="threads",
+        scheduler=scheduler,
+        reads=reads,
+        progress="clips" if progress else "",
     )
     with closing(results):
         for (method, pair), scores in results:
+            if isinstance(scores, WorkerDied):
+                scores = "killed the process that scored it, perhaps for lack of memory"  # noqa: PLW2901
             found[method][pair.clip] = scores
     return found
+
+
+def _score_job(scorer: Scorer, job: tuple[str, Pair]) -> ClipScores | str:
+    return scorer.score(job[1])

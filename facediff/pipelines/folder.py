@@ -21,7 +21,7 @@ from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
 from facediff.utils.hub import model_files
-from facediff.utils.jobs import PerWorker
+from facediff.utils.jobs import PerWorker, is_cluster
 from facediff.utils.tables import print_table
 
 LOCK = ".facediff-batch.lock"
@@ -29,6 +29,9 @@ LOCK = ".facediff-batch.lock"
 
 TABLE = 40
 """Recordings that the table at the end shows; of more, only the failed ones."""
+
+FEW = 20
+"""Recordings of which workers of a cluster are asked beforehand whether they see them."""
 
 Animate = Callable[[Path, Path], None]
 """Animates a recording (first) and writes a file (second), whole or not at all."""
@@ -45,6 +48,7 @@ def animate_folder(
     seed: int = 0,
     max_seconds: float | None = None,
     workers: int | None = None,
+    scheduler: str | None = "",
     retry_failed: bool = False,
 ) -> int:
     """Animate many recordings into a folder.
@@ -56,7 +60,9 @@ def animate_folder(
         suffix: format of the animations.
         seed: from which each recording's own seed follows, together with the name of its file.
         max_seconds: recordings that last longer fail.
-        workers: processes; as many as processors if None, one on an accelerator, which holds one model.
+        workers: recordings at a time; as many as processors if None, one on an accelerator, which holds one model, or
+            all workers of a cluster.
+        scheduler: where recordings are animated; see :func:`facediff.utils.jobs.run_tasks`.
         retry_failed: try recordings again that failed before.
 
     Returns:
@@ -94,7 +100,8 @@ def animate_folder(
         [f"{name}={json.dumps(value, default=str)}" for name, value in decides.items()],
         make_worker=partial(_load_pipeline, quiet, seed, max_seconds),
         files=_deciding_files(options),
-        workers=workers or (None if on_processor(options.device) else 1),
+        workers=workers or (None if on_processor(options.device) or is_cluster(scheduler) else 1),
+        scheduler=scheduler,
         retry_failed=retry_failed,
     )
 
@@ -172,6 +179,7 @@ def run_folder(
     make_worker: MakeWorker,
     files: Sequence[Path] = (),
     workers: int | None = None,
+    scheduler: str | None = "",
     retry_failed: bool = False,
 ) -> int:
     """Animate recordings into a folder.
@@ -204,7 +212,16 @@ def run_folder(
         try:
             to_do = [task for task in tasks if task.source not in states]
             work = PerWorker(partial(_set_up, make_worker, list(command)))
-            outcomes = run_batch(work, to_do, workers=workers, record=FileTask.record, survive_bugs=True)
+            outcomes = run_batch(
+                work,
+                to_do,
+                workers=workers,
+                scheduler=scheduler,
+                writes=output,
+                reads=[*files, *(task.source for task in to_do[:FEW])],
+                record=FileTask.record,
+                survive_bugs=True,
+            )
             with closing(outcomes):
                 for count, (task, outcome) in enumerate(outcomes, start=1):
                     if outcome.problem:

@@ -151,14 +151,17 @@ class StudyPlan:
         asked = 5 * len(self.study.choices) * len(trials)
         return (asked + sum(self.clips[trial.clip].seconds for trial in trials)) / 60
 
-    def make(self, output: Path, *, workers: int | None = None, progress: bool = True) -> int:
+    def make(
+        self, output: Path, *, workers: int | None = None, scheduler: str | None = "", progress: bool = True
+    ) -> int:
         """Draw the videos and write the page and the key; the number of videos that were drawn.
 
         What an earlier run has drawn of the same files and options is kept.
 
         Args:
             output: the study's folder.
-            workers: processes; as many as processors if None.
+            workers: videos at a time; as many as processors, or workers of a cluster, if None.
+            scheduler: where they are drawn; see :func:`facediff.utils.jobs.run_tasks`.
             progress: whether a progress bar is shown.
 
         Raises:
@@ -175,10 +178,17 @@ class StudyPlan:
                     remove_partial(folder, task.output.stem)
                     to_do.append(task)
             problems: list[str] = []
-            with (
-                progress_bar("drawing videos", len(to_do), shown=progress and bool(to_do)) as step,
-                closing(run_batch(draw, to_do, workers=workers, record=VideoTask.record)) as outcomes,
-            ):
+            outcomes = run_batch(
+                draw,
+                to_do,
+                workers=workers,
+                scheduler=scheduler,
+                writes=output,
+                reads=[task.source for task in to_do],
+                record=VideoTask.record,
+            )
+            bar = progress_bar("drawing videos", len(to_do), shown=progress and bool(to_do))
+            with bar as step, closing(outcomes):
                 for _, outcome in outcomes:
                     problems += [outcome.problem] if outcome.problem else []
                     step()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import errno
+import sys
 import time
 import traceback
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,12 +28,16 @@ RECORDS = ".facediff-batch"
 
 @dataclass(frozen=True)
 class Outcome(Generic[Result]):
-    """What became of a task: its result, or why it failed (``fatal``: all others would fail for the same reason)."""
+    """What became of a task: its result, or why it failed (``fatal``: all others would fail for the same reason).
+
+    Of a bug that is survived, there is the ``trace`` as well.
+    """
 
     result: Result | None = None
     problem: str = ""
     seconds: float = 0.0
     fatal: bool = False
+    trace: str = ""
 
 
 def run_batch(
@@ -40,15 +45,21 @@ def run_batch(
     tasks: Sequence[Task],
     *,
     workers: int | None = None,
+    scheduler: str | None = "",
+    writes: Path | None = None,
+    reads: Iterable[Path] = (),
     record: Callable[[Task, str], None] | None = None,
     survive_bugs: bool = False,
 ) -> Generator[tuple[Task, Outcome[Result]]]:
-    """Do tasks in several processes past failures, as :func:`~facediff.utils.jobs.run_tasks` does them.
+    """Do tasks in several workers past failures, as :func:`~facediff.utils.jobs.run_tasks` does them.
 
     Args:
         work: does a task; picklable, such as :class:`~facediff.utils.jobs.PerWorker`.
         tasks: errors name a task by its ``str()``.
-        workers: number of processes; as many as processors if None.
+        workers: number of workers; as many as processors, or as the cluster has, if None.
+        scheduler: where the tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
+        writes: folder that tasks write to.
+        reads: files and folders that tasks read.
         record: called with each task that is done and its problem, in the worker, so that also what is finished after
             Ctrl-C is recorded; picklable.
         survive_bugs: whether an exception that is no :class:`FaceDiffError` is printed and counts as a failure of the
@@ -59,13 +70,16 @@ def run_batch(
             failed, a package is missing or the disk is full.
     """
     attempt = partial(_attempt, work, record, survive_bugs)
-    with closing(run_tasks(attempt, tasks, workers=workers)) as results:
+    places: dict[str, Any] = {"scheduler": scheduler, "writes": writes, "reads": reads}
+    with closing(run_tasks(attempt, tasks, workers=workers, **places)) as results:
         for task, outcome in results:
             if isinstance(outcome, WorkerDied):
                 problem = f"{task}: killed its process, perhaps for lack of memory; try --workers 1"
                 outcome = Outcome(problem=problem)
                 if record is not None:
                     record(task, problem)
+            if outcome.trace:  # printed here, since a worker's standard error may be a log on another machine
+                print(outcome.trace, end="", file=sys.stderr, flush=True)
             if outcome.fatal:
                 raise FaceDiffError(outcome.problem)
             yield task, outcome
@@ -93,8 +107,8 @@ def _attempt(
         if not survive_bugs:
             error.add_note(f"while working on {task}")
             raise
-        traceback.print_exc()
-        outcome = Outcome(problem=f"{task}: {type(error).__name__}: {error} (see the traceback above)")
+        problem = f"{task}: {type(error).__name__}: {error} (see the traceback above)"
+        outcome = Outcome(problem=problem, trace=traceback.format_exc())
     if record is not None:
         record(task, outcome.problem)
     return replace(outcome, seconds=time.monotonic() - started)

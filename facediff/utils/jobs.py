@@ -1,22 +1,29 @@
-"""The one way to run many independent tasks: in processes, in threads or one after the other."""
+"""The one way to run many independent tasks: in processes, in threads, one after the other, or on a Dask cluster.
+
+Where tasks run changes nothing but the time that they take; :mod:`facediff.utils.cluster` has the part of the cluster.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import importlib.util
 import multiprocessing
 import os
 import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
+from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for_end
-from typing import Any, Generic, Literal, TypeVar, overload
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeVar, cast, overload
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.progress import progress_bar
 
 Task = TypeVar("Task")
@@ -25,6 +32,10 @@ Result = TypeVar("Result")
 Mode = Literal["processes", "threads", "serial"]
 """``processes`` for work in Python, ``threads`` for work that releases the interpreter's lock (torch, hashing)."""
 
+LOCAL = ("processes", "threads", "serial")
+ADDRESS = "DASK_SCHEDULER_ADDRESS"
+"""Environment variable, also of Dask's own programs, with the cluster that is used where nothing else is asked for."""
+SLURM = "slurm"
 MOST_WORKERS = 4  # For each processor: more would take memory and no time off
 GRACE = 10.0
 """Seconds that running tasks are given to come to their end when the work is stopped."""
@@ -34,6 +45,51 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 def processors() -> int:
     """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_scheduler(scheduler: str | None) -> str:
+    """Where tasks run: one of :data:`LOCAL`, the address of a Dask scheduler, ``slurm`` with options, or "" for here.
+
+    Args:
+        scheduler: as ``--scheduler`` takes it; if None, what the environment variable :data:`ADDRESS` says.
+
+    Raises:
+        FaceDiffError: if it is none of these.
+        MissingExtraError: if it is a cluster and Dask is not installed.
+
+    Example:
+        >>> check_scheduler("threads")
+        'threads'
+    """
+    name = "--scheduler"
+    if scheduler is None:
+        name, scheduler = ADDRESS, os.environ.get(ADDRESS, "")
+        if not scheduler:
+            return ""
+    kind, _, host = scheduler.partition("://")
+    if kind.partition(":")[0] == SLURM:
+        package = "dask_jobqueue"
+    elif kind in ("tcp", "tls", "ws", "wss", "inproc") and host:
+        package = "distributed"
+    elif scheduler in LOCAL and name != ADDRESS:
+        return scheduler
+    else:
+        raise FaceDiffError(
+            f"{name} {scheduler}: is no place for tasks; expected {', '.join(LOCAL)}, slurm, or the address of a Dask "
+            f"scheduler such as tcp://HOST:8786"
+        )
+    if importlib.util.find_spec(package) is None:
+        raise MissingExtraError(package, "cluster", f"{name} {scheduler}")
+    return scheduler
+
+
+def is_cluster(scheduler: str | None) -> bool:
+    """Whether tasks run on a cluster rather than on this machine.
+
+    Raises:
+        FaceDiffError: as :func:`check_scheduler`.
+    """
+    return scheduler != "" and check_scheduler(scheduler) not in ("", *LOCAL)
 
 
 class WorkerDied:
@@ -53,7 +109,11 @@ class PerWorker(Generic[Task, Result]):
 
     def __init__(self, setup: Callable[[], Callable[[Task], Result]]) -> None:
         self.setup = setup
-        self._work: Callable[[Task], Result] | None = None
+        self._here = threading.local()  # what is loaded need not be fit for two threads
+
+    def __reduce__(self) -> tuple[type[PerWorker[Task, Result]], tuple[Callable[[], Callable[[Task], Result]]]]:
+        """Pickling: nothing that one worker has loaded goes to another."""
+        return type(self), (self.setup,)
 
     def __call__(self, task: Task) -> Result:
         """Do a task.
@@ -61,12 +121,13 @@ class PerWorker(Generic[Task, Result]):
         Raises:
             SetupError: if the set-up failed in a way that the user can put right.
         """
-        if self._work is None:
+        work = getattr(self._here, "work", None)
+        if work is None:
             try:
-                self._work = self.setup()
+                work = self._here.work = self.setup()
             except FaceDiffError as error:
                 raise SetupError(str(error)) from error
-        return self._work(task)
+        return cast(Callable[[Task], Result], work)(task)
 
 
 @overload
@@ -87,6 +148,9 @@ def run_tasks(
     *,
     workers: int | None = None,
     mode: Mode = "processes",
+    scheduler: str | None = "",
+    writes: Path | None = None,
+    reads: Iterable[Path] = (),
     progress: str = "",
 ) -> Generator[tuple[Task, Result | WorkerDied]]: ...
 
@@ -97,23 +161,32 @@ def run_tasks(
     *,
     workers: int | None = None,
     mode: Mode = "processes",
+    scheduler: str | None = "",
+    writes: Path | None = None,
+    reads: Iterable[Path] = (),
     progress: str = "",
 ) -> Generator[tuple[Task, Any]]:
     """Do tasks in several workers, and yield each with its result as soon as it is done.
 
     No worker gets a task before it is free for it, and at most one result for each worker waits to be taken, so memory
     is bounded and a stop waits only for what is running. Wrap the generator in :func:`contextlib.closing`, so that it
-    stops with the loop that takes the results: what is running then has some seconds to come to its end before its
-    process is stopped, and nothing else is begun. Workers ignore Ctrl-C; only this process reacts to it.
+    stops with the loop that takes the results: what is running then has some seconds to come to its end before it is
+    stopped, and nothing else is begun. Workers ignore Ctrl-C; only this process reacts to it.
 
     Args:
-        work: does a task. For processes: a picklable function or object, which each worker gets once and keeps, such as
-            :class:`PerWorker`.
+        work: does a task. For processes and clusters: a picklable function or object, which each worker gets once and
+            keeps, such as :class:`PerWorker`. A task may be done again if its worker is lost, so it writes its files
+            whole or not at all.
         tasks: what it is called with.
-        workers: number of workers; as many as processors if None. One process is not worth starting: its tasks are
-            done in this process.
-        mode: what the workers are. Processes and threads compute on one processor each. Where processes cannot be
-            started (programs read from standard input, scripts without a main guard), this process does the work.
+        workers: number of workers; as many as processors, or as the cluster has, if None. One process is not worth
+            starting: its tasks are done in this process.
+        mode: what the workers are on this machine. Processes and threads compute on one processor each. Where processes
+            cannot be started (programs read from standard input, scripts without a main guard), this process does the
+            work.
+        scheduler: where the tasks run, as the option ``--scheduler`` says: a mode that takes precedence over ``mode``,
+            a cluster (see :func:`check_scheduler`), or None for what the environment says. Here, if empty.
+        writes: folder that tasks write to; workers of a cluster must see it, which is checked.
+        reads: files and folders that tasks read; likewise.
         progress: title of a progress bar; none if empty.
 
     Yields:
@@ -122,14 +195,22 @@ def run_tasks(
 
     Raises:
         Exception: the first one that ``work`` raises; tasks that have not been begun are dropped.
+        FaceDiffError: if the cluster cannot be used, or is lost.
 
     Example:
         >>> dict(run_tasks(len, ["a", "bb"], mode="threads"))
         {'a': 1, 'bb': 2}
     """
+    where = check_scheduler(scheduler) if scheduler != "" else ""
     count = min(workers or processors(), len(tasks), MOST_WORKERS * processors())
-    with progress_bar(progress, len(tasks), shown=bool(progress)) as step:
-        for pair in _results(work, tasks, count, mode):
+    if where in ("", *LOCAL):
+        results = _results(work, tasks, count, cast(Mode, where or mode))
+    else:
+        from facediff.utils.cluster import run_on_cluster
+
+        results = run_on_cluster(work, tasks, where, workers=workers, writes=writes, reads=reads)
+    with progress_bar(progress, len(tasks), shown=bool(progress)) as step, closing(results):
+        for pair in results:
             yield pair
             step()
 
@@ -139,7 +220,7 @@ def _results(
 ) -> Generator[tuple[Task, Result | WorkerDied]]:
     if mode == "threads" and tasks:
         with one_thread_each():
-            yield from _together(ThreadPoolExecutor(workers), work, deque(tasks), workers, deque())
+            yield from _together(ThreadPoolExecutor(workers), partial(_in_thread, work), deque(tasks), workers, deque())
     elif mode == "serial" or workers <= 1 or not _can_start():
         for task in tasks:
             yield task, work(task)
@@ -148,11 +229,11 @@ def _results(
         while waiting:
             suspects: deque[Task] = deque()
             workers = min(workers, len(waiting))
-            yield from _together(_pool(work, workers), _do, waiting, workers, suspects)
+            yield from _together(process_pool(work, workers), _do, waiting, workers, suspects)
             # One of these tasks killed its process and thereby the whole pool; one at a time it is known which.
             while suspects:
                 guilty: deque[Task] = deque()
-                yield from _together(_pool(work, 1), _do, suspects, 1, guilty)
+                yield from _together(process_pool(work, 1), _do, suspects, 1, guilty)
                 yield from ((task, WorkerDied()) for task in guilty)
 
 
@@ -164,7 +245,7 @@ def _together(
     try:
         while waiting or running:
             while waiting and len(running) < workers:
-                with _starting_processes() if isinstance(pool, ProcessPoolExecutor) else nullcontext():
+                with starting_processes() if isinstance(pool, ProcessPoolExecutor) else nullcontext():
                     running[pool.submit(work, waiting[0])] = waiting[0]
                 waiting.popleft()
             done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -176,23 +257,38 @@ def _together(
     except BrokenProcessPool:
         suspects += running.values()
     except (KeyboardInterrupt, SystemExit, GeneratorExit):
-        _end_soon(pool, running)
+        end_soon(pool, running)
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _end_soon(pool: Executor, running: Collection[Future[Any]]) -> None:
-    """Let what is running come to its end for some seconds, then end the worker processes; Ctrl-C again ends them."""
+_busy: set[int] = set()  # threads that are doing a task
+
+
+def _in_thread(work: Callable[[Task], Result], task: Task) -> Result:
+    me = threading.get_ident()
+    _busy.add(me)
+    try:
+        return work(task)
+    finally:
+        _busy.discard(me)
+
+
+def end_soon(pool: Executor, running: Collection[Future[Any]], grace: float = GRACE) -> None:
+    """Let what is running come to its end for some seconds, then end the workers; Ctrl-C again ends them."""
     workers = list((getattr(pool, "_processes", None) or {}).values())
+    threads = {thread.ident for thread in getattr(pool, "_threads", ())}
     pool.shutdown(wait=False, cancel_futures=True)
     try:
-        wait(running, GRACE)
+        wait(running, grace)
     finally:
         if any(not future.done() for future in running):
             for worker in workers:
                 worker.terminate()  # what it has begun to write is removed
-            wait(running, GRACE if workers else 0)
+            for thread in threads & _busy:  # nothing else ends a thread; it goes on until its next line of Python
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(SystemExit))
+            wait(running, GRACE)
         for worker in workers:
             if any(not future.done() for future in running):
                 worker.kill()
@@ -203,7 +299,8 @@ def _end_soon(pool: Executor, running: Collection[Future[Any]]) -> None:
 _work: Callable[[Any], Any] | None = None
 
 
-def _pool(work: Callable[[Any], Any] | None, workers: int) -> ProcessPoolExecutor:
+def process_pool(work: Callable[[Any], Any] | None, workers: int) -> ProcessPoolExecutor:
+    """Worker processes, to be started by :func:`starting_processes`."""
     # Never a plain fork: the caller may have started threads, those of torch for instance.
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(work,))
@@ -211,9 +308,9 @@ def _pool(work: Callable[[Any], Any] | None, workers: int) -> ProcessPoolExecuto
 
 def _can_start() -> bool:
     """Whether processes start at all; found out without work, since handing much to one that dies would block."""
-    with _pool(None, 1) as pool:
+    with process_pool(None, 1) as pool:
         try:
-            with _starting_processes():
+            with starting_processes():
                 return pool.submit(os.getpid).result() != os.getpid()
         except BrokenProcessPool:
             return False
@@ -245,7 +342,7 @@ def _do(task: Any) -> Any:  # noqa: ANN401
 
 
 @contextmanager
-def _starting_processes() -> Iterator[None]:
+def starting_processes() -> Iterator[None]:
     """Processes that are started inside compute on one thread each and ignore Ctrl-C, even while they start.
 
     A worker that Ctrl-C ended would break the pool in the middle of the others' work; this process receives the signal

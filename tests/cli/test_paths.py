@@ -53,9 +53,10 @@ NO_PATHS = {
         "region",
         "sampler",
         "scalar",
+        "scheduler",
         "split",
     ),
-    *("part", "splits"),
+    "splits",
     *("subjects", "suffix", "topology", "truth_pattern", "unit"),
 }
 """Texts that are no paths; a new option of type text either joins them or declares that it is read or written."""

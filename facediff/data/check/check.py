@@ -35,7 +35,7 @@ from facediff.data.check.shared import (
     check_templates,
 )
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.utils.jobs import WorkerDied, processors, run_tasks
+from facediff.utils.jobs import WorkerDied, is_cluster, processors, run_tasks
 
 if TYPE_CHECKING:
     from facediff.data.corpus import Clip, Corpus
@@ -61,6 +61,7 @@ def check(
     split: str | None = None,
     quick: bool = False,
     workers: int | None = None,
+    scheduler: str | None = "",
     progress: bool = False,
 ) -> Report:
     """Check a corpus folder; nothing in it is changed, trusted or run.
@@ -70,7 +71,8 @@ def check(
         corpus: name of the corpus (``biwi``), or import path of its data module; found out if None.
         split: only the totals of this way to split the corpus (3DMEAD: ``sentence``, ``identity``).
         quick: read headers only: no NaN, no comparison with templates, no copies; files are compared by size.
-        workers: processes; if None, as many as processors where there is much to read.
+        workers: clips at a time; if None, as many as processors where there is much to read, or all of a cluster.
+        scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
         progress: show a progress bar on standard error.
 
     Raises:
@@ -99,8 +101,10 @@ def check(
     }
     if view is not None:
         size = sum(path.stat().st_size for path in folder.motions.values() if path.is_file())
-        workers = workers or (1 if quick or size <= WORTH_IT else processors())
-        _check_corpus(report, view, folder, manifest, partial(_examine_all, workers=workers, progress=progress))
+        if not is_cluster(scheduler):
+            workers = workers or (1 if quick or size <= WORTH_IT else processors())
+        examine_all = partial(_examine_all, workers=workers, scheduler=scheduler, progress=progress)
+        _check_corpus(report, view, folder, manifest, examine_all)
     report.sort()
     return report
 
@@ -170,7 +174,9 @@ def _clips(opened: Corpus | None, view: View, folder: Folder, findings: Findings
     return clips
 
 
-def _examine_all(rules: Rules, view: View, folder: Folder, *, workers: int, progress: bool) -> list[ClipFacts]:
+def _examine_all(
+    rules: Rules, view: View, folder: Folder, *, workers: int | None, scheduler: str | None, progress: bool
+) -> list[ClipFacts]:
     try:
         import soundfile  # noqa: F401
     except ImportError as error:
@@ -181,7 +187,14 @@ def _examine_all(rules: Rules, view: View, folder: Folder, *, workers: int, prog
         if (clip := view.parse(name)) is not None
     ]
     examined: dict[str, ClipFacts] = {}
-    results = run_tasks(partial(examine, rules), tasks, workers=workers, progress="clips" if progress else "")
+    results = run_tasks(
+        partial(examine, rules),
+        tasks,
+        workers=workers,
+        scheduler=scheduler,
+        reads=[folder.root],
+        progress="clips" if progress else "",
+    )
     with closing(results):
         for task, facts in results:
             if isinstance(facts, WorkerDied):

@@ -114,7 +114,15 @@ class Report:
         return not self.failed
 
 
-def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = False) -> Report:
+def prepare(
+    plan: Plan,
+    out: Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = "",
+    reads: Sequence[Path] = (),
+    quiet: bool = False,
+) -> Report:
     """Write a corpus folder.
 
     A run that was killed is resumed: clips whose two files are there are kept. A second run over a complete folder
@@ -123,7 +131,9 @@ def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = 
     Args:
         plan: what to write.
         out: the folder; new, empty, or begun by this function with the same options.
-        workers: processes; as many as there are processors if None.
+        workers: clips at a time; as many as there are processors, or workers of a cluster, if None.
+        scheduler: where clips are written; see :func:`facediff.utils.jobs.run_tasks`.
+        reads: the raw files, which workers of a cluster must see.
         quiet: no progress bars.
 
     Raises:
@@ -151,16 +161,23 @@ def prepare(plan: Plan, out: Path, *, workers: int | None = None, quiet: bool = 
         _check_space(plan, pending, out)
         write_json(out / STATE, plan.recipe)
         remove_partial(out, recursive=True)
-        return _write_all(plan, pending, finished, out, workers, quiet)
+        places = {"scheduler": scheduler, "writes": out, "reads": reads}
+        return _write_all(plan, pending, finished, out, workers, places, quiet)
 
 
 def _write_all(
-    plan: Plan, pending: list[Job], finished: dict[str, int], out: Path, workers: int | None, quiet: bool
+    plan: Plan,
+    pending: list[Job],
+    finished: dict[str, int],
+    out: Path,
+    workers: int | None,
+    places: Mapping[str, Any],
+    quiet: bool,
 ) -> Report:
     shared = plan.shared(out)
     clips, failed = dict(finished), {}
     bar = progress_bar(plan.corpus, len(plan.jobs), done=len(finished), shown=not quiet)
-    outcomes = run_batch(methodcaller("work", out), pending, workers=workers)
+    outcomes = run_batch(methodcaller("work", out), pending, workers=workers, **places)
     with bar as step, closing(outcomes):
         for job, outcome in outcomes:
             if outcome.result is None:
