@@ -18,6 +18,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import keyword
+import threading
 import types
 import typing
 import warnings
@@ -33,6 +34,7 @@ from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.utils.ranges import mismatch
 
 T = TypeVar("T", bound=type)
+_loading = threading.RLock()  # one for all kinds: what one of them loads may ask for another
 
 
 class RegistrationError(FaceDiffError):
@@ -131,22 +133,23 @@ class Kind:
         return types.new_class(name, (implementation,), exec_body=body)
 
     def load(self) -> None:
-        """Import the built-in components and the installed plug-ins, once."""
-        if self._loaded:
-            return
-        self._loaded = True
-        for module in self._modules:
-            importlib.import_module(module)
-        for point in entry_points(group=f"facediff.{self.kind}"):
-            try:
-                self._add(point.name, point.load())
-            except Exception as error:  # noqa: BLE001 - whatever a plug-in raises must not take facediff down
-                source = point.dist.name if point.dist is not None else point.value
-                warnings.warn(
-                    f'the {self.kind} "{point.name}" of the installed package "{source}" was left out: '
-                    f"{type(error).__name__}: {error}",
-                    stacklevel=2,
-                )
+        """Import the built-in components and the installed plug-ins, once; another thread waits for them."""
+        with _loading:
+            if self._loaded:
+                return
+            self._loaded = True
+            for module in self._modules:
+                importlib.import_module(module)
+            for point in entry_points(group=f"facediff.{self.kind}"):
+                try:
+                    self._add(point.name, point.load())
+                except Exception as error:  # noqa: BLE001 - whatever a plug-in raises must not take facediff down
+                    source = point.dist.name if point.dist is not None else point.value
+                    warnings.warn(
+                        f'the {self.kind} "{point.name}" of the installed package "{source}" was left out: '
+                        f"{type(error).__name__}: {error}",
+                        stacklevel=2,
+                    )
 
     def names(self) -> list[str]:
         """All registered names, sorted."""

@@ -100,6 +100,9 @@ class SetupError(FaceDiffError):
     """The set-up of a worker failed, so that every task would fail for the same reason."""
 
 
+_setting_up = threading.Lock()  # one thread after the other: libraries are not made to be imported by several
+
+
 class PerWorker(Generic[Task, Result]):
     """Work that needs something loaded first, such as a model: it is loaded once in each worker.
 
@@ -124,7 +127,8 @@ class PerWorker(Generic[Task, Result]):
         work = getattr(self._here, "work", None)
         if work is None:
             try:
-                work = self._here.work = self.setup()
+                with _setting_up:
+                    work = self._here.work = self.setup()
             except FaceDiffError as error:
                 raise SetupError(str(error)) from error
         return cast(Callable[[Task], Result], work)(task)
@@ -348,12 +352,22 @@ def starting_processes() -> Iterator[None]:
     A worker that Ctrl-C ended would break the pool in the middle of the others' work; this process receives the signal
     afterwards. The libraries read the number of threads when they are imported, which is before a worker's first task.
     """
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     mask = None
     if hasattr(signal, "pthread_sigmask"):
         resource_tracker.ensure_running()  # if it started later, it would undo the mask
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with _one_thread_variables():
+            yield
+    finally:
+        if mask is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+@contextmanager
+def _one_thread_variables() -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
         yield
     finally:
@@ -362,16 +376,15 @@ def starting_processes() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-        if mask is not None:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Threads inside compute on one thread each, where torch is loaded; digits then do not depend on the machine."""
+    """Threads inside compute on one thread each; digits then do not depend on the machine."""
     torch: Any = sys.modules.get("torch")
-    if torch is None:
-        yield
+    if torch is None:  # a task may import it
+        with _one_thread_variables():
+            yield
         return
     before = torch.get_num_threads()
     torch.set_num_threads(1)

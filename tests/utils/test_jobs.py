@@ -13,27 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import MissingExtraError
 from facediff.utils.jobs import Mode, PerWorker, SetupError, WorkerDied, run_tasks
+from tests.fakes.tasks import deadly, failing_setup, raising, square
 
 ROOT = Path(__file__).parents[2]
 MODES: list[Mode] = ["processes", "threads", "serial"]
-
-
-def square(task: int) -> int:
-    return task * task
-
-
-def deadly(task: int) -> int:
-    if task == 3:
-        os._exit(9)
-    return task * task
-
-
-def raising(task: int) -> int:
-    if task == 1:
-        raise MissingExtraError("h5py", "prepare", "reading")
-    return task
 
 
 def note_threads(_: int) -> str | None:
@@ -48,10 +33,6 @@ def count_calls(base: int) -> Callable[[int], tuple[int, int]]:
         return os.getpid(), base + len(calls)
 
     return work
-
-
-def failing_setup() -> Callable[[int], int]:
-    raise FaceDiffError("C.ckpt: no such checkpoint")
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -1,0 +1,253 @@
+"""Tasks on a Dask cluster: the same results, errors and ends as on one machine."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils import cluster, jobs
+from facediff.utils.batch import run_batch
+from facediff.utils.jobs import PerWorker, SetupError, WorkerDied, check_scheduler, run_tasks
+from tests.fakes.tasks import counting, deadly, failing_oddly, failing_setup, place, raising, write_slowly
+
+distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.filterwarnings("ignore")  # of Dask's own shutdown
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """A cluster inside this process, whose two workers start processes for tasks as any other worker does."""
+    options = {"processes": False, "threads_per_worker": 2, "dashboard_address": None, "protocol": "tcp://"}
+    with distributed.LocalCluster(n_workers=2, host="127.0.0.1", **options) as made:
+        yield made.scheduler_address
+
+
+def test_tasks_run_in_the_clients_folder_on_one_thread_in_processes_of_the_workers(
+    scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FACEDIFF_TRIAL", "yes")
+    results = dict(run_tasks(place, range(6), scheduler=scheduler, writes=Path("out")))
+    assert sorted(results) == list(range(6))
+    found = {result for result in results.values() if isinstance(result, tuple)}
+    assert {result[1:] for result in found} == {(str(tmp_path), "1", "yes")}
+    assert len({result[0] for result in found} - {os.getpid()}) == 2
+    assert not list(tmp_path.rglob("*token*"))  # what workers had to see is gone
+
+
+def test_the_environment_names_the_cluster_where_nothing_else_does(
+    scheduler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(jobs.ADDRESS, scheduler)
+    (there,) = [result for _, result in run_tasks(place, [0], scheduler=None)]
+    (here,) = [result for _, result in run_tasks(place, [0])]
+    (threads,) = [result for _, result in run_tasks(place, [0], scheduler="threads")]
+    assert isinstance(there, tuple)
+    assert isinstance(here, tuple)
+    assert isinstance(threads, tuple)
+    assert there[0] != here[0] == threads[0] == os.getpid()
+
+
+def test_set_up_happens_once_in_each_worker(scheduler: str) -> None:
+    by_process: dict[int, list[int]] = {}
+    for _, result in run_tasks(PerWorker(counting), range(8), scheduler=scheduler):
+        assert isinstance(result, tuple)
+        by_process.setdefault(result[0], []).append(result[1])
+    assert len(by_process) == 2
+    assert all(sorted(counts) == list(range(1, len(counts) + 1)) for counts in by_process.values())
+
+
+def test_a_task_that_kills_its_process_loses_no_other(scheduler: str) -> None:
+    results = dict(run_tasks(deadly, range(6), scheduler=scheduler))
+    assert isinstance(results.pop(3), WorkerDied)
+    assert results == {task: task * task for task in (0, 1, 2, 4, 5)}
+
+
+def test_errors_are_those_of_one_machine(scheduler: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(MissingExtraError, match="h5py"):
+        list(run_tasks(raising, range(4), scheduler=scheduler))
+    with pytest.raises(SetupError, match=r"C\.ckpt"):
+        list(run_tasks(PerWorker(failing_setup), range(2), scheduler=scheduler))
+    outcomes = dict(run_batch(failing_oddly, range(3), scheduler=scheduler, survive_bugs=True))
+    assert [bool(outcomes[task].problem) for task in range(3)] == [False, True, False]
+    assert "failing_oddly" in capsys.readouterr().err  # the traceback is the client's to print
+
+
+def test_a_stop_ends_tasks_and_removes_what_is_half_written(
+    scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "GRACE", 0.1)
+    work = partial(write_slowly, tmp_path)
+    with closing(run_tasks(work, range(9), workers=2, scheduler=scheduler, writes=tmp_path)) as results:
+        assert next(results) == (0, 0)
+        while not list(tmp_path.glob("begun*")):
+            time.sleep(0.02)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert not {name for name in left if "partial" in name}
+    assert "0.txt" in left
+    assert "8.txt" not in left  # it was not begun
+
+
+@pytest.mark.parametrize("mode", ["threads"])
+def test_a_stop_ends_threads_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
+    monkeypatch.setattr(jobs.end_soon, "__defaults__", (0.1,))
+
+    def work(task: int) -> int:
+        if task:
+            (tmp_path / "begun").touch()
+            for _ in range(600):
+                time.sleep(0.05)
+        return task
+
+    started = time.monotonic()
+    with closing(run_tasks(work, range(3), workers=2, scheduler=mode)) as results:
+        next(results)
+        while not (tmp_path / "begun").exists():
+            time.sleep(0.02)
+    assert time.monotonic() - started < 20
+
+
+def test_workers_that_see_other_files_are_refused(
+    scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = tmp_path / "a.wav"
+    recording.write_bytes(b"long speech")
+    monkeypatch.setattr(cluster, "search_path", lambda: recording.write_bytes(b"short") and ())
+    with pytest.raises(FaceDiffError, match=r"tcp://.*a\.wav"):
+        list(run_tasks(place, [0], scheduler=scheduler, reads=[recording]))
+    monkeypatch.setattr(cluster, "search_path", tuple)
+    monkeypatch.setattr(cluster, "sees", lambda path, _: not path.endswith("token"))
+    with pytest.raises(FaceDiffError, match=str(tmp_path / "out")):
+        list(run_tasks(place, [0], scheduler=scheduler, writes=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_may_grow_but_not_lack_names(tmp_path: Path) -> None:
+    (tmp_path / "a").touch()
+    facts = cluster.look(str(tmp_path))
+    (tmp_path / "b").touch()
+    assert cluster.sees(str(tmp_path), facts)
+    (tmp_path / "a").unlink()
+    assert not cluster.sees(str(tmp_path), facts)
+    assert not cluster.sees(str(tmp_path / "none"), facts)
+
+
+@pytest.mark.parametrize(("field", "value"), [("version", "0.0.1"), ("python", "2.7"), ("folder", "/not/there")])
+def test_workers_of_another_version_or_without_the_folder_refuse(field: str, value: str) -> None:
+    run = cluster.Run("name", os.getcwd(), (), {}, {}, b"")
+    worker: Any = type("Worker", (), {"address": "tcp://nowhere:1"})
+    assert cluster.meet(run, worker) == ""
+    cluster._hosts.clear()
+    assert value in cluster.meet(replace(run, **{field: value}), worker)
+    assert not cluster._hosts
+
+
+@pytest.mark.parametrize(
+    ("where", "named"),
+    [("tcp://", "tcp://"), ("dask", "dask"), ("", "--scheduler"), ("processess", "processess"), ("tcp:/a:1", "tcp:/a")],
+)
+def test_what_is_no_place_for_tasks_is_refused(where: str, named: str) -> None:
+    with pytest.raises(FaceDiffError, match=named):
+        check_scheduler(where)
+
+
+def test_a_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "CONNECTING", 0.3)
+    with pytest.raises(FaceDiffError, match="tcp://127.0.0.1:9"):
+        list(run_tasks(place, [0], scheduler="tcp://127.0.0.1:9"))
+    assert list(run_tasks(place, [], scheduler="tcp://127.0.0.1:9")) == []  # nothing to do
+
+
+def test_a_cluster_without_workers_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "PATIENCE", 0.2)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=None) as empty,
+        pytest.raises(FaceDiffError, match="worker"),
+    ):
+        list(run_tasks(place, [0], scheduler=empty.scheduler_address))
+
+
+@pytest.mark.parametrize("where", ["tcp://host:1", "slurm:cores=1"])
+def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, where: str) -> None:
+    monkeypatch.setattr(jobs.importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(MissingExtraError, match="cluster"):
+        check_scheduler(where)
+
+
+def test_nothing_imports_dask_unless_a_cluster_is_asked_for() -> None:
+    import subprocess
+
+    program = (
+        "import sys\nfrom facediff.utils.jobs import run_tasks\n"
+        "assert dict(run_tasks(len, ['a'], mode='threads', scheduler=None)) == {'a': 1}\n"
+        "assert not {'dask', 'distributed', 'cloudpickle'} & set(sys.modules)\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != jobs.ADDRESS}
+    assert subprocess.run([sys.executable, "-c", program], env=environment, check=False).returncode == 0
+
+
+# SLURM, with programs in place of sbatch and scancel.
+
+
+@pytest.fixture
+def slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """``sbatch`` keeps the script of each job and starts it; ``scancel`` notes the job's number."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    sbatch = f'#!/bin/sh\ncp "$1" {tmp_path}/job.sh\necho x >> {tmp_path}/jobs\n[ -e {tmp_path}/run ] && '
+    sbatch += f'sh {tmp_path}/job.sh > {tmp_path}/log 2>&1 &\necho "Submitted batch job 7"\n'
+    for name, text in (("sbatch", sbatch), ("scancel", f'#!/bin/sh\necho "$@" >> {tmp_path}/cancelled\n')):
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+    monkeypatch.setattr(cluster, "_clusters", {})
+    yield tmp_path
+    for made in cluster._clusters.values():
+        made.close(timeout=5)
+
+
+def test_slurm_options_make_the_job_script(slurm: Path) -> None:
+    options = "queue=gpu,cores=4,memory=8GB,walltime=01:30:00,job_extra_directives=[--gres=gpu:1, --exclusive]"
+    made = cluster.slurm_cluster(f"slurm:{options}", 6, 100)
+    script = made.job_script()
+    for line in ("-p gpu", "--cpus-per-task=4", "--mem=8G", "-t 01:30:00", "--gres=gpu:1", "--exclusive"):
+        assert f"#SBATCH {line}" in script
+    assert "--nworkers 4" in script
+    assert "--nthreads 1" in script
+    end = time.monotonic() + 20
+    while not (slurm / "jobs").exists() or len((slurm / "jobs").read_text().split()) < 2:
+        assert time.monotonic() < end, "six workers of four a job are two jobs"
+        time.sleep(0.05)
+    assert (slurm / "job.sh").read_text() == script.replace("dummy-name", "SLURMCluster-1")
+
+
+@pytest.mark.parametrize("options", ["", "cores=2", "cors=2,memory=1GB", "cores,memory=1GB", "cores=two,memory=1GB"])
+def test_wrong_slurm_options_are_refused(slurm: Path, options: str) -> None:
+    with pytest.raises(FaceDiffError, match="--scheduler slurm"):
+        list(run_tasks(place, [0], scheduler=f"slurm:{options}"))
+
+
+def test_without_slurm_its_program_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster.shutil, "which", lambda _: None)
+    with pytest.raises(FaceDiffError, match="sbatch"):
+        list(run_tasks(place, [0], scheduler="slurm:cores=1,memory=1GB"))
+
+
+@pytest.mark.slow
+def test_tasks_run_in_jobs_of_slurm(slurm: Path) -> None:
+    (slurm / "run").touch()
+    where = "slurm:cores=1,memory=1GB,interface=lo"
+    results = dict(run_tasks(place, range(4), workers=2, scheduler=where))
+    assert sorted(results) == list(range(4))
+    cluster._clusters[where].close(timeout=5)
+    assert "7" in (slurm / "cancelled").read_text()
