@@ -542,9 +542,14 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
         key_tolerance: as :meth:`Weights.save` takes it.
 
     Raises:
-        FaceDiffError: if a file cannot be written.
+        FaceDiffError: if a file cannot be written, or no shape has one of ARKit's names.
     """
     column = {name: index for index, name in enumerate(weights.names)}
+    if not any(name in column for name in ARKIT):
+        raise FaceDiffError(
+            f"{path}: none of the shapes ({', '.join(weights.names[:3])} …) has a name of ARKit's, which are this "
+            f"table's columns; rename them, or write a table of their own names with --plain"
+        )
     header = ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
     times = [frame / weights.frame_rate for frame in range(len(weights.values))]
     held = [*times, SURELY_SIXTIETHS] if times and times[-1] < SURELY_SIXTIETHS else times

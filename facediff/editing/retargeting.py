@@ -17,9 +17,11 @@ from facediff.editing.correspondence import (
     Indices,
     averaging,
     correspond,
+    placed,
     refuse_other_mesh,
 )
 from facediff.editing.face_features import sides_of_pairs
+from facediff.editing.fit_check import check_fit
 from facediff.editing.landmarks import Landmarks, common_landmarks, known_topology, read_landmarks
 from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
 from facediff.editing.surface import Surface
@@ -240,6 +242,9 @@ def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer])
 def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
     """Blendshapes of another topology (as :func:`read_shape_files` reads them), transferred to an animation's mesh.
 
+    The shapes are carried as an animation would be, and the result is checked likewise. Where it fails, or the shapes
+    are a whole figure's or look another way, their face is laid onto the animation's first.
+
     Raises:
         FaceDiffError: if the shapes cannot be read, come without a neutral face with triangles, or do not fit.
     """
@@ -249,20 +254,60 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
             f"{path}: transferring shapes to another mesh needs their neutral face with triangles; add it as "
             f"neutral{files.first.suffix}"
         )
-    found = correspond(files.neutral, files.faces, animation.template, animation.triangles)
-    note = f"the shapes are transferred from a mesh of {len(files.neutral)} vertices"
-    if found.fits_badly:
-        note += ", which fits badly: look at the result with --show"
     template = animation.template.astype(np.float64)
+    goal = Mesh(template, animation.triangles)
+    neutral, points = np.asarray(files.neutral, np.float64), np.asarray(files.shapes, np.float64)
+    faces = np.asarray(files.faces, np.int64)
+    reports = []
+    for laid_first in (False, True):
+        if laid_first:
+            target = Surface(template, animation.triangles.astype(np.int64))
+            back, features, _ = placed(target, Surface(neutral, faces))
+            if features is None:
+                break
+            neutral, points = back.apply(neutral), back.apply(points)
+            faces = _about_what_moves(neutral, points, faces)
+        used, corners = np.unique(faces, return_inverse=True)
+        corners = corners.reshape(-1, 3)
+        found = correspond(neutral[used], corners, template, animation.triangles)
+        metres = found.similarity.scale * metres_per_unit(animation.unit)
+        shown = Animation(
+            str(path), points[:, used].astype(np.float32), neutral[used].astype(np.float32), 1.0,
+            faces=corners.astype(np.int32), unit=f"{metres:.9g}",
+        )  # fmt: skip
+        reports.append(check_fit(shown, carry(shown, found, goal), found))
+        if reports[-1].good:
+            break
+    if not reports[-1].good:
+        raise FaceDiffError(
+            f"{path}: its shapes cannot be carried to {animation.name}: {reports[0].faults[0]}. Carry the animation to "
+            f"their mesh with `facediff retarget`, and give them without --carry"
+        )
+    moves = carry_displacements(found, points[:, used] - neutral[used])
     moved = replace(
         files,
-        shapes=template + carry_displacements(found, files.shapes - files.neutral),
+        shapes=template + moves,
         neutral=template,
         faces=animation.faces,
         metric=False,
-        notes=(*files.notes, note),
+        notes=(*files.notes, f"the shapes are transferred from a mesh of {len(used)} vertices"),
     )
     return fitted(moved, animation.template, animation.unit)
+
+
+ABOUT_MOVING = 0.3  # Of a figure, the face alone is a source: what lies within this share of the moving part's size
+
+
+def _about_what_moves(neutral: Array, points: Array, faces: Indices) -> Indices:
+    """The triangles about the vertices that shapes (K, V, 3) move; all if nearly everything moves."""
+    furthest = np.linalg.norm(points - neutral, axis=2).max(axis=0, initial=0.0)
+    moving = neutral[furthest > 0.02 * furthest.max(initial=0.0)]
+    if not len(moving):
+        return faces
+    margin = ABOUT_MOVING * float(np.ptp(moving, axis=0).max())
+    inside = ((neutral >= moving.min(axis=0) - margin) & (neutral <= moving.max(axis=0) + margin)).all(axis=1)
+    kept = faces[inside[faces].all(axis=1)]
+    return kept if len(kept) >= 4 else faces
 
 
 # Correspondences on disk.

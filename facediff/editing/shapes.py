@@ -7,17 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
+from facediff.editing.glb_shapes import read_targets
 from facediff.errors import FaceDiffError
 from facediff.mesh import face_size, read_mesh, robust_align
-from facediff.mesh.glb import POSITIONS, TRIANGLES, Glb, open_glb
-from facediff.mesh.mesh import check_coordinates
-from facediff.utils.limits import LIMITS, check_array
+from facediff.mesh.glb import open_glb
 
 Array = npt.NDArray[np.float64]
 
@@ -183,7 +181,7 @@ def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m")
             occurs twice.
     """
     files = _built_in(np.asarray(template, np.float64) * metres_per_unit(unit)) if is_built_in(path) else None
-    return fitted(files or read_shape_files(path), template, unit)
+    return fitted(files or read_shape_files(path, len(template)), template, unit)
 
 
 def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m") -> ShapeSet:
@@ -276,8 +274,12 @@ class ShapeFiles:
     notes: tuple[str, ...] = ()  # what was done to the shapes since, a sentence each
 
 
-def read_shape_files(path: Path) -> ShapeFiles:
+def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
     """Read a folder of meshes or a .glb.
+
+    Args:
+        path: the folder or file.
+        vertices: of the mesh that they are for, by which the parts of a .glb are chosen; None for all that have shapes.
 
     Raises:
         FaceDiffError: if it is missing or damaged, holds no shapes, or its meshes differ in topology or vertex order.
@@ -285,7 +287,7 @@ def read_shape_files(path: Path) -> ShapeFiles:
     if is_built_in(path):
         return _built_in(None)
     if path.suffix.lower() == ".glb":
-        return _read_glb(path)
+        return _read_glb(path, vertices)
     if not path.is_dir():
         raise FaceDiffError(f"{path}: no such folder; expected one of .obj or .ply files, or a .glb with named targets")
     found = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
@@ -341,52 +343,10 @@ def _built_in(template: Array | None) -> ShapeFiles:
     return ShapeFiles(path, path, tuple(shapes), points, neutral, faces, metric=True, rest=BUILT_IN)
 
 
-# Morph targets of binary glTF 2.0 files: section 3.7.2.2 of the specification. Names of targets are in
-# ``mesh.extras.targetNames``, as its note has it.
-
-
-def _read_glb(path: Path) -> ShapeFiles:
-    """Read the mesh with the most targets, its primitives one after the other; nodes' transforms are not applied."""
+def _read_glb(path: Path, vertices: int | None) -> ShapeFiles:
     try:
-        names, neutral, deltas, faces = _targets(open_glb(path))
-    except ValueError as error:
+        found = read_targets(open_glb(path), vertices)
+    except (ValueError, IndexError) as error:
         raise FaceDiffError(f"{path}: not a readable glb with shapes ({error}); export it again") from error
-    return ShapeFiles(path, path, names, neutral + deltas, neutral, faces, metric=True, rest=path.name)
-
-
-def _targets(glb: Glb) -> tuple[tuple[str, ...], Array, Array, npt.NDArray[np.int64]]:
-    """Names (K,) of the targets, the neutral face (V, 3) and displacements (K, V, 3) in metres, triangles (F, 3)."""
-
-    def targets(primitive: dict[str, Any]) -> list[dict[str, Any]]:
-        return glb.entries("targets", primitive)
-
-    meshes = [parts for index in range(len(glb.entries("meshes"))) if (parts := glb.primitives(index))]
-    best = max(range(len(meshes)), key=lambda one: len(targets(meshes[one][0])), default=None)
-    if best is None or not targets(meshes[best][0]):
-        raise ValueError("no mesh in it has targets (shape keys); export them with the mesh")
-    count = len(targets(meshes[best][0]))
-    mesh = next(entry for entry in glb.entries("meshes") if entry.get("primitives") is meshes[best])
-    extras = mesh.get("extras")
-    names = extras.get("targetNames", []) if isinstance(extras, dict) else []
-    if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"has {count} targets and other names for them; export it with targetNames")
-    points, moves, faces, before = [], [], [], 0
-    for primitive in meshes[best]:
-        if primitive.get("mode", TRIANGLES) != TRIANGLES or len(targets(primitive)) != count:
-            raise ValueError("its mesh has parts that are no triangles, or have other targets; export one mesh")
-        position = glb.positions(primitive)
-        LIMITS.check("vertices", before + len(position), glb.source)
-        # Targets without data of their own cost a file nothing, however many they are.
-        check_array(glb.source, (2, count, before + len(position), 3), 8)
-        delta = np.zeros((count, len(position), 3))
-        for row, target in zip(delta, targets(primitive), strict=True):
-            if "POSITION" in target:
-                row[:] = glb.numbers(target["POSITION"], "VEC3", POSITIONS, len(position))
-        faces.append(glb.triangles(primitive, len(position)) + before)
-        points.append(position)
-        moves.append(delta)
-        before += len(position)
-    neutral, deltas = np.concatenate(points), np.concatenate(moves, axis=1)
-    check_coordinates(neutral, f"{glb.source}:")
-    check_coordinates(deltas, f"{glb.source}:")
-    return tuple(names), neutral, deltas, np.concatenate(faces)
+    points = found.neutral + found.deltas
+    return ShapeFiles(path, path, found.names, points, found.neutral, found.faces, metric=True, rest=path.name)

@@ -1,0 +1,120 @@
+"""Morph targets of binary glTF 2.0 files as blendshapes, also of avatars that consist of several parts.
+
+Section 3.7.2.2 of the specification. Names of targets are in ``mesh.extras.targetNames``, as its note has it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.mesh.glb import POSITIONS, TRIANGLES, Glb
+from facediff.mesh.glb_scene import Placed, placed_parts
+from facediff.mesh.mesh import check_coordinates
+from facediff.utils.limits import LIMITS, check_array
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """Shapes of one mesh, or of several parts as one."""
+
+    names: tuple[str, ...]  # (K,)
+    neutral: Array  # (V, 3) in metres
+    deltas: Array  # (K, V, 3)
+    faces: npt.NDArray[np.int64]  # (F, 3)
+
+
+def read_targets(glb: Glb, vertices: int | None = None) -> Targets:
+    """The shapes in a file.
+
+    Args:
+        glb: the file.
+        vertices: of the mesh that they are for: the mesh with the most targets, the parts that have targets, or all
+            parts of the scene as :func:`facediff.mesh.read_mesh` joins them, whichever has as many. None for the
+            parts that have targets, in the scene: of an avatar these are head, teeth and eyes.
+
+    Raises:
+        ValueError: saying what is wrong with the file.
+        FaceDiffError: if it is larger than the budget.
+    """
+    counts = [
+        max((len(glb.entries("targets", each)) for each in glb.primitives(index)), default=0)
+        for index in range(len(glb.entries("meshes")))
+    ]
+    if not max(counts, default=0):
+        raise ValueError("no mesh in it has targets (shape keys); export them with the mesh")
+    best = int(np.argmax(counts))
+    placed = list(placed_parts(glb))
+    moving = [part for part in placed if glb.entries("targets", part.primitive)]
+    if vertices is None and moving:
+        return _joined(glb, moving)
+    if vertices is not None and vertices != sum(len(glb.positions(each)) for each in glb.primitives(best)):
+        for parts in (moving, placed):
+            if moving and vertices == sum(len(part.local) for part in parts):
+                return _joined(glb, parts)
+    return _of_mesh(glb, best)
+
+
+def _of_mesh(glb: Glb, index: int) -> Targets:
+    """The targets of one mesh, its primitives one after the other, as they are stored: no node acts on them."""
+    parts = [
+        Placed(index, -1, each, (), local := glb.positions(each), None, glb.triangles(each, len(local)))
+        for each in glb.primitives(index)
+    ]
+    count = len(glb.entries("targets", parts[0].primitive))
+    if any(
+        part.primitive.get("mode", TRIANGLES) != TRIANGLES or len(glb.entries("targets", part.primitive)) != count
+        for part in parts
+    ):
+        raise ValueError("its mesh has parts that are no triangles, or have other targets; export one mesh")
+    return _joined(glb, parts)
+
+
+def _joined(glb: Glb, parts: list[Placed]) -> Targets:
+    """Parts one after the other; targets of one name are one shape, and a part that lacks it stands still."""
+    columns: dict[str, int] = {}
+    named = []
+    for part in parts:
+        names = _names(glb, part)
+        named.append(names)
+        for name in names:
+            columns.setdefault(name, len(columns))
+    total = sum(len(part.local) for part in parts)
+    LIMITS.check("vertices", total, glb.source)
+    # Targets without data of their own cost a file nothing, however many they are.
+    check_array(glb.source, (2, len(columns), total, 3), 8)
+    neutral, deltas, faces, before = np.zeros((total, 3)), np.zeros((len(columns), total, 3)), [], 0
+    for part, names in zip(parts, named, strict=True):
+        rows = slice(before, before + len(part.local))
+        neutral[rows] = part.points
+        for name, target in zip(names, glb.entries("targets", part.primitive), strict=True):
+            if "POSITION" in target:
+                moves = glb.numbers(target["POSITION"], "VEC3", POSITIONS, len(part.local)).astype(np.float64)
+                deltas[columns[name], rows] = part.turned(moves)
+        faces.append(part.faces + before)
+        before += len(part.local)
+    check_coordinates(neutral, f"{glb.source}:")
+    check_coordinates(deltas, f"{glb.source}:")
+    return Targets(tuple(columns), neutral, deltas, np.concatenate(faces))
+
+
+def _names(glb: Glb, part: Placed) -> list[str]:
+    """Names of a part's targets: its mesh's, or its own where an exporter wrote them there."""
+    count = len(glb.entries("targets", part.primitive))
+    holders: list[dict[str, Any]] = [glb.entry("meshes", part.mesh), part.primitive]
+    for holder in holders if count else []:
+        extras = holder.get("extras")
+        names = extras.get("targetNames") if isinstance(extras, dict) else None
+        if isinstance(names, list) and len(names) == count and all(isinstance(name, str) for name in names):
+            if len(set(names)) < count:
+                twice = next(name for name in names if names.count(name) > 1)
+                raise ValueError(f'has two targets "{twice}" in one mesh; rename one of them and export it again')
+            return names
+    if count:
+        raise ValueError(f"has {count} targets and other names for them; export it with targetNames")
+    return []
