@@ -273,6 +273,7 @@ corpus = Kind(
 metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class", aliases=False)
 augmentation = Kind("augmentation", "facediff.data.augmentation", "a change of training speech", aliases=False)
 voice_gate = Kind("voice_gate", "facediff.data.voice_activity", "finds the pauses of speech", aliases=False)
+acting = Kind("acting", "facediff.pipelines.acting", "moves brows, head and lids with the speech", aliases=False)
 export_format = Kind(
     "export_format",
     "facediff.export.arrays facediff.export.glb facediff.export.sequences facediff.export.usd facediff.export.video "
@@ -298,7 +299,7 @@ COMPONENTS: dict[str, Kind] = {
 
 KINDS: dict[str, Kind] = {
     **COMPONENTS,
-    **{kind.kind: kind for kind in (model, corpus, metric, augmentation, voice_gate, export_format)},
+    **{kind.kind: kind for kind in (model, corpus, metric, augmentation, voice_gate, acting, export_format)},
 }
 """Everything that can be chosen by name."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -175,10 +175,13 @@ def animate(
     check_model_source(checkpoint)
     check_scheduler(batch.scheduler)
     from facediff.data.voice_activity import speech_problems
-    from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, read_recording
+    from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, direction_for, read_recording
 
     several = len(speech) > 1 or speech[0].is_dir()
     files.check(batch.suffix if several else ".npy" if windows.stream else output.suffix)
+    wanted = controls.controls()
+    if wanted.direction is not None and not several:
+        wanted = replace(wanted, direction=direction_for(wanted.direction, speech[0], streamed=streamed))
     options = AnimationOptions(
         checkpoint=checkpoint,
         identity=identity,
@@ -200,7 +203,7 @@ def animate(
         alignment=sound.alignment,
         transcript=sound.transcript,
         closure_budget=sound.closure_budget,
-        controls=controls.controls(),
+        controls=wanted,
         target_mesh=target_mesh,
         correspondence=correspondence,
         export=files.export(quiet=quiet),

@@ -88,7 +88,7 @@ class SourceOptions:
 class ControlOptions:
     """Animation controls.
 
-    Blinks, gaze and sway are procedural: made by rules, not learnt, and called so in the metadata.
+    Blinks, gaze, sway and acting are procedural: made by rules, not learnt, and called so in the metadata.
 
     Attributes:
         expressiveness: scale the motion: 1.2, or by region, upper_face=1.5,lips=0.9,all=1.1 (all: every vertex that no
@@ -98,7 +98,10 @@ class ControlOptions:
         sway: a head that sways by so much at most (2 if no number)
         eyes: where lids and eyeballs are (.json or .npz, see docs/animation_controls.md); the built-in puppet needs
             none
-        controls_seed: seed of blinks, gaze and sway (default: --seed, or 0)
+        controls_seed: seed of blinks, gaze, sway and acting (default: --seed, or 0)
+        direction: keys over time of style, expressiveness, brows, head and others (.json, .csv, or an .npz that was
+            made with some; see docs/direction.md); for a batch also a folder with a file for each recording
+        acting: brows, head and lids that move with the speech: prosody, with options (prosody:strength=0.8,brows=3)
     """
 
     expressiveness: Annotated[str | None, Option(metavar="FACTORS")] = None
@@ -107,13 +110,22 @@ class ControlOptions:
     sway: Annotated[ranges.SwayAngle | None, Option(metavar="DEGREES", bare=ranges.USUAL_SWAY)] = None
     eyes: File = None
     controls_seed: Annotated[ranges.Seed | None, Option(metavar="N")] = None
+    direction: Annotated[Path | None, Option(metavar="KEYS", reads=True)] = None
+    acting: Annotated[str | None, Option(metavar="ACTING")] = None
 
     def controls(self) -> AnimationControls:
         """The controls that the options ask for."""
         from facediff.editing.controls import AnimationControls
 
         return AnimationControls(
-            self.expressiveness, self.blinks, self.gaze, self.sway, self.eyes, seed=self.controls_seed
+            self.expressiveness,
+            self.blinks,
+            self.gaze,
+            self.sway,
+            self.eyes,
+            seed=self.controls_seed,
+            direction=self.direction,
+            acting=self.acting,
         )
 
 

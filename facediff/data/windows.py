@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ Speech = npt.NDArray[np.float32]
 
 M = TypeVar("M")
 """Motion of one or several samples: an array or a tensor (seeds, frames, …)."""
+M_co = TypeVar("M_co", covariant=True)
 
 QUIETEST = 0.003
 """Standard deviation below which speech is not amplified further: noise of a microphone, not speech."""
@@ -164,6 +165,41 @@ class Window:
         return self.plan.overlap
 
 
+class Hearing(Protocol[M_co]):
+    """What hears speech in pieces, and gives motion; it counts the frames that it has given."""
+
+    frames: int
+
+    def feed(self, samples: Any, /) -> M_co:  # noqa: ANN401 - an array or a tensor
+        """The motion that has become certain after more speech."""
+
+    def finish(self, frames: int | None = None, /) -> M_co:
+        """The motion that is left."""
+
+
+def in_parts(
+    stream: Hearing[M_co],
+    speech: Any,  # noqa: ANN401 - an array or a tensor
+    *,
+    frames: int | None = None,
+    progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
+) -> Iterator[M_co]:
+    """All motion of a stream for a recording, part by part; the arguments are those of :meth:`SpeechWindows.parts`."""
+    # Fed by the second, as from a microphone, so that memory does not grow with the recording.
+    last = max(0, math.ceil(len(speech) / SAMPLE_RATE) - 1)
+    seconds = range(last + 1)
+    for second in progress(seconds) if progress is not None else seconds:
+        before = stream.frames
+        part = stream.feed(speech[second * SAMPLE_RATE : (second + 1) * SAMPLE_RATE])
+        if stream.frames > before:
+            yield part
+        if second == last:
+            before = stream.frames
+            part = stream.finish(frames)
+            if stream.frames > before:
+                yield part
+
+
 class SpeechWindows(ABC, Generic[M]):
     """Animates speech that arrives in pieces, window by window; memory does not grow with its length.
 
@@ -268,19 +304,7 @@ class SpeechWindows(ABC, Generic[M]):
             frames: how many frames it lasts; as many as fit its length if None.
             progress: wraps the iteration over its seconds.
         """
-        # Fed by the second, as from a microphone, so that memory does not grow with the recording.
-        last = max(0, math.ceil(len(speech) / SAMPLE_RATE) - 1)
-        seconds = range(last + 1)
-        for second in progress(seconds) if progress is not None else seconds:
-            before = self.frames
-            part = self.feed(speech[second * SAMPLE_RATE : (second + 1) * SAMPLE_RATE])
-            if self.frames > before:
-                yield part
-            if second == last:
-                before = self.frames
-                part = self.finish(frames)
-                if self.frames > before:
-                    yield part
+        return in_parts(self, speech, frames=frames, progress=progress)
 
     @property
     def _heard(self) -> int:

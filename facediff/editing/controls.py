@@ -1,8 +1,9 @@
-"""Animation controls: expressiveness, and procedural blinks, gaze and head sway, applied to finished animations."""
+"""Animation controls: expressiveness, procedural blinks, gaze and head sway, acting, and keys over time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +17,13 @@ from facediff.utils import ranges
 # What edits an animation is imported where it is asked for: most animations have no controls.
 if TYPE_CHECKING:
     from facediff.animation import Animation
-    from facediff.editing.eyes import Eyes
+    from facediff.editing.controlled import ControlledFace
+    from facediff.editing.direction import Direction
+    from facediff.editing.eyes import Array
+
+
+UNCHECKED = 25.0
+"""Frame rate by which frames and timecodes of keys are read before that of the animation is known."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +36,9 @@ class AnimationControls:
         gaze: largest angle of wandering eyes in degrees.
         sway: largest angle of a swaying head in degrees.
         eyes: file that says where lids and eyeballs are; the built-in puppet needs none.
-        seed: seed of blinks, gaze and sway; that of the sample if None.
+        seed: seed of blinks, gaze, sway and acting; that of the sample if None.
+        direction: keys over time, or their file; see :mod:`facediff.editing.direction`.
+        acting: brows, head and lids that move with the speech, by the name of a kind of acting with its options.
 
     Raises:
         FaceDiffError: naming the option whose value is impossible, or the file that is missing.
@@ -45,10 +54,14 @@ class AnimationControls:
     sway: ranges.SwayAngle | None = None
     eyes: Path | None = None
     seed: ranges.Seed | None = None
+    direction: Path | Direction | None = None
+    acting: str | None = None
 
     def __post_init__(self) -> None:
         ranges.check_fields(self)
         _ = self.factors
+        if isinstance(self.direction, Path) and not self.direction.exists():
+            raise FaceDiffError(f"--direction {self.direction}: no such file; expected keys over time, .json or .csv")
         if self.eyes is not None and not self.eyes.is_file():
             raise FaceDiffError(
                 f"--eyes {self.eyes}: no such file; expected .json or .npz (see docs/animation_controls.md)"
@@ -59,16 +72,45 @@ class AnimationControls:
         ):
             if idle:
                 raise FaceDiffError(f"{option}: has no effect without {users}; give one of them, or omit it")
+        if (keys := self.keys()) is not None:
+            for name in ("expressiveness", "blinks", "gaze", "sway"):
+                if getattr(self, name) is not None:
+                    keys.refuse_both(name)
+            if self.acting is None and "acting" in keys.channels:
+                raise FaceDiffError(f"{keys.source}: channel acting: has no effect without --acting; give it as well")
+
+    def keys(self, frame_rate: float | None = None) -> Direction | None:
+        """The keys over time; None if there are none, or each recording of a folder has its own.
+
+        Args:
+            frame_rate: of frames and timecodes, where the keys do not say it; not checked yet if None.
+
+        Raises:
+            FaceDiffError: naming the file, the row and the field that is wrong.
+        """
+        if not isinstance(self.direction, Path):
+            return self.direction
+        if self.direction.is_dir():
+            return None
+        from facediff.editing.direction import read_direction
+
+        return read_direction(self.direction, UNCHECKED if frame_rate is None else frame_rate)
 
     @property
     def is_procedural(self) -> bool:
-        """Whether something is drawn at random: blinks, gaze or sway."""
-        return (self.blinks, self.gaze, self.sway) != (None, None, None)
+        """Whether something is drawn at random: blinks, gaze, sway or acting."""
+        if (self.blinks, self.gaze, self.sway, self.acting) != (None, None, None, None):
+            return True
+        if isinstance(self.direction, Path) and self.direction.is_dir():
+            return True
+        keys = self.keys()
+        return keys is not None and any(keys.under(name) for name in ("blinks", "gaze", "sway"))
 
     @property
     def is_off(self) -> bool:
         """Whether nothing is changed."""
-        return self.expressiveness is None and self.blinks is None and self.gaze is None and self.sway is None
+        options = (self.expressiveness, self.blinks, self.gaze, self.sway, self.direction, self.acting)
+        return all(option is None for option in options)
 
     @property
     def factors(self) -> dict[str, float]:
@@ -79,77 +121,75 @@ class AnimationControls:
 
         return read_factors(self.expressiveness)
 
+    @property
+    def without_keys(self) -> AnimationControls:
+        """The controls without their keys over time."""
+        if self.direction is None:
+            return self
+        made = copy(self)
+        object.__setattr__(made, "direction", None)
+        return made
+
     def check(
         self,
         template: npt.NDArray[np.floating],
         faces: npt.NDArray[np.integer] | None,
-        regions: Mapping[str, object],
+        regions: Mapping[str, npt.NDArray[np.integer]],
         name: str,
     ) -> None:
-        """Refuse what cannot work on a face (V, 3), (F, 3), which errors call ``name``, before anything is sampled.
+        """Refuse what cannot work on a face, as :meth:`on_face` does, before anything is sampled."""
+        if not self.is_off:
+            self.on_face(template, faces, regions, name, direction=self.keys())
+
+    def on_face(
+        self,
+        template: npt.NDArray[np.floating],
+        faces: npt.NDArray[np.integer] | None,
+        regions: Mapping[str, npt.NDArray[np.integer]],
+        name: str,
+        *,
+        unit: str = "m",
+        direction: Direction | None = None,
+    ) -> ControlledFace:
+        """The controls on a face (V, 3), (F, 3), which errors call ``name``; all of its animations share it.
+
+        Args:
+            template: the neutral face.
+            faces: its triangles.
+            regions: vertex indices by name.
+            name: for errors.
+            unit: of length.
+            direction: the keys over time that hold; none if None.
 
         Raises:
-            FaceDiffError: if a region is unknown, or blinks or gaze are wanted and the eyes are not known.
+            FaceDiffError: if a region is unknown, or blinks, gaze or brows are wanted and are not known.
         """
-        if self.expressiveness is not None:
-            from facediff.editing.expressiveness import check_factors
+        from facediff.editing.controlled import ControlledFace
 
-            check_factors(self.factors, regions, name)
-        self._needed_eyes(template, faces)
+        return ControlledFace(self, direction, template, faces, regions, unit, name)
 
-    def apply(self, animation: Animation, *, seed: int = 0) -> Animation:
+    def apply(self, animation: Animation, *, seed: int = 0, acted: Array | None = None) -> Animation:
         """The animation with everything changed that is asked for; the very same one if nothing is.
-
-        Expressiveness comes first, then gaze, blinks, and last the head, which takes everything along.
 
         Args:
             animation: a finished animation.
             seed: seed of blinks, gaze and sway, unless the controls have their own.
+            acted: what acting does in each frame (T, 5), where there is any.
 
         Raises:
             FaceDiffError: naming the option that does not fit the animation, or if its head sways already.
         """
         if self.is_off:
             return animation
-        from facediff.editing.procedural import PROCEDURAL, SWAYS, add_blinks, add_gaze, add_sway
-
-        if SWAYS in animation.metadata.get(PROCEDURAL, ""):
-            raise FaceDiffError(
-                f"{animation.name}: its head sways already; apply the controls to the animation as it was before"
-            )
-        seed = seed if self.seed is None else self.seed
-        eyes = self._needed_eyes(animation.template, animation.faces)
-        # Expressiveness must not scale procedural motion, a blink must be able to shut eyes that gaze has opened, and
-        # all of them need the head in the pose of the neutral face, which sway leaves.
-        if self.expressiveness is not None:
-            from facediff.editing.expressiveness import scale_regions
-
-            animation = scale_regions(animation, self.factors, eyes)
-        if self.gaze is not None and eyes is not None:
-            animation = add_gaze(animation, eyes, degrees=self.gaze, seed=seed)
-        if self.blinks is not None and eyes is not None:
-            animation = add_blinks(animation, eyes, rate=self.blinks, seed=seed)
-        if self.sway is not None:
-            animation = add_sway(animation, degrees=self.sway, seed=seed)
-        return animation
-
-    def _needed_eyes(self, template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None) -> Eyes | None:
-        """The face's eyes, if anything needs them; expressiveness only works better where they are known."""
-        asking = "--blinks" if self.blinks is not None else "--gaze" if self.gaze is not None else None
-        if asking is None and self.expressiveness is None:
-            return None
-        from facediff.editing.eyes import GIVE, eyes_for
-
-        eyes = eyes_for(template, faces, self.eyes)
-        if asking is None:
-            return eyes
-        if eyes is None:
-            raise FaceDiffError(
-                f"{asking}: needs to know where lids and eyeballs are, which is known for the built-in puppet only; "
-                f"{GIVE}"
-            )
-        if self.blinks is not None:
-            eyes.lids()
-        if self.gaze is not None and not eyes.eyeballs:
-            raise FaceDiffError(f"--gaze: {eyes.source} does not say which vertices are the eyeballs; add them")
-        return eyes
+        direction = self.keys(animation.frame_rate)
+        if direction is not None:
+            direction.refuse_model_channels()
+        face = self.on_face(
+            animation.template,
+            animation.faces,
+            animation.regions,
+            animation.name,
+            unit=animation.unit,
+            direction=direction,
+        )
+        return face.apply(animation, seed=seed, acted=acted)

@@ -214,6 +214,33 @@ class Direction:
         """
         return text_shares(self.channels[channel], times)
 
+    def refuse_both(self, name: str) -> None:
+        """Refuse keys of what an option of this name sets from beginning to end.
+
+        Raises:
+            FaceDiffError: naming the channel and the option.
+        """
+        for channel in self.under(name):
+            raise FaceDiffError(f"{self.source}: channel {channel}: --{name} says the same; give one of them")
+
+    def refuse_model_channels(self) -> None:
+        """Refuse keys of what only a model can follow, such as the style.
+
+        Raises:
+            FaceDiffError: naming the channel.
+        """
+        for channel in self.channels:
+            if channel_of(channel).in_model:
+                raise FaceDiffError(
+                    f"{self.source}: channel {channel}: needs the model, and the animation is finished; give the keys "
+                    f"to `facediff animate --direction`"
+                )
+
+    def without_model_channels(self) -> Direction | None:
+        """The keys of what changes finished motion; None if there are none."""
+        left = tuple(key for key in self.keys if not channel_of(key.channel).in_model)
+        return Direction(left, self.source) if left else None
+
     def rows(self) -> list[dict[str, float | str]]:
         """The keys as the rows of a file."""
         return [
@@ -307,6 +334,15 @@ def read_direction(path: str | Path, frame_rate: float | None = None) -> Directi
             raise FaceDiffError(f"{path}: was made without a direction; give keys over time, .json or .csv")
         return Direction.parse(text, str(path), frame_rate)
     raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected .json, .csv or .npz')
+
+
+def direction_file(folder: Path, recording: Path) -> Path | None:
+    """The file of a folder that has the keys for a recording: ``NAME.direction.json``, ``NAME.json`` or ``.csv``."""
+    for name in (f"{recording.stem}.direction", recording.stem):
+        for suffix in (".json", ".csv"):
+            if (path := folder / f"{name}{suffix}").is_file():
+                return path
+    return None
 
 
 def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.editing.eyes import Array, Eyes, Indices, smooth_step
-from facediff.editing.procedural import EDITED, noted, room_for
+from facediff.editing.procedural import EDITED, in_words, noted, room_for
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.ranges import Range
 
@@ -58,25 +59,34 @@ def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], n
             raise FaceDiffError(f'{name}: has no region "{region}" to scale: {choices(region, [*regions, ALL])}')
 
 
-def scale_regions(animation: Animation, factors: Mapping[str, float], eyes: Eyes | None = None) -> Animation:
+def scale_regions(
+    animation: Animation, factors: Mapping[str, float | npt.NDArray[np.floating]], eyes: Eyes | None = None
+) -> Animation:
     """Scale how far every vertex goes from the neutral face; the head must not sway yet.
 
     Args:
         animation: with the regions that are named.
-        factors: by region; ``all`` stands for every vertex that no other name covers.
+        factors: by region, a number or one for each frame (T,); ``all`` stands for every vertex that no other name
+            covers.
         eyes: where they are known, the closing of the lids is left as it is: a blink stays a blink, and lids that meet
             do not run through each other.
 
     Raises:
         FaceDiffError: if the animation has no such region.
     """
-    factor = region_factors(animation.template, animation.regions, factors, animation.name).astype(np.float32)
-    vertices = room_for(animation.vertices)
+    weights = region_weights(animation.template, animation.regions, list(factors), animation.name)
     lids: Indices = np.zeros(0, np.int64)
     closing = None
     if eyes is not None and eyes.closing is not None:
         lids, closing = eyes.lids()
+    vertices = room_for(animation.vertices)
+    count = len(animation.vertices)
+    in_frames = {name: np.broadcast_to(np.asarray(value, np.float64), count) for name, value in factors.items()}
+    now: dict[str, float] = {}
     for index, frame in enumerate(animation.vertices):
+        before, now = now, {name: float(values[index]) for name, values in in_frames.items()}
+        if now != before:
+            factor = weights.factors(now).astype(np.float32)
         offsets = frame - animation.template
         scaled = factor[:, None] * offsets
         if closing is not None:
@@ -84,8 +94,30 @@ def scale_regions(animation: Animation, factors: Mapping[str, float], eyes: Eyes
             share = np.clip((offsets[lids] * closing).sum(-1) / (closing**2).sum(-1), 0.0, 1.0)
             scaled[lids] += ((1.0 - factor[lids]) * share)[:, None] * closing
         vertices[index] = animation.template + scaled
-    words = ", ".join(f"{name} {value:g}" for name, value in factors.items())
+    words = ", ".join(f"{name} {in_words(value)}" for name, value in factors.items())
     return noted(animation, vertices, EDITED, f"expressiveness ({words})")
+
+
+@dataclass(frozen=True, eq=False)
+class RegionWeights:
+    """How much each region counts at each vertex.
+
+    Attributes:
+        named: the regions but for ``all``.
+        weights: (regions, V), between 0 and 1.
+        rest: (V,) what is left for ``all``.
+    """
+
+    named: tuple[str, ...]
+    weights: Array
+    rest: Array
+
+    def factors(self, factors: Mapping[str, float]) -> Array:
+        """The factor of every vertex (V,), from those of the regions and ``all`` (1 if absent)."""
+        if not self.named:
+            return np.asarray(np.zeros(len(self.rest)) + self.rest * factors.get(ALL, 1.0))
+        of_regions = np.array([factors[region] for region in self.named]) @ self.weights
+        return np.asarray(of_regions + self.rest * factors.get(ALL, 1.0))
 
 
 def region_factors(
@@ -113,12 +145,23 @@ def region_factors(
     Raises:
         FaceDiffError: if a region is not there.
     """
+    return region_weights(template, regions, list(factors), name, fall_off).factors(factors)
+
+
+def region_weights(
+    template: npt.NDArray[np.floating],
+    regions: Mapping[str, npt.NDArray[np.integer]],
+    names: Sequence[str],
+    name: str = "expressiveness",
+    fall_off: float | None = None,
+) -> RegionWeights:
+    """The weights of regions at every vertex; the arguments are those of :func:`region_factors`."""
     from scipy.spatial import cKDTree
 
-    check_factors(factors, regions, name)
+    check_factors(dict.fromkeys(names, 1.0), regions, name)
     places = np.asarray(template, np.float64)
     width = FALL_OFF * float(np.linalg.norm(np.ptp(places, axis=0))) if fall_off is None else fall_off
-    named = [region for region in factors if region != ALL]
+    named = [region for region in names if region != ALL]
     weights = np.zeros((len(named), len(places)))
     for row, region in zip(weights, named, strict=True):
         distances = np.full(len(places), np.inf)
@@ -128,6 +171,4 @@ def region_factors(
     # Where regions overlap, their weights are made to sum to one; without it, two factors of 1 would scale by 2.
     total = weights.sum(axis=0)
     weights /= np.maximum(total, 1.0)
-    rest = np.clip(1.0 - total, 0.0, None)
-    of_regions = np.array([factors[region] for region in named]) @ weights if named else np.zeros(len(places))
-    return np.asarray(of_regions + rest * factors.get(ALL, 1.0))
+    return RegionWeights(tuple(named), weights, np.clip(1.0 - total, 0.0, None))

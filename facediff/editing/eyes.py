@@ -30,7 +30,7 @@ MEET = 0.12  # Where the lids meet, from the lower (0) to the upper edge (1): th
 AHEAD = 0.025
 """The shut upper lid lies further out by this share of the eye's width: its way is straight, the eyeball is round."""
 REACH = 0.4  # How far from the edges the skin follows, as a share of the eye's width
-KEYS = ("neutral", "blinks", "lids", "eyeballs")
+KEYS = ("neutral", "blinks", "lids", "eyeballs", "brows")
 PLAUSIBLE = (0.002, 0.2)  # The largest way of a lid, as a share of the face's size (the diagonal of its box)
 SAME_FACE = 1e-3  # Metres that a face may differ from a puppet's to count as that puppet's
 
@@ -48,6 +48,7 @@ class Eyes:
     closing: npt.NDArray[np.float32] | None
     eyeballs: tuple[Indices, ...]  # vertices of each eyeball
     source: str  # who says so, for messages
+    brows: Indices | None = None  # vertices of both brows; None if nobody says
 
     def __post_init__(self) -> None:
         if self.closing is not None and not (np.isfinite(self.closing).all() and self.closing.any()):
@@ -71,25 +72,18 @@ def eyes_for(template: Vertices, faces: npt.NDArray[np.integer] | None, file: Pa
 
 def puppet_eyes(template: Vertices, faces: npt.NDArray[np.integer] | None) -> Eyes | None:
     """The eyes of a face (V, 3) of the built-in corpus, by the rig that its blinks are made with; None for others."""
-    from facediff.synthetic import N_VERTICES
     from facediff.synthetic.corpus import rig_of
     from facediff.synthetic.face import build_face
     from facediff.synthetic.rig import LINEAR_FIELDS
-    from facediff.synthetic.speakers import SPEAKERS
 
-    if len(template) != N_VERTICES or faces is None:
+    nearest = nearest_puppet(template, faces)
+    if nearest is None:
         return None
-    mesh = build_face()  # takes a second or two
-    if not np.array_equal(np.asarray(faces), mesh.faces):
-        return None
-    # Templates pass through float32, and through files that round them, hence the tolerance.
-    distances = {
-        name: float(np.abs(speaker.shape(mesh.vertices) - template).max()) for name, speaker in SPEAKERS.items()
-    }
-    speaker = min(distances, key=lambda name: distances[name])
+    speaker, distance = nearest
+    mesh = build_face()
     left = np.concatenate([mesh.groups[name] for name in mesh.groups if name.startswith("eyeball") or name == "pupil"])
     balls = (np.sort(left), np.sort(mesh.mirror[left]))
-    if distances[speaker] <= SAME_FACE:
+    if distance <= SAME_FACE:
         closing = rig_of(speaker).fields[LINEAR_FIELDS.index("lids_close")].astype(np.float32)
     else:  # another speaker's face on the puppet's mesh has no rig: the edges of its own lids say how they shut
         ring = mesh.groups["eye_0"]  # from the inner corner over the upper lid to the outer one, and back below
@@ -99,15 +93,40 @@ def puppet_eyes(template: Vertices, faces: npt.NDArray[np.integer] | None) -> Ey
     return Eyes(closing, balls, "the built-in puppet")
 
 
+def nearest_puppet(template: Vertices, faces: npt.NDArray[np.integer] | None) -> tuple[str, float] | None:
+    """The speaker of the built-in corpus that a face (V, 3) is most like, and its largest distance from theirs.
+
+    Returns:
+        None for a face of another topology.
+    """
+    from facediff.synthetic import N_VERTICES
+    from facediff.synthetic.face import build_face
+    from facediff.synthetic.speakers import SPEAKERS
+
+    if len(template) != N_VERTICES or faces is None:
+        return None
+    mesh = build_face()  # takes a second or two
+    if not np.array_equal(np.asarray(faces), mesh.faces):
+        return None
+    # Templates pass through float32, and through files that round them, hence the tolerance of those who ask.
+    distances = {
+        name: float(np.abs(speaker.shape(mesh.vertices) - template).max()) for name, speaker in SPEAKERS.items()
+    }
+    speaker = min(distances, key=lambda name: distances[name])
+    return speaker, distances[speaker]
+
+
 def read_eyes(path: Path, template: Vertices) -> Eyes:
     """The eyes of a face (V, 3) from a file.
 
     ``.json`` names shapes of shut eyes or lists the lids' edges, and lists the eyeballs::
 
         {"neutral": "neutral.obj", "blinks": ["eyeBlinkLeft.obj", "eyeBlinkRight.obj"],
-         "eyeballs": ["FLAME_masks.pkl:left_eyeball", "FLAME_masks.pkl:right_eyeball"]}
+         "eyeballs": ["FLAME_masks.pkl:left_eyeball", "FLAME_masks.pkl:right_eyeball"],
+         "brows": ["brows.txt"]}
 
-    ``.npz`` holds the same as arrays: ``closing`` (V, 3), ``neutral`` (V, 3) and any ``eyeball…`` with indices.
+    ``.npz`` holds the same as arrays: ``closing`` (V, 3), ``neutral`` (V, 3), and ``brows`` and any ``eyeball…`` with
+    indices.
 
     Raises:
         FaceDiffError: naming the file and what is wrong with it.
@@ -121,14 +140,17 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
         names = sorted(name for name in found if name.startswith("eyeball"))
         balls = tuple(_checked(path, found[name], len(template)) for name in names)
         closing, neutral = found.get("closing"), found.get("neutral")
+        brows = _checked(path, found["brows"], len(template)) if "brows" in found else None
     elif path.suffix.lower() == ".json":
-        closing, neutral, balls = _read_json(path, template)
+        closing, neutral, balls, brows = _read_json(path, template)
     else:
         raise FaceDiffError(f"--eyes {path}: expected .json or .npz")
-    if closing is None and not balls:
-        raise FaceDiffError(f"--eyes {path}: says nothing of lids or eyeballs; known are {', '.join(KEYS)}")
+    if closing is None and not balls and brows is None:
+        raise FaceDiffError(
+            f"--eyes {path}: says nothing of lids or eyeballs, nor of brows; known are {', '.join(KEYS)}"
+        )
     if closing is None:
-        return Eyes(None, balls, f"--eyes {path}")
+        return Eyes(None, balls, f"--eyes {path}", brows)
     size = float(np.linalg.norm(np.ptp(template, axis=0)))
     if closing.shape != template.shape or (neutral is not None and neutral.shape != template.shape):
         raise FaceDiffError(f"--eyes {path}: its blink has shape {closing.shape}; the face has {template.shape}")
@@ -139,22 +161,28 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
             f"--eyes {path}: its blink moves a lid by {way:.3g} on a face of size {size:.3g}; give the shape of shut "
             f'eyes, and as "neutral" the open face in the same unit'
         )
-    return Eyes(np.asarray(scale * closing, np.float32), balls, f"--eyes {path}")
+    return Eyes(np.asarray(scale * closing, np.float32), balls, f"--eyes {path}", brows)
 
 
-def _read_json(path: Path, template: Vertices) -> tuple[Vertices | None, Vertices | None, tuple[Indices, ...]]:
-    """How the lids shut, by shapes or by edges, and the open face, both None where the file does not say; eyeballs."""
+def _read_json(
+    path: Path, template: Vertices
+) -> tuple[Vertices | None, Vertices | None, tuple[Indices, ...], Indices | None]:
+    """How the lids shut, by shapes or by edges; the open face; eyeballs; brows. None where the file does not say."""
     content = load_json(path, name=f"--eyes {path}")
     fit = isinstance(content, dict) and all(isinstance(content.get(key, []), list) for key in KEYS[1:])
     unknown = [key for key in content if key not in KEYS] if fit else []
     if not fit or unknown or not isinstance(content.get("neutral", ""), str):
         raise FaceDiffError(
-            f"--eyes {path}: expected an object with {', '.join(KEYS)}, the last three of them lists"
+            f"--eyes {path}: expected an object with {', '.join(KEYS)}, all but the first of them lists"
             + (f', not "{unknown[0]}"' if unknown else "")
         )
     count = len(template)
     balls = tuple(_indices(path, listed, count) for listed in content.get("eyeballs", []))
     neutral = _read_shape(path, content["neutral"]) if "neutral" in content else None
+    brows = None
+    if listed := content.get("brows"):
+        whole = listed if any(isinstance(each, str | list) for each in listed) else [listed]
+        brows = np.unique(np.concatenate([_indices(path, each, count) for each in whole]))
     if content.get("blinks"):
         total: Vertices = np.zeros((count, 3))
         for name in content["blinks"]:
@@ -165,15 +193,15 @@ def _read_json(path: Path, template: Vertices) -> tuple[Vertices | None, Vertice
             if len(shape) != count or (neutral is not None and len(neutral) != count):
                 raise FaceDiffError(f'--eyes {path}: "{name}" has {len(shape)} vertices, the face {count}')
             total = total + (shape - neutral if absolute and neutral is not None else shape)
-        return total, neutral, balls
+        return total, neutral, balls, brows
     if content.get("lids"):
         try:
             sides = [(lid["upper"], lid["lower"]) for lid in content["lids"]]
         except (TypeError, KeyError) as error:
             raise FaceDiffError(f'--eyes {path}: expected "lids" as a list of {{"upper": …, "lower": …}}') from error
         edges = [(_indices(path, upper, count), _indices(path, lower, count)) for upper, lower in sides]
-        return closing_of_lids(template, edges, np.concatenate(balls) if balls else None), neutral, balls
-    return None, neutral, balls
+        return closing_of_lids(template, edges, np.concatenate(balls) if balls else None), neutral, balls, brows
+    return None, neutral, balls, brows
 
 
 def _read_shape(path: Path, name: object) -> Vertices:

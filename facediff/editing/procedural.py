@@ -22,9 +22,14 @@ PROCEDURAL = "procedural"  # Metadata key: what was added by rules
 EDITED = "edited"  # Metadata key: how the animation's own motion was changed
 SWAYS = "head sway"
 """Name of a swaying head in the metadata; such an animation moves as a whole, so that nothing can be added any more."""
+MOVED_HEAD = (SWAYS, "head keys", "head acting")
+"""Names in the metadata of whatever moves the head."""
 
-Layer = Literal["blinks", "gaze", "sway"]
-STREAMS: dict[Layer, int] = {"blinks": 1, "gaze": 2, "sway": 3}
+Amount = float | npt.NDArray[np.floating]
+"""A number, or one for each frame (T,)."""
+
+Layer = Literal["blinks", "gaze", "sway", "kept blinks"]
+STREAMS: dict[Layer, int] = {"blinks": 1, "gaze": 2, "sway": 3, "kept blinks": 5}
 
 
 def random_of(layer: Layer, seed: int) -> np.random.Generator:
@@ -45,32 +50,73 @@ WIDENED = -0.5
 """How far an eye may be open beyond the neutral face, as a share of a closing, so that a blink still shuts it."""
 
 
-def add_blinks(animation: Animation, eyes: Eyes, *, rate: float = RATE, seed: int = 0) -> Animation:
-    """Let the eyes blink, in addition to any blinks of the animation.
+def add_blinks(animation: Animation, eyes: Eyes, *, rate: Amount = RATE, seed: int = 0) -> Animation:
+    """Let the eyes blink, in addition to any blinks of the animation, see :func:`shut_lids`.
 
-    The lids' own closing a and the blink's b make a + b (1 − a): at b = 0 the animation's own, at b = 1 shut, never
-    more. An eye that is shut already stays as it is. The head must not sway yet; ``rate`` is blinks a minute, 1 to 40.
+    The head must not sway yet; ``rate`` is blinks a minute, 1 to 40, or as many of each frame, down to 0.
 
     Raises:
         FaceDiffError: if the rate is impossible, or the eyes' lids are not known.
     """
+    curve = blinks_over_time(len(animation.vertices), animation.frame_rate, rate, seed)
+    vertices = shut_lids(animation, eyes, curve)
+    return noted(animation, vertices, PROCEDURAL, blink_words(rate, seed))
+
+
+def blink_words(rate: Amount, seed: int) -> str:
+    """Blinks in the metadata."""
+    return f"blinks ({in_words(rate)} a minute, seed {seed})"
+
+
+def shut_lids(animation: Animation, eyes: Eyes, curve: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+    """Vertices (T, V, 3) with the eyes shut as far as a curve (T,) says, 0 to 1.
+
+    The lids' own closing a and the curve's b make a + b (1 − a): at b = 0 the animation's own, at b = 1 shut, never
+    more. An eye that is shut already stays as it is.
+    """
     lids, closing = eyes.lids()
-    curve = blink_curve(len(animation.vertices), animation.frame_rate, rate=rate, seed=seed)
     vertices = copied(animation.vertices)
     size = (closing**2).sum(axis=-1)
     for index in np.flatnonzero(curve):
         offsets = vertices[index, lids] - animation.template[lids]
         shut = np.clip((offsets * closing).sum(axis=-1) / size, WIDENED, 1.0)
         vertices[index, lids] += ((1.0 - shut) * np.float32(curve[index]))[:, None] * closing
-    return noted(animation, vertices, PROCEDURAL, f"blinks ({rate:g} a minute, seed {seed})")
+    return vertices
+
+
+def blinks_over_time(frames: int, frame_rate: float, rate: Amount, seed: int) -> Array:
+    """How far the eyes are shut in every frame (T,) at a rate that may change from frame to frame.
+
+    Of the blinks at the highest rate, each is kept with the chance of the rate at its time over the highest (thinning;
+    Lewis and Shedler, "Simulation of nonhomogeneous Poisson processes by thinning", Naval Research Logistics Quarterly
+    26(3), 1979): a rate that never changes keeps them all.
+    """
+    if not isinstance(rate, np.ndarray):
+        return blink_curve(frames, frame_rate, rate=rate, seed=seed)
+    highest = max(float(rate.max(initial=0.0)), 1.0)
+    return blink_curve(frames, frame_rate, rate=highest, seed=seed, kept=rate / highest)
 
 
 @ranges.checked
-def blink_curve(frames: int, frame_rate: float, *, rate: ranges.BlinkRate = RATE, seed: int = 0) -> Array:
+def blink_curve(
+    frames: int,
+    frame_rate: float,
+    *,
+    rate: ranges.BlinkRate = RATE,
+    seed: int = 0,
+    kept: npt.NDArray[np.floating] | None = None,
+) -> Array:
     """How far the eyes are shut in every frame (T,), 0 to 1.
 
     Intervals are a gamma distribution of shape 2 above the shortest possible one, with the mean that the rate asks for.
     No two blinks overlap, none begins before the first frame or ends after the last, each is fully shut for a frame.
+
+    Args:
+        frames: T.
+        frame_rate: frames a second.
+        rate: blinks a minute.
+        seed: of the random numbers.
+        kept: with which chance a blink is kept that begins in each frame (T,); all of them are if None.
 
     Raises:
         FaceDiffError: if the rate is not in 1 … 40.
@@ -79,7 +125,7 @@ def blink_curve(frames: int, frame_rate: float, *, rate: ranges.BlinkRate = RATE
         >>> bool((blink_curve(250, 25.0, seed=1) == 1.0).any())
         True
     """
-    random = random_of("blinks", seed)
+    random, chance = random_of("blinks", seed), random_of("kept blinks", seed)
     times = np.arange(frames) / frame_rate
     last = times[-1] if frames else 0.0
     hold = max(SHUT, 1.0 / frame_rate)  # so that one frame at least falls into it
@@ -94,7 +140,8 @@ def blink_curve(frames: int, frame_rate: float, *, rate: ranges.BlinkRate = RATE
             length = float(random.uniform(*SPREAD))
             down, up = CLOSE * length, OPEN * length
             end = start + down + hold + up
-            if end <= last:
+            keeps = kept is None or chance.random() < kept[min(int(start * frame_rate), frames - 1)]
+            if end <= last and keeps:
                 span = slice(int(start * frame_rate), int(end * frame_rate) + 2)
                 now = times[span]
                 curve[span] = np.maximum(curve[span], smooth_step((now - start) / down) * smooth_step((end - now) / up))
@@ -115,17 +162,18 @@ LIDS_PER_DEGREE = 0.012
 """How far the lids close with each degree that the eyes look down, as a share of a full closing (up: they open)."""
 
 
-def add_gaze(animation: Animation, eyes: Eyes, *, degrees: float = DEGREES_GAZE, seed: int = 0) -> Animation:
+def add_gaze(animation: Animation, eyes: Eyes, *, degrees: Amount = DEGREES_GAZE, seed: int = 0) -> Animation:
     """Let the eyes wander: eyeballs turn about their centres, lids follow slightly where their closing is known.
 
-    The head must not sway yet; ``degrees`` is how far from straight ahead the eyes turn at most.
+    The head must not sway yet; ``degrees`` is how far from straight ahead the eyes turn at most, or that in each frame.
 
     Raises:
         FaceDiffError: if the angle is impossible, or the eyeballs are not known.
     """
     if not eyes.eyeballs:
         raise FaceDiffError(f"{eyes.source}: does not say which vertices are the eyeballs; {GIVE}")
-    angles = gaze_curve(len(animation.vertices), animation.frame_rate, degrees=degrees, seed=seed)
+    most, share = largest_of(degrees)
+    angles = share * gaze_curve(len(animation.vertices), animation.frame_rate, degrees=most, seed=seed)
     turns = gaze_rotations(angles)
     vertices = copied(animation.vertices)
     for ball in eyes.eyeballs:
@@ -142,7 +190,7 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: float = DEGREES_GAZE,
         follow = (-LIDS_PER_DEGREE * angles[:, 1]).astype(np.float32)
         for index in np.flatnonzero(follow):
             vertices[index, lids] += follow[index] * closing
-    return noted(animation, vertices, PROCEDURAL, f"gaze ({degrees:g} degrees, seed {seed})")
+    return noted(animation, vertices, PROCEDURAL, f"gaze ({in_words(degrees)} degrees, seed {seed})")
 
 
 @ranges.checked
@@ -211,13 +259,38 @@ SHIFT = 0.004  # Largest shift for each degree of rotation, as a share of the he
 AT_REST = 1.0  # Seconds over which the sway begins and ends
 
 
-def add_sway(animation: Animation, *, degrees: float = DEGREES_SWAY, seed: int = 0) -> Animation:
-    """Let the head sway, by ``degrees`` at most; all vertices move as one. Nothing can be added after it.
+def add_sway(animation: Animation, *, degrees: Amount = DEGREES_SWAY, seed: int = 0) -> Animation:
+    """Let the head sway, by ``degrees`` at most, or that in each frame; all vertices move as one.
+
+    Nothing can be added after it.
 
     Raises:
         FaceDiffError: if the angle is impossible.
     """
-    turns, shifts = sway_curve(len(animation.vertices), animation.frame_rate, degrees=degrees, seed=seed)
+    turns, shifts = sway_over_time(len(animation.vertices), animation.frame_rate, degrees, seed)
+    return noted(animation, move_head(animation, turns, shifts), PROCEDURAL, sway_words(degrees, seed))
+
+
+def sway_words(degrees: Amount, seed: int) -> str:
+    """Sway in the metadata."""
+    return f"{SWAYS} ({in_words(degrees)} degrees, seed {seed})"
+
+
+def sway_over_time(frames: int, frame_rate: float, degrees: Amount, seed: int) -> tuple[Array, Array]:
+    """Rotations and shifts (T, 3) of a sway whose largest rotation may change from frame to frame."""
+    most, share = largest_of(degrees)
+    turns, shifts = sway_curve(frames, frame_rate, degrees=most, seed=seed)
+    return share * turns, share * shifts
+
+
+def move_head(animation: Animation, turns: Array, shifts: Array) -> npt.NDArray[np.float32]:
+    """Vertices (T, V, 3) that move as one.
+
+    Args:
+        animation: whose head does not move yet.
+        turns: rotations about the neck (T, 3), axis-angle in radians.
+        shifts: (T, 3) in head heights.
+    """
     matrices = rotations(turns)
     template = np.asarray(animation.template, np.float64)
     pivot, height = neck(template), float(np.ptp(template[:, 1]))
@@ -225,7 +298,7 @@ def add_sway(animation: Animation, *, degrees: float = DEGREES_SWAY, seed: int =
     for index, frame in enumerate(animation.vertices):
         moving = turns[index].any() or shifts[index].any()  # at rest to the last bit
         vertices[index] = (frame - pivot) @ matrices[index].T + pivot + height * shifts[index] if moving else frame
-    return noted(animation, vertices, PROCEDURAL, f"{SWAYS} ({degrees:g} degrees, seed {seed})")
+    return vertices
 
 
 def neck(template: npt.NDArray[np.floating]) -> Array:
@@ -265,6 +338,31 @@ def _largest(vectors: Array, size: float) -> Array:
 
 
 # What all changes to an animation have in common: arrays that may be too large for memory, and a note in the metadata.
+
+
+def moves_head(animation: Animation) -> bool:
+    """Whether the head of an animation moves as a whole, so that nothing can be added any more."""
+    entries = [animation.metadata.get(key, "") for key in (PROCEDURAL, EDITED)]
+    return any(word in entry for word in MOVED_HEAD for entry in entries)
+
+
+def largest_of(amount: Amount) -> tuple[float, float | Array]:
+    """The largest of an amount, and the share of it: 1, or one for each frame (T, 1)."""
+    if not isinstance(amount, np.ndarray):
+        return amount, 1.0
+    most = float(amount.max(initial=0.0)) or 1.0
+    return most, (np.asarray(amount, np.float64) / most)[:, None]
+
+
+def in_words(amount: Amount) -> str:
+    """An amount in the metadata.
+
+    Example:
+        >>> in_words(2.5), in_words(np.array([1.0, 3.0])), in_words(np.array([2.0, 2.0]))
+        ('2.5', '1 to 3', '2')
+    """
+    low, high = np.min(amount), np.max(amount)
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

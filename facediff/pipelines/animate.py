@@ -28,9 +28,13 @@ if TYPE_CHECKING:
     from facediff.data import Assets, Reference
     from facediff.data.phonemes import Phoneme
     from facediff.data.voice_activity import VoiceGate
+    from facediff.editing.controlled import ControlledFace
     from facediff.editing.correspondence import Correspondence
+    from facediff.editing.direction import Direction
     from facediff.models import AnimationModel, Style
     from facediff.models.styles import StyleLike
+    from facediff.pipelines.acting import Acting, Performer
+    from facediff.pipelines.directing import DirectedStream
     from facediff.pipelines.rest import MouthAtRest
 
 MIN_SECONDS = 0.2
@@ -71,6 +75,14 @@ class AnimationOptions:
     def __post_init__(self) -> None:
         ranges.check_fields(self)
         _ = self.expressivity_factors, self.guidance_scales, self.gate
+        if self.controls.acting is not None:
+            from facediff.pipelines.acting import read_acting
+
+            read_acting(self.controls.acting)
+        if (keys := self.controls.keys()) is not None:
+            for name in ("style", "condition", "expressivity", "guidance"):
+                if getattr(self, name) is not None:
+                    keys.refuse_both(name)
 
     @property
     def expressivity_factors(self) -> dict[str, float]:
@@ -178,7 +190,6 @@ class AnimationPipeline:
         self.model.check_condition(options.condition)
         facts = facts_of(self.model.assets, self.identity)
         name = f"the checkpoint's corpus {self.model.assets.corpus}"
-        controls.check(facts["template"], facts["faces"], facts["regions"], name)
         if options.expressivity is not None:
             self._choose_expressivity(facts["template"], facts["regions"], name)
         gate = options.gate
@@ -193,6 +204,42 @@ class AnimationPipeline:
         wanted = style if style is not None else options.style or None
         if wanted is not None:
             self.style = style_from(wanted, self.identity, self.model, template=options.style_template)
+        self.acting: Acting | None = None
+        if controls.acting is not None:
+            from facediff.pipelines.acting import read_acting
+
+            self.acting = read_acting(controls.acting)
+        self.direct(controls.keys(self.model.frame_rate))
+
+    def direct(self, direction: Direction | None) -> None:
+        """Follow other keys over time from now on.
+
+        Raises:
+            FaceDiffError: naming the channel that the model or its face cannot follow.
+        """
+        from facediff.pipelines.directing import plan_runs
+
+        options, controls = self.options, self.options.controls
+        if direction is not None and self.style is not None:
+            direction.refuse_both("style")
+        self.direction = direction
+        self.runs = plan_runs(
+            direction, self.model, self.identity, self.style, options.condition, options.style_template
+        )
+        finished = None if direction is None else direction.without_model_channels()
+        self.face: ControlledFace | None = None
+        if finished is not None or not controls.without_keys.is_off:
+            facts = facts_of(self.model.assets, self.identity)
+            name = f"the checkpoint's corpus {self.model.assets.corpus}"
+            self.face = controls.on_face(
+                facts["template"], facts["faces"], facts["regions"], name, unit=facts["unit"], direction=finished
+            )
+
+    def stream(self, seeds: Sequence[int]) -> DirectedStream:
+        """What animates speech of any length while it arrives, a sample for each seed."""
+        from facediff.pipelines.directing import DirectedStream
+
+        return DirectedStream(self.model, self.runs, identity=self.identity, seeds=seeds)
 
     def _choose_expressivity(
         self, template: npt.NDArray[np.floating], regions: Mapping[str, npt.NDArray[np.integer]], name: str
@@ -222,7 +269,7 @@ class AnimationPipeline:
         count, heard = self.options.samples, len(speech) / SAMPLE_RATE
         frames = count * heard * self.model.frame_rate
         steps = getattr(getattr(self.model, "sampler", None), "steps", 1)
-        seconds = STEP_SECONDS * steps * count * heard
+        seconds = STEP_SECONDS * steps * count * heard * len(self.runs)
         if output.suffix == ".mp4":
             seconds += PIXEL_SECONDS * frames * self.options.export.size**2
         return seconds, 12 * frames * len(self.model.assets.template(self.identity))
@@ -259,8 +306,6 @@ class AnimationPipeline:
         The arguments are those of :meth:`write`; the folder of ``output`` must have room for long samples, which are
         kept in memory if it is None.
         """
-        import torch
-
         seeds, name = [seed + i for i in range(self.options.samples)], valid_text(name)
         heard = speech
         if self.options.denoise:
@@ -276,17 +321,7 @@ class AnimationPipeline:
         with spool as folder:
             with self.precision():
                 if folder is None:
-                    made = self.model.animate_samples(
-                        torch.from_numpy(heard).to(self.model.device),
-                        identity=self.identity,
-                        condition=self.options.condition,
-                        style=self.style,
-                        seeds=seeds,
-                        progress=None
-                        if self.options.quiet
-                        else partial(track, description="sampling" if short else "seconds of speech"),
-                    )
-                    motions, style = [sample.vertices.numpy() for sample in made], made[0].reference_name
+                    motions, style = self._in_one_pass(heard, seeds, "sampling" if short else "seconds of speech")
                     opened = self.openness(heard, len(motions[0]))
                     motions = [self.at_rest(motion, opened) for motion in motions]
                 else:
@@ -298,7 +333,9 @@ class AnimationPipeline:
 
     def finished(self, animation: Animation, seed: int) -> Animation:
         """A sample after everything that the options ask for after inference."""
-        animation = self.options.controls.apply(self.closed(animation), seed=seed)
+        animation = self.closed(animation)
+        if self.face is not None:
+            animation = self.face.apply(animation, seed=seed, acted=self._acted(animation, seed))
         target = self.options.target_mesh
         if target is None:
             return animation
@@ -317,6 +354,27 @@ class AnimationPipeline:
             judge=None if known else lambda made, found: refuse_poor(target, check_fit(animation, made, found)),
         )
         return made
+
+    def performer(self, seed: int) -> Performer | None:
+        """What acts to speech while it arrives; None without acting."""
+        if self.acting is None:
+            return None
+        seed = seed if self.options.controls.seed is None else self.options.controls.seed
+        return self.acting.performer(self.model.frame_rate, seed)
+
+    def animation_of(self, vertices: npt.NDArray[np.float32]) -> Animation:
+        """Frames (m, V, 3) of the animated face, with nothing else that is known of them."""
+        from facediff.animation import Animation
+
+        return Animation(name="stream", vertices=vertices, **facts_of(self.model.assets, self.identity))
+
+    def _acted(self, animation: Animation, seed: int) -> npt.NDArray[np.float64] | None:
+        """What acting does in each frame of a sample; None without it."""
+        if self.acting is None:
+            return None
+        from facediff.pipelines.acting import act
+
+        return act(self.acting, animation, seed if self.options.controls.seed is None else self.options.controls.seed)
 
     def closed(self, animation: Animation) -> Animation:
         """A sample whose lips touch where its phonemes say so, if their times are given."""
@@ -356,6 +414,30 @@ class AnimationPipeline:
         """Vertices (T, V, 3) with the mouth as far at rest as the openness (T,) of their frames says."""
         return vertices if self.rest is None or openness is None else self.rest.apply(vertices, openness)
 
+    def _in_one_pass(
+        self, speech: npt.NDArray[np.float32], seeds: Sequence[int], description: str
+    ) -> tuple[list[npt.NDArray[np.float32]], str]:
+        """Vertices (T, V, 3) of the samples, in memory, and the style's name."""
+        import torch
+
+        from facediff.pipelines.directing import blend
+
+        audio, motions = torch.from_numpy(speech).to(self.model.device), []
+        styles: dict[str, None] = {}
+        for run in self.runs:
+            with self.model.choosing(run.choices):
+                made = self.model.animate_samples(
+                    audio,
+                    identity=self.identity,
+                    condition=run.condition,
+                    style=run.style,
+                    seeds=seeds,
+                    progress=None if self.options.quiet else partial(track, description=description),
+                )
+            motions.append(torch.stack([sample.vertices for sample in made]))
+            styles[made[0].reference_name] = None
+        return [*blend(motions, self.runs, self.model.frame_rate).numpy()], ", ".join(styles)
+
     def _by_windows(
         self, speech: npt.NDArray[np.float32], seeds: Sequence[int], folder: Path
     ) -> tuple[list[npt.NDArray[np.float32]], str]:
@@ -363,9 +445,7 @@ class AnimationPipeline:
         from facediff.animation.files import MotionWriter
         from facediff.utils.arrays import open_array
 
-        stream = self.model.stream(
-            identity=self.identity, condition=self.options.condition, style=self.style, seeds=seeds
-        )
+        stream = self.stream(seeds)
         progress = None if self.options.quiet else partial(track, description="seconds of speech")
         template = self.model.assets.template(self.identity)
         writers = [MotionWriter(folder / f"{seed}.npy", tuple(template.shape)) for seed in seeds]
@@ -374,10 +454,10 @@ class AnimationPipeline:
             now = None if opened is None else opened[done : done + part.shape[1]]
             done += part.shape[1]
             for writer, motion in zip(writers, part, strict=True):
-                writer.write(self.at_rest((motion.cpu() + template).numpy(), now))
+                writer.write(self.at_rest(motion.numpy(), now))
         for writer in writers:
             writer.close()
-        return [open_array(writer.path) for writer in writers], stream.clip.reference_names[0]
+        return [open_array(writer.path) for writer in writers], ", ".join(stream.style_names)
 
     def _animation(
         self, motion: npt.NDArray[np.float32], speech: npt.NDArray[np.float32], name: str, seed: int, style: str
@@ -406,6 +486,8 @@ class AnimationPipeline:
             metadata["voice gate"] = self.options.voice_gate
         if self.options.denoise:
             metadata["denoised"] = "yes"
+        if self.direction is not None:
+            metadata["direction"] = self.direction.text()
         for option in ("expressivity", "guidance"):
             if (chosen := getattr(self.options, option)) is not None:
                 metadata[option] = chosen
@@ -433,6 +515,24 @@ def read_scales(words: str) -> dict[str, float]:
             )
         scales[name.strip()] = ranges.GUIDANCE_SCALE.read(f"--guidance {name.strip()}", number.strip())
     return scales
+
+
+def direction_for(direction: Path | Direction, recording: Path, *, streamed: bool = False) -> Path | Direction:
+    """The keys over time of one recording, where a folder has a file for each.
+
+    Raises:
+        FaceDiffError: if the folder has none for this recording.
+    """
+    if not isinstance(direction, Path) or not direction.is_dir():
+        return direction
+    from facediff.editing.direction import direction_file
+
+    found = None if streamed else direction_file(direction, recording)
+    if found is None:
+        raise FaceDiffError(
+            f"--direction {direction}: has no {recording.stem}.json or {recording.stem}.csv; give the file's name"
+        )
+    return found
 
 
 def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[np.float32]:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from facediff.models import AnimationModel
     from facediff.models.styles import StyleLike
+    from facediff.pipelines.motion import DirectionLike
 
 Precision = Literal["32", "bf16"]
 
@@ -234,6 +235,8 @@ class Animator:
         sway: float | bool | None = None,
         eyes: str | Path | None = None,
         controls_seed: int | None = None,
+        direction: DirectionLike | None = None,
+        acting: str | None = None,
         target_mesh: str | Path | None = None,
         correspondence: str | Path | None = None,
         name: str | None = None,
@@ -276,6 +279,8 @@ class Animator:
             sway: likewise.
             eyes: likewise.
             controls_seed: likewise; the seed of the sample if None.
+            direction: likewise; keys of style, condition, guidance and expressivity as well.
+            acting: likewise.
             target_mesh: transfer the motion to this mesh.
             correspondence: with ``target_mesh``: .npz to use if it exists, else to write.
             name: the animation's name; the recording's if None.
@@ -313,6 +318,8 @@ class Animator:
                         "sway": sway,
                         "eyes": eyes,
                         "controls_seed": controls_seed,
+                        "direction": direction,
+                        "acting": acting,
                     }
                 )
             ),
@@ -350,6 +357,9 @@ class Animator:
         window: float | None = None,
         overlap: float | None = None,
         voice_gate: str = "energy",
+        controls_seed: int | None = None,
+        direction: DirectionLike | None = None,
+        acting: str | None = None,
     ) -> Iterator[npt.NDArray[np.float32]]:
         """Animate speech of any length while it arrives, as ``facediff animate --stream`` does.
 
@@ -371,6 +381,9 @@ class Animator:
             window: likewise; shorter windows give frames sooner.
             overlap: likewise.
             voice_gate: likewise.
+            controls_seed: likewise, of acting.
+            direction: likewise; keys of blinks, gaze and sway need the whole animation.
+            acting: likewise.
 
         Yields:
             absolute vertices (m, V, 3) of the next frames, as soon as these are certain.
@@ -398,6 +411,9 @@ class Animator:
             window=window,
             overlap=overlap,
             voice_gate=voice_gate,
+            controls=controls_of(
+                **_given({"controls_seed": controls_seed, "direction": direction, "acting": acting}),
+            ),
         )
         options.check_inputs(styled=style is not None)
         with self.module.choosing():

@@ -90,6 +90,9 @@ def animate_folder(
         facts = facts_of(read_assets(options.checkpoint), options.identity)
         neutral = Animation(name=str(options.checkpoint), vertices=facts["template"][None], **facts)
         retarget(neutral, options.target_mesh, options.correspondence)
+    directions = options.controls.direction
+    if isinstance(directions, Path) and directions.is_dir():
+        check_directions(options, found, directions)
     quiet = replace(options, quiet=True, export=replace(options.export, quiet=True))
     decides = {**asdict(quiet), "seed": seed, "max_seconds": max_seconds}
     del decides["commercial_only"]  # refuses a model, and changes no animation
@@ -100,18 +103,58 @@ def animate_folder(
         [f"{name}={json.dumps(value, default=str)}" for name, value in decides.items()],
         make_worker=partial(_load_pipeline, quiet, seed, max_seconds),
         files=_deciding_files(options),
+        files_of=partial(_own_files, options),
         workers=workers or (None if on_processor(options.device) or is_cluster(scheduler) else 1),
         scheduler=scheduler,
         retry_failed=retry_failed,
     )
 
 
+def check_directions(options: AnimationOptions, found: Sequence[Path], folder: Path) -> None:
+    """Read the keys of every recording, and say which recordings have none.
+
+    Raises:
+        FaceDiffError: if a file is wrong, or no recording has one.
+    """
+    from facediff.editing.direction import direction_file
+
+    files = {recording: direction_file(folder, recording) for recording in found}
+    without = [recording.name for recording, file in files.items() if file is None]
+    if len(without) == len(found):
+        raise FaceDiffError(
+            f"--direction {folder}: has no keys for any recording; expected {found[0].stem}.json or {found[0].stem}.csv"
+        )
+    for file in files.values():
+        if file is not None:
+            replace(options, controls=replace(options.controls, direction=file))  # reads and checks it
+    if without:
+        shown = ", ".join(without[:5]) + (" …" if len(without) > 5 else "")
+        print(f"note: {folder}: has no keys for {len(without)} of {len(found)} recordings ({shown})")
+
+
+def _own_files(options: AnimationOptions, recording: Path) -> list[Path]:
+    """The files that decide one recording's animation alone: its keys over time."""
+    folder = options.controls.direction
+    if not isinstance(folder, Path) or not folder.is_dir():
+        return []
+    from facediff.editing.direction import direction_file
+
+    file = direction_file(folder, recording)
+    return [] if file is None else [file]
+
+
 def _deciding_files(options: AnimationOptions) -> list[Path]:
     """The files whose content decides the animations."""
     files = [*model_files(options.checkpoint), *style_paths(options.style)]
     template = None if options.style_template is None else Path(options.style_template)
-    optional = (options.target_mesh, options.controls.eyes, options.correspondence, template)
-    files += [path for path in optional if path is not None and path.is_file()]
+    optional = (
+        options.target_mesh,
+        options.controls.eyes,
+        options.correspondence,
+        template,
+        options.controls.direction,
+    )
+    files += [path for path in optional if isinstance(path, Path) and path.is_file()]
     shapes = options.export.shapes
     if shapes is not None and shapes.exists():
         inside = sorted(shapes.iterdir()) if shapes.is_dir() else [shapes]
@@ -122,9 +165,15 @@ def _deciding_files(options: AnimationOptions) -> list[Path]:
 def _load_pipeline(options: AnimationOptions, seed: int, max_seconds: float | None, _command: list[str]) -> Animate:
     """Load what all recordings have in common, once in each process."""
     pipeline = AnimationPipeline(options, seed=seed)
+    own = isinstance(options.controls.direction, Path) and options.controls.direction.is_dir()
 
     def animate(recording: Path, output: Path) -> None:
         speech = read_recording(recording, max_seconds)
+        if own:
+            from facediff.editing.direction import read_direction
+
+            file = next(iter(_own_files(options, recording)), None)
+            pipeline.direct(None if file is None else read_direction(file, pipeline.model.frame_rate))
         pipeline.write(speech, recording.stem, output, seed=seed_of_recording(recording, seed))
 
     return animate
@@ -178,6 +227,7 @@ def run_folder(
     *,
     make_worker: MakeWorker,
     files: Sequence[Path] = (),
+    files_of: Callable[[Path], Sequence[Path]] = lambda _: (),
     workers: int | None = None,
     scheduler: str | None = "",
     retry_failed: bool = False,
@@ -188,7 +238,8 @@ def run_folder(
     is tried again only if something has changed or ``retry_failed`` is given. Each output appears whole or not at all.
     Ctrl-C waits for the recordings that are being animated; the same command continues.
 
-    ``command`` and ``files`` are the options and the files (checkpoint, styles …) that decide the result.
+    ``command`` and ``files`` are the options and the files (checkpoint, styles …) that decide the result; ``files_of``
+    gives those of one recording in addition.
     ``make_worker``, a function of a module, is called once in each process with the command.
     """
     if workers is not None and workers < 1:
@@ -203,7 +254,10 @@ def run_folder(
     check_writable(output / names[0])
     states: dict[Path, tuple[str, str]] = {}  # by recording: "made", "up to date" or "failed", and a remark
     with locked(output / LOCK, "facediff animate"):
-        tasks = [FileTask(speech, output / name, recipe) for speech, name in zip(speeches, names, strict=True)]
+        tasks = [
+            FileTask(speech, output / name, recipe.joined(files_of(speech)))
+            for speech, name in zip(speeches, names, strict=True)
+        ]
         for task in tasks:
             if state := _earlier_state(task, retry_failed):
                 states[task.source] = state

@@ -22,9 +22,13 @@ from facediff.utils import ranges
 if TYPE_CHECKING:
     from facediff.editing.blendshapes import SolveOptions, Weights
     from facediff.editing.controls import AnimationControls
+    from facediff.editing.direction import Direction
     from facediff.editing.shapes import ShapeSet
     from facediff.export import ExportOptions
     from facediff.pipelines.animator import Animator
+
+    DirectionLike = str | Path | Direction | list[dict[str, Any]] | dict[str, Any]
+    """What keys over time may be given as in Python."""
 
 INLINE_MB = 8.0
 """The largest page that a notebook shows; of a larger one, it shows the beginning. A notebook keeps what it shows."""
@@ -121,6 +125,8 @@ class Animation(finished.Animation):
         sway: float | bool | None = None,
         eyes: str | Path | None = None,
         controls_seed: int | None = None,
+        direction: DirectionLike | None = None,
+        acting: str | None = None,
     ) -> Animation:
         """The animation with animation controls applied: ``anim.control(expressiveness=1.2, blinks=True)``.
 
@@ -130,12 +136,18 @@ class Animation(finished.Animation):
             gaze: eyes that wander by so many degrees at most; True for 4.
             sway: a head that sways by so many degrees at most; True for 2.
             eyes: file that says where lids and eyeballs are; the built-in puppet needs none.
-            controls_seed: seed of blinks, gaze and sway; 0 if None.
+            controls_seed: seed of blinks, gaze, sway and acting; 0 if None.
+            direction: keys over time: a file, a :class:`facediff.Direction`, or a list of its rows.
+            acting: brows, head and lids that move with the speech: ``"prosody"``, with options
+                (``"prosody:strength=0.8"``).
 
         Raises:
             FaceDiffError: if a value is out of range, or does not fit the face.
         """
-        return Animation.of(controls_of(**_given(locals())).apply(self))
+        wanted = controls_of(**_given(locals()))
+        from facediff.pipelines.acting import controlled
+
+        return Animation.of(controlled(self, wanted))
 
     @in_python_words
     def retarget(
@@ -530,9 +542,19 @@ def controls_of(**options: Any) -> AnimationControls:  # noqa: ANN401 - see Anim
     return AnimationControls(
         expressiveness=words_of(options.pop("expressiveness", None)),
         eyes=_path(options.pop("eyes", None)),
+        direction=direction_of(options.pop("direction", None)),
         seed=options.pop("controls_seed", None),
         **options,
     )
+
+
+def direction_of(given: DirectionLike | None) -> Path | Direction | None:
+    """Keys over time from a file's name, rows, or what they were made into already."""
+    if given is None or isinstance(given, str | Path):
+        return None if given is None else Path(given)
+    from facediff.editing.direction import Direction
+
+    return given if isinstance(given, Direction) else Direction.parse(given, "direction")
 
 
 def solve_weights(

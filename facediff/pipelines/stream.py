@@ -86,20 +86,24 @@ class LiveAnimation:
 
         from facediff.data.audio import resampler
 
-        self._pipeline, model = pipeline, pipeline.model
+        self._pipeline, model, self._seed = pipeline, pipeline.model, seed
         self._chosen = model.choices()
         self._template = model.assets.template(pipeline.identity)
         self._convert = None if rate == SAMPLE_RATE else resampler(rate)
         with pipeline.precision():  # the style is encoded within it as well, as it is for a file
-            self._stream = model.stream(
-                identity=pipeline.identity, condition=pipeline.options.condition, style=pipeline.style, seeds=[seed]
-            )
+            self._stream = pipeline.stream([seed])
 
         self._rest = pipeline.rest
         self._openness = None if self._rest is None else self._rest.openness()
-        # Frames of the model, and how far their mouths may be open, whichever is certain first.
+        self._face = pipeline.face
+        if self._face is not None:
+            self._face.refuse_whole_animation()
+        self._performer = pipeline.performer(seed)
+        # Frames of the model, how far their mouths may be open, and how they are acted, whichever is certain first.
         self._held = np.zeros((0, *self._template.shape), np.float32)
         self._opened = np.zeros(0, np.float32)
+        self._acted = np.zeros((0, 5))
+        self._given = 0
 
     def feed(self, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Hear samples (n,), and give the frames (m, V, 3) that are certain now; m may be 0."""
@@ -109,23 +113,37 @@ class LiveAnimation:
     def _hear(self, speech: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """The frames that are certain after more speech (n,) at 16 kHz."""
         import numpy as np
-        import torch
 
         with self._pipeline.model.choosing(self._chosen), self._pipeline.precision():
-            made = self._absolute(self._stream.feed(torch.from_numpy(speech)))
-        if self._openness is None:
-            return made
-        self._opened = np.concatenate([self._opened, self._openness.feed(speech)])
-        return self._at_rest(made)
+            made = self._first(self._stream.feed(speech))
+        if self._openness is not None:
+            self._opened = np.concatenate([self._opened, self._openness.feed(speech)])
+        if self._performer is not None:
+            self._acted = np.concatenate([self._acted, self._performer.feed(speech)])
+        return self._finished(made)
 
-    def _at_rest(self, made: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """With more frames of the model, those whose pauses are known, with the mouth at rest in them."""
+    def _finished(self, made: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """With more frames of the model, those of which all is known, with the mouth at rest in pauses, and acted."""
         import numpy as np
 
+        if self._openness is None and self._performer is None and self._face is None:
+            return made
         held = np.concatenate([self._held, made]) if len(self._held) else made
-        count = min(len(held), len(self._opened))
-        opened, self._opened, self._held = self._opened[:count], self._opened[count:], held[count:]
-        return self._pipeline.at_rest(held[:count], opened)
+        count = len(held)
+        if self._openness is not None:
+            count = min(count, len(self._opened))
+        if self._performer is not None:
+            count = min(count, len(self._acted))
+        part, opened, moves = held[:count], self._opened[:count], self._acted[:count]
+        self._held, self._opened, self._acted = held[count:], self._opened[count:], self._acted[count:]
+        if self._openness is not None:
+            part = self._pipeline.at_rest(part, opened)
+        if self._face is not None and count:
+            animation = self._pipeline.animation_of(part)
+            acted = None if self._performer is None else moves
+            part = self._face.apply(animation, seed=self._seed, start=self._given, acted=acted).vertices
+        self._given += count
+        return part
 
     def finish(self) -> npt.NDArray[np.float32]:
         """The frames (m, V, 3) that are left.
@@ -140,15 +158,16 @@ class LiveAnimation:
             if self._convert is not None:
                 rest = self._convert(np.zeros(0, np.float32), True)
                 last.append(self._hear(rest))
-            made = self._absolute(self._stream.finish())
-        if self._openness is None:
-            return np.concatenate([*last, made])
-        self._opened = np.concatenate([self._opened, self._openness.finish(self._stream.frames)])
-        return np.concatenate([*last, self._at_rest(made)])
+            made = self._first(self._stream.finish())
+        if self._openness is not None:
+            self._opened = np.concatenate([self._opened, self._openness.finish(self._stream.frames)])
+        if self._performer is not None:
+            self._acted = np.concatenate([self._acted, self._performer.finish(self._stream.frames)])
+        return np.concatenate([*last, self._finished(made)])
 
-    def _absolute(self, motion: Tensor) -> npt.NDArray[np.float32]:
-        """Vertices of the first sample's offsets."""
-        vertices: npt.NDArray[np.float32] = (motion[0].cpu() + self._template).numpy()
+    def _first(self, motion: Tensor) -> npt.NDArray[np.float32]:
+        """Vertices of the first sample."""
+        vertices: npt.NDArray[np.float32] = motion[0].numpy()
         return vertices
 
 

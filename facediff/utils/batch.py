@@ -136,6 +136,14 @@ class Recipe:
                 raise FaceDiffError(f"{path}: no such file")
         return cls(tuple(command), {str(path): sha256(path) for path in files})
 
+    def joined(self, files: Sequence[Path]) -> Recipe:
+        """The recipe with further files.
+
+        Raises:
+            FaceDiffError: if one is missing.
+        """
+        return replace(self, files={**self.files, **Recipe.of((), files).files}) if files else self
+
 
 @dataclass(frozen=True)
 class FileTask:

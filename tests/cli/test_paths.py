@@ -25,6 +25,7 @@ LIGHTNING = {"fit", "validate", "test", "predict"}
 NO_PATHS = {
     *(
         "accelerator",
+        "acting",
         "baseline",
         "by",
         "clip",

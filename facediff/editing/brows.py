@@ -1,0 +1,111 @@
+"""Where a face's brows are, and how they rise: known for the built-in puppet, found or given for any other face."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation
+from facediff.animation.animation import metres_per_unit
+from facediff.editing.expressiveness import ALL, region_factors
+from facediff.editing.eyes import Array, Eyes, nearest_puppet
+from facediff.editing.procedural import copied
+from facediff.errors import FaceDiffError
+
+REGION = "brows"
+"""A region of this name says where the brows are."""
+UP = ("inner_brow_up", "outer_brow_up")
+DOWN = ("brow_frown",)
+"""Controls of the built-in face that raise brows, and lower them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Brows:
+    """The brows of a face.
+
+    Attributes:
+        up: displacements (V, 3) of which the largest is one millimetre, in the face's unit.
+        down: the same for lowered brows.
+    """
+
+    up: npt.NDArray[np.float32]
+    down: npt.NDArray[np.float32]
+
+    def moved(self, frame: npt.NDArray[np.float32], millimetres: float) -> npt.NDArray[np.float32]:
+        """A frame (V, 3) with brows raised by so much, or lowered where it is negative."""
+        if not millimetres:
+            return frame
+        field = self.up if millimetres > 0 else self.down
+        return frame + np.float32(abs(millimetres)) * field
+
+
+def brows_of(
+    template: npt.NDArray[np.floating],
+    faces: npt.NDArray[np.integer] | None,
+    regions: Mapping[str, npt.NDArray[np.integer]],
+    unit: str,
+    eyes: Eyes | None = None,
+) -> Brows:
+    """The brows of a face (V, 3).
+
+    They are those that ``eyes`` or a region "brows" names, where there are; else those of the built-in face, which are
+    carried over to other faces.
+
+    Raises:
+        FaceDiffError: if nobody says where they are, and no face is found in the mesh.
+    """
+    named = eyes.brows if eyes is not None and eyes.brows is not None else regions.get(REGION)
+    if named is not None and len(named):
+        weights = region_factors(template, {REGION: named}, {REGION: 1.0, ALL: 0.0})
+        up = weights[:, None] * np.array([0.0, 1.0, 0.0])
+        return Brows(_one_millimetre(up, unit), _one_millimetre(-up, unit))
+    from facediff.synthetic.corpus import rig_of
+    from facediff.synthetic.rig import LINEAR_FIELDS
+
+    puppet = nearest_puppet(template, faces)
+    rig = rig_of("F1" if puppet is None else puppet[0])
+    fields = [sum(rig.fields[LINEAR_FIELDS.index(name)] for name in names) for names in (UP, DOWN)]
+    if puppet is None:
+        fields = list(_carried(rig.neutral, np.stack(fields), template, faces))
+    return Brows(*(_one_millimetre(field, unit) for field in fields))
+
+
+def _carried(
+    neutral: Array, fields: Array, template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None
+) -> Array:
+    """Displacements (2, V, 3) of the built-in face on another one."""
+    from facediff.editing.correspondence import correspond
+    from facediff.editing.face_features import find_features
+    from facediff.editing.retargeting import carry_displacements
+    from facediff.synthetic.face import build_face
+
+    if faces is not None and len(faces):
+        found = correspond(neutral, build_face().faces, template, faces)
+        laid = found.similarity.inverse().apply(found.target_vertices)
+        seen = find_features(laid, found.target_faces, find_features(found.source_vertices, found.source_faces))
+        if seen is not None and not found.fits_badly:
+            return carry_displacements(found, fields)
+    raise FaceDiffError(
+        'brows: where they are is not known for this face; list their vertices as "brows" in the file of --eyes, or '
+        "give a mesh with triangles whose mouth can open"
+    )
+
+
+def _one_millimetre(field: npt.ArrayLike, unit: str) -> npt.NDArray[np.float32]:
+    """Displacements (V, 3) scaled so that the largest is one millimetre."""
+    displacements = np.asarray(field, np.float64)
+    largest = float(np.linalg.norm(displacements, axis=-1).max(initial=0.0))
+    if largest <= 0:
+        raise FaceDiffError("brows: no vertex of this face moves with them; list their vertices in the file of --eyes")
+    return np.asarray(displacements * (0.001 / metres_per_unit(unit) / largest), np.float32)
+
+
+def raise_brows(animation: Animation, brows: Brows, curve: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+    """Vertices (T, V, 3) with brows raised by millimetres (T,)."""
+    vertices = copied(animation.vertices)
+    for index in np.flatnonzero(curve):
+        vertices[index] = brows.moved(vertices[index], float(curve[index]))
+    return vertices
