@@ -4,7 +4,8 @@
 # laid over one another by the browser itself; behind what stands over the faces may be any colour, so that the worse of
 # black and white counts.
 CONTRASTS = """(() => {
-  const pen = Object.assign(document.createElement("canvas"), { width: 1, height: 1 }).getContext("2d");
+  const dot = Object.assign(document.createElement("canvas"), { width: 1, height: 1 });
+  const pen = dot.getContext("2d", { willReadFrequently: true });
   const style = getComputedStyle(document.body), named = (name) => style.getPropertyValue(name);
   const mixed = (colours) => {
     for (const colour of colours) (pen.fillStyle = colour), pen.fillRect(0, 0, 1, 1);

@@ -115,7 +115,7 @@ def test_keys_come_back_as_they_were_and_their_curves_are_those_of_python(show: 
 
 
 def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp_path: Path) -> None:
-    page = show([directed(Direction([Key(1.0, "expressiveness", 2.0)]))], width=900, height=900)
+    page = show([directed(Direction([Key(1.0, "expressiveness", 2.0)]))], width=760, height=800)
     before = page.evaluate("facediff.direction")
     double_click(page, at(page, "expressiveness", 1.611, 0.75))
     after_adding = keys_in(page).channels["expressiveness"]
@@ -183,7 +183,7 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
 
 def test_preview_scales_about_the_neutral_face_and_turns_the_head(show: Show) -> None:
     animation = directed(Direction([Key(0.0, "expressiveness", 2.0)]))
-    page = show([animation])
+    page = show([animation], width=600, height=500)
     frame = "(async (frame) => { await facediff.seek(frame); return [...facediff.positions(0)]; })"
     as_made = np.reshape(page.evaluate(f"{frame}(7)"), (-1, 3))
     assert np.allclose(as_made, animation.vertices[7], atol=0.03)
@@ -202,7 +202,7 @@ def test_preview_scales_about_the_neutral_face_and_turns_the_head(show: Show) ->
 
 def test_takes_are_compared_in_one_panel(show: Show) -> None:
     green = np.repeat(np.array([[20, 20, 220], [20, 220, 20], [20, 220, 20]], np.uint8), 4, axis=0)
-    page = show([clicks(name="A"), clicks(name="a"), replace(clicks(name="B"), colours=green)], width=900, height=700)
+    page = show([clicks(name="A"), clicks(name="a"), replace(clicks(name="B"), colours=green)], width=600, height=500)
     page.evaluate("second.value = '2', second.dispatchEvent(new Event('change')), facediff.seek(1)")
     see = """(async (x) => {
       facediff.turn(0, 0);

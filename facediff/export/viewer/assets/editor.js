@@ -16,6 +16,7 @@ class Editor {
     );
     this.lanes = [];
     this.selected = null;
+    this.drawing = null;
     this.connect();
     this.show(this.facts.animations.some(({ direction }) => direction));
     this.direct(this.number);
@@ -139,13 +140,21 @@ class Editor {
     this.selected = key;
     if (lane && document.activeElement !== lane.canvas) lane.canvas.focus({ preventScroll: true });
     this.showFields();
-    for (const each of this.lanes) each.draw();
+    this.drawLanes();
     if (key) find("direction-said").textContent = `${key.channel}: ${sayKey(key)}`;
   }
 
   /** The focus has come to a lane: keys of another one are no longer chosen. */
   enter(lane) {
     if (this.selected && this.selected.channel !== lane.name) this.select(null);
+  }
+
+  /** Draw all lanes before the next picture, once however much has changed. */
+  drawLanes() {
+    this.drawing ??= requestAnimationFrame(() => {
+      this.drawing = null;
+      for (const lane of this.lanes) lane.draw();
+    });
   }
 
   removeKey() {
@@ -163,7 +172,7 @@ class Editor {
       this.selected = direction.at(this.selected.channel, this.selected.time) ?? null;
     }
     for (const name of direction.channels) this.addLane(name);
-    for (const lane of this.lanes) lane.draw();
+    this.drawLanes();
     find("undo").disabled = !direction.past.length;
     find("redo").disabled = !direction.future.length;
     find("save-keys").disabled = !direction.keys.length;

@@ -32,7 +32,7 @@ async function readFace(facts, animation) {
   };
 }
 
-/** A picture is still when the camera has not moved for this long. */
+/** A picture is still when neither the camera nor what it shows was changed by hand for this long. */
 const STILL_MS = 200;
 
 class Player {
@@ -50,13 +50,10 @@ class Player {
     this.extent = [0, 1, 2].map((axis) => Math.max(...facts.animations.map((animation) => animation.extent[axis])));
     this.clock = new SilentClock(facts.frames / facts.frameRate);
     this.scene = new Scene(find("view"), faces, ramp);
-    this.camera = new Camera(find("stage"), () => {
-      this.dirty = true;
-      this.movedAt = performance.now();
-    });
+    this.camera = new Camera(find("stage"), () => this.stir());
     this.panels = new Panels(facts, () => (this.dirty = true));
     this.wav = wav ? readWav(wav) : null;
-    this.comparison = new Comparison(facts, this.panels.boxes, () => (this.dirty = true));
+    this.comparison = new Comparison(facts, this.panels.boxes, () => this.stir());
     const lines = faces.flatMap(({ opening }, number) => (opening ? [{ values: opening, number }] : []));
     find("opening").hidden = !lines.length;
     const toFrame = (frame) => this.seek(frame);
@@ -130,9 +127,16 @@ class Player {
     this.panels.press("wireframe", on);
   }
 
-  /** Make the shown frame again. */
+  /** Draw again, quickly: more changes are likely to follow. */
+  stir() {
+    this.dirty = true;
+    this.movedAt = performance.now();
+  }
+
+  /** Make the shown frame again, as changed keys have it. */
   redraw() {
     this.shown = -1;
+    this.stir();
   }
 
   tick() {

@@ -43,9 +43,12 @@ class Plot {
   pen() {
     const { clientWidth: wide, clientHeight: high } = this.canvas;
     const scale = devicePixelRatio || 1;
-    Object.assign(this.canvas, { width: Math.round(wide * scale), height: Math.round(high * scale) });
-    const pen = this.canvas.getContext("2d");
-    pen.scale(scale, scale);
+    const width = Math.round(wide * scale), height = Math.round(high * scale);
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+    // Drawn by the processor: without a graphics card, a drag would otherwise pile up work for seconds.
+    const pen = this.canvas.getContext("2d", { willReadFrequently: true });
+    pen.setTransform(scale, 0, 0, scale, 0, 0);
+    pen.clearRect(0, 0, wide, high);
     const style = getComputedStyle(this.canvas);
     pen.font = `11px ${style.fontFamily}`;
     return Object.assign(pen, { wide, high, colour: (name) => style.getPropertyValue(name).trim() });
