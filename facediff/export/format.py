@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError
-from facediff.render.rasteriser import face_outward, to_linear, vertex_normals
+from facediff.render.meshes import face_outward, vertex_normals
+from facediff.render.rasteriser import to_linear
 from facediff.utils import ranges
 
 Up = Literal["y", "z"]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable, Iterator, Sequence
+import multiprocessing
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,12 +17,14 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.render.rasteriser import Renderer, opencv
 from facediff.utils.files import atomic
+from facediff.utils.jobs import processors
 
 Frame = npt.NDArray[np.uint8]
 Motion = npt.NDArray[np.floating]
 
 INK = (52, 56, 66)
 FAINT_INK = (104, 110, 122)
+MOST_THREADS = 8  # An encoder takes pictures one by one, and more than these would wait for it
 
 
 def side_by_side(
@@ -43,7 +48,8 @@ def side_by_side(
         footer: text under all panels, such as "synthetic corpus".
 
     Returns:
-        A generator of T pictures as wide as all panels; strips for labels above and footer below add height.
+        A generator of T pictures, drawn in several threads. They are as wide as all panels; strips for labels above
+        and footer below add height.
 
     Raises:
         FaceDiffError: if the numbers of motions, labels, renderers and colours differ, or a motion cannot be drawn.
@@ -75,16 +81,48 @@ def _frames(
     colours: Sequence[npt.NDArray[np.generic] | None],
     footer: str | None,
 ) -> Iterator[Frame]:
-    for index in range(len(motions[0])):
+    threads = min(drawing_threads(), len(motions[0]))
+    # A renderer draws one picture at a time: each thread takes a set of them and gives it back.
+    free = [renderers, *([renderer.twin() for renderer in renderers] for _ in range(threads - 1))]
+    labelled = any(text.strip() for text in labels)
+    ground = np.hstack([renderer.backdrop[-1:] for renderer in renderers])
+
+    def draw(index: int) -> Frame:
+        own = free.pop()
         panels = []
-        for renderer, motion, label, tint in zip(renderers, motions, labels, colours, strict=True):
+        for renderer, motion, label, tint in zip(own, motions, labels, colours, strict=True):
             now = tint[index] if tint is not None and np.ndim(tint) == 3 else tint
             panel = renderer.render(motion[index], colours=now)
-            labelled = any(text.strip() for text in labels)
             panels.append(_caption(panel, label, "top", INK, renderer.backdrop[:1]) if labelled else panel)
+        free.append(own)
         row = np.hstack(panels)
-        ground = np.hstack([renderer.backdrop[-1:] for renderer in renderers])
-        yield row if not footer else _caption(row, footer, "bottom", FAINT_INK, ground)
+        return row if not footer else _caption(row, footer, "bottom", FAINT_INK, ground)
+
+    return _in_order(draw, len(motions[0]), threads)
+
+
+def drawing_threads() -> int:
+    """Threads that draw: as many as processors, and one where this process is itself one of several workers."""
+    return 1 if multiprocessing.parent_process() is not None else min(processors(), MOST_THREADS)
+
+
+def _in_order(draw: Callable[[int], Frame], count: int, threads: int) -> Iterator[Frame]:
+    """What `draw` makes of 0, 1, 2 …; few pictures wait, however slowly they are taken."""
+    if threads <= 1:
+        yield from map(draw, range(count))
+        return
+    coming: deque[Future[Frame]] = deque()
+    with ThreadPoolExecutor(threads, thread_name_prefix="drawing") as pool:
+        try:
+            for index in range(count):
+                coming.append(pool.submit(draw, index))
+                if len(coming) > threads:
+                    yield coming.popleft().result()
+            while coming:
+                yield coming.popleft().result()
+        finally:
+            for picture in coming:
+                picture.cancel()
 
 
 def check_motion(motion: Motion, n_vertices: int, name: str) -> None:

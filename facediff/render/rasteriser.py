@@ -1,11 +1,12 @@
 """Drawing meshes without display or GPU, on the software rasteriser of OpenCV 5.
 
 :class:`Renderer` draws a frame; :class:`Camera` and :class:`Look` say what it looks like; ``_Canvas`` holds the buffers
-that OpenCV fills; functions on meshes (normals, winding, hollows) follow at the end.
+that OpenCV fills.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,24 +17,38 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.render.meshes import (
+    Faces,
+    Float64,
+    Floats,
+    VertexSums,
+    check_faces,
+    check_vertices,
+    face_outward,
+    hollowness,
+    is_open,
+    vertex_normals,
+)
+from facediff.render.refinement import Refinement
 
 Picture = npt.NDArray[np.uint8]
-Faces = npt.NDArray[np.int32]
 Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.floating[Any]]
 
 INSIDE = 0.2  # Share of its light that the back of a face keeps: the inside of a head is dark
 HOLLOW_STRENGTH = 0.45  # How strongly hollows of the surface are darkened
 DEPTH_STRENGTH = 14.0  # How strongly points that lie behind their surroundings in the picture are darkened
+EDGE = 1 / 25  # Longest edge of a lit triangle, as a share of the picture's height
+SHORTEST_EDGE = 3.0  # Pixels: shorter edges are never split, since light does not change over so few of them
+LOOKED_UP = 1024  # Vertices per row of the lookup of their light
 GAMMA_STEPS = 4095  # Steps of the gamma table: fine enough that the darkest step stays below one level of the picture
 
 
 class Renderer:
-    """Draws one topology in one view; keeps its buffers between frames, so use one per thread.
+    """Draws one topology in one view; keeps its buffers between frames, so use one (a `twin`) per thread.
 
-    Normals are computed again for every frame and interpolated over the triangles; the light is looked up per sample of
-    the supersampled picture, averaged in linear light and gamma-corrected last. The same input gives the same bytes.
+    Normals are computed again for every frame; the light is looked up per vertex of a mesh that is refined until its
+    triangles are small in the picture, interpolated over them per sample of the supersampled picture, averaged in
+    linear light and gamma-corrected last. The same input gives the same bytes.
 
     Args:
         faces: triangles (F, 3) as vertex numbers; either winding.
@@ -79,7 +94,16 @@ class Renderer:
         self._colours = None if colours is None else self._linear_colours(colours)
         self._open = is_open(self.faces)
         self._canvas = _Canvas(self.camera, self.height, self.width, supersample)
-        self._light = light_table(self.look)
+        self._sums = VertexSums(self.faces, self.n_vertices)
+        self._backs = np.ascontiguousarray(self.faces[:, ::-1])
+        pixel = self.camera.pixel_size(self.height)
+        normals = vertex_normals(rest, self.faces, self._sums)
+        longest, shortest = EDGE * self.height * pixel, SHORTEST_EDGE * pixel
+        self._refinement = Refinement(self.faces, rest, longest, normals, shortest)
+        table = light_table(self.look)
+        self._strongest = max(np.float32((table[..., :3].max(axis=2) + table[..., 3]).max()), np.float32(1e-6))
+        self._light = table / self._strongest  # the rasteriser interpolates values from 0 to 1
+        self._albedo, self._tint = to_linear(self.look.albedo), np.asarray(self.look.hollow, np.float32)
         self._gamma = np.rint(255 * to_srgb(np.linspace(0, 1, GAMMA_STEPS + 1))).astype(np.uint8)
         self._background = background(self.look, self.height, self.width)
         self.backdrop = self._to_bytes(self._background.copy())
@@ -102,56 +126,67 @@ class Renderer:
             picture[window.pixels] = self._draw(points, linear, window)
         return picture
 
+    def twin(self) -> Renderer:
+        """This renderer with buffers of its own: both may draw at the same time, each in its thread."""
+        other = copy.copy(self)
+        other._canvas = _Canvas(self.camera, self.height, self.width, self._canvas.supersample)
+        return other
+
     def _draw(self, points: Float64, colours: Float32 | None, window: _Window) -> Picture:
-        """The window's pixels: rasterise, light, darken hollows, put over the background, gamma-correct."""
-        cv2, canvas = opencv(), self._canvas
-        positions = points.astype(np.float32)
-        self._draw_normals(points, positions, window)
+        """The window's pixels: light the vertices, rasterise, darken what lies behind, put over the background."""
+        canvas = self._canvas
+        canvas.clear(window)
+        fine = self._fine_vertices(points, colours)
+        canvas.draw(fine[:, :3], self._lit(fine), self._refinement.faces)
+        if self._open:
+            # Backs are drawn against the same depth buffer: they show only where one looks inside. It is dark there, so
+            # that no facets are seen, and the mesh need not be fine.
+            vertices = fine[: self.n_vertices]
+            vertices[:, 3:5] *= -1  # the normal of the other side
+            vertices[:, 5] *= INSIDE
+            canvas.draw(vertices[:, :3], self._lit(vertices), self._backs)
         coverage = canvas.coverage(window)
-        # Samples that no triangle reached hold -1 and fall off the table: remap gives them no light.
-        column, row = canvas.channel(window, 0), canvas.channel(window, 1)
-        column *= np.float32(TABLE_SIZE - 1)
-        row *= np.float32(TABLE_SIZE - 1)
-        lit = window.shrink(cv2.remap(self._light, column, row, cv2.INTER_LINEAR))
-        kept = self._kept_light(coverage, window)
-        if colours is None:
-            picture = lit[..., :3] * to_linear(self.look.albedo)
-            hollow = np.asarray(self.look.hollow, np.float32)
-            kept = kept * (1 - hollow) + hollow
-        else:
-            picture = lit[..., :3] * self._draw_albedo(positions, colours, coverage, window)
-        picture += lit[..., 3:]
-        picture *= kept
+        picture = window.shrink(canvas.values[window.samples])
+        picture *= self._kept_light(coverage, window, tinted=colours is None)
         picture += self._background[window.pixels] * (1 - coverage)[..., None]
         return self._to_bytes(picture)
 
-    def _draw_normals(self, points: Float64, positions: Float32, window: _Window) -> None:
-        """Fill the canvas with the normal's x and y from 0 to 1 and the share of light that a hollow leaves."""
-        normals = vertex_normals(points, self.faces)
-        shade = np.clip(1 - HOLLOW_STRENGTH * hollowness(points, normals, self.faces), 0, 1)
-        self._canvas.clear(window)
-        front = np.column_stack([normals[:, :2] * 0.5 + 0.5, shade])
-        self._canvas.draw(positions, self.faces, front, "front")
-        if self._open:
-            # Backs are drawn against the same depth buffer: they show only where one looks inside.
-            back = np.column_stack([0.5 - normals[:, :2] * 0.5, INSIDE * shade])
-            self._canvas.draw(positions, self.faces, back, "back")
+    def _fine_vertices(self, points: Float64, colours: Float32 | None) -> Float32:
+        """Of each vertex of the refined mesh: position, normal's x and y, light left in a hollow, own colour if any."""
+        normals = vertex_normals(points, self.faces, self._sums)
+        shade = np.clip(1 - HOLLOW_STRENGTH * hollowness(points, normals, self._sums), 0, 1)
+        parts: list[Floats] = [points, normals[:, :2], shade[:, None]]
+        if colours is not None:
+            parts.append(colours)
+        return self._refinement.values(np.concatenate(parts, axis=1, dtype=np.float32))
 
-    def _draw_albedo(self, positions: Float32, colours: Float32, coverage: Float32, window: _Window) -> Float32:
-        """Linear surface colour per pixel from linear colours per vertex; overwrites the canvas."""
-        self._canvas.clear(window)
-        self._canvas.draw(positions, self.faces, colours, "both" if self._open else "front")
-        albedo = window.shrink(self._canvas.values[window.samples])
-        albedo[..., :2] += (1 - coverage)[..., None]  # the blank's -1 in the samples that are not covered
-        return np.asarray(albedo / np.maximum(coverage, np.float32(1e-3))[..., None], dtype=np.float32)
+    def _lit(self, vertices: Float32) -> Float32:
+        """Light that leaves the vertices of `_fine_vertices` for the viewer, as a share of the strongest: (N, 3)."""
+        table, shade, colours = self._light_of(vertices[:, 3:5]), vertices[:, 5:6], vertices[:, 6:]
+        tinted = colours.shape[1] == 0
+        light = table[:, :3] * (self._albedo if tinted else colours)
+        light += table[:, 3:]
+        light *= shade * (1 - self._tint) + self._tint if tinted else shade
+        return light
 
-    def _kept_light(self, coverage: Float32, window: _Window) -> Float32:
-        """Share of the light that is left in hollows of the surface, per pixel (height, width, 1)."""
-        # Two cues: the surface's own hollows, and pixels that lie behind the mean depth of their surroundings
-        # (depth-buffer unsharp masking, Luft et al. 2006), which darkens the mouth between the lips.
+    def _light_of(self, normals: Float32) -> Float32:
+        """Light by the table, as a share of the strongest, of normals' x and y (N, 2): (N, 4)."""
+        cv2, count = opencv(), len(normals)
+        # OpenCV looks up pictures, and none that is wider than 32 767 pixels: the vertices go into rows.
+        columns = np.zeros((2, -(-count // LOOKED_UP), LOOKED_UP), np.float32)
+        np.multiply(normals.T, np.float32((TABLE_SIZE - 1) / 2), out=columns.reshape(2, -1)[:, :count])
+        columns += np.float32((TABLE_SIZE - 1) / 2)
+        found = cv2.remap(self._light, columns[0], columns[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(found.reshape(-1, 4)[:count], dtype=np.float32)
+
+    def _kept_light(self, coverage: Float32, window: _Window, *, tinted: bool) -> Float32:
+        """What is multiplied to the drawn values: the strongest light's strength, less where a pixel lies behind.
+
+        (height, width, 1 or 3)
+        """
+        # Pixels behind the mean depth of their surroundings (depth-buffer unsharp masking, Luft et al. 2006): this
+        # darkens the mouth between the lips. The surface's own hollows are part of the vertices' light.
         cv2, (width, height) = opencv(), window.size
-        shade = window.shrink(self._canvas.channel(window, 2))
-        shade /= np.maximum(coverage, np.float32(1e-3))
         distances = self._canvas.distances(window, coverage)
         small = (max(width // 4, 1), max(height // 4, 1))
         sums = [cv2.resize(image, small, interpolation=cv2.INTER_AREA) for image in (distances * coverage, coverage)]
@@ -161,7 +196,8 @@ class Renderer:
         behind = np.maximum(distances, 0, out=distances)
         behind *= coverage
         behind *= np.float32(DEPTH_STRENGTH / self.camera.radius)
-        return np.asarray((shade / (1 + behind))[..., None], dtype=np.float32)
+        kept = (1 / (1 + behind))[..., None]
+        return np.asarray((kept * (1 - self._tint) + self._tint if tinted else kept) * self._strongest, np.float32)
 
     def _to_bytes(self, picture: Float32) -> Picture:
         """Linear light to sRGB bytes; overwrites its input."""
@@ -252,6 +288,10 @@ class Camera:
     def far(self) -> float:
         """Depth behind which nothing is drawn."""
         return self.distance + self.radius
+
+    def pixel_size(self, height: int) -> float:
+        """Length that a pixel of a picture of this height shows at the centre, in the mesh's unit."""
+        return 2 * self.distance * math.tan(FIELD_OF_VIEW / 2) / height
 
     def to_camera(self, vertices: Floats) -> Float64:
         """Positions (V, 3) in the camera's axes, origin at the camera: visible points have negative z."""
@@ -417,7 +457,6 @@ class _Canvas:
         self.height, self.width, self.supersample = height, width, supersample
         self.depth = np.ones((height * supersample, width * supersample), np.float32)
         self.values = np.zeros((*self.depth.shape, 3), np.float32)
-        self._blank = np.broadcast_to(np.array([-1, -1, 0], np.float32), self.values.shape).copy()
 
     def window(self, points: Float64) -> _Window | None:
         """The part of the picture that can show the points (V, 3, camera axes); None if there is none."""
@@ -442,14 +481,14 @@ class _Canvas:
         )
 
     def clear(self, window: _Window) -> None:
-        """Nothing drawn yet: depth 1, values (-1, -1, 0)."""
+        """Nothing drawn yet: depth 1, values 0."""
         self.depth[window.samples] = 1
-        self.values[window.samples] = self._blank[window.samples]
+        self.values[window.samples] = 0
 
-    def draw(self, positions: Float32, faces: Faces, values: Floats, side: str) -> None:
-        """Interpolate values (V, 3) from 0 to 1 over the triangles where they are the nearest surface so far.
+    def draw(self, positions: Float32, values: Float32, faces: Faces) -> None:
+        """Interpolate values (V, 3) from 0 to 1 over the triangles that face the viewer and are nearest.
 
-        Positions (V, 3) are in camera axes; the side of the triangles is "front", "back" or "both".
+        Positions (V, 3) are in camera axes.
         """
         cv2 = opencv()
         settings = cv2.TriangleRasterizeSettings()
@@ -458,15 +497,11 @@ class _Canvas:
         # other mode converts to distances and back around every call and loses what a second pass adds: the empty
         # samples come back a rounding error behind the far plane and are never drawn again.
         settings.setGlCompatibleMode(cv2.RASTERIZE_COMPAT_INVDEPTH)
-        culled = {"front": "CW", "back": "CCW", "both": "NONE"}[side]
-        settings.setCullingMode(getattr(cv2, f"RASTERIZE_CULLING_{culled}"))
+        settings.setCullingMode(cv2.RASTERIZE_CULLING_CW)
         lens = (FIELD_OF_VIEW, self.camera.near, self.camera.far)
-        values, pose = values.astype(np.float32), np.eye(4, dtype=np.float32)
+        pose = np.eye(4, dtype=np.float32)
+        positions, values = np.ascontiguousarray(positions), np.ascontiguousarray(values)
         cv2.triangleRasterize(positions, faces, values, self.values, self.depth, pose, *lens, settings)
-
-    def channel(self, window: _Window, index: int) -> Float32:
-        """One of the three values per sample of the window."""
-        return np.asarray(opencv().extractChannel(self.values[window.samples], index), dtype=np.float32)
 
     def coverage(self, window: _Window) -> Float32:
         """Share of each pixel that the mesh covers."""
@@ -482,97 +517,3 @@ class _Canvas:
         depth /= np.maximum(coverage, np.float32(1e-3))
         near, far = 1 / self.camera.near, 1 / self.camera.far
         return np.asarray(1 / (np.float32(near) + depth * np.float32(far - near)), dtype=np.float32)
-
-
-# Meshes: what can be drawn, which side is outside, normals and hollows.
-
-
-def check_vertices(vertices: npt.ArrayLike, name: str, n_vertices: int | None = None) -> Float64:
-    """Vertex positions (V, 3) as float64; refuses other shapes and kinds of number, and what is not finite."""
-    array = np.asarray(vertices)
-    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
-        raise FaceDiffError(f"{name} must have the shape (vertices, 3), got {array.shape}: x, y, z each.")
-    if n_vertices is not None and array.shape[0] != n_vertices:
-        raise FaceDiffError(
-            f"{name} has {array.shape[0]} vertices but the renderer's template has {n_vertices}: "
-            "draw a motion with the template and the faces of its own topology."
-        )
-    if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
-        raise FaceDiffError(f"{name} must hold real numbers, got {array.dtype}: convert it to float32.")
-    array = array.astype(np.float64)
-    if not np.isfinite(array).all():
-        bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise FaceDiffError(f"{name} holds NaN or infinity (first at vertex {bad}): check its source.")
-    return array
-
-
-def check_faces(faces: npt.ArrayLike, n_vertices: int) -> Faces:
-    """Triangles (F, 3) as int32; refuses another shape, and vertices that do not exist."""
-    array = np.asarray(faces)
-    shaped = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
-    if not shaped or not np.issubdtype(array.dtype, np.integer):
-        raise FaceDiffError(
-            f"faces must be whole numbers of the shape (faces, 3), got {array.dtype} {array.shape}: "
-            "pass the triangles of the template's mesh file."
-        )
-    low, high = int(array.min()), int(array.max())
-    if low < 0 or high >= n_vertices:
-        raise FaceDiffError(
-            f"faces name vertex {low if low < 0 else high} but the template has vertices 0 to "
-            f"{n_vertices - 1}: pass the faces of the same topology (counting from 0)."
-        )
-    return array.astype(np.int32)
-
-
-def face_outward(faces: Faces, template: Float64) -> Faces:
-    """Triangles (F, 3) that are counter-clockwise seen from outside: all are reversed if the mesh is inside out."""
-    # The sign of the flux that leaves through the faces decides. For a closed mesh it is the signed volume, whatever
-    # the reference point; for an open mask the point must lie behind the mesh (z looks at the viewer).
-    low, high = template.min(axis=0), template.max(axis=0)
-    behind = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2] - (high - low).max()])
-    a, b, c = (template[faces[:, corner]] - behind for corner in range(3))
-    flux = np.einsum("ij,ij->", a, np.cross(b, c))
-    return faces if flux >= 0 else np.ascontiguousarray(faces[:, ::-1])
-
-
-def is_open(faces: Faces) -> bool:
-    """Whether an edge belongs to one triangle only, so that the inside may be visible."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    _, counts = np.unique(edges, axis=0, return_counts=True)
-    return bool((counts == 1).any())
-
-
-def vertex_normals(vertices: Floats, faces: Faces) -> Float64:
-    """Unit normals (V, 3): the mean of the adjacent triangles' normals, weighted by their areas.
-
-    A vertex without triangles (or with triangles of no area only) looks along +z.
-    """
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
-    # Written out, since numpy's cross product is several times slower on (F, 3). Its length is twice the triangle's
-    # area, so that summing it unnormalised gives the weights.
-    cross = np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
-    normals = _sum_at_vertices(cross, faces, len(vertices))
-    length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-    flat = length <= np.finfo(np.float64).tiny
-    normals[flat] = (0.0, 0.0, 1.0)
-    length[flat] = 1.0
-    return np.asarray(normals / length[:, None], dtype=np.float64)
-
-
-def hollowness(vertices: Floats, normals: Float64, faces: Faces) -> Float64:
-    """How far each vertex is below its neighbourhood, as a share of the neighbourhood's radius (V,).
-
-    Positive in hollows (between the lips, in the corner of an eye), negative on ridges, near zero on smooth parts.
-    """
-    centres = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
-    counts = np.maximum(np.bincount(faces.ravel(), minlength=len(vertices)), 1)
-    offset = _sum_at_vertices(centres, faces, len(vertices)) / counts[:, None] - vertices
-    radius = np.sqrt(np.einsum("ij,ij->i", offset, offset)) + np.ptp(vertices, axis=0).max() * 1e-2
-    return np.asarray(np.einsum("ij,ij->i", offset, normals) / radius, dtype=np.float64)
-
-
-def _sum_at_vertices(values: Floats, faces: Faces, n_vertices: int) -> Float64:
-    """Add each triangle's values (F, 3) to its three vertices: (V, 3)."""
-    corners = faces.ravel()
-    return np.stack([np.bincount(corners, np.repeat(values[:, k], 3), minlength=n_vertices) for k in range(3)], axis=1)

@@ -22,8 +22,11 @@ Frame = npt.NDArray[np.uint8]
 AAC_RATES = (96000, 88200, 64000, 48000, 44100, 32000, 24000, 22050, 16000, 12000, 11025, 8000)
 """Rates (Hz) that AAC supports; sound of any other rate is resampled to 48 kHz."""
 
-X264_OPTIONS = {"crf": "18", "preset": "medium", "threads": "1"}
-"""One thread, since x264's output depends on the number of threads, which would otherwise follow the machine."""
+X264_OPTIONS = {"crf": "15", "preset": "veryfast", "threads": "1"}
+"""As close to the pictures as "medium" at 18, in half its time and with files a fifth larger.
+
+One thread, since x264's output depends on the number of threads, which would otherwise follow the machine.
+"""
 
 VP9_OPTIONS = {"crf": "24", "b": "0", "deadline": "good", "cpu-used": "4", "row-mt": "0", "threads": "1"}
 """Constant quality, which needs a bit rate of 0, on one thread like x264."""

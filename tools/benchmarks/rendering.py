@@ -6,17 +6,26 @@ other programs on the machine disturb little.
 
 ``python tools/benchmarks/rendering.py preview`` trains on the built-in corpus for some epochs, and says what share of
 training the previews of `SamplingPreview` are; some minutes.
+
+``python tools/benchmarks/rendering.py video`` writes videos and prints seconds for each second of speech; with
+``--against REVISION`` it also runs an older version of the package, in turn with this one, and prints the ratio.
 """
 
+import argparse
 import importlib
 import importlib.util
+import io
+import json
 import math
 import os
 import platform
+import subprocess
 import sys
+import tarfile
 import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from statistics import median
 
 import numpy as np
@@ -161,7 +170,88 @@ def preview() -> None:
         print(f"{f'  share of training, every {epochs} epochs':<46}{shares[0]:>9.1%}{shares[1]:>9.1%}")
 
 
+def talking_faces(frames: int) -> dict[str, tuple[Array, Faces, npt.NDArray[np.uint8]]]:
+    """Motion (T, V, 3), faces and colours of the built-in face and of an egg of BIWI's size, whose mouths open."""
+    from facediff.synthetic.face import build_face
+    from facediff.synthetic.rig import CONTROLS, Shape, build_rig
+
+    opening = np.sin(np.arange(frames) / 2) ** 2
+    weights = np.zeros((frames, len(CONTROLS)))
+    weights[:, CONTROLS.index("jaw_open")] = opening
+    face = build_face()
+    egg, egg_faces = head(SIZES[-1])
+    moving = motion(egg)[np.rint(opening * (FRAMES // 2)).astype(int)]
+    tint = np.rint(255 * np.clip(np.abs(egg), 0, 1)).astype(np.uint8)
+    return {
+        "the built-in face": (build_rig(Shape()).pose(weights), face.faces.astype(np.int64), face.colours),
+        "an egg of BIWI's size": (moving, egg_faces, tint),
+    }
+
+
+def video_seconds(seconds: float, size: int, frame_rate: int = 25) -> dict[str, list[float]]:
+    """For each face: seconds of the clock and of processors for each second of a video with sound."""
+    from facediff.render import side_by_side, write_video
+
+    sound = np.random.default_rng(0).normal(0, 0.1, round(seconds * 16000)).astype(np.float32)
+    costs = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, (frames, faces, colours) in talking_faces(round(seconds * frame_rate)).items():
+            renderer = Renderer(faces, template=frames[0], size=size, colours=colours)
+            renderer.render(frames[0])
+            clock, processor = time.perf_counter(), time.process_time()
+            pictures = side_by_side(renderer, [frames], ["face"])
+            write_video(Path(folder, "face.mp4"), pictures, frame_rate, sound, 16000)
+            costs[name] = [(time.perf_counter() - clock) / seconds, (time.process_time() - processor) / seconds]
+    return costs
+
+
+def video(options: argparse.Namespace) -> None:
+    """Print seconds for each second of speech, of this version and of another in turn."""
+    versions = {"this version": Path(__file__).parents[2]}
+    with tempfile.TemporaryDirectory() as older:
+        if options.against:
+            command = ["git", "-C", str(Path(__file__).parents[2]), "archive", options.against, "facediff"]
+            archive = subprocess.run(command, capture_output=True, check=True).stdout
+            with tarfile.open(fileobj=io.BytesIO(archive)) as files:
+                files.extractall(older, filter="data")
+            versions[options.against] = Path(older)
+        found: dict[str, list[dict[str, list[float]]]] = {version: [] for version in versions}
+        for _ in range(options.rounds):
+            for version, folder in versions.items():
+                words = ["video", f"--seconds={options.seconds}", f"--size={options.size}", "--json"]
+                command = [sys.executable, str(Path(__file__).resolve()), *words]
+                environment = {**os.environ, "PYTHONPATH": str(folder)}
+                done = subprocess.run(command, capture_output=True, check=True, env=environment, text=True)
+                found[version].append(json.loads(done.stdout))
+    print(f"machine: {machine()}; {options.size} pixels, 25 frames a second, best of {options.rounds}")
+    print(f"{'seconds for each second of video':<36}{'':<22}{'clock':>8}{'CPU':>8}{'ratio':>8}")
+    for face in found["this version"][0]:
+        best = {
+            version: [min(column) for column in zip(*(costs[face] for costs in rounds), strict=True)]
+            for version, rounds in found.items()
+        }
+        for version, (clock, processor) in best.items():
+            ratio = clock / best["this version"][0]
+            print(f"{face:<36}{version:<22}{clock:>8.2f}{processor:>8.2f}{ratio:>8.2f}")
+
+
 def main() -> None:
+    """Print what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", nargs="?", choices=("frames", "preview", "video"), default="frames")
+    parser.add_argument("--against", help="video: a revision of git to compare with")
+    parser.add_argument("--seconds", type=float, default=4.0, help="video: length")
+    parser.add_argument("--size", type=int, default=512, help="video: pixels")
+    parser.add_argument("--rounds", type=int, default=3, help="video: runs, of which the best counts")
+    parser.add_argument("--json", action="store_true", help="video: one run of this version, as JSON")
+    options = parser.parse_args()
+    if options.json:
+        print(json.dumps(video_seconds(options.seconds, options.size)))
+    else:
+        {"frames": drawing, "preview": preview, "video": lambda: video(options)}[options.what]()
+
+
+def drawing() -> None:
     """Print one line per mesh and way of drawing."""
     import cv2
 
@@ -199,4 +289,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    preview() if sys.argv[1:] == ["preview"] else main()
+    main()

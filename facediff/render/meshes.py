@@ -1,0 +1,133 @@
+"""Meshes for drawing: what can be drawn, which side is outside, normals and hollows."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+
+Faces = npt.NDArray[np.int32]
+Float64 = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating[Any]]
+
+
+def check_vertices(vertices: npt.ArrayLike, name: str, n_vertices: int | None = None) -> Float64:
+    """Vertex positions (V, 3) as float64; refuses other shapes and kinds of number, and what is not finite."""
+    array = np.asarray(vertices)
+    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
+        raise FaceDiffError(f"{name} must have the shape (vertices, 3), got {array.shape}: x, y, z each.")
+    if n_vertices is not None and array.shape[0] != n_vertices:
+        raise FaceDiffError(
+            f"{name} has {array.shape[0]} vertices but the renderer's template has {n_vertices}: "
+            "draw a motion with the template and the faces of its own topology."
+        )
+    if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
+        raise FaceDiffError(f"{name} must hold real numbers, got {array.dtype}: convert it to float32.")
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise FaceDiffError(f"{name} holds NaN or infinity (first at vertex {bad}): check its source.")
+    return array
+
+
+def check_faces(faces: npt.ArrayLike, n_vertices: int) -> Faces:
+    """Triangles (F, 3) as int32; refuses another shape, and vertices that do not exist."""
+    array = np.asarray(faces)
+    shaped = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
+    if not shaped or not np.issubdtype(array.dtype, np.integer):
+        raise FaceDiffError(
+            f"faces must be whole numbers of the shape (faces, 3), got {array.dtype} {array.shape}: "
+            "pass the triangles of the template's mesh file."
+        )
+    low, high = int(array.min()), int(array.max())
+    if low < 0 or high >= n_vertices:
+        raise FaceDiffError(
+            f"faces name vertex {low if low < 0 else high} but the template has vertices 0 to "
+            f"{n_vertices - 1}: pass the faces of the same topology (counting from 0)."
+        )
+    return array.astype(np.int32)
+
+
+def face_outward(faces: Faces, template: Float64) -> Faces:
+    """Triangles (F, 3) that are counter-clockwise seen from outside: all are reversed if the mesh is inside out."""
+    # The sign of the flux that leaves through the faces decides. For a closed mesh it is the signed volume, whatever
+    # the reference point; for an open mask the point must lie behind the mesh (z looks at the viewer).
+    low, high = template.min(axis=0), template.max(axis=0)
+    behind = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2] - (high - low).max()])
+    a, b, c = (template[faces[:, corner]] - behind for corner in range(3))
+    flux = np.einsum("ij,ij->", a, np.cross(b, c))
+    return faces if flux >= 0 else np.ascontiguousarray(faces[:, ::-1])
+
+
+def is_open(faces: Faces) -> bool:
+    """Whether an edge belongs to one triangle only, so that the inside may be visible."""
+    starts, ends = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
+    edges = np.minimum(starts, ends) * (int(faces.max()) + 1) + np.maximum(starts, ends)
+    _, counts = np.unique(edges, return_counts=True)
+    return bool((counts == 1).any())
+
+
+class VertexSums:
+    """Adds values of triangles at their vertices; made once for a topology of which many frames are drawn.
+
+    Args:
+        faces: triangles (F, 3).
+        n_vertices: number of vertices.
+
+    Attributes:
+        counts: how many triangles each vertex has (V, 1); 1 where there is none.
+    """
+
+    def __init__(self, faces: Faces, n_vertices: int) -> None:
+        from scipy.sparse import csr_array
+
+        corners = faces.ravel()
+        triangles = np.repeat(np.arange(len(faces)), 3)
+        self._at_vertices = csr_array((np.ones(len(corners)), (corners, triangles)), shape=(n_vertices, len(faces)))
+        self.counts = np.maximum(np.bincount(corners, minlength=n_vertices), 1)[:, None]
+
+    def __call__(self, values: Floats) -> Float64:
+        """Sums (V, 3) of the triangles' values (F, 3)."""
+        return np.asarray(self._at_vertices @ values, dtype=np.float64)
+
+    def mean_centres(self, vertices: Floats) -> Float64:
+        """The mean (V, 3) of the centres of each vertex's triangles."""
+        return np.asarray((self._neighbours @ vertices) / (3 * self.counts), dtype=np.float64)
+
+    @cached_property
+    def _neighbours(self) -> Any:  # noqa: ANN401 - a sparse matrix of scipy
+        """How many triangles each two vertices share."""
+        return self._at_vertices @ self._at_vertices.T
+
+
+def vertex_normals(vertices: Floats, faces: Faces, sums: VertexSums | None = None) -> Float64:
+    """Unit normals (V, 3): the mean of the adjacent triangles' normals, weighted by their areas.
+
+    A vertex without triangles (or with triangles of no area only) looks along +z. Give ``sums`` of the same faces where
+    many frames of a topology need normals.
+    """
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
+    # Written out, since numpy's cross product is several times slower on (F, 3). Its length is twice the triangle's
+    # area, so that summing it unnormalised gives the weights.
+    cross = np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
+    normals = (sums or VertexSums(faces, len(vertices)))(cross)
+    length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
+    flat = length <= np.finfo(np.float64).tiny
+    normals[flat] = (0.0, 0.0, 1.0)
+    length[flat] = 1.0
+    return np.asarray(normals / length[:, None], dtype=np.float64)
+
+
+def hollowness(vertices: Floats, normals: Float64, sums: VertexSums) -> Float64:
+    """How far each vertex is below its neighbourhood, as a share of the neighbourhood's radius (V,).
+
+    Positive in hollows (between the lips, in the corner of an eye), negative on ridges, near zero on smooth parts.
+    """
+    offset = sums.mean_centres(vertices) - vertices
+    radius = np.sqrt(np.einsum("ij,ij->i", offset, offset)) + np.ptp(vertices, axis=0).max() * 1e-2
+    return np.asarray(np.einsum("ij,ij->i", offset, normals) / radius, dtype=np.float64)
