@@ -1,15 +1,16 @@
-"""What ``facediff test`` prints and writes, and the files that ``facediff predict`` writes."""
+"""What training without a terminal and ``facediff test`` print and writes, and the files that ``facediff predict`` writes."""
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import BasePredictionWriter
+from lightning.pytorch.callbacks import BasePredictionWriter, ModelCheckpoint
 from lightning.pytorch.loggers import WandbLogger
 
 from facediff.callbacks.dashboard import measure_clips, provenance_of, wandb_media, worst_clips
@@ -27,6 +28,30 @@ METHOD_NAMES = {
     "mean_face": "speaker's mean face",
     "shuffled": "model, shuffled speech",
 }
+
+
+class EpochLines(Callback):
+    """Prints a line after each epoch of training, where no terminal would show a progress bar.
+
+    The line has the training loss, what is monitored in validation (names that a run logs, see ``docs/dashboard.md``)
+    where that has been measured, and the seconds since training began. It goes to standard error.
+    """
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Remember when training began."""
+        self._started = time.monotonic()
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Print the line, on one process."""
+        if not trainer.is_global_zero:
+            return
+        names = ["train/loss", *dict.fromkeys(checkpoint.monitor for checkpoint in trainer.checkpoint_callbacks
+                                              if isinstance(checkpoint, ModelCheckpoint))]  # fmt: skip
+        found = trainer.callback_metrics
+        values = ", ".join(f"{name} {float(found[name]):.4g}" for name in names if name in found)
+        last = f" of {trainer.max_epochs}" if trainer.max_epochs not in (None, -1) else ""
+        seconds = time.monotonic() - self._started
+        print(f"epoch {trainer.current_epoch + 1}{last}: {values}, {seconds:.0f} s", file=sys.stderr, flush=True)
 
 
 class ScoreTable(Callback):

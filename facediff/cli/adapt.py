@@ -72,6 +72,7 @@ def adapt(
     from facediff.models.adaptation import train_only, with_extra_identities
     from facediff.models.checkpoint import build_model, read_checkpoint
     from facediff.utils.licences import require_cleared
+    from facediff.utils.progress import on_terminal
 
     started = time.monotonic()
     content = read_checkpoint(checkpoint)
@@ -104,7 +105,7 @@ def adapt(
             logger=False,
             enable_checkpointing=False,
             enable_model_summary=False,
-            enable_progress_bar=not quiet,
+            enable_progress_bar=not quiet and on_terminal(),
             plugins=[AtomicCheckpointIO()],
         )
     with exit_statuses():

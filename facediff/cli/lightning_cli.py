@@ -30,7 +30,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from omegaconf import OmegaConf
 
 from facediff import registry
-from facediff.callbacks import GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
+from facediff.callbacks import EpochLines, GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
 from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, resumable
 from facediff.cli.configs import guard_configs
@@ -41,6 +41,7 @@ from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
 from facediff.utils.files import atomic
 from facediff.utils.limits import brief
+from facediff.utils.progress import on_terminal
 from facediff.utils.ranges import Range, mismatch
 
 LINKS = ("n_vertices", "identities", "frame_rate")
@@ -296,7 +297,11 @@ class FaceDiffCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:  # noqa: ANN401
         """Make the trainer; a callback of the config replaces the built-in one of its class."""
-        with explained({**self._get(self.config_init, "trainer", default={}), **kwargs}):
+        chosen = self._get(self.config_init, "trainer", default={})
+        bar_in_a_pipe = chosen.get("enable_progress_bar") is None and not on_terminal()
+        if bar_in_a_pipe:
+            kwargs["enable_progress_bar"] = False
+        with explained({**chosen, **kwargs}):
             trainer = super().instantiate_trainer(**kwargs)
         built_in = self.trainer_defaults["callbacks"]
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
@@ -308,6 +313,8 @@ class FaceDiffCLI(LightningCLI):
         callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in named]
         if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:  # written whole, read by the one door
             trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+        if bar_in_a_pipe and self.subcommand == "fit":
+            callbacks.append(EpochLines())
         if self.subcommand != "fit":  # for fit, as soon as it is known whether a run continues
             trainer.loggers = resumable(trainer.loggers)
         return trainer

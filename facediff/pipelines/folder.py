@@ -286,6 +286,9 @@ def run_folder(
                         states[task.source] = "made", f"{outcome.seconds:.1f} s"
                         print(f"[{count}/{len(to_do)}] {printable(task.output)}, {outcome.seconds:.1f} s", flush=True)
         finally:
+            for task in tasks:
+                if task.source not in states and (state := _state_after_stop(task)):
+                    states[task.source] = state
             _print_states(speeches, states)
     return int(any(state == "failed" for state, _ in states.values()))
 
@@ -306,6 +309,14 @@ def _earlier_state(task: FileTask, retry_failed: bool) -> tuple[str, str] | None
     if problem is None or retry_failed:
         return None
     return "failed", f"{problem} (in an earlier run; --retry-failed tries again)"
+
+
+def _state_after_stop(task: FileTask) -> tuple[str, str] | None:
+    """What has become of a recording that was being animated when the batch was stopped; None if it is left to do."""
+    # What is running after Ctrl-C comes to its end and records it, but nobody takes the result any more.
+    if task.earlier_problem() == "" and not task.change():
+        return "made", "while the batch was being stopped"
+    return None
 
 
 def _print_states(speeches: Sequence[Path], states: dict[Path, tuple[str, str]]) -> None:

@@ -45,13 +45,14 @@ def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_00
     model = pipeline.model
     plan = model.windows
     template = model.assets.template(pipeline.identity)
-    report(
-        f"look-ahead {plan.look_ahead:.2f} s and the time that a window takes; {plan.in_frames(model.frame_rate).hop} "
-        f"frames at a time, {model.frame_rate:g} a second, {len(template)} vertices; reading {rate} Hz, 16 bit"
-    )
     busy, heard = 0.0, 0
     with sink(output, tuple(template.shape)) as write, ended_by_interrupt() as read:
         live = LiveAnimation(pipeline, rate=rate, seed=seed)
+        report(
+            f"ready; look-ahead {plan.look_ahead:.2f} s and the time that a window takes; "
+            f"{plan.in_frames(model.frame_rate).hop} frames at a time, {model.frame_rate:g} a second, "
+            f"{len(template)} vertices; reading {rate} Hz, 16 bit"
+        )
         for samples in pcm(sys.stdin.buffer, rate, read):
             started = time.perf_counter()
             part = live.feed(samples)

@@ -10,6 +10,11 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 
+def on_terminal() -> bool:
+    """Whether somebody sees a bar: both streams lead to a terminal, and neither to a file or another program."""
+    return all(stream is not None and stream.isatty() for stream in (sys.stderr, sys.stdout))
+
+
 @contextmanager
 def progress_bar(
     description: str, total: int | None, *, done: int = 0, shown: bool = True

@@ -238,6 +238,7 @@ def test_ctrl_c_finishes_running_recordings_and_a_second_run_the_rest(folder: Pa
     assert "the same command" in out
     done = outputs(folder)  # no partial files
     assert 2 <= len(done) < 6
+    assert f"6 recordings: {len(done)} made, {6 - len(done)} left" in out  # also what was finished after the signal
     before = times(folder)
     assert run(folder, "--pause", "0.6", workers=1) == 0
     after = times(folder)

@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -101,9 +100,9 @@ def test_pictures_that_nobody_takes_are_not_drawn(
     started: list[int] = []
     render = Renderer.render
 
-    def counted(self: Renderer, *arguments: Any, **options: Any) -> object:
+    def counted(self: Renderer, vertices: npt.ArrayLike, *, colours: npt.ArrayLike | None = None) -> object:
         started.append(1)
-        return render(self, *arguments, **options)
+        return render(self, vertices, colours=colours)
 
     monkeypatch.setattr(Renderer, "render", counted)
     face = build_face()
