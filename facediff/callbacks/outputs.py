@@ -1,4 +1,4 @@
-"""What training without a terminal and ``facediff test`` print and writes, and the files that ``facediff predict`` writes."""
+"""Lines for each epoch of training, what ``facediff test`` prints and writes, and the files of ``facediff predict``."""
 
 from __future__ import annotations
 

@@ -339,8 +339,8 @@ def test_ctrl_c_ends_the_speech_and_what_was_said_is_kept(checkpoint: Path, tmp_
         assert process.stderr is not None
         # docs/long_speech.md promises this line to programs that wait for it.
         ready = process.stderr.readline().decode()
-        assert re.fullmatch(r"facediff animate: ready; .* \d+ frames at a time, 25 a second, 24 vertices; reading 16000 Hz, "
-                            r"16 bit\n", ready)  # fmt: skip
+        told = r"look-ahead 4.50 s .* 75 frames at a time, 25 a second, 24 vertices; reading 16000 Hz, 16 bit"
+        assert re.fullmatch(f"facediff animate: ready; {told}\n", ready)
         process.stdin.write(pcm(2))
         process.stdin.flush()
         time.sleep(1)
