@@ -1,4 +1,4 @@
-"""``facediff adapt``: a trained model is fine-tuned on a new speaker."""
+"""``facediff adapt``: a trained model is fine-tuned on a new speaker, or learns to hear other voices."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from facediff.utils.hub import check_model_source, model_name
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
+    from facediff.models.hearing import HearingOptions
 
 CLIP_SECONDS = 0.05  # What training on a clip takes with the built-in corpus's small model, on two processor cores
 Mode = Literal["finetune", "joint"]
@@ -25,7 +26,9 @@ Mode = Literal["finetune", "joint"]
 def adapt(
     *,
     checkpoint: Checkpoint,
-    person: Annotated[str, Option(metavar="DIR", reads=True)],
+    person: Annotated[str | None, Option(metavar="DIR", reads=True)] = None,
+    voices: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_VOICE_STEPS)] = None,
+    augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     output: Output,
     mode: Mode = "finetune",
     train: Literal["all", "person"] = "all",
@@ -39,14 +42,20 @@ def adapt(
     quiet: bool = False,
     yes: bool = False,
 ) -> None:
-    """Fine-tune a checkpoint on a minute of a new speaker's motion, and write a checkpoint that knows them by name.
+    """Fine-tune a checkpoint on a new speaker, or let it learn to hear other voices, and write a checkpoint.
 
-    The corpus that the checkpoint was trained on must be on this machine.
+    With --person, it learns from a minute of the new speaker's motion, and knows them by name. With --voices, it learns
+    to hear other voices, rooms and noise, and moves as before. The corpus that the checkpoint was trained on must be on
+    this machine.
 
     Args:
         checkpoint: trained model (.ckpt)
         person: folder that `facediff data import-person` wrote, or the name of a speaker of the corpus who was not
             trained on and has clips that belong to no split
+        voices: let the audio encoder learn other voices, rooms and noise, in so many steps (600 if no number); modes,
+            epochs and rates are those of --person
+        augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
+            docs/voices.md)
         output: checkpoint to write (.ckpt)
         mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
         train: train all weights, or those of identity and style only (person)
@@ -63,7 +72,17 @@ def adapt(
     """
     if output.suffix != ".ckpt":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
+    if (person is None) == (voices is None):
+        raise FaceDiffError("--person, --voices: expected one of them: a new speaker to move like, or voices to hear")
+    if augmentation and voices is None:
+        raise FaceDiffError("--augmentation: says how --voices changes speech; give --voices as well")
     check_model_source(checkpoint, "--checkpoint")
+    if voices is not None:
+        device = {"gpu": "cuda"}.get(accelerator, accelerator)
+        chosen = {"steps": voices, "seed": seed, **({"augmentations": augmentation} if augmentation else {})}
+        adapt_to_voices(checkpoint, output, data_root, corpus, device, commercial_only, chosen, quiet=quiet)
+        return
+    assert person is not None  # noqa: S101 - for the type checker
     from lightning.pytorch import Trainer, seed_everything
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
@@ -121,6 +140,74 @@ def adapt(
         f"{output}: adapted to {name} by {seconds:.0f} s of motion, in {time.monotonic() - started:.0f} s; "
         f"next: {shlex.join(words)}"
     )
+
+
+def adapt_to_voices(
+    checkpoint: Path,
+    output: Path,
+    data_root: Path | None,
+    corpus: str | None,
+    device: str,
+    commercial_only: bool,
+    chosen: dict[str, Any],
+    *,
+    quiet: bool,
+) -> None:
+    """Write a checkpoint whose audio encoder has learnt other voices; see :func:`adapt`."""
+    from facediff.models.base import PROVENANCE_KEY
+    from facediff.models.checkpoint import build_model, read_checkpoint
+    from facediff.models.hearing import HearingOptions
+    from facediff.pipelines.animate import usable_device
+    from facediff.utils.licences import require_cleared
+
+    started = time.monotonic()
+    device = usable_device(device)
+    content = read_checkpoint(checkpoint)
+    if commercial_only:
+        require_cleared(checkpoint, build_model(checkpoint, content).licences)
+    module, options = corpus_and_folder(checkpoint, content, corpus, data_root)
+    data = module(**options)
+    data.prepare_data()
+    if not data.root.is_dir():
+        raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
+    content[PROVENANCE_KEY] = {**content.get(PROVENANCE_KEY, {}), "parent": model_name(checkpoint)}
+    left = hear_voices(checkpoint, content, data, output, HearingOptions(**chosen), device=device, quiet=quiet)
+    tell(
+        f"{output}: has learnt other voices in {time.monotonic() - started:.0f} s; they change what it hears by "
+        f"{left:.2f} of its variance"
+    )
+
+
+def hear_voices(
+    checkpoint: Path,
+    content: dict[str, Any],
+    data: SpeechMotionDataModule,
+    output: Path,
+    options: HearingOptions,
+    *,
+    device: str = "cpu",
+    quiet: bool = False,
+) -> float:
+    """Write a checkpoint's content with an audio encoder that has learnt other voices, and everything else as it is.
+
+    Returns:
+        as :func:`facediff.models.hearing.learn_voices`.
+    """
+    from facediff.callbacks.checkpoints import AtomicCheckpointIO
+    from facediff.models.checkpoint import build_model
+    from facediff.models.hearing import encoder_weights, learn_voices
+    from facediff.utils.progress import progress_bar
+
+    model = build_model(checkpoint, content).to(device)
+    with progress_bar("other voices", options.steps, shown=not quiet) as step:
+        left = learn_voices(model, data, options, step)
+    weights = encoder_weights(model)
+    # With averaged weights, those of the last step are kept for a training that goes on.
+    for key in ("state_dict", "current_model_state"):
+        if key in content:
+            content[key] = {**content[key], **weights}
+    AtomicCheckpointIO().save_checkpoint(content, output)
+    return left
 
 
 def adaptation_data(

@@ -17,7 +17,9 @@ from facediff.data import collate
 from facediff.data.prepare.runner import write_templates
 from facediff.models import load_model
 from facediff.models.adaptation import grow
+from facediff.models.base import PROVENANCE_KEY
 from facediff.models.checkpoint import read_checkpoint
+from facediff.models.hearing import encoder_weights
 from facediff.utils.pickles import load_pickle
 from tests.fakes.tiny import Tiny
 
@@ -217,3 +219,22 @@ def test_a_persons_folder_is_learnt_by_name(checkpoint: Path, tiny_root: Path, t
     other = person_folder(tiny_root, tmp_path / "eve", name="Eve")
     assert main(["adapt", "--checkpoint", str(first), "--person", str(other), "-o", str(second), *FAST]) == 0
     assert load_model(second).identities == ["Eve", "Maria", "A", "B"]
+
+
+def test_voices(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Everything but the encoder's weights, and whose child it is, is what it was, bit for bit."""
+    out = tmp_path / "voices.ckpt"
+    words = ["adapt", "--checkpoint", str(checkpoint), "-o", str(out), "--accelerator", "cpu", "--quiet"]
+    assert main([*words, "--voices", "2", "--augmentation", "noise:share=1"]) == 0
+    before, after = read_checkpoint(checkpoint), read_checkpoint(out)
+    assert after[PROVENANCE_KEY]["parent"] == checkpoint.name
+    encoder = set(encoder_weights(load_model(out)))
+    for key in ("state_dict", "current_model_state"):
+        for name, value in before.get(key, {}).items():
+            assert torch.equal(value, after[key][name]) or name in encoder
+    assert not all(torch.equal(before["state_dict"][name], after["state_dict"][name]) for name in encoder)
+    assert before["optimizer_states"]
+    assert set(before) <= set(after)
+    for wrong in ([], ["--voices", "2", "--person", "C"], ["--person", "C", "--augmentation", "noise"]):
+        assert main([*words, *wrong]) == 2
+        assert "--voices" in capsys.readouterr().err

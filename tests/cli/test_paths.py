@@ -26,6 +26,7 @@ NO_PATHS = {
     *(
         "accelerator",
         "acting",
+        "augmentation",
         "baseline",
         "by",
         "clip",

@@ -1,0 +1,209 @@
+"""A trained model learns to hear other voices, rooms and microphones, while it moves as before.
+
+Training with changed speech asks of the whole model that it learns the same motion again from every voice, which is
+long, and clean speech pays for it. Here only the audio encoder learns: of changed speech it is to make what it made of
+the recording itself. The encoder as it was is the teacher, and clean and changed speech run in parallel (Li, Seltzer,
+Wang, Zhao and Gong 2017, "Large-scale domain adaptation via teacher-student learning"). Nothing else of the model takes
+part, so that a step costs a small part of a training step, and no motion is needed. In the end the weights go most of
+the way from the old ones to the new ones, which gives back most of what clean speech has lost and keeps most of what
+other voices have gained (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models").
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from facediff.data import SpeechMotionDataModule
+from facediff.data.augmentation import Augmenter, Example, read_augmentations
+from facediff.data.corpus import Clip, Corpus
+from facediff.errors import FaceDiffError
+from facediff.models.base import AnimationModel
+from facediff.models.layers import frame_mask
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.jobs import processors
+from facediff.utils.ranges import USUAL_VOICE_STEPS
+
+OTHER_VOICES = (
+    "voice:share=0.8,semitones=6,formants=0.22",
+    "loudness:share=0.3",
+    "room:share=0.6,seconds=0.8,direct=-4",
+    "tilt:share=0.6",
+    "band:share=0.25",
+    "codec:share=0.1",
+    "noise:share=0.7",
+    "hum:share=0.1",
+)
+"""How speech is changed unless somebody says otherwise; see docs/voices.md."""
+
+WINDOW = 4.0
+"""Seconds of a clip that are heard at a time, at most."""
+
+STEP_RATE = 50
+"""Features a second that are compared."""
+
+
+@dataclass(frozen=True)
+class HearingOptions:
+    """How an audio encoder learns other voices.
+
+    Attributes:
+        augmentations: by name with their options, in the order in which they are applied.
+        steps: training steps.
+        batch_size: clips in a step.
+        share: of the clips that are changed; the others are to sound as they did.
+        moved: how far the weights go from the old ones (0) to those that were learnt (1).
+        learning_rate: the highest; it rises over the first twentieth of the steps and falls as a cosine.
+        seed: of all that is drawn.
+        workers: processes that change speech; 0 for this one.
+    """
+
+    augmentations: Sequence[str] = OTHER_VOICES
+    steps: int = USUAL_VOICE_STEPS
+    batch_size: int = 12
+    share: float = 0.65
+    moved: float = 0.85
+    learning_rate: float = 1e-3
+    seed: int = 0
+    workers: int = 1
+
+
+def learn_voices(
+    model: AnimationModel,
+    data: SpeechMotionDataModule,
+    options: HearingOptions = HearingOptions(),  # noqa: B008 - it cannot be changed
+    step_done: Callable[[], object] = lambda: None,
+) -> float:
+    """Let a trained model's audio encoder learn other voices, in place.
+
+    Args:
+        model: a trained model.
+        data: the corpus; its training clips are heard, and their motion is not looked at.
+        options: how.
+        step_done: called after each step.
+
+    Returns:
+        what is left of the difference that the changes of speech made to the features, as a share of the features'
+        variance; the mean of the last tenth of the steps.
+
+    Raises:
+        FaceDiffError: if nothing of the encoder can be trained, or an augmentation is unknown.
+    """
+    augmentations = read_augmentations(options.augmentations)
+    if moving := [each for each in augmentations if each.moves]:
+        raise FaceDiffError(
+            f"augmentations: {type(moving[0]).__name__.lower()} changes how long speech lasts, so that features cannot "
+            f"be compared; omit it"
+        )
+    student = model.speech_encoder
+    weights = [weight for weight in student.parameters() if weight.requires_grad]
+    if not weights:
+        raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
+    teacher = copy.deepcopy(student).eval().requires_grad_(False)
+    before = [weight.detach().clone() for weight in weights]
+    pairs = _Pairs(data.corpus, data.clips("train"), Augmenter(augmentations), options)
+    workers = min(options.workers, processors() - 1)
+    loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
+    optimiser = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, options.steps))
+    left: list[float] = []
+    devices = [] if model.device.type == "cpu" else [model.device]
+    with torch.random.fork_rng(devices):
+        torch.manual_seed(options.seed)
+        student.train()
+        for clean, changed, lengths in loader:
+            clean, changed, lengths = (each.to(model.device) for each in (clean, changed, lengths))
+            steps = (lengths * STEP_RATE // SAMPLE_RATE).clamp_min(1)
+            with torch.no_grad():
+                wanted = teacher(clean, lengths, steps)
+            mask = frame_mask(steps, wanted.shape[1])[..., None]
+            error = _difference(student(changed, lengths, steps), wanted, mask)
+            optimiser.zero_grad()
+            error.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(weights, 1.0)
+            optimiser.step()
+            schedule.step()
+            left.append(float(error.detach()))
+            step_done()
+    student.eval()
+    with torch.no_grad():
+        for weight, old in zip(weights, before, strict=True):
+            weight.copy_(torch.lerp(old, weight, options.moved))
+    return float(np.mean(left[-max(1, options.steps // 10) :]))
+
+
+def encoder_weights(model: AnimationModel) -> dict[str, Tensor]:
+    """The weights of a model's audio encoder, by their names in its checkpoint."""
+    name = next(name for name, module in model.named_modules() if module is model.speech_encoder)
+    return {f"{name}.{key}": value.detach().cpu() for key, value in model.speech_encoder.state_dict().items()}
+
+
+def _difference(made: Tensor, wanted: Tensor, mask: Tensor) -> Tensor:
+    """Squared difference of features (batch, steps, channels) as a share of their variance, over valid steps."""
+    # Channels that hardly vary hold nothing worth hearing: their variance counts as a twentieth of the mean one.
+    count = mask.sum()
+    mean = (wanted * mask).sum((0, 1)) / count
+    variance = ((wanted - mean).square() * mask).sum((0, 1)) / count
+    least = (variance.mean() / 20).clamp_min(1e-12)
+    return (((made - wanted).square() * mask).sum((0, 1)) / count / variance.clamp_min(least)).mean()
+
+
+def _rate(step: int, steps: int) -> float:
+    """The share of the learning rate at a step."""
+    rise = max(1, steps // 20)
+    return (step + 1) / rise if step < rise else 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
+
+
+class _Pairs(Dataset[tuple[Tensor, Tensor, Tensor]]):
+    """Batches of speech as it was recorded and as it was changed, (batch, samples) each, and the valid samples.
+
+    A batch follows from its number and the seed, whatever process makes it.
+    """
+
+    def __init__(self, corpus: Corpus, clips: list[Clip], augmenter: Augmenter, options: HearingOptions) -> None:
+        self.corpus, self.clips, self.augmenter, self.options = corpus, clips, augmenter, options
+
+    def __len__(self) -> int:
+        """Number of batches."""
+        return self.options.steps
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+        """A batch by number."""
+        if index >= len(self):
+            raise IndexError(index)
+        random = np.random.default_rng([self.options.seed, index])
+        recorded, changed = [], []
+        for place in random.integers(len(self.clips), size=self.options.batch_size):
+            speech = self._speech(self.clips[int(place)], random)
+            recorded.append(speech)
+            changed.append(self._changed(speech, random) if random.random() < self.options.share else speech)
+        lengths = torch.tensor([len(speech) for speech in recorded])
+        return _padded(recorded), _padded(changed), lengths
+
+    def _speech(self, clip: Clip, random: np.random.Generator) -> npt.NDArray[np.float32]:
+        """A clip, or a random window of it."""
+        frames = self.corpus.frames(clip)
+        most = max(1, round(WINDOW * self.corpus.frame_rate))
+        start = int(random.integers(frames - most + 1)) if frames > most else 0
+        return self.corpus.read_audio(clip, start, min(frames, start + most)).numpy()
+
+    def _changed(self, speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
+        """Speech of the same length in another voice, another room or with noise."""
+        nothing = np.zeros((1, 1, 3), np.float32)
+        example = Example(
+            speech, nothing, len(nothing) * SAMPLE_RATE / max(1, len(speech)), nothing[0], nothing[0, :, 0]
+        )
+        return self.augmenter(example, int(random.integers(2**31))).speech
+
+
+def _padded(speech: list[Any]) -> Tensor:
+    return nn.utils.rnn.pad_sequence([torch.from_numpy(each) for each in speech], batch_first=True)

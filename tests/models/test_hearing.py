@@ -1,0 +1,99 @@
+"""An audio encoder learns to hear changed speech as it hears the recording, and the rest of the model stays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from facediff.data.augmentation import filtered
+from facediff.errors import FaceDiffError
+from facediff.models.base import AnimationModel
+from facediff.models.hearing import HearingOptions, encoder_weights, learn_voices
+from tests.fakes.tiny import Tiny
+
+FEW = HearingOptions(steps=3, batch_size=2, workers=0)
+
+
+@pytest.fixture
+def model(make_model: Callable[..., AnimationModel]) -> AnimationModel:
+    return make_model()
+
+
+def muffled(speech: np.ndarray) -> np.ndarray:
+    """Speech through a door, which no augmentation is."""
+    quieter = filtered(speech, lambda hertz: 1 / (1 + (hertz / 250) ** 2))
+    return (quieter + 0.02 * np.random.default_rng(1).standard_normal(len(speech))).astype(np.float32)
+
+
+def features(model: AnimationModel, speech: np.ndarray) -> torch.Tensor:
+    count = torch.tensor([len(speech)])
+    with torch.inference_mode():
+        return model.speech_encoder(torch.from_numpy(speech)[None], count, count // 640)[0]
+
+
+def test_speech_that_was_never_trained_on_is_heard_better(model: AnimationModel, tiny: Tiny) -> None:
+    """On test clips, by a change that training does not use, and clean speech stays."""
+    speech = [tiny.dataset("test_a")[index].audio.numpy() for index in range(4)]
+    wanted = [features(model, each) for each in speech]
+
+    def error(change: bool) -> float:
+        made = [features(model, muffled(each) if change else each) for each in speech]
+        return float(torch.cat([(one - two).square() for one, two in zip(made, wanted, strict=True)]).mean())
+
+    before = error(change=True)
+    learn_voices(model, tiny, HearingOptions(steps=60, batch_size=6, workers=0, moved=1.0, learning_rate=3e-3))
+    assert error(change=True) < 0.5 * before
+    assert error(change=False) < 0.2 * before
+
+
+def test_only_the_audio_encoder_changes(model: AnimationModel, tiny: Tiny) -> None:
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    learn_voices(model, tiny, FEW)
+    changed = {name for name, value in model.state_dict().items() if not torch.equal(value, before[name])}
+    assert changed
+    assert changed <= set(encoder_weights(model))
+    assert not model.speech_encoder.training
+    assert all(weight.requires_grad for weight in model.parameters())
+
+
+def test_weights_go_a_share_of_the_way(make_model: Callable[..., AnimationModel], tiny: Tiny) -> None:
+    """0 is the model as it was, and a half lies in the middle between that and all of the way."""
+    ends = {}
+    for moved in (0.0, 0.5, 1.0):
+        model = make_model()
+        learn_voices(model, tiny, replace(FEW, moved=moved))
+        ends[moved] = encoder_weights(model)
+    for name, before in encoder_weights(make_model()).items():
+        assert torch.equal(ends[0.0][name], before)
+        torch.testing.assert_close(ends[0.5][name], (before + ends[1.0][name]) / 2)
+
+
+def test_the_seed_decides_whatever_process_changes_speech(
+    make_model: Callable[..., AnimationModel], tiny: Tiny
+) -> None:
+    """And nothing else does, nor are other random numbers moved on."""
+    made = []
+    for seed, workers in ((0, 0), (0, 1), (1, 0)):
+        model = make_model()
+        torch.manual_seed(len(made))
+        learn_voices(model, tiny, replace(FEW, seed=seed, workers=workers))
+        after = torch.rand(1)
+        torch.manual_seed(len(made))
+        assert torch.equal(after, torch.rand(1))
+        made.append(encoder_weights(model))
+    assert all(torch.equal(made[0][name], made[1][name]) for name in made[0])
+    assert not all(torch.equal(made[0][name], made[2][name]) for name in made[0])
+
+
+def test_what_cannot_be_learnt_is_refused(model: AnimationModel, tiny: Tiny) -> None:
+    with pytest.raises(FaceDiffError, match="speed"):
+        learn_voices(model, tiny, replace(FEW, augmentations=["noise", "speed"]))
+    with pytest.raises(FaceDiffError, match=r"data\.augmentations"):
+        learn_voices(model, tiny, replace(FEW, augmentations=["voices"]))
+    model.speech_encoder.requires_grad_(False)
+    with pytest.raises(FaceDiffError, match="audio_encoder"):
+        learn_voices(model, tiny, FEW)
