@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
-from facediff.data.augmentation import Augmenter, Example, read_augmentations
+from facediff.data.augmentation import Augmenter, Example, OfSpeech, read_augmentations
 from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
 from facediff.models.base import AnimationModel
@@ -99,10 +99,10 @@ def learn_voices(
         FaceDiffError: if nothing of the encoder can be trained, or an augmentation is unknown.
     """
     augmentations = read_augmentations(options.augmentations)
-    if moving := [each for each in augmentations if each.moves]:
+    if moving := [each for each in augmentations if not isinstance(each, OfSpeech)]:
         raise FaceDiffError(
-            f"augmentations: {type(moving[0]).__name__.lower()} changes how long speech lasts, so that features cannot "
-            f"be compared; omit it"
+            f"augmentations: {type(moving[0]).__name__.lower()} changes the motion with the speech, so that no "
+            f"recording says what is to be heard; omit it"
         )
     student = model.speech_encoder
     weights = [weight for weight in student.parameters() if weight.requires_grad]

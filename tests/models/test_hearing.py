@@ -90,8 +90,9 @@ def test_the_seed_decides_whatever_process_changes_speech(
 
 
 def test_what_cannot_be_learnt_is_refused(model: AnimationModel, tiny: Tiny) -> None:
-    with pytest.raises(FaceDiffError, match="speed"):
-        learn_voices(model, tiny, replace(FEW, augmentations=["noise", "speed"]))
+    for name in ("speed", "pauses"):
+        with pytest.raises(FaceDiffError, match=name):
+            learn_voices(model, tiny, replace(FEW, augmentations=["noise", name]))
     with pytest.raises(FaceDiffError, match=r"data\.augmentations"):
         learn_voices(model, tiny, replace(FEW, augmentations=["voices"]))
     model.speech_encoder.requires_grad_(False)
