@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import File, Map, Output, Picture, SourceOptions, check_picture_path
-from facediff.cli.parsing import Option
+from facediff.cli.parsing import Option, refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
+from facediff.utils import ranges
+from facediff.utils.files import check_writable
+from facediff.utils.server import LOOPBACK
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -27,9 +31,13 @@ def retarget(
     correspondence: Map = None,
     landmarks: File = None,
     part: Annotated[list[str] | None, Option(metavar="NAME", many=True)] = None,
+    pick: bool = False,
     show: Picture = None,
     accept_poor: bool = False,
     add_to_mesh: bool = False,
+    host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1",
+    port: Annotated[ranges.Port, Option(metavar="N")] = 0,
+    open: bool = False,  # noqa: A002 - the option's name
     source: SourceOptions,
 ) -> None:
     """Transfer an animation to another mesh. The suffix of OUT chooses the format, as in `facediff export`.
@@ -43,9 +51,14 @@ def retarget(
             vertex, such as `nose_tip,4034`; or the .json that was picked
         part: names of the parts that show the face, by node, mesh, group or material; `*` stands for any letters
             (default: it is searched for in all parts). Teeth and tongue follow the jaw, other parts stand still
+        pick: pick landmarks on a page in the browser first; they are saved next to the correspondence, or to OUT, as
+            <name>.landmarks.json, and the command goes on with them
         show: picture of both faces at the most open mouth
         accept_poor: write the animation although its lips, its folds or its coverage are found to be wrong
         add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
+        host: address at which the page of --pick is served; by default nobody but this machine reaches it
+        port: its port; 0 for any free one
+        open: open the page of --pick in the browser
         source: what completes a bare .npy.
     """
     if output.suffix == ".csv":
@@ -57,6 +70,11 @@ def retarget(
         if file is not None and not file.is_file():
             raise FaceDiffError(f"{option} {file}: no such file")
     check_picture_path(show)
+    picked = landmarks_path(correspondence or output)
+    if pick:
+        check_pick(picked, landmarks, correspondence)
+    else:
+        refuse_idle("is for --pick", host=host != "127.0.0.1", port=port != 0, open=open)
 
     from facediff.editing.fit_check import check_fit, refuse_poor
     from facediff.editing.retargeting import retarget as transfer
@@ -65,6 +83,9 @@ def retarget(
 
     check_export(output, ExportOptions())
     own = source.read(animation)
+    if pick:
+        pick_on_page(own, target_mesh, part or (), picked, landmarks, host, port, open)
+        landmarks = picked
     reports = []
 
     def judge(made: Animation, found: Correspondence) -> None:
@@ -86,6 +107,70 @@ def retarget(
     if show is not None:
         written.append(show)
     tell(*written, *remarks(own, made, found, reports[-1]), *notes)
+
+
+PICKED = ".landmarks.json"
+
+
+def landmarks_path(output: Path) -> Path:
+    """Where the landmarks are saved that are picked for a correspondence or an animation: next to it.
+
+    Example:
+        >>> landmarks_path(Path("out/map.npz")).as_posix()
+        'out/map.landmarks.json'
+    """
+    return output.with_name(output.stem + PICKED)
+
+
+def check_pick(picked: Path, landmarks: Path | None, correspondence: Path | None) -> None:
+    """Refuse, before anything is shown, what would make picking useless."""
+    if correspondence is not None and correspondence.exists():
+        raise FaceDiffError(
+            f"--pick: {correspondence} exists and would be used without landmarks; remove it, or omit --pick"
+        )
+    if landmarks is not None and picked.exists() and landmarks.samefile(picked):
+        raise FaceDiffError(f"--landmarks {landmarks}: is what --pick continues from and writes anyway; omit it")
+    check_writable(picked)
+
+
+def pick_on_page(
+    animation: Animation,
+    target_mesh: Path,
+    parts: Sequence[str],
+    picked: Path,
+    landmarks: Path | None,
+    host: str,
+    port: int,
+    show: bool,
+) -> None:
+    """Serve the page on which landmarks are picked, until they are saved."""
+    from facediff.export.viewer.picking import pick_landmarks
+    from facediff.mesh import read_mesh
+    from facediff.mesh.parts import named_triangles
+
+    def ready(address: str) -> None:
+        tell(f"{address} shows both faces: pick the same places and save; Ctrl-C ends the command")
+        if host not in LOOPBACK:
+            tell(f"note: everybody who reaches {host} may pick, without encryption")
+        if show:
+            import webbrowser
+
+            webbrowser.open(address)
+
+    saved = pick_landmarks(
+        animation,
+        read_mesh(target_mesh),
+        picked,
+        names=(animation.name, target_mesh.name),
+        start=landmarks,
+        shown=named_triangles(target_mesh, parts) if parts else None,
+        host=host,
+        port=port,
+        ready=ready,
+    )
+    if not saved:
+        raise FaceDiffError("--pick: no landmarks were saved; save them on the page, or omit --pick")
+    tell(picked)
 
 
 def remarks(animation: Animation, made: Animation, found: Correspondence, report: FitReport) -> list[str]:

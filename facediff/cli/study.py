@@ -26,6 +26,7 @@ from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.jobs import check_scheduler
 from facediff.utils.ranges import Range
+from facediff.utils.server import LOOPBACK
 
 Controls = Annotated[int, Range(0, 50)]
 LEVEL = 0.95
@@ -172,7 +173,7 @@ def serve(
 
     def ready(address: str) -> None:
         tell(f"{address} serves {study}; Ctrl-C ends it")
-        if host not in ("127.0.0.1", "localhost", "::1"):
+        if host not in LOOPBACK:
             tell(f"note: everybody who reaches {host} may answer, without encryption")
         if open:
             import webbrowser

@@ -76,8 +76,8 @@ def refuse_poor(source: object, report: FitReport) -> None:
     """
     if not report.good:
         raise FaceDiffError(
-            f"{source}: {report.faults[0]}. Look at it with `facediff retarget --show`, name places that are the same "
-            f"with --landmarks, or write it as it is with --accept-poor"
+            f"{source}: {report.faults[0]}. Look at it with `facediff retarget --show`, show places that are the same "
+            f"with --pick or --landmarks, or write it as it is with --accept-poor"
         )
 
 

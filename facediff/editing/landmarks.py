@@ -434,6 +434,18 @@ def _is_index(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
 
 
+def as_rows(landmarks: Landmarks) -> list[dict[str, Any]]:
+    """Pairs of places as plain data, a row for each, as :func:`parse_landmarks` takes them."""
+    rows = []
+    for number, name in enumerate(landmarks.names):
+        row: dict[str, Any] = {"name": name}
+        for key, places in (("source", landmarks.source), ("target", landmarks.target)):
+            corners, weights = places.corners[number].tolist(), places.weights[number].tolist()
+            row[key] = corners[0] if weights[0] == 1.0 else {"corners": corners, "weights": weights}
+        rows.append(row)
+    return rows
+
+
 def write_landmarks(path: Path, landmarks: Landmarks, source_vertices: int, target_vertices: int) -> None:
     """Write pairs of places as JSON, whole or not at all.
 
@@ -443,19 +455,12 @@ def write_landmarks(path: Path, landmarks: Landmarks, source_vertices: int, targ
         source_vertices: of the source mesh.
         target_vertices: of the target mesh.
     """
-    rows = []
-    for number, name in enumerate(landmarks.names):
-        row: dict[str, Any] = {"name": name}
-        for key, places in (("source", landmarks.source), ("target", landmarks.target)):
-            corners, weights = places.corners[number].tolist(), places.weights[number].tolist()
-            row[key] = corners[0] if weights[0] == 1.0 else {"corners": corners, "weights": weights}
-        rows.append(row)
     write_json(
         path,
         {
             "format": FORMAT,
             "source_vertices": source_vertices,
             "target_vertices": target_vertices,
-            "landmarks": rows,
+            "landmarks": as_rows(landmarks),
         },
     )

@@ -6,13 +6,12 @@ checked by :mod:`facediff.study.answers`, and only the videos that the study nam
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 from facediff.study.answers import (
     LONGEST_CODE,
     MOST_RATERS,
@@ -26,32 +25,15 @@ from facediff.study.answers import (
 from facediff.study.definition import DATABASE, PAGE_FOLDER, VIDEO_FOLDER, Study, read_study
 from facediff.study.page import PAGE
 from facediff.study.store import FullError, Store
-from facediff.utils.limits import brief
-from facediff.utils.plain_files import parse_json
+from facediff.utils.server import RefusedError, WithHeaders, read_body, require_server, run_server
 
 if TYPE_CHECKING:
-    import uvicorn
     from starlette.applications import Starlette
     from starlette.requests import Request
     from starlette.responses import Response
 
 MOST_BYTES = 32_768
 """Of a body; the longest comment in any script, and more."""
-HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-}
-
-
-class RefusedError(Exception):
-    """A request that is answered with an error."""
-
-    def __init__(self, status: int, message: str) -> None:
-        super().__init__(message)
-        self.status = status
 
 
 def make_app(folder: Path, study: Study, store: Store) -> Starlette:
@@ -61,18 +43,13 @@ def make_app(folder: Path, study: Study, store: Store) -> Starlette:
         folder: the study's folder.
         study: what it asks.
         store: where answers go.
-
-    Raises:
-        MissingExtraError: if Starlette is not installed.
     """
-    try:
-        from starlette.applications import Starlette
-        from starlette.concurrency import run_in_threadpool
-        from starlette.middleware import Middleware
-        from starlette.responses import FileResponse, JSONResponse
-        from starlette.routing import Route
-    except ImportError as error:
-        raise MissingExtraError("starlette", "study", "serving a study") from error
+    from starlette.applications import Starlette
+    from starlette.concurrency import run_in_threadpool
+    from starlette.middleware import Middleware
+    from starlette.responses import FileResponse, JSONResponse
+    from starlette.routing import Route
+
     videos = set(study.videos())
 
     async def page(_: Request) -> Response:
@@ -116,7 +93,7 @@ def make_app(folder: Path, study: Study, store: Store) -> Starlette:
     def taking(work: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[Request], Awaitable[Response]]:
         async def endpoint(request: Request) -> Response:
             try:
-                content = await read_body(request)
+                content = await read_body(request, MOST_BYTES)
                 check_study(content, study, "request")
                 return JSONResponse(await run_in_threadpool(work, content))
             except RefusedError as error:
@@ -142,47 +119,6 @@ def make_app(folder: Path, study: Study, store: Store) -> Starlette:
     )
 
 
-class WithHeaders:
-    """Adds :data:`HEADERS` to every response."""
-
-    def __init__(self, app: Any) -> None:  # noqa: ANN401 - any ASGI application
-        self.app = app
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401 - of ASGI
-        """Answer a request."""
-
-        async def answer(message: Any) -> None:  # noqa: ANN401
-            if message["type"] == "http.response.start":
-                added = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
-                message = {**message, "headers": [*message.get("headers", []), *added]}
-            await send(message)
-
-        await self.app(scope, receive, answer)
-
-
-async def read_body(request: Request) -> dict[str, Any]:
-    """The object that a request holds.
-
-    Only JSON is taken: a page of another origin cannot send that without asking, and nobody tells it that it may.
-
-    Raises:
-        RefusedError: if it is of another type or too large.
-        FaceDiffError: if it is no JSON.
-    """
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind != "application/json":
-        raise RefusedError(415, "expected application/json")
-    body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > MOST_BYTES:
-            raise RefusedError(413, f"expected at most {MOST_BYTES} bytes")
-    content = parse_json(body, "request", remedy="expected an object")
-    if not isinstance(content, dict):
-        raise FaceDiffError("request: holds no object; expected one")
-    return content
-
-
 def serve(
     folder: Path,
     *,
@@ -204,56 +140,12 @@ def serve(
         FaceDiffError: if the study is not complete, or the address cannot be used.
         MissingExtraError: if the server's packages are not installed.
     """
-    try:
-        import uvicorn
-    except ImportError as error:
-        raise MissingExtraError("uvicorn", "study", "serving a study") from error
-
+    require_server("serving a study")
     study = check_folder(folder)
     store = Store(folder / DATABASE, study, most_raters=most_raters or MOST_RATERS)
-    app = make_app(folder, study, store)
-    try:
-        listening = _listen(host, port)
-    except (OSError, ValueError) as error:  # a name that is none, or an address in use
-        reason = getattr(error, "strerror", None) or brief(error)
-        raise FaceDiffError(
-            f"--host {host} --port {port}: cannot be listened at ({reason}); choose another port, or 0 for any free one"
-        ) from error
-    with listening:
-        name, number = listening.getsockname()[:2]
-        shown = f"[{name}]" if ":" in name else name
-        config = uvicorn.Config(
-            app, log_level="error", access_log=False, server_header=False, lifespan="off", ws="none"
-        )
-        server = make_server(config, lambda: ready(f"http://{shown}:{number}/") if ready is not None else None)
-        with suppress(KeyboardInterrupt):
-            server.run(sockets=[listening])
+    with suppress(KeyboardInterrupt):
+        run_server(lambda _: make_app(folder, study, store), host=host, port=port, ready=ready)
     return store
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-    listening = socket.socket(family[0], socket.SOCK_STREAM)
-    try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(family[4])
-        listening.listen(128)
-    except BaseException:
-        listening.close()
-        raise
-    return listening
-
-
-def make_server(config: uvicorn.Config, ready: Callable[[], object]) -> uvicorn.Server:
-    """A server that calls a function as soon as it takes requests."""
-    import uvicorn
-
-    class Server(uvicorn.Server):
-        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-            await super().startup(sockets=sockets)
-            ready()
-
-    return Server(config)
 
 
 def check_folder(folder: Path) -> Study:

@@ -368,6 +368,13 @@ def landmarks(path: Path) -> None:
     path.write_text("source,target\n1,2\n3,4\n5,6\n")
 
 
+def picked_landmarks(path: Path) -> None:
+    from facediff.editing.landmarks import Landmarks, Places, write_landmarks
+
+    target = Places(np.array([[4, 4, 4], [1, 2, 3]]), np.array([[1.0, 0.0, 0.0], [0.25, 0.5, 0.25]]))
+    write_landmarks(path, Landmarks(("nose_tip", "mole"), Places.of_vertices(np.array([124, 7])), target), 1008, 42)
+
+
 def read_the_landmarks(path: Path) -> object:
     from facediff.editing.landmarks import read_landmarks
 
@@ -819,6 +826,7 @@ READERS = {
     "correspondence": Reader(".npz", correspondence, read_correspondence),
     "hierarchy": Reader(".npz", hierarchy, read_hierarchy, 0.5),
     "landmarks": Reader(".csv", landmarks, read_the_landmarks),
+    "picked landmarks": Reader(".json", picked_landmarks, read_the_landmarks),
     "templates": Reader(".pkl", templates, read_the_templates),
     "vertices": Reader(".npy", vertices, read_the_vertices),
     "indices": Reader(".txt", indices, read_the_indices),

@@ -43,7 +43,7 @@ NOT_FROM_ELSEWHERE = {
     "facediff/study/texts.py": "part of the package",
     "facediff/study/page.py": "part of the package",
     "facediff/study/store.py": "what the server has checked and stored itself",
-    "facediff/study/server.py": "hands bodies over to the reader of answers",
+    "facediff/utils/server.py": "hands bodies over to the reader of answers",
     "facediff/synthetic/speech.py": "the answer of a process of our own",
     "facediff/export/viewer/page.py": "part of the package",
     "facediff/registry.py": "part of the package",

@@ -12,8 +12,9 @@ import uvicorn
 
 from facediff.study import StudyOptions, plan_study, read_study
 from facediff.study.definition import DATABASE
-from facediff.study.server import make_app, make_server
+from facediff.study.server import make_app
 from facediff.study.store import Store
+from facediff.utils.server import make_server
 from tests.export.viewer.conftest import browser, program
 from tests.fakes.study import write_methods
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -38,7 +38,7 @@ MOST_ANIMATIONS = 4
 SCRIPTS = (
     *("motion", "surface", "clock", "camera", "scene"),
     *("plot", "curve", "waveform", "dialogs", "panels", "compare"),
-    *("direction", "lanes", "preview", "takes", "editor", "player"),
+    *("direction", "lanes", "preview", "takes", "editor", "report", "player"),
 )
 """Parts of the script; each uses only the parts before it."""
 
@@ -250,18 +250,45 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
 
 def _page_parts(facts: dict[str, Any], blobs: Blobs) -> list[str]:
     """The text of the page in pieces, in order."""
-    style = _without_comments(_asset("style.css"))
-    script = "(() => {\n" + "\n".join(_without_comments(_asset(f"{name}.js")) for name in SCRIPTS) + "\n})();\n"
-    values = {
-        "title": html.escape(" · ".join(animation["name"] for animation in facts["animations"])),
-        # Lets this script and this style run, and nothing be loaded.
+    title = html.escape(" · ".join(animation["name"] for animation in facts["animations"]))
+    return assemble(
+        "page.html", ("style.css",), SCRIPTS, {"title": title}, facts, blobs, loads="img-src data:; media-src blob:"
+    )
+
+
+def assemble(
+    page: str,
+    styles: Sequence[str],
+    scripts: Sequence[str],
+    values: Mapping[str, str],
+    facts: Mapping[str, object],
+    blobs: Blobs,
+    *,
+    loads: str,
+) -> list[str]:
+    """A page of this package's assets in pieces, in order.
+
+    Args:
+        page: its template, with places for style, script, policy, facts, blobs and further values.
+        styles: files of its style.
+        scripts: parts of its script, without the suffix; each uses only the parts before it.
+        values: further values of the template, as HTML.
+        facts: JSON that the script reads.
+        blobs: the binary parts.
+        loads: what the page may load, as its content security policy says it; nothing else is let in.
+    """
+    style = "\n".join(_without_comments(_asset(name)) for name in styles)
+    script = "(() => {\n" + "\n".join(_without_comments(_asset(f"{name}.js")) for name in scripts) + "\n})();\n"
+    filled = {
+        **values,
+        # Lets this script and this style run, and nothing else be loaded.
         "policy": f"default-src 'none'; script-src {hash_source(script)}; style-src {hash_source(style)}; "
-        f"img-src data:; media-src blob:; base-uri 'none'; form-action 'none'",
+        f"{loads}; base-uri 'none'; form-action 'none'",
         "style": style,
         "facts": script_data(facts),
         "script": script,
     }
-    before, after = (fill(part, values) for part in _asset("page.html").split("{{blobs}}"))
+    before, after = (fill(part, filled) for part in _asset(page).split("{{blobs}}"))
     texts = enumerate(blobs.texts)
     return [before, *(f'<script type="text/plain" id="blob-{n}">{text}</script>\n' for n, text in texts), after]
 

@@ -1,20 +1,5 @@
 // Puts the parts together: reads the page's data, follows the clock, and listens to buttons and keys.
 
-const find = (id) => document.getElementById(id);
-const errors = [];
-
-/** Keep an error for scripts, and show it on the page. */
-function report(error) {
-  const words = error && error.message ? error.message : String(error);
-  errors.push(words);
-  find("message").textContent = words;
-  find("message").hidden = false;
-}
-
-addEventListener("error", (event) => report(event.error ?? event.message));
-addEventListener("unhandledrejection", (event) => report(event.reason));
-addEventListener("securitypolicyviolation", (event) => report(`refused by the page's policy: ${event.blockedURI}`));
-
 /** One animation, ready to be drawn. */
 async function readFace(facts, animation) {
   const positions = new Float32Array(await readBlob(animation.template));

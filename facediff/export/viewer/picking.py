@@ -1,0 +1,259 @@
+"""A page on which a person names the same places on two faces, and the small server that saves them.
+
+The page shows the animation's mesh and the target at rest, the target as the automatic alignment lays it, so that both
+are seen from the front. It sends the places as triangles and weights of the meshes as they are in their files.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation
+from facediff.editing.correspondence import placed
+from facediff.editing.face_features import Features
+from facediff.editing.landmarks import (
+    FORMAT,
+    NAMES,
+    Landmarks,
+    as_rows,
+    known_landmarks,
+    known_topology,
+    landmarks_by_shape,
+    parse_landmarks,
+    read_landmarks,
+    write_landmarks,
+)
+from facediff.editing.surface import Surface
+from facediff.editing.symmetry import Plane, symmetry_plane
+from facediff.errors import FaceDiffError
+from facediff.export.format import outward
+from facediff.export.viewer.packing import Blobs, bounds, millimetres
+from facediff.export.viewer.page import assemble
+from facediff.mesh import Mesh
+from facediff.render.rasteriser import face_outward
+from facediff.utils.server import (
+    OwnPagesOnly,
+    RefusedError,
+    WithHeaders,
+    names_of,
+    read_body,
+    require_server,
+    run_server,
+)
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import Response
+
+Array = npt.NDArray[np.float64]
+
+MOST_BYTES = 1_000_000  # of a body; a thousand landmarks take a fifth of it
+FEWEST = 3  # pairs that determine an alignment
+SCRIPTS = ("motion", "surface", "camera", "scene", "dialogs", "report", "picking")
+
+
+@dataclass(frozen=True, eq=False)
+class Picking:
+    """Two meshes on which the same places are picked.
+
+    Attributes:
+        source: the animation, whose mesh at rest is shown.
+        target: the other mesh.
+        names: what the page calls both.
+        file: where the places are saved.
+        start: what the page begins with; None for nothing.
+        shown: numbers of the target's triangles that the face is searched for in; None for all.
+    """
+
+    source: Animation
+    target: Mesh
+    names: tuple[str, str]
+    file: Path
+    start: Landmarks | None = None
+    shown: npt.NDArray[np.integer] | None = None
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Vertices of both meshes."""
+        return len(self.source.template), len(self.target.vertices)
+
+    def save(self, content: dict[str, Any]) -> int:
+        """Check what the page sends and write it; how many pairs there are.
+
+        Raises:
+            FaceDiffError: naming what is wrong, or the file if it cannot be written.
+        """
+        found = parse_landmarks(content, "request", counts=self.counts)
+        if len(found) < FEWEST:
+            raise FaceDiffError(f"request: holds {len(found)} pairs; expected {FEWEST} or more")
+        write_landmarks(self.file, found, *self.counts)
+        return len(found)
+
+
+def picking_page(picking: Picking) -> list[str]:
+    """The text of the page in pieces, in order. It loads nothing, and talks to its own server only."""
+    source, target = picking.source, picking.target
+    rest: Array = np.asarray(source.template, np.float64)
+    faces = source.triangles.astype(np.int64)
+    corners = face_outward(target.faces, target.vertices)
+    shown = (corners if picking.shown is None else corners[picking.shown]).astype(np.int64)
+    back, features, seen = placed(Surface(rest, faces), Surface(target.vertices, shown))
+    laid = back.apply(target.vertices)
+    known = known_landmarks(rest, faces)
+    of_target = known_topology(target.vertices)
+    suggested = landmarks_by_shape(laid, shown, seen) if seen is not None and of_target is None else {}
+    blobs = Blobs()
+    animations = [
+        Animation(
+            name,
+            points.astype(np.float32)[None],
+            points.astype(np.float32),
+            25.0,
+            faces=triangles,
+            unit=source.unit,
+            colours=colours,
+        )
+        for name, points, triangles, colours in (
+            (picking.names[0], rest, source.triangles, source.colours),
+            (picking.names[1], laid, corners, target.colours),
+        )
+    ]
+    facts = {
+        "format": FORMAT,
+        "file": picking.file.name,
+        "fewest": FEWEST,
+        "names": [[name, words] for name, words in NAMES.items()],
+        "known": {"source": known.vertices, "target": {} if of_target is None else of_target.vertices},
+        "exact": known.topology is not None,
+        "suggested": suggested,
+        "start": [] if picking.start is None else as_rows(picking.start),
+        "sides": {
+            side: _side(animation, features, blobs)
+            for side, animation in zip(("source", "target"), animations, strict=True)
+        },
+    }
+    return assemble(
+        "picking.html",
+        ("style.css", "picking.css"),
+        SCRIPTS,
+        {"title": html.escape(f"{picking.names[0]} · {picking.names[1]}")},
+        facts,
+        blobs,
+        loads="img-src data:; connect-src 'self'",
+    )
+
+
+ABOUT = 1.5, 1.9, 0.55
+"""Half width and half height of what is shown of a face, and how far its middle lies above the mouth's; in widths of
+the mouth."""
+
+
+def _side(animation: Animation, features: Features | None, blobs: Blobs) -> dict[str, Any]:
+    """One mesh, laid like the source, in mm."""
+    scale = millimetres(animation)
+    points = np.asarray(animation.template, np.float64) * scale
+    whole_centre, whole_extent = bounds(animation)
+    centre, extent = whole_centre, whole_extent
+    about = points
+    if features is not None:
+        mouth, width = features.mouth.centre * scale, features.mouth.width * scale
+        middle = mouth + [0.0, ABOUT[2] * width, -0.5 * width]
+        centre, extent = middle.round(3).tolist(), [ABOUT[0] * width, ABOUT[1] * width, width]
+        about = points[(np.abs(points - middle) < 2.0 * width).all(axis=1)]
+    about = about if len(about) >= 20 else points
+    plane = symmetry_plane(about, Plane(np.array([1.0, 0.0, 0.0]), centre[0]))
+    return {
+        "name": animation.name,
+        "vertices": len(points),
+        "template": blobs.add(points.astype("<f4").tobytes()),
+        "faces": blobs.add(outward(animation).astype("<u4").tobytes()),
+        "colours": None if animation.colours is None else blobs.add(animation.colours.astype(np.uint8).tobytes()),
+        "centre": centre,
+        "extent": extent,
+        "whole": {"centre": whole_centre, "extent": whole_extent},
+        "plane": [*plane.normal.tolist(), plane.offset],
+    }
+
+
+def make_app(picking: Picking, page: str, hosts: tuple[str, ...] | None, stop: Callable[[], None]) -> Starlette:
+    """The ASGI application: the page, and an address that takes what it sends.
+
+    Args:
+        picking: what is picked, and where it is saved.
+        page: its text.
+        hosts: names under which the page is served; None for any.
+        stop: called when the places are saved.
+    """
+    from starlette.applications import Starlette
+    from starlette.background import BackgroundTask
+    from starlette.concurrency import run_in_threadpool
+    from starlette.middleware import Middleware
+    from starlette.responses import HTMLResponse, JSONResponse
+    from starlette.routing import Route
+
+    async def show(_: Request) -> Response:
+        return HTMLResponse(page, headers={"Cache-Control": "no-store"})
+
+    async def save(request: Request) -> Response:
+        try:
+            content = await read_body(request, MOST_BYTES)
+            pairs = await run_in_threadpool(picking.save, content)
+        except RefusedError as error:
+            return JSONResponse({"error": str(error)}, error.status)
+        except FaceDiffError as error:
+            return JSONResponse({"error": str(error)}, 503 if isinstance(error.__cause__, OSError) else 400)
+        return JSONResponse({"saved": pairs, "file": picking.file.name}, background=BackgroundTask(stop))
+
+    return Starlette(
+        routes=[Route("/", show), Route("/api/landmarks", save, methods=["POST"])],
+        middleware=[Middleware(WithHeaders), Middleware(OwnPagesOnly, hosts=hosts)],
+    )
+
+
+def pick_landmarks(
+    source: Animation,
+    target: Mesh,
+    file: Path,
+    *,
+    names: tuple[str, str],
+    start: Path | None = None,
+    shown: npt.NDArray[np.integer] | None = None,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    ready: Callable[[str], object] | None = None,
+) -> bool:
+    """Let a person pick the same places on two meshes, on a page of a server; whether they were saved.
+
+    Args:
+        source: the animation, whose mesh at rest is shown.
+        target: the other mesh.
+        file: the .json to write; what is in it already is shown.
+        names: what the page calls both.
+        start: landmarks to begin with instead; None for none.
+        shown: numbers of the target's triangles that the face is searched for in; None for all.
+        host: address to listen at; by default nobody but this machine reaches it.
+        port: to listen at; 0 for any free one.
+        ready: called with the page's address as soon as it can be opened.
+
+    Raises:
+        FaceDiffError: if the landmarks to begin with do not fit the meshes, the file cannot be written, or the address
+            cannot be used.
+        MissingExtraError: if the server's packages are not installed.
+    """
+    require_server("picking landmarks")
+    begin = start if start is not None else file if file.exists() else None
+    given = None
+    if begin is not None:
+        given = read_landmarks(begin, known_topology(source.template), known_topology(target.vertices))
+        given.check(len(source.template), len(target.vertices))
+    picking = Picking(source, target, names, file, given, shown)
+    page = "".join(picking_page(picking))
+    return run_server(lambda stop: make_app(picking, page, names_of(host), stop), host=host, port=port, ready=ready)

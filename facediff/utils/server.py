@@ -1,0 +1,213 @@
+"""Small servers of a page on this machine: bounded bodies, strict headers, and nobody else's pages let in.
+
+For the user study and for picking landmarks; both are ASGI applications of Starlette, run by uvicorn.
+"""
+
+from __future__ import annotations
+
+import importlib
+import socket
+from collections.abc import Callable, Collection
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.limits import brief
+from facediff.utils.plain_files import parse_json
+
+if TYPE_CHECKING:
+    import uvicorn
+    from starlette.requests import Request
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+"""Names by which nobody but this machine reaches itself."""
+HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+class RefusedError(Exception):
+    """A request that is answered with an error."""
+
+    def __init__(self, status: int, message: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+def names_of(host: str) -> tuple[str, ...] | None:
+    """The names under which a page is served that listens at an address; None if any may be right.
+
+    Example:
+        >>> names_of("127.0.0.1") == LOOPBACK, names_of("0.0.0.0")
+        (True, None)
+    """
+    if host in ("", "0.0.0.0", "::"):  # noqa: S104 - a person has told the command so
+        return None
+    return tuple(dict.fromkeys((*LOOPBACK, host)))
+
+
+class WithHeaders:
+    """Adds :data:`HEADERS` to every response."""
+
+    def __init__(self, app: Any) -> None:  # noqa: ANN401 - any ASGI application
+        self.app = app
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401 - of ASGI
+        """Answer a request."""
+
+        async def answer(message: Any) -> None:  # noqa: ANN401
+            if message["type"] == "http.response.start":
+                added = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
+                message = {**message, "headers": [*message.get("headers", []), *added]}
+            await send(message)
+
+        await self.app(scope, receive, answer)
+
+
+class OwnPagesOnly:
+    """Refuses requests under another host's name, and those that another page's script sends.
+
+    A page from elsewhere can let its own name point to this machine; its requests then carry that name as their host.
+
+    Args:
+        app: the ASGI application.
+        hosts: names under which the page is served; None if any may be right, as where all addresses are listened at.
+    """
+
+    def __init__(self, app: Any, hosts: Collection[str] | None) -> None:  # noqa: ANN401 - any ASGI application
+        self.app = app
+        self.hosts = None if hosts is None else {host.lower() for host in hosts}
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401 - of ASGI
+        """Answer a request."""
+        headers = {name.lower(): value.decode("latin-1") for name, value in scope.get("headers", [])}
+        host, origin = headers.get(b"host", ""), headers.get(b"origin")
+        if self._knows(host) and (origin is None or origin.lower() == f"http://{host.lower()}"):
+            await self.app(scope, receive, send)
+            return
+        body = b'{"error": "only the page that this server shows may ask it"}'
+        length = str(len(body)).encode()
+        start = [(b"content-type", b"application/json"), (b"content-length", length)]
+        await send({"type": "http.response.start", "status": 403, "headers": start})
+        await send({"type": "http.response.body", "body": body})
+
+    def _knows(self, host: str) -> bool:
+        if self.hosts is None:
+            return True
+        try:
+            return (urlsplit(f"//{host}").hostname or "") in self.hosts
+        except ValueError:
+            return False
+
+
+async def read_body(request: Request, most_bytes: int) -> dict[str, Any]:
+    """The object that a request holds.
+
+    Only JSON is taken: a page of another origin cannot send that without asking, and nobody tells it that it may.
+
+    Raises:
+        RefusedError: if it is of another type or too large.
+        FaceDiffError: if it is no JSON.
+    """
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        raise RefusedError(415, "expected application/json")
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > most_bytes:
+            raise RefusedError(413, f"expected at most {most_bytes} bytes")
+    content = parse_json(body, "request", remedy="expected an object")
+    if not isinstance(content, dict):
+        raise FaceDiffError("request: holds no object; expected one")
+    return content
+
+
+def require_server(purpose: str) -> None:
+    """Refuse to begin where the server's packages are not installed.
+
+    Args:
+        purpose: what they are needed for.
+
+    Raises:
+        MissingExtraError: naming the extra.
+    """
+    for name in ("starlette", "uvicorn"):
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise MissingExtraError(name, "study", purpose) from error
+
+
+def run_server(
+    app_of: Callable[[Callable[[], None]], Any],
+    *,
+    host: str,
+    port: int,
+    ready: Callable[[str], object] | None = None,
+) -> bool:
+    """Serve an application until it is stopped; whether it was. Ctrl-C comes out as such.
+
+    Args:
+        app_of: makes the ASGI application; is given a function that stops the server after the present answer.
+        host: address to listen at.
+        port: to listen at; 0 for any free one.
+        ready: called with the page's address as soon as it can be opened.
+
+    Raises:
+        FaceDiffError: if the address cannot be used.
+    """
+    import uvicorn
+
+    stopped: list[bool] = []
+
+    def stop() -> None:
+        stopped.append(True)
+        server.should_exit = True
+
+    app = app_of(stop)
+    try:
+        listening = _listen(host, port)
+    except (OSError, ValueError) as error:  # a name that is none, or an address in use
+        reason = getattr(error, "strerror", None) or brief(error)
+        raise FaceDiffError(
+            f"--host {host} --port {port}: cannot be listened at ({reason}); choose another port, or 0 for any free one"
+        ) from error
+    with listening:
+        name, number = listening.getsockname()[:2]
+        shown = f"[{name}]" if ":" in name else name
+        config = uvicorn.Config(
+            app, log_level="error", access_log=False, server_header=False, lifespan="off", ws="none"
+        )
+        server = make_server(config, lambda: ready(f"http://{shown}:{number}/") if ready is not None else None)
+        server.run(sockets=[listening])
+    return bool(stopped)
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    listening = socket.socket(family[0], socket.SOCK_STREAM)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(family[4])
+        listening.listen(128)
+    except BaseException:
+        listening.close()
+        raise
+    return listening
+
+
+def make_server(config: uvicorn.Config, ready: Callable[[], object]) -> uvicorn.Server:
+    """A server that calls a function as soon as it takes requests."""
+    import uvicorn
+
+    class Server(uvicorn.Server):
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets=sockets)
+            ready()
+
+    return Server(config)

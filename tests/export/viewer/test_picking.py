@@ -1,0 +1,267 @@
+"""Landmarks that a person picks: what the server takes, and the page in a real browser."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import uvicorn
+
+from facediff.animation import write_archive
+from facediff.editing.landmarks import NAMES, puppet_landmarks, read_landmarks
+from facediff.errors import FaceDiffError
+from facediff.export.viewer.picking import MOST_BYTES, Picking, make_app, pick_landmarks, picking_page
+from facediff.mesh import Mesh
+from facediff.synthetic.face import build_face
+from facediff.synthetic.rig import build_rig
+from facediff.utils.server import LOOPBACK, make_server, names_of
+from tests.fakes.heads import LONG, talking
+from tools.browser.chromium import Chromium, Page
+
+FACE, MARKS = build_face(), puppet_landmarks()
+
+
+def other_face() -> Mesh:
+    """Another speaker's face in millimetres, whose vertices and triangles run backwards."""
+    count = len(FACE.vertices)
+    faces = count - 1 - FACE.faces[::-1, :]
+    return Mesh(1000.0 * build_rig(LONG).neutral[::-1], faces.astype(np.int32))
+
+
+def own(name: str) -> int:
+    """The vertex of a name on the other face."""
+    return len(FACE.vertices) - 1 - MARKS[name]
+
+
+Serve = Callable[[str], str]
+
+
+@pytest.fixture
+def picking(tmp_path: Path) -> Picking:
+    return Picking(talking(), other_face(), ("mine", "<b>other</b>.obj"), tmp_path / "map.landmarks.json")
+
+
+@pytest.fixture
+def serve(picking: Picking) -> Iterator[Serve]:
+    """Serves a page on a free port until it is stopped; gives its address without a slash at its end."""
+    running: list[tuple[uvicorn.Server, threading.Thread, socket.socket]] = []
+
+    def start(page: str) -> str:
+        listening = socket.create_server(("127.0.0.1", 0))
+        ready = threading.Event()
+        stops: list[uvicorn.Server] = []
+        app = make_app(picking, page, LOOPBACK, lambda: setattr(stops[0], "should_exit", True))
+        config = uvicorn.Config(app, log_level="error", lifespan="off", ws="none", server_header=False)
+        stops.append(make_server(config, ready.set))
+        thread = threading.Thread(target=stops[0].run, args=([listening],), daemon=True)
+        thread.start()
+        assert ready.wait(20)
+        running.append((stops[0], thread, listening))
+        return f"http://127.0.0.1:{listening.getsockname()[1]}"
+
+    yield start
+    for server, thread, listening in running:
+        server.should_exit = True
+        thread.join(10)
+        listening.close()
+
+
+def ask(url: str, content: object = None, *, raw: bytes | None = None, **headers: str) -> tuple[int, Any]:
+    """Status and answer; a POST if there is anything to send."""
+    body = raw if raw is not None else None if content is None else json.dumps(content).encode()
+    given = {"Content-Type": "application/json"} if body is not None else {}
+    request = urllib.request.Request(url, body, {**given, **headers})  # noqa: S310 - our own server
+    try:
+        with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310 - our own server
+            return response.status, response.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read()
+
+
+def ask_often(url: str) -> None:
+    for _ in range(200):
+        ask(url)
+
+
+def pairs(**changed: object) -> dict[str, object]:
+    """What the page sends."""
+    rows = [{"name": name, "source": MARKS[name], "target": own(name)} for name in list(NAMES)[:4]]
+    counts = {"source_vertices": 1008, "target_vertices": 1008}
+    return {"format": "facediff landmarks 1", **counts, "landmarks": rows, **changed}
+
+
+def test_what_the_page_sends_is_saved_and_ends_the_server(serve: Serve, picking: Picking) -> None:
+    address = serve("the page")
+    assert ask(f"{address}/") == (200, b"the page")
+    status, answer = ask(f"{address}/api/landmarks", pairs(), Origin=address)
+    assert (status, json.loads(answer)) == (200, {"saved": 4, "file": "map.landmarks.json"})
+    found = read_landmarks(picking.file)
+    assert found.nearest_vertices.tolist() == [[MARKS[name], own(name)] for name in list(NAMES)[:4]]
+    with pytest.raises(OSError, match="refused|reset|closed"):
+        ask_often(f"{address}/")
+
+
+WRONG: dict[str, object] = {
+    "no object": [1],
+    "another format": pairs(format="facediff landmarks 9"),
+    "too few pairs": pairs(landmarks=[{"name": "a", "source": 1, "target": 2}]),
+    "a vertex that does not exist": pairs(landmarks=[{"name": "a", "source": 1, "target": 1008}] * 3),
+    "another mesh": pairs(target_vertices=1007),
+    "weights that are none": pairs(
+        landmarks=[{"name": "a", "source": 1, "target": {"corners": [1, 2, 3], "weights": [1e300, 0, 0]}}] * 3
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_the_page_does_not_send_is_refused_and_not_saved(name: str, serve: Serve, picking: Picking) -> None:
+    address = serve("the page")
+    assert ask(f"{address}/api/landmarks", WRONG[name])[0] == 400
+    assert not picking.file.exists()
+    assert ask(f"{address}/")[0] == 200
+
+
+def test_other_pages_other_bodies_and_other_paths_are_refused(serve: Serve, picking: Picking) -> None:
+    address = serve("the page")
+    url, port = f"{address}/api/landmarks", address.rpartition(":")[2]
+    for host in ("evil.example", f"evil.example:{port}", f"127.0.0.1.evil.example:{port}", "[::1", ""):
+        assert ask(f"{address}/", Host=host)[0] in (400, 403)
+        assert ask(url, pairs(), Host=host)[0] in (400, 403)
+    for origin in ("http://evil.example", "null", f"https://127.0.0.1:{port}", "http://127.0.0.1:1"):
+        assert ask(url, pairs(), Origin=origin)[0] == 403
+    assert ask(f"{address}/", Host=f"localhost:{port}")[0] == 200
+    assert ask(url, raw=b"{")[0] == 400
+    assert ask(url, raw=b"\xff\xfe{")[0] == 400
+    assert ask(url, raw=b'{"format": NaN}')[0] == 400
+    assert ask(url, raw=b"[" + b"0," * (MOST_BYTES // 2) + b"0]")[0] == 413
+    assert ask(url, raw=b"{}", **{"Content-Type": "text/plain"})[0] == 415
+    assert ask(url)[0] == 405
+    for path in ("api", "map.landmarks.json", "api/../../etc/passwd", "..%2f..%2fetc%2fpasswd", "docs", "openapi.json"):
+        assert ask(f"{address}/{path}")[0] == 404
+    assert not picking.file.exists()
+    with urllib.request.urlopen(f"{address}/", timeout=20) as response:  # noqa: S310 - our own server
+        assert response.headers["X-Frame-Options"] == "DENY"
+        assert response.headers["Server"] is None
+    assert names_of("0.0.0.0") is None  # noqa: S104
+    assert "10.0.0.7" in (names_of("10.0.0.7") or ())
+
+
+def test_a_port_that_is_taken_and_landmarks_of_other_meshes_are_refused(
+    picking: Picking, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facediff.export.viewer.picking.picking_page", lambda _: ["page"])
+
+    def pick(**options: Any) -> None:  # noqa: ANN401 - passed on
+        pick_landmarks(picking.source, picking.target, picking.file, names=("a", "b"), **options)
+
+    taken = socket.create_server(("127.0.0.1", 0))
+    port = taken.getsockname()[1]
+    with taken, pytest.raises(FaceDiffError, match=f"--port {port}"):
+        pick(port=port)
+    picking.file.write_text(json.dumps(pairs(landmarks=[{"name": "a", "source": 1, "target": 4000}])))
+    with pytest.raises(FaceDiffError, match="target vertex 4000"):
+        pick()
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_command_without_a_file(tmp_path: Path) -> None:
+    write_archive(tmp_path / "talk.npz", talking())
+    trimesh.Trimesh(other_face().vertices, other_face().faces, process=False).export(tmp_path / "face.ply")
+    words = ["retarget", "talk.npz", "--target-mesh", "face.ply", "-o", "out.npz", "--pick"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "facediff", *words], cwd=tmp_path, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert re.match(r"http://127\.0\.0\.1:\d+/ ", process.stdout.readline())
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["face.ply", "talk.npz"]
+
+
+# In a browser.
+
+
+def click(page: Page, name: str, vertex: int) -> None:
+    """Click where a vertex of one of the faces is seen."""
+    part = f"facediffPicking.positions('{name}').slice({3 * vertex}, {3 * vertex + 3})"
+    x, y = page.evaluate(f"facediffPicking.seen('{name}', {part})")
+    for kind in ("mousePressed", "mouseReleased"):
+        page.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+
+def choose(page: Page, name: str) -> None:
+    page.evaluate(f"document.querySelectorAll('#list button')[{list(NAMES).index(name)}].click()")
+
+
+def places(page: Page, side: str) -> dict[str, np.ndarray]:
+    """Where the points are in the mesh's own coordinates, by name."""
+    rest = talking().template if side == "source" else other_face().vertices
+    return {
+        point["name"]: np.array(point[side]["weights"]) @ rest[point[side]["corners"]]
+        for point in page.evaluate("facediffPicking.points")
+        if point[side]
+    }
+
+
+@pytest.mark.slow
+def test_points_are_picked_mirrored_taken_back_and_saved(serve: Serve, picking: Picking, browser: Chromium) -> None:
+    page = browser.open(f"{serve(''.join(picking_page(picking)))}/", width=1100, height=800)
+    page.wait_for("window.facediffPicking && document.body.classList.contains('ready')")
+    assert page.evaluate("document.querySelector('#target .file').textContent") == "<b>other</b>.obj"
+    assert page.evaluate("document.getElementById('save').disabled")
+    # The built-in face is known: its points are there, each at its vertex.
+    for name, place in places(page, "source").items():
+        assert np.array_equal(place, talking().template[MARKS[name]])
+    rest = other_face().vertices
+    for name in ("nose_tip", "mouth_corner_left", "eye_outer_left"):
+        choose(page, name)
+        click(page, "target", own(name))
+    found = places(page, "target")
+    assert set(found) == {"nose_tip", "mouth_corner_left", "eye_outer_left"}
+    # A pixel of the window is half a millimetre; the rim of an eye may hide what is behind it.
+    assert all(np.linalg.norm(place - rest[own(name)]) < 2.0 for name, place in found.items())
+    # A mirror image lies where the same point of the other side is.
+    choose(page, "mouth_corner_left")
+    page.press("m")
+    assert np.linalg.norm(places(page, "target")["mouth_corner_right"] - rest[own("mouth_corner_right")]) < 2.0
+    page.press("u")
+    assert "mouth_corner_right" not in places(page, "target")
+    choose(page, "mouth_corner_left")
+    page.press("m")
+    # A point without a name, by keys alone: to the face, a cross, and Enter.
+    page.press("f")
+    for side in ("source", "target"):
+        page.evaluate(f"document.querySelector('#{side} .face').focus()")
+        for key in ("Enter", "ArrowDown", "Enter"):
+            page.press(key)
+    assert {"point 1"} <= set(places(page, "source")) & set(places(page, "target"))
+    page.press("f")
+    page.press("Delete")
+    assert len(page.evaluate("facediffPicking.points")) == len(NAMES) + 1
+    page.resize(375, 740)
+    assert page.evaluate("document.documentElement.scrollWidth") == 375
+    page.evaluate("document.getElementById('save').click()")
+    page.wait_for("facediffPicking.saved")
+    assert page.problems == page.evaluate("facediffPicking.errors") == []
+    assert {url.split("/")[2] for url in page.requests if url.startswith("http")} == {page.evaluate("location.host")}
+    saved = read_landmarks(picking.file)
+    assert set(saved.names) == {"nose_tip", "mouth_corner_left", "mouth_corner_right", "eye_outer_left", "point 1"}
+    for name, point in zip(saved.names, saved.target.points(rest), strict=True):
+        if name != "point 1":
+            assert np.linalg.norm(point - rest[own(name)]) < 2.0
+    page.close()
