@@ -37,7 +37,7 @@ from facediff.export.format import outward
 from facediff.export.viewer.packing import Blobs, bounds, millimetres
 from facediff.export.viewer.page import assemble
 from facediff.mesh import Mesh
-from facediff.render.rasteriser import face_outward
+from facediff.render.meshes import face_outward
 from facediff.utils.server import (
     OwnPagesOnly,
     RefusedError,
