@@ -5,13 +5,15 @@ from __future__ import annotations
 import mmap
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.mesh.flame import rotations
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import in_range
 from facediff.utils.limits import COORDINATE, FRAME_RATES, SAMPLE_RATES, brief, check_number
@@ -68,6 +70,8 @@ class Animation:
         colours: (V, 3) vertex colours (sRGB, 0 to 255); None if there are none.
         regions: vertex indices by region name (``lips``, ``upper_face``).
         inner_lip_pairs: (P, 2) upper and lower vertices of the inner lips, for the mouth's opening; None if unknown.
+        head: (T, 6) how the head moves as a whole, if it does: a rotation about the origin, axis-angle in radians, and
+            then a shift; the vertices have been moved by it, see :meth:`still`.
         metadata: text about how it was made: identity, style, what in it is procedural …
 
     Raises:
@@ -91,6 +95,7 @@ class Animation:
     colours: npt.NDArray[np.uint8] | None = None
     regions: Mapping[str, npt.NDArray[np.int64]] = field(default_factory=dict)
     inner_lip_pairs: npt.NDArray[np.int64] | None = None
+    head: npt.NDArray[np.float64] | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -113,6 +118,11 @@ class Animation:
             raise FaceDiffError(
                 f"{self.name}: has {shape[1]} vertices and colours of shape {self.colours.shape}; give the mesh that "
                 f"the motion was made for"
+            )
+        if self.head is not None and (self.head.shape != (shape[0], 6) or not in_range(self.head)):
+            raise FaceDiffError(
+                f"{self.name}: has {shape[0]} frames and the motion of its head the shape {self.head.shape}; expected "
+                f"finite numbers (frames, 6)"
             )
         if not in_range(self.template):
             raise FaceDiffError(f"{self.name}: its template holds {OUT_OF_RANGE}; give another one")
@@ -140,6 +150,28 @@ class Animation:
                 f".mdd, which need none"
             )
         return self.faces
+
+    def part(self, frames: slice | list[int]) -> Self:
+        """The same with some of the frames only."""
+        return replace(self, vertices=self.vertices[frames], head=None if self.head is None else self.head[frames])
+
+    def still(self) -> Self:
+        """The same with a head that does not move as a whole; itself if it does not.
+
+        Example:
+            >>> face = np.eye(3, dtype=np.float32)
+            >>> turned = Animation("nod", face[None] + 1, face, 25, head=np.array([[0, 0, 0, 1.0, 1, 1]]))
+            >>> bool((turned.still().vertices == face).all())
+            True
+        """
+        if self.head is None:
+            return self
+        matrices = rotations(self.head[:, :3])
+        vertices = np.empty(self.vertices.shape, np.float32)
+        for index, frame in enumerate(self.vertices):
+            moving = self.head[index].any()
+            vertices[index] = (frame - self.head[index, 3:]) @ matrices[index] if moving else frame
+        return replace(self, vertices=vertices, head=None)
 
     def frames(self) -> Iterator[npt.NDArray[np.float32]]:
         """Frame after frame (V, 3); the pages of a memory map that have been read are released."""

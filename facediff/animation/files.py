@@ -29,6 +29,7 @@ ARRAYS: dict[str, tuple[str, str, tuple[int | None, ...], type[np.generic]]] = {
     "faces": ("iu", "whole numbers (triangles, 3)", (None, 3), np.int32),
     "speech": ("f", "floating point (samples,)", (None,), np.float32),
     "colours": ("u", "bytes (vertices, 3)", (None, 3), np.uint8),
+    "head": ("f", "floating point (frames, 6)", (None, 6), np.float64),
     "inner_lip_pairs": ("iu", "whole numbers (pairs, 2)", (None, 2), np.int64),
 }
 """An archive's arrays: kinds of number, in words, lengths of the axes, and the type that :class:`Animation` has."""

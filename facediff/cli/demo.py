@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -98,7 +97,7 @@ def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModu
         footer = f"{model.assets.corpus}: synthetic corpus"
         write_animations(path, animations, ExportOptions(footer=footer, quiet=False))
         picks = [round(i * (len(motion) - 1) / (SHEET + 1)) for i in range(1, SHEET + 1)]
-        few = [replace(animation, vertices=animation.vertices[picks]) for animation in animations]
+        few = [animation.part(picks) for animation in animations]
         frames = drawn_frames(few, ExportOptions(footer=footer, size=224))
         times = [f"{pick / model.frame_rate:.2f} s" for pick in picks]
         save_image(path.with_suffix(".png"), contact_sheet(list(frames), 4, labels=times))

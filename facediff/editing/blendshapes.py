@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +83,7 @@ class Weights:
         frame_rate: frames a second.
         still: names whose shape moves no vertex, and whose weight therefore says nothing.
         metadata: the animation's, and how the weights were solved for.
+        head: (T, 3) rotation of the head that the weights leave out, axis-angle in radians; None if it does not move.
     """
 
     names: tuple[str, ...]
@@ -94,6 +94,7 @@ class Weights:
     frame_rate: float
     still: tuple[str, ...] = ()
     metadata: Mapping[str, str] = field(default_factory=dict)
+    head: Array | None = None
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -142,6 +143,7 @@ class Weights:
             residual_rms_mm=interpolated(self.residual_rms_mm),
             residual_max_mm=interpolated(self.residual_max_mm),
             frame_rate=frame_rate,
+            head=None if self.head is None else np.stack([interpolated(of) for of in self.head.T], axis=1),
         )
 
     def curves(self, tolerance: float) -> dict[str, tuple[list[float], list[float]]]:
@@ -213,6 +215,7 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
             f"{animation.name}: has {len(animation.template)} vertices and the shapes {shapes.deltas.shape[1]}; give "
             f"shapes of the same mesh, or carry them over with `facediff blendshapes --carry`"
         )
+    head, animation = animation.head, animation.still()
     moving = _moving(animation, shapes, options)
     # In weights times the root of each shape's energy, the matrix of the problem has ones on its diagonal.
     scale = np.sqrt(moving.energy)
@@ -270,6 +273,7 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         frame_rate=animation.frame_rate,
         still=tuple(name for k, name in enumerate(shapes.names) if k not in moving.places),
         metadata={**animation.metadata, **{f"solve {key}": value for key, value in about.items()}},
+        head=None if head is None else head[:, :3],
     )
 
 
@@ -523,6 +527,10 @@ def _newton(problem: Problem, right: Array, free: Mask) -> Array:
 
 FORMAT = "facediff blendshape weights 1"
 DAY = 24 * 3600
+HEAD_COLUMNS = (
+    "head in shares of 180 degrees: yaw and roll to its own left and pitch upwards are positive; the eyes were not "
+    "solved for, their columns are 0 and say nothing"
+)
 SURELY_SIXTIETHS = 31 / 60  # A table with a row at this time is read as one of sixtieths
 
 
@@ -553,21 +561,38 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
     header = ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
     times = [frame / weights.frame_rate for frame in range(len(weights.values))]
     held = [*times, SURELY_SIXTIETHS] if times and times[-1] < SURELY_SIXTIETHS else times
+    shown, rotations = (
+        np.concatenate([rows, rows[-1:]])[: len(held)] for rows in (weights.values, live_link_rotations(weights))
+    )
     rows = (
         [
             timecode(seconds),
             str(len(ARKIT) + len(ROTATIONS)),
             *(f"{values[column[name]]:.8f}" if name in column else "0.00000000" for name in ARKIT),
-            *("0.00000000" for _ in ROTATIONS),
+            *(f"{value:.8f}" for value in turned),
         ]
-        for seconds, values in zip_longest(held, weights.values, fillvalue=weights.values[-1])
+        for seconds, values, turned in zip(held, shown, rotations, strict=True)
     )
-    more = {
-        "rotations": "head and eyes were not solved for: their columns are 0 and say nothing",
+    said = "head and eyes were not solved for: their columns are 0 and say nothing"
+    more: dict[str, object] = {
+        "rotations": said if weights.head is None else HEAD_COLUMNS,
         "timecode": "frames are sixtieths of a second with a fraction, whatever the frame rate",
         "rows_held": len(held) - len(times),
     }
     _write_both(path, header, rows, _about(weights, in_table=ARKIT, more=more, key_tolerance=key_tolerance))
+
+
+def live_link_rotations(weights: Weights) -> Array:
+    """The rotations of a table's rows (T, 9): those of the head as shares of 180 degrees; the eyes' are 0.
+
+    Epic's plug-in for ARKit fills these columns with yaw, pitch and roll in degrees over 180; yaw and roll are positive
+    to the face's own left, pitch upwards.
+    """
+    found = np.zeros((len(weights.values), len(ROTATIONS)))
+    if weights.head is not None:
+        pitch, yaw, roll = np.rad2deg(weights.head).T
+        found[:, :3] = np.stack([yaw, -pitch, -roll], axis=1) / 180
+    return found
 
 
 def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> None:

@@ -249,7 +249,7 @@ class ControlledFace:
             animation = noted(animation, animation.vertices, PROCEDURAL, procedural.sway_words(amounts.sway, seed))
         if self._keys("head"):
             animation = noted(animation, animation.vertices, EDITED, "head keys")
-        return replace(animation, vertices=procedural.move_head(animation, turns, shifts))
+        return procedural.move_head(animation, turns, shifts)
 
     def _with_direction(self, animation: Animation) -> Animation:
         """The direction in the metadata, unless the model has followed it already and it stands there."""

@@ -268,7 +268,8 @@ def add_sway(animation: Animation, *, degrees: Amount = DEGREES_SWAY, seed: int 
         FaceDiffError: if the angle is impossible.
     """
     turns, shifts = sway_over_time(len(animation.vertices), animation.frame_rate, degrees, seed)
-    return noted(animation, move_head(animation, turns, shifts), PROCEDURAL, sway_words(degrees, seed))
+    moved = move_head(animation, turns, shifts)
+    return noted(moved, moved.vertices, PROCEDURAL, sway_words(degrees, seed))
 
 
 def sway_words(degrees: Amount, seed: int) -> str:
@@ -283,8 +284,8 @@ def sway_over_time(frames: int, frame_rate: float, degrees: Amount, seed: int) -
     return share * turns, share * shifts
 
 
-def move_head(animation: Animation, turns: Array, shifts: Array) -> npt.NDArray[np.float32]:
-    """Vertices (T, V, 3) that move as one.
+def move_head(animation: Animation, turns: Array, shifts: Array) -> Animation:
+    """The animation with vertices that move as one.
 
     Args:
         animation: whose head does not move yet.
@@ -298,7 +299,9 @@ def move_head(animation: Animation, turns: Array, shifts: Array) -> npt.NDArray[
     for index, frame in enumerate(animation.vertices):
         moving = turns[index].any() or shifts[index].any()  # at rest to the last bit
         vertices[index] = (frame - pivot) @ matrices[index].T + pivot + height * shifts[index] if moving else frame
-    return vertices
+    shift = pivot + height * np.asarray(shifts, np.float64) - np.einsum("tij,j->ti", matrices, pivot)
+    shift[~(turns.any(axis=1) | shifts.any(axis=1))] = 0.0
+    return replace(animation, vertices=vertices, head=np.concatenate([turns, shift], axis=1))
 
 
 def neck(template: npt.NDArray[np.floating]) -> Array:
@@ -342,6 +345,8 @@ def _largest(vectors: Array, size: float) -> Array:
 
 def moves_head(animation: Animation) -> bool:
     """Whether the head of an animation moves as a whole, so that nothing can be added any more."""
+    if animation.head is not None:
+        return True
     entries = [animation.metadata.get(key, "") for key in (PROCEDURAL, EDITED)]
     return any(word in entry for word in MOVED_HEAD for entry in entries)
 

@@ -47,7 +47,14 @@ class Archive(Format):
         space = Space.of(animation, options)
         if options.unit is not None:
             vertices = np.stack(list(space.frames(animation)))
-            animation = replace(animation, vertices=vertices, template=space.place(animation.template), unit=space.unit)
+            head = animation.head
+            animation = replace(
+                animation,
+                vertices=vertices,
+                template=space.place(animation.template),
+                unit=space.unit,
+                head=None if head is None else head * np.repeat([1.0, space.factor], 3),
+            )
         write_archive(path, animation if options.speech else replace(animation, speech=None))
 
 

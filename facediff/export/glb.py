@@ -50,6 +50,7 @@ class Glb(Format):
         """
         (animation,) = animations
         space = Space.of(animation, options, "m")
+        head, animation = animation.head, animation.still()
         rest = space.place(animation.template)
         extras = facts(animation, space)
         if options.shapes is not None:
@@ -62,7 +63,10 @@ class Glb(Format):
         if options.speech_file is not None:
             extras["speech"] = options.speech_file
         binary = Binary()
-        write_container(path, make_document(animation, space, rest, morphs, binary, extras), binary)
+        document = make_document(animation, space, rest, morphs, binary, extras)
+        if head is not None:
+            add_head(document, animation.frame_rate, head * np.repeat([1.0, space.factor], 3), binary)
+        write_container(path, document, binary)
 
 
 @dataclass(frozen=True)
@@ -210,7 +214,7 @@ class Binary:
         self.accessors: list[Any] = []
 
     def add(self, array: npt.NDArray[Any], *, target: int | None = None, bounds: bool = False) -> int:
-        """Append an array (N,) or (N, 3) and return its accessor's number."""
+        """Append an array (N,), (N, 3) or (N, 4) and return its accessor's number."""
         from pygltflib import Accessor, BufferView
 
         array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
@@ -222,7 +226,7 @@ class Binary:
                 bufferView=len(self.views) - 1,
                 componentType=COMPONENT_TYPES[array.dtype],
                 count=len(array),
-                type="SCALAR" if array.ndim == 1 else "VEC3",
+                type="SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
                 min=columns.min(0).tolist() if bounds else None,
                 max=columns.max(0).tolist() if bounds else None,
             )
@@ -290,6 +294,31 @@ def make_document(
         bufferViews=binary.views,
         buffers=[gltf.Buffer(byteLength=binary.length)],
     )
+
+
+def add_head(document: GLTF2, frame_rate: float, head: npt.NDArray[np.float64], binary: Binary) -> None:
+    """Add a node "head" that carries the face, and turns and shifts it.
+
+    Args:
+        document: of :func:`make_document`, with the face as its only node.
+        frame_rate: frames a second.
+        head: (T, 6) rotations, axis-angle in radians, and shifts in metres.
+        binary: to which the curves are appended.
+    """
+    import pygltflib as gltf
+
+    half = 0.5 * np.linalg.norm(head[:, :3], axis=1, keepdims=True)
+    quaternions = np.concatenate([0.5 * np.sinc(half / np.pi) * head[:, :3], np.cos(half)], axis=1)
+    times = binary.add((np.arange(len(head)) / frame_rate).astype(np.float32), bounds=True)
+    (motion,) = document.animations
+    for path, values in (("rotation", quaternions), ("translation", head[:, 3:])):
+        output = binary.add(values.astype(np.float32))
+        motion.samplers.append(gltf.AnimationSampler(input=times, output=output, interpolation="LINEAR"))
+        target = gltf.AnimationChannelTarget(node=1, path=path)
+        motion.channels.append(gltf.AnimationChannel(sampler=len(motion.samplers) - 1, target=target))
+    document.nodes.append(gltf.Node(name="head", children=[0]))
+    document.scenes[0].nodes = [1]
+    document.buffers[0].byteLength = binary.length
 
 
 def write_container(path: Path, document: GLTF2, binary: Binary) -> None:

@@ -342,7 +342,7 @@ class Page:
 
     def beginning(self, frames: int) -> Page:
         """The page with the first frames only."""
-        return Page([replace(each, vertices=each.vertices[:frames]) for each in self.animations], self.truth)
+        return Page([each.part(slice(frames)) for each in self.animations], self.truth)
 
     def _repr_html_(self) -> str | None:
         """The page in a frame of a notebook; of a page that is too large, the beginning; None without a mesh."""
@@ -421,7 +421,7 @@ def view(
         shown = [replace(animation, name=label) for animation, label in zip(shown, labels, strict=True)]
     if shortest:
         frames = min(len(animation.vertices) for animation in shown)
-        shown = [replace(animation, vertices=animation.vertices[:frames]) for animation in shown]
+        shown = [animation.part(slice(frames)) for animation in shown]
     from facediff.export.viewer.page import check_page
 
     number = None if truth is None else 0

@@ -52,7 +52,7 @@ class Motion:
         if animation.faces is None:
             raise FaceDiffError(f"{self.path}: comes without a mesh (triangles); give one with --mesh")
         if self.stride > 1:
-            animation = replace(animation, vertices=animation.vertices[:: self.stride])
+            animation = animation.part(slice(None, None, self.stride))
         animation.refuse_not_finite()
         return animation
 

@@ -24,7 +24,7 @@ from facediff.export.glb import compress
 from facediff.synthetic.arkit import puppet_shapes
 
 COMPONENTS = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC3": 3}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 class Reader:
