@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.files import FORMAT as ARCHIVE
@@ -38,7 +39,7 @@ MOST_ANIMATIONS = 4
 SCRIPTS = (
     *("motion", "surface", "clock", "camera", "scene"),
     *("plot", "curve", "waveform", "dialogs", "panels", "compare"),
-    *("direction", "lanes", "preview", "takes", "editor", "report", "player"),
+    *("direction", "lanes", "preview", "glb", "takes", "editor", "report", "player"),
 )
 """Parts of the script; each uses only the parts before it."""
 
@@ -211,6 +212,11 @@ def _keys_of(animation: Animation) -> list[dict[str, Any]] | None:
         return None  # the page shows it as it shows other metadata
 
 
+def _head_in_mm(head: npt.NDArray[np.float64], animation: Animation) -> bytes:
+    """The motion of the head (T, 6), its shifts in mm."""
+    return (head * np.repeat([1.0, millimetres(animation)], 3)).astype("<f4").tobytes()
+
+
 def _weights_of(animation: Animation, blobs: Blobs) -> dict[str, int]:
     """How much each vertex belongs to each region, in 255ths: what the preview of expressiveness needs."""
     found = {}
@@ -241,6 +247,7 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
         "compared": compared,
         "pairs": None if pairs is None or not len(pairs) else blobs.add(pairs.astype("<i4").tobytes()),
         "regions": {name: blobs.add(np.asarray(each, "<i4").tobytes()) for name, each in animation.regions.items()},
+        "head": None if animation.head is None else blobs.add(_head_in_mm(animation.head, animation)),
         "weights": _weights_of(animation, blobs),
         "neck": (neck(animation.template) * millimetres(animation)).round(3).tolist(),
         "direction": _keys_of(animation),

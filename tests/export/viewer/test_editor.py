@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import facediff
 from facediff.animation import Animation, read_archive
 from facediff.editing.direction import METADATA, STEP_SECONDS, Direction, Key, curve, read_direction
-from facediff.editing.expressiveness import region_factors
-from facediff.editing.procedural import neck
-from facediff.mesh.flame import rotations
+from facediff.export.format import linear_colours
 from tests.fakes.clicks import FRAMES, RATE, SAMPLE_RATE, clicks
 from tests.fakes.contrasts import CONTRASTS
+from tests.fakes.glb_reader import Reader
 from tools.browser.chromium import Page
 
 Show = Callable[..., Page]
@@ -89,7 +89,7 @@ def downloaded(page: Page, folder: Path, action: Callable[[], object]) -> Path:
     page.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
     action()
     end = time.monotonic() + 20
-    while not (found := [each for each in folder.iterdir() if each.suffix in (".json", ".npz", ".wav")]):
+    while not (found := [each for each in folder.iterdir() if each.suffix in (".json", ".npz", ".glb", ".wav")]):
         assert time.monotonic() < end, list(folder.iterdir())
         time.sleep(0.02)
     return found[0]
@@ -181,23 +181,25 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
         assert keys_in(page).rows() == wanted.rows()
 
 
-def test_preview_scales_about_the_neutral_face_and_turns_the_head(show: Show) -> None:
-    animation = directed(Direction([Key(0.0, "expressiveness", 2.0)]))
-    page = show([animation], width=600, height=500)
+def test_preview_of_changed_keys_is_what_a_new_run_makes(show: Show) -> None:
+    """The page starts from the take that was made with old keys; the other way is from the bare motion."""
+    bare = facediff.Animation.of(directed(Direction([Key(0, "head.roll", 0.0)])))
+    bare = facediff.Animation.of(replace(bare, metadata={}))
+    old = [Key(0, "expressiveness", 2.0), Key(0, "head.yaw", -10.0, "linear"), Key(2, "head.yaw", 20.0)]
+    new = [Key(0, "expressiveness", 0.5), Key(0, "expressiveness.lips", 3.0), Key(0, "head.pitch", 25.0)]
+    made = bare.control(direction=Direction(old), sway=3.0)
+    page = show([made], width=600, height=500)
     frame = "(async (frame) => { await facediff.seek(frame); return [...facediff.positions(0)]; })"
-    as_made = np.reshape(page.evaluate(f"{frame}(7)"), (-1, 3))
-    assert np.allclose(as_made, animation.vertices[7], atol=0.03)
-    new = [Key(0.0, "expressiveness", 0.5), Key(0, "expressiveness.lips", 3.0), Key(0, "head.yaw", 25.0)]
-    text = json.dumps({"keys": Direction(new).rows()})
-    page.evaluate(f"facediff.openKeys({json.dumps(text)})")
-    factors = region_factors(animation.template, animation.regions, {"all": 0.5, "lips": 3.0}) / 2.0
-    scaled = animation.template + factors[:, None] * (animation.vertices[7] - animation.template)
-    pivot = neck(animation.template)
-    expected = (scaled - pivot) @ rotations(np.deg2rad([[0.0, 25.0, 0.0]]))[0].T + pivot
-    found = np.reshape(page.evaluate(f"{frame}(7)"), (-1, 3))
-    assert np.allclose(found, expected, atol=0.2)  # weights in 255ths of up to 60 mm
+    before = np.reshape(page.evaluate(f"{frame}(31)"), (-1, 3))
+    assert np.allclose(before, made.vertices[31], atol=0.03)
+    page.evaluate(f"facediff.openKeys({json.dumps(json.dumps({'keys': Direction(new).rows()}))})")
+    wanted = bare.control(direction=Direction(new), sway=3.0)
+    for number in (31, 63):
+        found = np.reshape(page.evaluate(f"{frame}({number})"), (-1, 3))
+        assert np.allclose(found, wanted.vertices[number], atol=0.2)  # weights in 255ths of up to 60 mm
+        assert not np.allclose(found, made.vertices[number], atol=2)
     page.evaluate("document.getElementById('preview').click()")
-    assert np.array_equal(np.reshape(page.evaluate(f"{frame}(7)"), (-1, 3)), as_made)
+    assert np.array_equal(np.reshape(page.evaluate(f"{frame}(31)"), (-1, 3)), before)
 
 
 def test_takes_are_compared_in_one_panel(show: Show) -> None:
@@ -257,7 +259,8 @@ def test_takes_are_compared_in_one_panel(show: Show) -> None:
 
 
 def test_a_take_is_downloaded_as_an_archive_that_the_command_line_reads(show: Show, tmp_path: Path) -> None:
-    animation = replace(directed(name="wäre/es: so?"), unit="cm")
+    head = np.linspace(0, 0.1, 6 * FRAMES).reshape(FRAMES, 6)
+    animation = replace(directed(name="wäre/es: so?"), unit="cm", head=head)
     page = show([clicks(), animation])
     page.evaluate("(downloads.click(), taken.value = '1')")
     click = "document.getElementById('take-motion').click()"
@@ -269,6 +272,8 @@ def test_a_take_is_downloaded_as_an_archive_that_the_command_line_reads(show: Sh
     assert off.max() <= 0.05 * 3**0.5 / 2 + 1e-3
     assert np.allclose(found.template, 10 * animation.template)
     assert np.array_equal(found.triangles, animation.triangles)
+    assert found.head is not None
+    assert np.allclose(found.head, head * [1, 1, 1, 10, 10, 10])
     for name in ("colours", "inner_lip_pairs"):
         assert np.array_equal(getattr(found, name), getattr(animation, name))
     assert {name: each.tolist() for name, each in found.regions.items()} == {
@@ -279,3 +284,15 @@ def test_a_take_is_downloaded_as_an_archive_that_the_command_line_reads(show: Sh
     assert np.abs(found.speech - animation.speech).max() < 1e-4
     assert {**animation.metadata, **found.metadata} == found.metadata
     assert read_direction(path).rows() == KEYS.rows()
+    click = "(document.getElementById('take-glb').click(), 0)"
+    reader = Reader(downloaded(page, tmp_path / "scene", lambda: page.evaluate(click)))
+    assert len(reader.primitive.targets) == 1  # one lip, one way
+    assert reader.weights.min() >= 0
+    assert reader.weights.max() <= 1
+    for frame in (0, 1, 7, 74):
+        off = np.linalg.norm(reader.at(frame / RATE) * 1000 - found.vertices[frame], axis=1)
+        assert off.max() <= 0.05 + 1e-4
+    corners = reader.values(reader.primitive.indices).reshape(-1, 3)
+    assert np.array_equal(corners, animation.triangles)
+    linear = linear_colours(animation.colours)
+    assert np.allclose(reader.values(reader.primitive.attributes.COLOR_0), linear, atol=1e-5)

@@ -17,6 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facediff.animation import Animation
+from facediff.editing.direction import METADATA, Direction, Key, channel_of
+from facediff.editing.expressiveness import region_factors
 from facediff.errors import FaceDiffError
 from facediff.export.viewer import write_page
 from facediff.render.panels import heat_ramp
@@ -184,6 +186,39 @@ def test_page_keeps_hostile_names_as_text_and_refers_to_nothing(tmp_path: Path) 
     assert policies[0] is not None
     assert policies[0].startswith("default-src 'none'; script-src 'sha256-")
     assert "unsafe" not in policies[0]
+
+
+def test_page_has_the_keys_of_its_animation_and_what_their_preview_needs(tmp_path: Path) -> None:
+    keys = Direction([Key(0.5, "expressiveness.lips", 2.0), Key(1.0, "style", HOSTILE, "step")])
+    animation = replace(clicks(), regions={"lips": np.arange(4, 8)}, metadata={METADATA: keys.text()})
+    odd = replace(clicks(name="odd"), metadata={METADATA: "no keys"})
+    write_page(tmp_path / "a.html", [animation, odd])
+    page = Written(tmp_path / "a.html")
+    first, second = page.facts["animations"]
+    assert first["direction"] == keys.rows()
+    assert second["direction"] is None  # and stays among the metadata
+    assert second["metadata"] == odd.metadata
+    weights = np.frombuffer(page.blob(first["weights"]["lips"]), np.uint8) / 255
+    assert np.allclose(
+        weights, region_factors(animation.template, animation.regions, {"lips": 1, "all": 0}), atol=0.002
+    )
+    assert np.frombuffer(page.blob(first["regions"]["lips"]), "<i4").tolist() == [4, 5, 6, 7]
+    channels = page.facts["direction"]["channels"]
+    for name, facts in channels.items():
+        limits = channel_of(name).range
+        assert facts["range"] == (None if limits is None else [limits.least, limits.most])
+        assert limits is None or facts["rest"] in limits
+
+
+def test_page_has_code_of_its_own_of_less_than_100_kilobytes(tmp_path: Path) -> None:
+    """Many pages are mailed."""
+    write_page(tmp_path / "a.html", [clicks(speech=False)])
+    assert (tmp_path / "a.html").stat().st_size < 125_000
+    page = Written(tmp_path / "a.html")
+    (program,) = [text for attributes, text in page.reader.scripts if "type" not in attributes]
+    assert len(program) < 100_000
+    assert "\n//" not in program
+    assert "\n " not in program
 
 
 def test_page_is_the_same_every_time(tmp_path: Path) -> None:

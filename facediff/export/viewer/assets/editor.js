@@ -93,13 +93,14 @@ class Editor {
         name, Float32Array.from(new Uint8Array(await readBlob(blob)), (weight) => weight / 255)]);
       const made = new Direction(this.facts.direction, [], () => {});
       made.keys = this.directions[number].keys;
-      return new Preview(this.facts, animation, Object.fromEntries(await Promise.all(entries)), made);
+      const head = animation.head === null ? null : new Float32Array(await readBlob(animation.head));
+      return new Preview(this.facts, animation, Object.fromEntries(await Promise.all(entries)), head, made);
     }));
   }
 
   preview(number, face, frame) {
     if (!find("preview").checked || !this.previews) return;
-    this.previews[number].apply(face.positions, face.template, frame / this.facts.frameRate, this.directions[number]);
+    this.previews[number].apply(face.positions, face.template, frame, this.directions[number]);
   }
 
   /** Open the editor, or close it. */

@@ -15,36 +15,47 @@ function rotationOf(x, y, z) {
 const HEAD = ["head.pitch", "head.yaw", "head.roll"];
 const LEAST_FACTOR = 0.05; // a motion that was scaled to less cannot be scaled back
 
+/** A point (3) turned by a matrix. */
+const turned = (m, [x, y, z]) => [0, 3, 6].map((row) => m[row] * x + m[row + 1] * y + m[row + 2] * z);
+
+/** Turn positions (3 V) about a point, which then goes to a place. */
+function move(positions, m, [x, y, z], [toX, toY, toZ]) {
+  for (let i = 0; i < positions.length; i += 3) {
+    const a = positions[i] - x, b = positions[i + 1] - y, c = positions[i + 2] - z;
+    positions[i] = m[0] * a + m[1] * b + m[2] * c + toX;
+    positions[i + 1] = m[3] * a + m[4] * b + m[5] * c + toY;
+    positions[i + 2] = m[6] * a + m[7] * b + m[8] * c + toZ;
+  }
+}
+
 /** The preview of one animation, from the direction that it was made with to the one that is edited. */
 class Preview {
-  /** Args: the page's facts; the animation's; weights of its regions (V, 0 to 1) by name; the direction as it was. */
-  constructor(facts, animation, weights, before) {
-    Object.assign(this, { facts, animation, weights, before });
+  /**
+   * Args: the page's facts; the animation's; weights of its regions (V, 0 to 1) by name; the motion of its head (T · 6: a
+   * rotation about the origin and a shift in mm), or null; the direction as it was.
+   */
+  constructor(facts, animation, weights, head, before) {
+    Object.assign(this, { facts, animation, weights, head, before });
   }
 
-  /** Bring a frame's positions (3 V) from the old direction to the new one; both are given as a time in s has them. */
-  apply(positions, template, time, now) {
+  /** Bring a frame's positions (3 V) from the old direction to the new one. */
+  apply(positions, template, frame, now) {
     const { before } = this;
     if (before.keys === now.keys) return;
+    const time = frame / this.facts.frameRate;
     const value = (direction, name) => direction.value(name, time, this.facts.direction.stepSeconds);
-    const turn = (direction) => HEAD.map((name) => (direction.of(name).length ? value(direction, name) : 0));
-    const was = turn(before), is = turn(now);
-    if (was.some(Boolean)) this.rotate(positions, was, true);
-    this.scale(positions, template, (direction, name) => value(direction, name), now);
-    if (is.some(Boolean)) this.rotate(positions, is, false);
-  }
-
-  /** Turn the head about its neck by pitch, yaw and roll in degrees, or back. */
-  rotate(positions, degrees, back) {
-    const [x, y, z] = degrees.map((each) => (each * Math.PI) / 180);
-    const m = back ? rotationOf(-x, -y, -z) : rotationOf(x, y, z);
-    const [px, py, pz] = this.animation.neck;
-    for (let i = 0; i < positions.length; i += 3) {
-      const a = positions[i] - px, b = positions[i + 1] - py, c = positions[i + 2] - pz;
-      positions[i] = m[0] * a + m[1] * b + m[2] * c + px;
-      positions[i + 1] = m[3] * a + m[4] * b + m[5] * c + py;
-      positions[i + 2] = m[6] * a + m[7] * b + m[8] * c + pz;
-    }
+    const turn = (direction) => HEAD.map((name) => (direction.of(name).length ? (value(direction, name) * Math.PI) / 180 : 0));
+    const moved = this.head ? [...this.head.subarray(6 * frame, 6 * frame + 6)] : [0, 0, 0, 0, 0, 0];
+    // What acting and sway add to the keys stays: rotations of the head are sums of rotation vectors.
+    const was = turn(before), is = turn(now).map((angle, axis) => moved[axis] + angle - was[axis]);
+    const old = rotationOf(...moved.slice(0, 3)), wanted = rotationOf(...is);
+    const { neck } = this.animation;
+    const back = [0, 1, 2].map((row) => [0, 1, 2].map((column) => old[3 * column + row])).flat(); // the inverse
+    if (moved.some(Boolean)) move(positions, back, moved.slice(3), [0, 0, 0]);
+    this.scale(positions, template, value, now);
+    // The neck stays where the old motion had it.
+    const place = turned(old, neck).map((each, axis) => each + moved[3 + axis]);
+    if (is.some(Boolean) || moved.some(Boolean)) move(positions, wanted, neck, place);
   }
 
   /** Scale how far each vertex is from the neutral face by the new factor over the old one. */

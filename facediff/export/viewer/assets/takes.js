@@ -90,7 +90,8 @@ class Takes {
     this.facts = player.facts;
     find("taken").append(...this.facts.animations.map(({ name }, number) => new Option(name, number)));
     find("take-sound").hidden = this.facts.sound === null;
-    find("take-motion").addEventListener("click", () => this.motion(this.number));
+    find("take-motion").addEventListener("click", () => this.motion("npz"));
+    find("take-glb").addEventListener("click", () => this.motion("glb"));
     find("take-sound").addEventListener("click", () => this.sound());
     find("take-keys").addEventListener("click", () => player.editor.save(this.number));
     find("downloads").addEventListener("click", () => this.open());
@@ -108,17 +109,21 @@ class Takes {
     find("takes").showModal();
   }
 
-  async motion(number) {
-    const button = find("take-motion");
-    button.disabled = true;
+  /** Download the chosen take as a file of a kind. */
+  async motion(kind) {
+    const buttons = [find("take-motion"), find("take-glb")];
+    for (const button of buttons) button.disabled = true;
     find("takes-said").textContent = "packing the motion …";
+    const { number } = this;
+    const name = `${fileName(this.facts.animations[number].name)}.${kind}`;
     try {
-      const { name } = this.facts.animations[number];
-      download(`${fileName(name)}.npz`, "application/zip", await this.archive(number));
-      find("takes-said").textContent = `${fileName(name)}.npz: facediff export turns it into .glb, .usda, .abc and others`;
-    } finally {
-      button.disabled = false;
+      if (kind === "npz") download(name, "application/zip", await this.archive(number));
+      else download(name, "model/gltf-binary", await this.scene(number));
+      find("takes-said").textContent = `${name} is ready`;
+    } catch (error) {
+      find("takes-said").textContent = error.message;
     }
+    for (const button of buttons) button.disabled = false;
   }
 
   async sound() {
@@ -150,6 +155,9 @@ class Takes {
       const { samples } = this.player.wav;
       entries.push(["speech", "<f4", [samples.length], [bytesOf(samples)]]);
     }
+    if (animation.head !== null) {
+      entries.push(["head", "<f4", [facts.frames, 6], [new Uint8Array(await readBlob(animation.head))]]);
+    }
     if (animation.pairs !== null) {
       const pairs = new Uint8Array(await readBlob(animation.pairs));
       entries.push(["inner_lip_pairs", "<i4", [pairs.length / 8, 2], [pairs]]);
@@ -163,6 +171,27 @@ class Takes {
       yield* parts;
     }
     return zip(entries.map(([name, type, shape, parts]) => [`${name}.npy`, pieces(type, shape, parts)]));
+  }
+
+  /** The parts of an animation's .glb, in metres. */
+  async scene(number) {
+    const { facts } = this;
+    const face = this.player.faces[number], size = face.template.length;
+    if (4 * size * facts.frames > GLB_MEMORY) {
+      throw new Error("too much motion for a .glb made in a page: download the .npz, and run facediff export");
+    }
+    const offsetsOf = async () => {
+      const offsets = new Float32Array(size * facts.frames);
+      let at = 0;
+      for await (const bytes of this.frames(face)) {
+        const positions = new Float32Array(bytes.buffer);
+        for (let i = 0; i < size; i++) offsets[at + i] = positions[i] - face.template[i];
+        at += size;
+      }
+      return offsets;
+    };
+    const extras = { ...face.animation.metadata, tolerance_mm: GLB_TOLERANCE };
+    return glb(face, offsetsOf, facts.frameRate, face.animation.name, extras);
   }
 
   /** Positions of all frames, as the page holds them: without the preview of changed keys. */
