@@ -14,8 +14,8 @@ from facediff.editing.controls import AnimationControls
 from facediff.editing.direction import Direction, Key
 from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, write_animations
-from tests.export.test_export_glb import Reader
 from tests.fakes.clicks import clicks
+from tests.fakes.glb_reader import Reader
 
 DEGREES = {"head.pitch": 8.0, "head.yaw": -12.0, "head.roll": 5.0}
 
