@@ -152,6 +152,13 @@ DRILLS = [
         pieces=True,
     ),
     Drill(
+        "test",
+        f"--ckpt_path model.ckpt --data {TINY} --data.root packed.zarr {RUN}",
+        f"--ckpt_path model.ckpt --data {TINY} --data.root packed.zarr {RUN} --seed_everything=5",
+        label="packed",
+        pieces=True,
+    ),
+    Drill(
         "predict",
         f"--ckpt_path model.ckpt --data {TINY} --data.root corpus {RUN}",
         f"--ckpt_path model.ckpt --data {TINY} --data.root corpus {RUN} --seed_everything=5",
@@ -195,6 +202,8 @@ DRILLS = [
     Drill("data prepare", "biwi biwi out --workers 1 --quiet", label="biwi", pieces=True),
     Drill("data prepare", "vocaset vocaset out --workers 1 --quiet", label="vocaset", pieces=True),
     Drill("data prepare", "mead3d mead3d out --flame flame.pkl --workers 1 --quiet", label="mead3d", pieces=True),
+    Drill("data pack", f"corpus corpus.zarr --corpus {TINY} --workers 1 --quiet", pieces=True),
+    Drill("data unpack", "packed.zarr back --workers 1 --quiet"),
     Drill("data regions", f"corpus --corpus {TINY} --size 64 -o a.png", f"corpus --corpus {TINY} --size 80 -o a.png"),
     Drill(
         "data import-person",
@@ -239,6 +248,7 @@ def write_inputs(folder: Path, run: object) -> None:
     rows = [f"{step},{step},{1 / (step + 1)}" for step in range(30)]
     (folder / "curve" / "metrics.csv").write_text("\n".join(["epoch,step,train/loss", *rows]))
 
+    run(["data", "pack", "corpus", "packed.zarr", "--corpus", TINY, "--workers", "1", "--quiet"], folder)
     (folder / "demo.yaml").write_text(SMALL_MODEL + SMALL_TRAINER)
     (folder / "fit.yaml").write_text(SMALL_MODEL + SMALL_TRAINER + CALLBACKS)
     run(["fit", "--config", "fit.yaml", "--trainer.max_epochs=2", "--trainer.logger.save_dir=training"], folder)

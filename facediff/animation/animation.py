@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import mmap
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,41 +15,11 @@ from facediff.errors import FaceDiffError
 from facediff.mesh.flame import rotations
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import in_range
-from facediff.utils.limits import COORDINATE, FRAME_RATES, SAMPLE_RATES, brief, check_number
+from facediff.utils.limits import COORDINATE, FRAME_RATES, SAMPLE_RATES, check_number
+from facediff.utils.units import metres_per_unit as metres_per_unit
 
 MAPPED_BYTES = 1 << 26  # How much of a memory map is read before its pages are released
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 OUT_OF_RANGE = f"NaN, infinity or a coordinate beyond {COORDINATE:g}"
-UNITS = (1e-9, 1e9)
-"""Metres that a unit of length may have."""
-_ABOUT = re.compile(r"about ([0-9.]+) mm\b")
-
-
-def metres_per_unit(unit: str) -> float:
-    """Metres in one unit of length.
-
-    Args:
-        unit: ``m``, ``cm``, ``mm``, ``in``, a number of metres, or a description with "about … mm", such as that of a
-            corpus whose faces were normalised.
-
-    Raises:
-        FaceDiffError: if it is none of these.
-
-    Example:
-        >>> metres_per_unit("mm"), metres_per_unit("normalised (about 185 mm)")
-        (0.001, 0.185)
-    """
-    about = _ABOUT.search(unit)
-    try:
-        value = float(about[1]) / 1000 if about else METRES.get(unit) or float(unit)
-    except ValueError:
-        value = 0.0
-    if not UNITS[0] <= value <= UNITS[1]:
-        raise FaceDiffError(
-            f'unit "{brief(unit) if unit else ""}": expected one of {", ".join(METRES)}, or a number of metres from '
-            f"{UNITS[0]:g} to {UNITS[1]:g}"
-        )
-    return value
 
 
 @dataclass(frozen=True, eq=False)

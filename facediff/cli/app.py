@@ -59,6 +59,8 @@ COMMANDS = {
     "data check": Command(
         "facediff.cli.data:check", "report what a folder is, what is missing and what is wrong in it"
     ),
+    "data pack": Command("facediff.cli.data:pack", "pack a corpus, for object storage and small disks"),
+    "data unpack": Command("facediff.cli.data:unpack", "write the corpus folder that a packed corpus holds"),
     "data regions": Command("facediff.cli.data:regions", "draw a corpus's lips and upper face on its mesh"),
     "data import-person": Command("facediff.cli.data:import_person", "make a reconstructed video a corpus entry"),
     "components": Command("facediff.cli.components:components", "list what can be chosen by name"),
@@ -68,7 +70,7 @@ GROUPS = {
     "style": "speaking styles of trained models",
     "figure": "draw the figures of a paper: faces, heat maps, lip and training curves",
     "study": "user studies: make, serve, report",
-    "data": "prepare and check corpora, import a reconstructed video",
+    "data": "prepare, check and pack corpora, import a reconstructed video",
 }
 
 

@@ -1,4 +1,4 @@
-"""``facediff data``: preparing, checking and importing corpora."""
+"""``facediff data``: preparing, checking, packing and importing corpora."""
 
 from __future__ import annotations
 
@@ -23,12 +23,14 @@ if TYPE_CHECKING:
     from facediff.data.prepare.runner import Plan, Report
 
 Root = Annotated[Path, Option(reads=True)]
+Packed = Annotated[str, Option(reads=True)]
+"""A folder, or the address of a packed corpus, such as ``s3://bucket/corpus.zarr``."""
 
 # ``facediff data check``
 
 
 def check(
-    root: Root,
+    root: Packed,
     *,
     corpus: Corpus = None,
     split: Annotated[str | None, Option(metavar="NAME")] = None,
@@ -43,7 +45,7 @@ def check(
     Nothing is changed. Exit status: 0 sound (warnings allowed), 1 not sound, 2 wrong usage.
 
     Args:
-        root: the corpus folder
+        root: the corpus folder, or a packed corpus: its folder or its address
         corpus: what it is: biwi, vocaset, mead3d, puppet, or package.module.Class
         split: totals of one way to split the corpus only (3DMEAD: sentence, identity)
         quick: read headers only, and compare files by size
@@ -55,8 +57,7 @@ def check(
     Returns:
         0 if the folder is sound, 1 if not.
     """
-    if not root.is_dir():
-        raise FaceDiffError(f"{root}: no such folder; expected a corpus folder")
+    refuse_no_folder(root, "a corpus folder")
     check_scheduler(scheduler)
     from facediff.data.check import check as check_folder
     from facediff.data.check import text
@@ -76,6 +77,12 @@ def check(
     else:
         tell(*text(report).split("\n"))
     return 0 if report.sound else 1
+
+
+def refuse_no_folder(source: str, expected: str) -> None:
+    """Refuse what is neither a folder nor an address, before anything heavy is imported."""
+    if "://" not in source and not Path(source).expanduser().is_dir():
+        raise FaceDiffError(f"{source}: no such folder; expected {expected}")
 
 
 def find_own_module(corpus: str | None) -> None:
@@ -209,6 +216,97 @@ def grouped(entries: dict[str, str]) -> list[str]:
         f"{keys[0]}{f' … {keys[-1]} ({len(keys)} in all)' if len(keys) > 1 else ''}: {entries[keys[0]]}"
         for keys in groups.values()
     ]
+
+
+# ``facediff data pack`` and ``facediff data unpack``
+
+
+def pack(
+    root: Root,
+    out: Annotated[Path, Option(writes="folder")],
+    *,
+    corpus: Corpus = None,
+    tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.01,
+    lossless: bool = False,
+    unit: Annotated[str | None, Option(metavar="U")] = None,
+    chunk_seconds: Annotated[ranges.ChunkLength, Option(metavar="S")] = 0.5,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    quiet: bool = False,
+) -> None:
+    """Pack a corpus into one Zarr store, about a sixth of its size, that is also read from an address.
+
+    Every data module reads it: --data.root=OUT.zarr, or the address that it was copied to. A run that was stopped is
+    continued by the same command.
+
+    Args:
+        root: the corpus folder
+        out: packed corpus to write, a name that ends in .zarr: a new one, or one that this command has begun
+        corpus: what the folder is: biwi, vocaset, mead3d, puppet, or package.module.Class
+        tolerance: by how many millimetres a stored coordinate may differ, at most
+        lossless: keep the motion bit for bit, at about half its size
+        unit: the corpus's unit of length, m, cm, mm or a number of metres (default: that of its manifest.json, or the
+            corpus's own)
+        chunk_seconds: motion is read in pieces of this length
+        workers: processes (default: as many as processors)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        quiet: no progress bar
+    """
+    refuse_no_folder(str(root), "a corpus folder")
+    check_scheduler(scheduler)
+    from facediff.data.packed.packing import pack as pack_folder
+
+    find_own_module(corpus)
+    try:
+        report = pack_folder(
+            root.expanduser(),
+            out,
+            corpus=corpus,
+            tolerance=tolerance,
+            lossless=lossless,
+            unit=unit,
+            chunk_seconds=chunk_seconds,
+            workers=workers,
+            scheduler=scheduler,
+            quiet=quiet,
+        )
+    except KeyboardInterrupt:
+        print(f"\nstopped; the same command continues where {printable(out)} was left", file=sys.stderr)
+        raise
+    left = [f"note: left out, since no clip has it: {name}" for name in report.left_out[:SHOWN]]
+    if len(report.left_out) > SHOWN:
+        left.append(f"note: … and {len(report.left_out) - SHOWN} more")
+    tell(
+        f"{out}: {report.clips} clips, {report.seconds / 60:.1f} min, {report.after / 1e9:.3g} GB of "
+        f"{report.before / 1e9:.3g} GB, {report.gb_an_hour:.2f} GB an hour; {report.written} shards written now",
+        *left,
+        f"Next: facediff data check {out}",
+    )
+
+
+def unpack(
+    packed: Packed,
+    out: Annotated[Path, Option(writes="folder")],
+    *,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    quiet: bool = False,
+) -> None:
+    """Write the corpus folder that a packed corpus holds.
+
+    Args:
+        packed: folder of a packed corpus (.zarr), or its address
+        out: folder to make
+        workers: processes (default: as many as processors)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        quiet: no progress bar
+    """
+    refuse_no_folder(packed, "a packed corpus, as `facediff data pack` writes it, or its address")
+    check_scheduler(scheduler)
+    from facediff.data.packed.unpacking import unpack as unpack_folder
+
+    clips = unpack_folder(packed, out, workers=workers, scheduler=scheduler, quiet=quiet)
+    tell(f"{out}: {clips} clips", f"Next: facediff data check {out}")
 
 
 # ``facediff data import-person``

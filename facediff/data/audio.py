@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -132,8 +132,12 @@ def _check_rate(path: Path, rate: object, channels: object) -> None:
 
 
 @contextmanager
-def open_sound(path: Path) -> Iterator[Any]:
+def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
     """A ``soundfile.SoundFile`` whose rate and number of channels are in range.
+
+    Args:
+        source: the file, or its content.
+        name: what messages call a content.
 
     Raises:
         FaceDiffError: if it cannot be read, now or in the context.
@@ -143,9 +147,10 @@ def open_sound(path: Path) -> Iterator[Any]:
         import soundfile
     except ImportError as error:
         raise MissingExtraError("soundfile", "audio", "reading speech") from error
+    path = source if isinstance(source, Path) else Path(name)
     try:
         # As bytes, since a name need not be UTF-8.
-        with soundfile.SoundFile(os.fsencode(path)) as file:
+        with soundfile.SoundFile(os.fsencode(source) if isinstance(source, Path) else source) as file:
             _check_rate(path, file.samplerate, file.channels)
             yield file
     except (soundfile.LibsndfileError, RuntimeError, TypeError, ValueError, OSError) as error:

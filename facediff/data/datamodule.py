@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Annotated, Any, ClassVar, Literal, Self
+from typing import IO, TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -33,12 +33,16 @@ from facediff.data.dataset import (
     ResumableLoader,
 )
 from facediff.data.measuring import measure_components, measure_scale
+from facediff.data.packed.stores import address_of, is_packed
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.registry import defaults, keeps_arguments, plain
 from facediff.utils.licences import Commercial, Licence, merged, read_licences
 from facediff.utils.plain_options import read_options
 from facediff.utils.ranges import Range
 from facediff.utils.torch_files import load_tensors, open_checkpoint
+
+if TYPE_CHECKING:
+    from facediff.data.packed.reader import PackedCorpus
 
 Count = Annotated[int, Range(1, 10**9)]
 """Clips or frames."""
@@ -86,7 +90,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         aligner: lets the windows of two neighbours that speak the same sentence begin at the same sound; set likewise.
 
     Args:
-        root: the corpus folder.
+        root: the corpus folder; or a packed corpus, its folder or an address such as ``s3://bucket/corpus.zarr``.
         batch_size: clips a batch; used where no frame budget is given.
         max_frames_per_batch: frame budget: training and evaluation batches hold clips of similar length that fit into
             this many frames once they are padded.
@@ -162,7 +166,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         super().__init__()
         if not str(root):
             raise ArgumentError({"root": root}, "expected the corpus's folder")
-        self.root = Path(root).expanduser()
+        self.source = address_of(root) or str(root)
         self.batch_size = batch_size
         self.max_frames_per_batch = max_frames_per_batch
         self.num_workers = num_workers
@@ -285,6 +289,20 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     # The clips.
 
     @cached_property
+    def packed(self) -> PackedCorpus | None:
+        """The packed corpus that ``data.root`` names; None if it names a folder of files."""
+        if not is_packed(self.source):
+            return None
+        from facediff.data.packed.reader import PackedCorpus
+
+        return PackedCorpus(self.source)
+
+    @cached_property
+    def root(self) -> Path:
+        """The corpus folder; of a packed corpus, a folder on this machine with all files but motion and speech."""
+        return Path(self.source).expanduser() if self.packed is None else self.packed.folder
+
+    @cached_property
     def corpus(self) -> Corpus:
         """The corpus on disk.
 
@@ -300,6 +318,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             stored_frame_rate=self.stored_frame_rate,
             parse=self.parse_name,
             people=self.people,
+            storage=self.packed,
         )
 
     @property

@@ -98,7 +98,7 @@ class Puppet(SpeechMotionDataModule):
 
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
-        if not puppet.is_complete(self.root, seed=self.seed, drawn=self.drawn_speakers):
+        if self.packed is None and not puppet.is_complete(self.root, seed=self.seed, drawn=self.drawn_speakers):
             workers = min(4, processors()) if self.drawn_speakers else 1
             puppet.generate(self.root, seed=self.seed, drawn=self.drawn_speakers, workers=workers)
 

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
-from facediff.animation.animation import METRES
 from facediff.editing.correspondence import (
     Array,
     Correspondence,
@@ -31,6 +30,7 @@ from facediff.mesh.parts import named_triangles
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.limits import check_format
+from facediff.utils.units import METRES
 
 ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20

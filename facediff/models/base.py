@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, pad
+from facediff.data.packed.stores import address_of
 from facediff.data.windows import WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.mesh.hierarchy import mesh_hierarchy
@@ -484,7 +485,7 @@ class AnimationModel(LightningModule, Inference, ABC):
             self.licences = merged(self.licences, data.licences(), network_licences(dict(self.hparams)))
         self.data_source = {
             "class_path": f"{type(data).__module__}.{type(data).__qualname__}",
-            "root": str(data.root.resolve()),
+            "root": address_of(data.source) or str(Path(data.source).expanduser().resolve()),
         }
         # Measured on the training split once; a resumed or adapted model keeps the scale that its weights know.
         scale = self._assets.motion_scale if self._assets is not None else None

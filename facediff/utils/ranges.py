@@ -223,6 +223,7 @@ BlinkRate = Annotated[float, Range(1, 40)]
 USUAL_BLINKS = 17.0
 """Blinks a minute where no number is given: those of somebody at rest."""
 Bound = Annotated[float, Range(-1000, 1000)]
+ChunkLength = Annotated[float, Range(0.01, 60)]
 ClipLength = Annotated[float, Range(1, 600)]
 Correlation = Annotated[float, Range(0, 1)]
 Duration = Annotated[float, Range(0.001, 604_800)]

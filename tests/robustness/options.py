@@ -81,6 +81,8 @@ BASES: dict[str, str] = {
     "study serve": "WORLD/study --port 0",
     "study report": "WORLD/study --answers WORLD/answers.json --bootstrap 10 -o out",
     "data check": "WORLD/corpus --corpus tests.fakes.tiny.Tiny --workers 1 --quiet",
+    "data pack": "WORLD/corpus out.zarr --corpus tests.fakes.tiny.Tiny --workers 1 --quiet",
+    "data unpack": "WORLD/packed.zarr back --workers 1 --quiet",
     "data regions": "WORLD/corpus --corpus tests.fakes.tiny.Tiny --size 64 -o out.png",
     "data import-person": "WORLD/motion.npy --audio WORLD/person.wav --name P --corpus WORLD/people --frame-rate 30 "
     "-o person --quiet",
@@ -100,6 +102,7 @@ def build_world(folder: Path) -> Path:
     import trimesh
 
     from facediff.animation import write_archive
+    from facediff.data.packed.packing import pack
     from facediff.study import simulate
     from tests.fakes.benchmark import write_benchmark
     from tests.fakes.clicks import clicks
@@ -110,6 +113,7 @@ def build_world(folder: Path) -> Path:
 
     folder.mkdir(parents=True, exist_ok=True)
     corpus = write_tiny(folder / "corpus")
+    pack(corpus, folder / "packed.zarr", corpus="tests.fakes.tiny.Tiny", workers=1)
     time_ = np.arange(8000) / 16_000
     soundfile.write(folder / "speech.wav", 0.3 * np.sin(2 * np.pi * 200 * time_), 16_000)
     animation = clicks()

@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
@@ -57,12 +58,20 @@ def grid() -> np.ndarray:
 
 @functools.cache
 def shared(name: str) -> Path:
-    """Material that is made once in a process: ``tiny`` (a corpus), ``checkpoint`` (a model trained on it)."""
+    """Material that is made once in a process.
+
+    ``tiny`` (a corpus), ``packed`` (the same, packed), ``checkpoint`` (a model trained on it).
+    """
     folder = new_folder()
     if name == "tiny":
         from tests.fakes.tiny import write_tiny
 
         return write_tiny(folder / "tiny", sentences=2)
+    if name == "packed":
+        from facediff.data.packed.packing import pack
+
+        pack(shared("tiny"), folder / "corpus.zarr", corpus="tests.fakes.tiny.Tiny", workers=1)
+        return folder / "corpus.zarr"
     import lightning.pytorch as pl
     import torch
 
@@ -425,6 +434,42 @@ def read_the_vertices(path: Path) -> object:
     from facediff.utils.arrays import open_vertices
 
     return np.asarray(open_vertices(path, VERTICES)).sum()
+
+
+def packed(place: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """A file of a packed corpus; it is read at an address, so that what is kept of it is read as well."""
+
+    def write(path: Path) -> None:
+        shutil.copy(shared("packed") / place, path)
+
+    def read(path: Path) -> object:
+        from facediff.data.check import check
+        from tests.fakes.tiny import Tiny
+
+        with tempfile.TemporaryDirectory(dir=MATERIAL) as folder:
+            root = Path(shutil.copytree(shared("packed"), Path(folder) / "corpus.zarr"))
+            shutil.copy(path, root / place)
+            with mock.patch.dict(os.environ, FACEDIFF_CACHE=str(Path(folder) / "cache")):
+                corpus = Tiny(root=f"file://{root}").corpus
+                for clip in corpus.clips.values():
+                    corpus.read_motion(clip)
+                    corpus.read_audio(clip, 0, corpus.frames(clip))
+                    corpus.read_motion(clip)
+                return check(root, "tests.fakes.tiny.Tiny", workers=1).sound
+
+    return write, read
+
+
+def read_to_pack(path: Path) -> object:
+    """Pack a corpus that has this recording, and find that it is packed."""
+    from facediff.data.packed.packing import pack
+
+    with tempfile.TemporaryDirectory(dir=MATERIAL) as folder:
+        root = Path(shutil.copytree(shared("tiny"), Path(folder) / "corpus"))
+        shutil.copy(path, root / "wav" / "A_e01.wav")
+        for _ in range(2):
+            report = pack(root, Path(folder) / "corpus.zarr", corpus="tests.fakes.tiny.Tiny", workers=1)
+        return report.clips
 
 
 def indices(path: Path) -> None:
@@ -875,6 +920,13 @@ READERS = {
         f"voca, {name}": Reader(Path(name).suffix, *voca(name), 0.2)
         for name in ("gstep_52280.model.index", "gstep_52280.model.data-00000-of-00001", "output_graph.pb")
     },
+    **{
+        f"packed, {name}": Reader(Path(name).suffix, *packed(name), 0.2)
+        for name in ("zarr.json", "motion_int16/zarr.json", "motion_int16/c/0/0", "speech/c/0", "files/c/0")
+    },
+    "recording to pack": Reader(
+        ".wav", lambda path: shutil.copy(shared("tiny") / "wav/A_e01.wav", path), read_to_pack, 0.2
+    ),
     "curves": Reader(".csv", curves, read_the_curves),
     "hubert, config": Reader(".json", *hubert("config.json"), 0.2),
     "hubert, weights": Reader(".safetensors", *hubert("model.safetensors"), 0.2),

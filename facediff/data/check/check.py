@@ -21,8 +21,10 @@ from facediff.data.check.layouts import (
     identify,
     is_rate,
     list_folder,
+    list_packed,
     read_record,
 )
+from facediff.data.check.packed import check_packed, examine_packed
 from facediff.data.check.report import FEW, Findings, Report, counted, few, number
 from facediff.data.check.shared import (
     check_account,
@@ -34,6 +36,7 @@ from facediff.data.check.shared import (
     check_regions,
     check_templates,
 )
+from facediff.data.packed.stores import is_packed
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.jobs import WorkerDied, is_cluster, processors, run_tasks
 
@@ -67,7 +70,7 @@ def check(
     """Check a corpus folder; nothing in it is changed, trusted or run.
 
     Args:
-        root: the folder.
+        root: the folder; or a packed corpus, its folder or its address.
         corpus: name of the corpus (``biwi``), or import path of its data module; found out if None.
         split: only the totals of this way to split the corpus (3DMEAD: ``sentence``, ``identity``).
         quick: read headers only: no NaN, no comparison with templates, no copies; files are compared by size.
@@ -79,18 +82,24 @@ def check(
         FaceDiffError: if there is no such folder, corpus or split. What is wrong in the folder is in the report.
         MissingExtraError: if soundfile or trimesh is not installed.
     """
-    root = Path(root).expanduser()
+    packed = None
+    if is_packed(root):
+        from facediff.data.packed.reader import PackedCorpus
+
+        packed = PackedCorpus(root)
+    source: Path | str = Path(root).expanduser() if packed is None else packed.source
+    root = Path(root).expanduser() if packed is None else packed.folder
     if not root.is_dir():
         raise FaceDiffError(f"{root}: no such folder; expected a corpus with wav/, vertices_npy/ and templates.pkl")
     if workers is not None and workers < 1:
         raise FaceDiffError(f"--workers: is {workers}; expected 1 or more")
     from facediff.data.corpus import MOTION_FOLDERS
 
-    report = Report(root, quick)
+    report = Report(source, quick)
     manifest = read_record(root, MANIFEST, report.findings)
     state = read_record(root, STATE, report.findings)
-    folder = list_folder(root, MOTION_FOLDERS)
-    recorded = manifest.get("corpus", state.get("corpus"))
+    folder = list_folder(root, MOTION_FOLDERS) if packed is None else list_packed(packed)
+    recorded = manifest.get("corpus", state.get("corpus") if packed is None else packed.record.corpus)
     view = identify(report, folder, recorded, corpus, split, manifest)
     report.manifest = {
         "there": (root / MANIFEST).is_file(),
@@ -100,7 +109,10 @@ def check(
         "missing": [],
     }
     if view is not None:
-        size = sum(path.stat().st_size for path in folder.motions.values() if path.is_file())
+        if packed is None:
+            size = sum(path.stat().st_size for path in folder.motions.values() if path.is_file())
+        else:
+            size = sum(sum(facts.shards) for facts in packed.record.arrays.values())
         if not is_cluster(scheduler):
             workers = workers or (1 if quick or size <= WORTH_IT else processors())
         examine_all = partial(_examine_all, workers=workers, scheduler=scheduler, progress=progress)
@@ -126,7 +138,12 @@ def _check_corpus(
     if not any(finding.where == MANIFEST or finding.kind == "unfinished" for finding in findings):
         with findings.guard("frame_rate", root / MANIFEST, root):
             opened = Corpus(
-                root, view.n_vertices, view.frame_rate, stored_frame_rate=view.stored_frame_rate, parse=view.parse
+                root,
+                view.n_vertices,
+                view.frame_rate,
+                stored_frame_rate=view.stored_frame_rate,
+                parse=view.parse,
+                storage=folder.packed,
             )
     rate = manifest.get("frame_rate")
     stored = report.stored_frame_rate = rate if is_rate(rate) else view.stored_frame_rate
@@ -154,6 +171,14 @@ def _check_corpus(
     _check_copies(facts, findings)
     if report.templates["file"]:
         _check_subjects(clips, {*templates, *report.templates["broken"]}, findings)
+    if folder.packed is not None:
+        check_packed(folder.packed, view.n_vertices, templates, findings)
+        files = manifest.get("files")
+        if isinstance(files, dict):  # of which motion and speech are no files any more
+            manifest = {
+                **manifest,
+                "files": {name: files[name] for name in files if name in folder.packed.record.files},
+            }
     hashes = {where: digest for clip in facts for where, digest in clip.hashes.items()}
     report.manifest |= check_files(root, manifest, hashes, findings, quick=report.quick)
     check_account(manifest, findings)
@@ -187,12 +212,13 @@ def _examine_all(
         if (clip := view.parse(name)) is not None
     ]
     examined: dict[str, ClipFacts] = {}
+    work: Any = partial(examine, rules) if folder.packed is None else partial(examine_packed, rules, folder.packed)
     results = run_tasks(
-        partial(examine, rules),
+        work,
         tasks,
         workers=workers,
         scheduler=scheduler,
-        reads=[folder.root],
+        reads=[folder.root] if folder.packed is None else folder.packed.places,
         progress="clips" if progress else "",
     )
     with closing(results):

@@ -86,7 +86,7 @@ def examine(rules: Rules, clip: ClipFiles) -> ClipFacts:
         if clip.sound is not None:
             _check_sound(facts, rules, clip.sound)
         if facts.frames is not None and facts.seconds is not None:
-            _compare_lengths(facts, rules.stored_frame_rate, facts.frames, facts.seconds)
+            compare_lengths(facts, rules.stored_frame_rate, facts.frames, facts.seconds)
         for path in (clip.motion, clip.sound):
             if path is not None and not rules.quick and path.is_file() and path.stat().st_size:
                 facts.hashes[relative(path, rules.root)] = sha256(path)
@@ -126,9 +126,13 @@ def _check_motion(facts: ClipFacts, rules: Rules, path: Path, subject: str) -> N
         findings.warning("motion_dtype", where, "is in half precision, some three digits; get it in float32")
     facts.frames = len(array)
     if not rules.quick:
-        motion = array.reshape(len(array), expected, 3)
-        if _check_frames(findings, motion, where) and subject in rules.templates:
-            _compare_with_templates(findings, motion, where, subject, rules.templates)
+        check_vertices(findings, array.reshape(len(array), expected, 3), where, subject, rules.templates)
+
+
+def check_vertices(findings: Findings, motion: Array, where: str, subject: str, templates: Mapping[str, Array]) -> None:
+    """Look at all frames (T, V, 3) of a clip, and compare them with the speakers' templates."""
+    if _check_frames(findings, motion, where) and subject in templates:
+        _compare_with_templates(findings, motion, where, subject, templates)
 
 
 def _check_frames(findings: Findings, motion: Array, where: str) -> bool:
@@ -252,7 +256,8 @@ def _decode(findings: Findings, file: Any, where: str) -> None:  # noqa: ANN401 
 # Both together.
 
 
-def _compare_lengths(facts: ClipFacts, frame_rate: float, frames: int, seconds: float) -> None:
+def compare_lengths(facts: ClipFacts, frame_rate: float, frames: int, seconds: float) -> None:
+    """Remark on motion and speech that do not last equally long."""
     motion = frames / frame_rate
     difference = abs(motion - seconds)
     if difference <= SLIGHT:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     Module = type[SpeechMotionDataModule]
     from facediff.data.corpus import Clip
+    from facediff.data.packed.reader import PackedCorpus
 
 MANIFEST = "manifest.json"
 STATE = "prepare.json"
@@ -59,6 +60,7 @@ class Folder:
     sounds: dict[str, Path] = field(default_factory=dict)
     leftovers: list[str] = field(default_factory=list)
     strays: list[str] = field(default_factory=list)
+    packed: PackedCorpus | None = None  # what the clips lie in, if they are no files
 
     @property
     def names(self) -> list[str]:
@@ -67,6 +69,8 @@ class Folder:
 
     def n_vertices(self) -> int | None:
         """The vertex count of most of the first few readable files of motion; None if there is none."""
+        if self.packed is not None:
+            return self.packed.record.n_vertices
         counts: Counter[int] = Counter()
         for path in islice(self.motions.values(), PROBED):
             try:
@@ -95,6 +99,7 @@ class View:
     region_sources: dict[str, tuple[str, ...]] = field(default_factory=dict)
     region_help: str = ""  # where the files of the regions can be obtained
     obtain: str = ""  # how the corpus can be obtained
+    unit: str = ""  # of length, where manifest.json has none
 
 
 def identify(
@@ -141,6 +146,30 @@ def identify(
     return None
 
 
+def view_of(root: Path, corpus: str | None) -> View:
+    """What a corpus folder is.
+
+    Args:
+        root: the folder.
+        corpus: name or import path of its data module; found out if None.
+
+    Raises:
+        FaceDiffError: if that cannot be found out, or its preparation was interrupted.
+    """
+    from facediff.data.corpus import MOTION_FOLDERS
+    from facediff.data.manifest import read_manifest
+
+    if not root.is_dir():
+        raise FaceDiffError(f"{root}: no such folder; expected a corpus with wav/, vertices_npy/ and templates.pkl")
+    if (root / STATE).is_file() and not (root / MANIFEST).is_file():
+        raise FaceDiffError(f"{root}: its preparation was interrupted; run the same `facediff data prepare` again")
+    manifest, report = read_manifest(root), Report(root)
+    view = identify(report, list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, None, manifest)
+    if view is None:
+        raise FaceDiffError(f"{root}: {report.findings[0].message}")
+    return view
+
+
 # What lies in the folder.
 
 
@@ -164,6 +193,13 @@ def list_folder(root: Path, motion_folders: tuple[str, ...]) -> Folder:
             else:
                 folder.strays.append(f"{name}/{path.name}")
     return folder
+
+
+def list_packed(packed: PackedCorpus) -> Folder:
+    """The clips of a packed corpus, named as the files that they would be."""
+    motions = {name: Path(f"vertices_npy/{name}.npy") for name in packed.names()}
+    sounds = {name: Path(f"wav/{name}.wav") for name in packed.names()}
+    return Folder(packed.folder, motions, sounds, packed=packed)
 
 
 def read_record(root: Path, name: str, findings: Findings) -> dict[str, Any]:
@@ -313,6 +349,7 @@ def _view_of_module(module: Module, root: Path, split: str | None) -> View:
         region_sources=dict(module.region_sources),
         region_help=module.region_help,
         obtain=module.obtain,
+        unit=module.unit,
     )
 
 

@@ -68,7 +68,7 @@ class Findings(list[Finding]):
 class Report:
     """What a folder is and what is wrong in it."""
 
-    root: Path
+    root: Path | str  # an address of a packed corpus is a text
     quick: bool = False  # whether headers only were read
     corpus: str | None = None  # name of the corpus; None if it was not recognised
     # import path of the data module that reads it; None for a person's folder, or if unknown

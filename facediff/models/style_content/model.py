@@ -219,7 +219,7 @@ class StyleContentDisentanglement(AnimationModel):
                 self.network.decoder.start_from(mean * self.scale, shapes * self.scale)
             if self.distance.lip_gap and self.assets.inner_lip_pairs is None:
                 print(
-                    f"note: lip_gap_weight has no effect: {data.root} has no regions/inner_lip_pairs.txt",
+                    f"note: lip_gap_weight has no effect: {data.source} has no regions/inner_lip_pairs.txt",
                     flush=True,
                 )
 

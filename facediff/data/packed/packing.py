@@ -1,0 +1,608 @@
+"""Packing a corpus folder: what is packed, in which tasks, and how an interrupted run is continued."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.audio import open_sound
+from facediff.data.corpus import read_templates
+from facediff.data.manifest import read_manifest
+from facediff.data.packed.layout import (
+    BIAS,
+    BLOB_CHUNK,
+    BLOB_SHARD,
+    CODINGS,
+    EXACT,
+    METADATA,
+    PIECE_SECONDS,
+    QUANTISED,
+    RECORD,
+    ROOM,
+    SHARD_BYTES,
+    STATE,
+    SUFFIX,
+    ArrayFacts,
+    PackedClip,
+    PackedFile,
+    Record,
+    Sound,
+    read_record,
+)
+from facediff.data.packed.shards import shard_key
+from facediff.data.packed.stores import is_packed
+from facediff.data.storage import MOTION_FOLDERS, motion_path, refuse_out_of_range
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.arrays import open_vertices
+from facediff.utils.files import atomic, check_writable, locked, remove_partial
+from facediff.utils.jobs import WorkerDied, run_tasks
+from facediff.utils.limits import LIMITS
+from facediff.utils.plain_files import load_json, write_json
+from facediff.utils.units import metres_per_unit
+
+LOCK = ".pack.lock"
+PARTS = "parts"
+"""Folder in the store with the encoded speech of single clips, while packing runs."""
+MARGIN = 0.99
+"""Of the tolerance that steps may use; the rest is for the rounding of vertices to single precision."""
+FINEST = 0.001
+"""Millimetres of the smallest tolerance: single precision rounds the vertices of a face by some hundred-thousandths."""
+BITS = {"PCM_16": 16, "PCM_24": 24, "PCM_S8": 16, "PCM_U8": 16}
+"""Bits of FLAC samples that hold those of a recording exactly, by the recording's form."""
+FLAC_CHANNELS, FLAC_RATE = 8, 655_350
+FRAMES = 8  # that are quantised at a time
+REMEDY = "run `facediff data check` on the folder, and correct or remove the clip"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What packing did.
+
+    Attributes:
+        out: the packed corpus.
+        clips: number of clips.
+        seconds: of motion.
+        before: bytes of the folder's motion and speech.
+        after: bytes of the packed corpus.
+        written: shards written by this run.
+        left_out: files that no clip has: motion without speech, or speech without motion.
+    """
+
+    out: Path
+    clips: int
+    seconds: float
+    before: int
+    after: int
+    written: int
+    left_out: tuple[str, ...]
+
+    @property
+    def gb_an_hour(self) -> float:
+        """Gigabytes of the packed corpus for an hour of motion."""
+        return self.after / 1e9 / max(self.seconds / 3600, 1e-9)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Frames of a clip that lie in a shard.
+
+    Attributes:
+        path: the clip's motion.
+        identity: whose template is subtracted.
+        row: the first row in the shard.
+        start: the first frame.
+        stop: the frame after the last one.
+    """
+
+    path: Path
+    identity: str
+    row: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Task:
+    """One file to write: a shard of motion, or the encoded speech of a clip.
+
+    Attributes:
+        target: path below the store.
+        coding: of the motion; empty for speech.
+        parts: of the shard.
+        sound: the recording.
+    """
+
+    target: str
+    coding: str = ""
+    parts: tuple[Part, ...] = ()
+    sound: Path | None = None
+
+    def __str__(self) -> str:
+        return self.target
+
+
+def pack(
+    root: Path,
+    out: Path,
+    *,
+    corpus: str | None = None,
+    tolerance: float = 0.01,
+    lossless: bool = False,
+    unit: str | None = None,
+    chunk_seconds: float = 0.5,
+    workers: int | None = None,
+    scheduler: str | None = "",
+    quiet: bool = True,
+) -> Report:
+    """Pack a corpus folder.
+
+    A run that was killed is resumed: shards that are there are kept. The record that makes a Zarr group of the folder
+    appears last.
+
+    Args:
+        root: the corpus folder.
+        out: the packed corpus; a new folder whose name ends in ``.zarr``, or one that this function has begun.
+        corpus: name or import path of the corpus; found out if None.
+        tolerance: millimetres by which a coordinate may differ, at most.
+        lossless: keep every bit of the motion.
+        unit: the corpus's unit of length; that of its manifest or its data module if None.
+        chunk_seconds: length of the pieces in which motion is read.
+        workers: processes; as many as there are processors if None.
+        scheduler: where tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
+        quiet: no progress bar.
+
+    Raises:
+        FaceDiffError: if the folder cannot be packed, a clip is damaged, or ``out`` is in the way.
+    """
+    if not lossless and tolerance < FINEST:
+        raise FaceDiffError(
+            f"--tolerance {tolerance:g}: is finer than single precision allows; expected {FINEST:g} mm or more, or "
+            f"--lossless"
+        )
+    if out.suffix != SUFFIX:
+        raise FaceDiffError(f'{out}: unknown suffix "{out.suffix}"; expected a name that ends in {SUFFIX}')
+    if out.exists() and not out.is_dir():
+        raise FaceDiffError(f"{out}: is a file; expected a new folder")
+    if is_packed(root):
+        raise FaceDiffError(f"{root}: is packed already; expected a corpus folder with wav/ and vertices_npy/")
+    if out.resolve().is_relative_to(root.resolve()):
+        raise FaceDiffError(f"{out}: lies in the corpus folder {root}; choose a folder outside it")
+    require_zarr("packing a corpus")
+    plan = Plan.of(root, corpus, 0.0 if lossless else tolerance, unit, chunk_seconds)
+    check_writable(out / STATE)
+    with locked(out / LOCK, "facediff data pack"):
+        return _carry_out(plan, out, workers, scheduler, quiet)
+
+
+def require_zarr(purpose: str) -> None:
+    """Refuse to begin what needs the zarr package where it is not installed.
+
+    Raises:
+        MissingExtraError: naming the extra.
+    """
+    try:
+        import zarr  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("zarr", "packed", purpose) from error
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is packed, found by a look at every file's header.
+
+    Attributes:
+        root: the corpus folder.
+        record: without the shards' sizes, the speech and the files.
+        files: other files of the folder, by path below it.
+        left_out: files of motion or speech that no clip has.
+        sources: size and time of every file that is packed; a resumed run must find the same.
+        bytes: of motion and speech.
+    """
+
+    root: Path
+    record: Record
+    files: tuple[str, ...]
+    left_out: tuple[str, ...]
+    sources: str
+    bytes: int
+
+    @classmethod
+    def of(cls, root: Path, corpus: str | None, tolerance: float, unit: str | None, chunk_seconds: float) -> Plan:
+        """Look through a corpus folder.
+
+        Raises:
+            FaceDiffError: if it is none, or a clip has no template.
+        """
+        from facediff.data.check.layouts import view_of
+
+        view = view_of(root, corpus)
+        manifest = read_manifest(root)
+        named = unit or str(manifest.get("unit") or view.unit)
+        try:
+            millimetres = 1000.0 * metres_per_unit(named)
+        except FaceDiffError as error:
+            if tolerance:
+                raise FaceDiffError(f"{root}: {error}; give it with --unit, or pack with --lossless") from error
+            millimetres = 1.0
+        rate = float(manifest.get("frame_rate") or view.stored_frame_rate)
+        chunk = max(1, round(rate * chunk_seconds))
+        step = 2 * MARGIN * tolerance / millimetres
+        coding = "int16" if step * millimetres * np.iinfo(np.int16).max >= ROOM else "int32"
+        templates = read_templates(root / "templates.pkl", view.n_vertices)
+        clips, arrays, left_out, size, seen = {}, {}, [], 0, hashlib.sha256()
+        rows = 0
+        sounds = {path.stem: path for path in sorted((root / "wav").glob("*.wav"))}
+        motions = {
+            path.stem: path
+            for folder in reversed(MOTION_FOLDERS)
+            for path in sorted((root / folder).glob("*.npy"))
+            if not path.name.startswith(".")
+        }
+        for name in sorted({*sounds, *motions}):
+            clip = view.parse(name) if name in sounds and name in motions else None
+            if clip is None:
+                left_out += [str(each[name].relative_to(root)) for each in (sounds, motions) if name in each]
+                continue
+            path = motion_path(root, name)
+            vertices = open_vertices(path, view.n_vertices)
+            if vertices.dtype.name not in EXACT:
+                raise FaceDiffError(f"{path}: holds {vertices.dtype}; expected {', '.join(EXACT)}")
+            if clip.identity not in templates:
+                raise FaceDiffError(
+                    f"{root / 'templates.pkl'}: no template for {clip.identity}, needed by clip {name}; {REMEDY}"
+                )
+            own = coding if tolerance else vertices.dtype.name
+            nothing = Sound(0, (), "flac", 16_000, 1, 1, 16)
+            clips[name] = PackedClip(name, clip.identity, own, vertices.dtype.name, rows, len(vertices), nothing)
+            rows += -(-len(vertices) // chunk) * chunk
+            for each in (path, sounds[name]):
+                facts = each.stat()
+                size += facts.st_size
+                seen.update(f"{each.name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
+        if not clips:
+            raise FaceDiffError(f"{root}: no clip with both wav/<clip>.wav and vertices_npy/<clip>.npy; {REMEDY}")
+        width = 3 * view.n_vertices
+        for own in sorted({clip.coding for clip in clips.values()}):
+            dtype = CODINGS[own]
+            chunks = max(1, SHARD_BYTES // (chunk * width * dtype.itemsize))
+            arrays[f"motion_{own}"] = ArrayFacts(dtype.name, rows, width, chunk, min(chunks, -(-rows // chunk)), ())
+        record = Record(
+            made_by=_version(),
+            corpus=view.corpus,
+            n_vertices=view.n_vertices,
+            frame_rate=rate,
+            tolerance=tolerance,
+            step=step,
+            bias=BIAS,
+            unit=named,
+            chunk_seconds=chunk_seconds,
+            identities=tuple(sorted(templates)),
+            clips=clips,
+            arrays=arrays,
+        )
+        return cls(root, record, _other_files(root), tuple(left_out), seen.hexdigest(), size)
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What decides what is written; a run may be resumed only with the same."""
+        record = self.record
+        return {
+            **{name: getattr(record, name) for name in ("made_by", "corpus", "n_vertices", "frame_rate")},
+            **{name: getattr(record, name) for name in ("tolerance", "unit", "chunk_seconds", "bias")},
+            "clips": {name: [clip.coding, clip.frames] for name, clip in record.clips.items()},
+        }
+
+    def tasks(self) -> Iterator[Task]:
+        """A task for every shard of motion, and for every clip's speech."""
+        for name, facts in self.record.arrays.items():
+            each = facts.chunk * facts.chunks
+            parts: dict[int, list[Part]] = {}
+            for clip in self.record.clips.values():
+                if name != f"motion_{clip.coding}":
+                    continue
+                path = motion_path(self.root, clip.name)
+                for shard in range(clip.first // each, -(-(clip.first + clip.frames) // each)):
+                    low, high = max(clip.first, shard * each), min(clip.first + clip.frames, (shard + 1) * each)
+                    part = Part(path, clip.identity, low - shard * each, low - clip.first, high - clip.first)
+                    parts.setdefault(shard, []).append(part)
+            for shard in range(-(-facts.rows // each)):
+                yield Task(
+                    f"{name}/{shard_key(shard, facts.width)}",
+                    name.removeprefix("motion_"),
+                    tuple(parts.get(shard, ())),
+                )
+        for clip in self.record.clips.values():
+            yield Task(f"{PARTS}/{clip.name}", sound=self.root / "wav" / f"{clip.name}.wav")
+
+
+def _other_files(root: Path) -> tuple[str, ...]:
+    """Every file of a corpus folder but motion, speech and hidden ones, by path below it."""
+    found, size = [], 0
+    for path in sorted(root.rglob("*")):
+        place = path.relative_to(root)
+        if place.parts[0] in (*MOTION_FOLDERS, "wav") or any(part.startswith(".") for part in place.parts):
+            continue
+        if path.is_file():
+            found.append(place.as_posix())
+            size += path.stat().st_size
+    LIMITS.check("bytes", size, f"{root}: its other files")
+    return tuple(found)
+
+
+def _version() -> str:
+    from facediff.data.prepare.runner import version
+
+    return version()
+
+
+def _carry_out(plan: Plan, out: Path, workers: int | None, scheduler: str | None, quiet: bool) -> Report:
+    if (out / METADATA).is_file():
+        return _finished(plan, out)
+    begun = {"recipe": plan.recipe, "sources": plan.sources}
+    if (out / STATE).is_file():
+        if load_json(out / STATE, remedy=f"remove {out}") != begun:
+            raise FaceDiffError(
+                f"{out}: was begun with other options, or the corpus has changed since; remove it, or choose another "
+                f"folder"
+            )
+    else:
+        found = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
+        if found:
+            raise FaceDiffError(f"{out}: holds other files ({', '.join(found[:3])}); choose a new folder")
+        write_json(out / STATE, begun)
+    remove_partial(out, recursive=True)
+    tasks = [task for task in plan.tasks() if not (out / task.target).is_file()]
+    work = partial(_write, out, plan.root, plan.record)
+    results = run_tasks(
+        work,
+        tasks,
+        workers=workers,
+        scheduler=scheduler,
+        writes=out,
+        reads=[plan.root],
+        progress="" if quiet else "packing",
+    )
+    with closing(results):
+        for task, died in results:
+            if isinstance(died, WorkerDied):
+                raise FaceDiffError(
+                    f"{out / task.target}: writing it killed its process, perhaps for lack of memory; try --workers 1"
+                )
+    record = _finish(plan, out)
+    return _report(plan, record, out, sum(bool(task.coding) for task in tasks))
+
+
+def _finished(plan: Plan, out: Path) -> Report:
+    record = read_record((out / METADATA).read_bytes(), str(out))
+    if replace(plan, record=record).recipe != plan.recipe:
+        raise FaceDiffError(f"{out}: holds a corpus that was packed otherwise; choose a new folder, or remove this one")
+    _clear(out)
+    return _report(plan, record, out, 0)
+
+
+def _report(plan: Plan, record: Record, out: Path, written: int) -> Report:
+    seconds = sum(clip.frames for clip in record.clips.values()) / record.frame_rate
+    after = sum(size for facts in record.arrays.values() for size in facts.shards)
+    return Report(out, len(record.clips), seconds, plan.bytes, after, written, plan.left_out)
+
+
+def _finish(plan: Plan, out: Path) -> Record:
+    """Write speech, files and templates from what is there, and the record last."""
+    clips, place = {}, 0
+    for name, clip in plan.record.clips.items():
+        with (out / PARTS / name).open("rb") as stream:
+            sound = Sound(**{**json.loads(stream.readline()), "first": place})
+        clips[name] = replace(clip, sound=replace(sound, pieces=tuple(sound.pieces)))
+        place += sum(sound.pieces)
+    speech = ((out / PARTS / name).read_bytes().partition(b"\n")[2] for name in clips)
+    files, read = {}, 0
+    for path in plan.files:
+        content = (plan.root / path).read_bytes()
+        files[path] = PackedFile(path, read, len(content), hashlib.sha256(content).hexdigest())
+        read += len(content)
+    templates = read_templates(plan.root / "templates.pkl", plan.record.n_vertices)
+    faces = np.stack([templates[name].numpy().ravel() for name in plan.record.identities])
+    arrays = dict(plan.record.arrays)
+    arrays["templates"] = ArrayFacts("float32", len(faces), faces.shape[1], 1, len(faces), ())
+    with atomic(out / "templates" / shard_key(0, faces.shape[1])) as temporary:
+        temporary.write_bytes(encoded(arrays["templates"], faces))
+    arrays["speech"] = write_blob(out, "speech", place, speech)
+    arrays["files"] = write_blob(out, "files", read, ((plan.root / path).read_bytes() for path in plan.files))
+    for name, facts in arrays.items():
+        with atomic(out / name / METADATA) as temporary:
+            temporary.write_bytes(encoded(facts, None))
+        count = -(-facts.rows // (facts.chunk * facts.chunks))
+        sizes = tuple((out / name / shard_key(shard, facts.width)).stat().st_size for shard in range(count))
+        arrays[name] = replace(facts, shards=sizes)
+    record = replace(plan.record, clips=clips, files=files, arrays=arrays)
+    with atomic(out / METADATA) as temporary:
+        temporary.write_bytes(group_metadata(record))
+    _clear(out)
+    return record
+
+
+def _clear(out: Path) -> None:
+    """Remove what only an unfinished packed corpus needs."""
+    for path in sorted((out / PARTS).glob("*")):
+        path.unlink()
+    if (out / PARTS).is_dir():
+        (out / PARTS).rmdir()
+    (out / STATE).unlink(missing_ok=True)
+
+
+# Tasks: run in worker processes, each writes one file.
+
+
+def _write(out: Path, root: Path, record: Record, task: Task) -> None:
+    if task.sound is not None:
+        content = encode_speech(task.sound)
+    else:
+        facts = record.arrays[f"motion_{task.coding}"]
+        rows = np.zeros((facts.chunk * facts.chunks, facts.width), CODINGS[task.coding])
+        templates = read_templates(root / "templates.pkl", record.n_vertices)
+        for part in task.parts:
+            read = _quantised if task.coding in QUANTISED else _exact
+            vertices = open_vertices(part.path, record.n_vertices)
+            rows[part.row : part.row + part.stop - part.start] = read(
+                part, vertices, templates[part.identity].numpy(), record, rows.dtype
+            )
+            last = part.row + part.stop - part.start
+            padded = -(-last // facts.chunk) * facts.chunk
+            rows[last:padded] = rows[last - 1]  # which compresses to nothing
+        for first in range(0, len(rows), facts.chunk):
+            chunk = rows[first : first + facts.chunk]
+            chunk[1:] = chunk[1:] - chunk[:-1] + chunk.dtype.type(record.bias)
+        content = encoded(facts, rows)
+    with atomic(out / task.target) as temporary:
+        temporary.write_bytes(content)
+
+
+def _quantised(
+    part: Part,
+    vertices: npt.NDArray[np.floating],
+    template: npt.NDArray[np.float32],
+    record: Record,
+    dtype: np.dtype[Any],
+) -> npt.NDArray[Any]:
+    """Offsets from the template in whole steps (frames, 3V)."""
+    stored = vertices[part.start : part.stop]
+    steps = np.empty((len(stored), stored.shape[1] * 3), dtype)
+    limit = np.iinfo(dtype).max
+    for first in range(0, len(stored), FRAMES):
+        piece = np.array(stored[first : first + FRAMES], np.float64)
+        with np.errstate(all="ignore"):
+            refuse_out_of_range(piece.astype(np.float32), range(part.start + first, part.stop), part.path)
+        piece -= template
+        piece /= record.step
+        np.rint(piece, out=piece)
+        most = float(np.abs(piece).max(initial=0.0))
+        if most > limit:
+            raise FaceDiffError(
+                f"{part.path}: a coordinate lies {most * record.step:.4g} {record.unit.split(' ')[0]} away from the "
+                f"template of {part.identity}, more than can be packed at this tolerance; {REMEDY}, or pack with "
+                f"--lossless"
+            )
+        steps[first : first + FRAMES] = piece.reshape(len(piece), -1)
+    return steps
+
+
+def _exact(
+    part: Part,
+    vertices: npt.NDArray[np.floating],
+    template: npt.NDArray[np.float32],
+    record: Record,
+    dtype: np.dtype[Any],
+) -> npt.NDArray[Any]:
+    """The bits of absolute vertices as whole numbers (frames, 3V)."""
+    stored = np.ascontiguousarray(vertices[part.start : part.stop], vertices.dtype.newbyteorder("<"))
+    with np.errstate(all="ignore"):
+        refuse_out_of_range(stored.astype(np.float32), range(part.start, part.stop), part.path)
+    return stored.reshape(len(stored), -1).view(dtype)
+
+
+def encode_speech(path: Path) -> bytes:
+    """A recording as FLAC streams after a line of JSON that says where they lie; kept as it is where FLAC would lose.
+
+    Raises:
+        FaceDiffError: if it cannot be read, or is cut short.
+    """
+    import soundfile
+
+    with open_sound(path) as file:
+        rate, channels, samples = int(file.samplerate), int(file.channels), int(file.frames)
+        LIMITS.check("seconds", samples / rate, path)
+        if not samples:
+            raise FaceDiffError(f"{path}: holds no samples; {REMEDY}")
+        bits = BITS.get(file.subtype, 0)
+        pieces, form = [], "flac"
+        if not bits or channels > FLAC_CHANNELS or rate > FLAC_RATE:
+            bits, form = 0, "wav"
+            pieces.append(path.read_bytes())
+        for first in range(0, samples if bits else 0, PIECE_SECONDS * rate):
+            wanted = min(PIECE_SECONDS * rate, samples - first)
+            block = file.read(wanted, dtype="int32", always_2d=True)
+            if len(block) != wanted:
+                raise FaceDiffError(f"{path}: is cut short: {first + len(block)} of {samples} samples; copy it again")
+            stream = io.BytesIO()
+            soundfile.write(stream, block, rate, format="FLAC", subtype=f"PCM_{bits}")
+            pieces.append(stream.getvalue())
+    sound = Sound(0, tuple(map(len, pieces)), form, rate, channels, samples, bits)
+    return json.dumps(asdict(sound)).encode() + b"\n" + b"".join(pieces)
+
+
+# Zarr's files, made by the zarr package.
+
+
+def write_blob(out: Path, name: str, size: int, contents: Iterable[bytes]) -> ArrayFacts:
+    """Write an array of bytes, of which no more than a shard is in memory.
+
+    Args:
+        out: the packed corpus.
+        name: the array's name.
+        size: of all contents together.
+        contents: what it holds, in order.
+    """
+    chunks = max(1, min(BLOB_SHARD, size + BLOB_CHUNK - 1) // BLOB_CHUNK)
+    facts = ArrayFacts("uint8", size, 0, BLOB_CHUNK, chunks, ())
+    each, waiting, shard = BLOB_CHUNK * chunks, bytearray(), 0
+    for content in chain(contents, [b""]):
+        waiting += content
+        while len(waiting) >= each or (not content and waiting):
+            with atomic(out / name / shard_key(shard, 0)) as temporary:
+                temporary.write_bytes(encoded(facts, np.frombuffer(bytes(waiting[:each]), np.uint8)))
+            del waiting[:each]
+            shard += 1
+    return facts
+
+
+def encoded(facts: ArrayFacts, rows: npt.NDArray[Any] | None) -> bytes:
+    """A shard as Zarr writes it, with zeros after ``rows``; the array's ``zarr.json`` if ``rows`` is None."""
+    import zarr
+    from zarr.codecs import BloscCodec, Crc32cCodec
+    from zarr.storage import MemoryStore
+
+    each = facts.chunk * facts.chunks
+    width = (facts.width,) if facts.width else ()
+    files: dict[str, Any] = {}
+    itemsize = np.dtype(facts.dtype).itemsize
+    array: Any = zarr.create_array(
+        store=MemoryStore(files),
+        shape=(facts.rows if rows is None else each, *width),
+        shards=(each, *width),
+        chunks=(facts.chunk, *width),
+        dtype=facts.dtype,
+        compressors=[
+            # One block as large as the chunk: smaller ones take longer to decode, higher levels too.
+            BloscCodec(typesize=itemsize, cname="zstd", clevel=1, shuffle="shuffle", blocksize=facts.chunk_bytes),
+            Crc32cCodec(),
+        ],
+        fill_value=0,
+        config={"write_empty_chunks": True},
+    )
+    if rows is None:
+        return bytes(files[METADATA].to_bytes())
+    whole = np.zeros((each, *width), facts.dtype)
+    whole[: len(rows)] = rows
+    array[...] = whole
+    return bytes(files[shard_key(0, facts.width)].to_bytes())
+
+
+def group_metadata(record: Record) -> bytes:
+    """The group's ``zarr.json``."""
+    import zarr
+    from zarr.storage import MemoryStore
+
+    files: dict[str, Any] = {}
+    zarr.create_group(store=MemoryStore(files), attributes={RECORD: record.state()})
+    return bytes(files[METADATA].to_bytes())

@@ -1,0 +1,314 @@
+"""Reading a packed corpus: its small files as a folder, its clips as every data module reads them."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.audio import fit_length, open_sound, read_speech, to_speech
+from facediff.data.packed.layout import (
+    DAMAGED,
+    EXACT,
+    METADATA,
+    PIECE_SECONDS,
+    REMEDY,
+    STATE,
+    PackedClip,
+    Record,
+    read_record,
+)
+from facediff.data.packed.shards import ShardedArray, chunks_of
+from facediff.data.packed.stores import Folder, Store, address_of, open_store
+from facediff.data.storage import refuse_out_of_range, within
+from facediff.errors import FaceDiffError
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.arrays import ArrayStore
+from facediff.utils.files import atomic_folder, cache_dir
+from facediff.utils.jobs import processors
+
+Floats = npt.NDArray[np.float32]
+
+MOST_THREADS = 4
+"""Threads that decode the chunks of a window; more wait for memory."""
+
+
+class PackedCorpus:
+    """A packed corpus, opened.
+
+    Args:
+        source: its folder, or its address.
+
+    Raises:
+        FaceDiffError: if there is none, or its record is damaged.
+        MissingExtraError: if fsspec is needed and not installed.
+    """
+
+    def __init__(self, source: str | Path) -> None:
+        store = open_store(source)
+        if isinstance(store, Folder) and not (store.root / METADATA).is_file():
+            what = (
+                f"its packing was interrupted ({STATE} is there, {METADATA} is not); run the same `facediff data pack` "
+                f"again to continue it"
+                if (store.root / STATE).is_file()
+                else "no packed corpus; expected what `facediff data pack` writes"
+            )
+            raise FaceDiffError(f"{store.root}: {what}")
+        text = store.whole(METADATA)
+        self.source = store.source
+        self.record: Record = read_record(text, self.source)
+        self.identity = hashlib.sha256(text).hexdigest()[:40]
+        self.store: Store = open_store(source, self.identity)
+        self._arrays = {name: ShardedArray(self.store, name, facts) for name, facts in self.record.arrays.items()}
+
+    @property
+    def places(self) -> list[Path]:
+        """Folders that other machines must see to read it: its own, or none where it is at an address."""
+        return [] if address_of(self.source) else [Path(self.source)]
+
+    # Its small files.
+
+    @cached_property
+    def folder(self) -> Path:
+        """A folder on this machine with every file of the corpus but motion and speech, made on first use.
+
+        Raises:
+            FaceDiffError: if a file is not what was packed, or the cache cannot be written.
+        """
+        place = cache_dir() / "packed" / self.identity / "corpus"
+        if not place.is_dir():
+            try:
+                with atomic_folder(place) as made:
+                    self.write_files(made)
+            except FaceDiffError:
+                if not place.is_dir():  # else another process was quicker
+                    raise
+        return place
+
+    def write_files(self, folder: Path) -> None:
+        """Write every file of the corpus but motion and speech.
+
+        Raises:
+            FaceDiffError: if one is not what was packed.
+        """
+        for file in self.record.files.values():
+            content = self._arrays["files"].read(file.first, file.first + file.bytes).tobytes()
+            if hashlib.sha256(content).hexdigest() != file.sha256:
+                raise FaceDiffError(f"{self.source}: its file {file.path} is not what was packed; {DAMAGED}")
+            path = folder / file.path
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+
+    def templates(self) -> dict[str, Floats]:
+        """Neutral face (V, 3) of every identity, from the array."""
+        rows = self._arrays["templates"].read(0, len(self.record.identities))
+        return {name: row.reshape(-1, 3) for name, row in zip(self.record.identities, rows, strict=True)}
+
+    # Its clips: what ClipStorage asks for.
+
+    def names(self) -> list[str]:
+        """Every clip, sorted."""
+        return list(self.record.clips)
+
+    def open(self, name: str) -> PackedMotion:
+        """The motion of a clip; nothing is read yet."""
+        clip = self.record.clips[name]
+        return PackedMotion(self.source, self.record, clip, self._arrays[f"motion_{clip.coding}"])
+
+    def version(self, name: str) -> object:
+        """The same for all clips: that of the whole record, which holds the size of every shard."""
+        return self.identity
+
+    def speech(self, name: str, first: int, length: int, store: ArrayStore) -> Floats:
+        """Samples of a clip's speech at 16 kHz (length,), filled with zeros past its end.
+
+        Of speech that is 16 kHz mono only the streams that hold the samples are read. Any other is decoded as a whole
+        once and kept in ``store``, as that of a folder is.
+        """
+        sound = self.record.clips[name].sound
+        if sound.form == "flac" and sound.rate == SAMPLE_RATE and sound.channels == 1:
+            stop = min(first + length, sound.samples)
+            samples = self.samples(name, first, stop) if stop > first else np.zeros((0, 1), np.int32)
+            scale = np.float32(2.0 ** (1 - sound.bits))
+            return fit_length(samples[:, 0].astype(np.float32) * scale, length)
+        key = store.key("packed speech", SAMPLE_RATE, self.identity, name)
+        speech = store.get(key)
+        if speech is None:
+            speech = store.put(key, self.whole_speech(name))
+        return fit_length(np.array(speech[first : first + length], np.float32), length)
+
+    def whole_speech(self, name: str) -> Floats:
+        """All speech of a clip as 16 kHz mono (S,)."""
+        sound = self.record.clips[name].sound
+        if sound.form == "flac":
+            whole = self.samples(name, 0, sound.samples)
+            return to_speech(whole * np.float32(2.0 ** (1 - sound.bits)), sound.rate, self._speech_of(name))
+        with tempfile.TemporaryDirectory(prefix="facediff-") as folder:
+            path = Path(folder) / f"{name}.wav"
+            path.write_bytes(self.recording(name))
+            return read_speech(path)
+
+    def samples(self, name: str, first: int, stop: int) -> npt.NDArray[np.int32]:
+        """Samples ``first`` to ``stop`` of a clip (samples, channels) as they were recorded, whole numbers.
+
+        Raises:
+            FaceDiffError: if a stream is damaged, or not what the record says.
+        """
+        sound = self.record.clips[name].sound
+        each = PIECE_SECONDS * sound.rate
+        places = np.cumsum([sound.first, *sound.pieces])
+        found = np.empty((stop - first, sound.channels), np.int32)
+        for number in range(first // each, -(-stop // each)):
+            encoded = self._arrays["speech"].read(int(places[number]), int(places[number + 1])).tobytes()
+            expected = min(each, sound.samples - number * each)
+            piece = self._decoded(encoded, name, expected)
+            low, high = max(first, number * each), min(stop, number * each + expected)
+            found[low - first : high - first] = piece[low - number * each : high - number * each]
+        return found >> (32 - sound.bits)
+
+    def recording(self, name: str) -> bytes:
+        """The file of a recording that was kept as it was."""
+        sound = self.record.clips[name].sound
+        return self._arrays["speech"].read(sound.first, sound.first + sum(sound.pieces)).tobytes()
+
+    def _decoded(self, encoded: bytes, name: str, expected: int) -> npt.NDArray[np.int32]:
+        sound = self.record.clips[name].sound
+        with open_sound(io.BytesIO(encoded), self._speech_of(name)) as file:
+            declared = (file.format, file.frames, file.channels, file.samplerate)
+            wanted = ("FLAC", expected, sound.channels, sound.rate)
+            if declared == wanted:
+                piece: npt.NDArray[np.int32] = file.read(expected, dtype="int32", always_2d=True)
+                if len(piece) == expected:
+                    return piece
+        raise FaceDiffError(f"{self._speech_of(name)} is not what the record says; {REMEDY}")
+
+    def _speech_of(self, name: str) -> str:
+        return f"{self.source}: speech of clip {name}"
+
+
+class PackedMotion:
+    """The motion of one clip of a packed corpus.
+
+    Args:
+        source: the corpus, for messages.
+        record: of the corpus.
+        clip: the clip.
+        array: that holds its rows.
+    """
+
+    def __init__(self, source: str, record: Record, clip: PackedClip, array: ShardedArray) -> None:
+        self.source = source
+        self.record = record
+        self.clip = clip
+        self.array = array
+
+    @property
+    def frames(self) -> int:
+        """Stored frames."""
+        return self.clip.frames
+
+    def offsets(self, picks: Sequence[int], template: Floats) -> Floats:
+        """Offsets from the template of some frames; only the chunks that hold them are read.
+
+        Raises:
+            FaceDiffError: naming the clip and the chunk that is damaged.
+        """
+        picks = within(picks, self.frames)
+        motion = np.empty((len(picks), self.array.facts.width), np.float32)
+        wanted = chunks_of(picks, self.array.facts.chunk)
+        begin = self.clip.first // self.array.facts.chunk
+        tasks: list[tuple[int, memoryview]] = []
+        try:
+            for run in _neighbours(sorted(wanted)):
+                fetched = self.array.fetch(begin + run[0], begin + run[-1] + 1)
+                tasks += zip(run, fetched, strict=True)
+
+            def decode(task: tuple[int, memoryview]) -> None:
+                self._decode(begin + task[0], task[1], wanted[task[0]], motion)
+
+            threads = min(len(tasks), _threads())
+            if threads > 1:
+                list(_pool().map(decode, tasks))
+            else:
+                for task in tasks:
+                    decode(task)
+        except FaceDiffError as error:
+            raise FaceDiffError(f"clip {self.clip.name}: {error}") from error
+        offsets = motion.reshape(len(picks), -1, 3)
+        if self.clip.coding in EXACT:
+            refuse_out_of_range(offsets, picks, f"{self.source}: clip {self.clip.name}")
+            offsets -= template
+        return offsets
+
+    def _decode(self, number: int, encoded: memoryview, wanted: list[tuple[int, int]], motion: Floats) -> None:
+        """Decode a chunk, and write the rows that are wanted to their places."""
+        chunk = self.array.decode(number, encoded)
+        exact = np.dtype(self.clip.coding) if self.clip.coding in EXACT else None
+        step, bias = np.float32(self.record.step), chunk.dtype.type(self.record.bias)
+        places: dict[int, list[int]] = {}
+        for row, place in wanted:
+            places.setdefault(row, []).append(place)
+        row = chunk[0]  # summed up in place: whole numbers that wrap around, so that nothing is ever lost
+        for inner in range(max(places) + 1):
+            if inner:
+                row += chunk[inner]
+                row -= bias
+            for place in places.get(inner, ()):
+                if exact is None:
+                    np.multiply(row, step, out=motion[place], casting="unsafe")
+                else:
+                    with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused
+                        np.copyto(motion[place], row.view(exact), casting="same_kind")
+
+    def vertices(self) -> npt.NDArray[np.floating]:
+        """All frames as they were, bit for bit (T, V, 3), of a clip that was packed without loss."""
+        facts = self.array.facts
+        begin = self.clip.first // facts.chunk
+        rows = np.empty((self.frames, facts.width), facts.dtype)
+        stop = -(-self.frames // facts.chunk)
+        for number, encoded in enumerate(self.array.fetch(begin, begin + stop)):
+            chunk = self.array.decode(begin + number, encoded)
+            chunk[1:] -= chunk.dtype.type(self.record.bias)
+            np.cumsum(chunk, axis=0, dtype=chunk.dtype, out=chunk)
+            place = number * facts.chunk
+            rows[place : place + facts.chunk] = chunk[: self.frames - place]
+        return rows.view(np.dtype(self.clip.coding)).reshape(self.frames, -1, 3)
+
+
+def _neighbours(numbers: Sequence[int]) -> list[list[int]]:
+    """Numbers in groups of which each is one more than the one before."""
+    found: list[list[int]] = []
+    for number in numbers:
+        if found and found[-1][-1] == number - 1:
+            found[-1].append(number)
+        else:
+            found.append([number])
+    return found
+
+
+def _threads() -> int:
+    """Threads that may decode at the same time: processors that no other loader process uses."""
+    from torch.utils.data import get_worker_info
+
+    worker: Any = get_worker_info()
+    return max(1, min(MOST_THREADS, processors() // (1 if worker is None else worker.num_workers)))
+
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+
+def _pool() -> ThreadPoolExecutor:
+    """The threads of this process that decode; those of the process that it was forked from did not come along."""
+    if os.getpid() not in _pools:
+        _pools.clear()
+        _pools[os.getpid()] = ThreadPoolExecutor(_threads(), "facediff-packed")
+    return _pools[os.getpid()]

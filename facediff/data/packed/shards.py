@@ -1,0 +1,182 @@
+"""Chunks of a sharded array, each fetched and decoded for itself, within bounds that are known beforehand.
+
+The zarr package could read them as well. It would obey whatever codecs the metadata name, believe a chunk's own size,
+and take some milliseconds of event loop for each window, in threads that do not survive the forks of a data loader.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from functools import cached_property
+from threading import Lock, local
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.packed.layout import DAMAGED, METADATA, ArrayFacts, check_array_metadata
+from facediff.data.packed.stores import Range, Store
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.limits import LIMITS, brief
+
+MISSING = 2**64 - 1
+"""Offset and size of a chunk that a shard does not hold."""
+CHECKSUM = 4
+HEADER = struct.Struct("<BBBBIII")
+"""Of a Blosc buffer: two versions, flags, size of a number, bytes decoded, bytes of a block, bytes encoded."""
+
+
+class ShardedArray:
+    """Read access to an array of a packed corpus.
+
+    Args:
+        store: where it lies.
+        name: the array's name.
+        facts: what the record says of it.
+    """
+
+    def __init__(self, store: Store, name: str, facts: ArrayFacts) -> None:
+        self.store = store
+        self.name = name
+        self.facts = facts
+        self._indices: dict[int, npt.NDArray[np.uint64]] = {}
+        self._checked = False
+        self._reset()
+
+    def _reset(self) -> None:
+        self._lock, self._scratch = Lock(), local()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Locks do not go to other processes."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_lock", "_scratch", "_codecs")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make new ones."""
+        self.__dict__.update(state)
+        self._reset()
+
+    @cached_property
+    def _codecs(self) -> tuple[Any, Any]:
+        """Blosc and CRC-32C."""
+        try:
+            import google_crc32c
+            from numcodecs import blosc
+        except ImportError as error:
+            raise MissingExtraError("zarr", "packed", "reading a packed corpus") from error
+        # Its own threads would not survive a fork, and chunks are decoded in several threads already.
+        blosc.use_threads = False
+        return blosc, google_crc32c
+
+    def fetch(self, first: int, stop: int) -> list[memoryview]:
+        """The encoded bytes of chunks ``first`` to ``stop``, counted over the whole array.
+
+        Raises:
+            FaceDiffError: if a shard is missing, cut short or damaged.
+        """
+        if not self._checked:
+            check_array_metadata(
+                self.store.whole(f"{self.name}/{METADATA}"), f"{self.store.source}/{self.name}/{METADATA}", self.facts
+            )
+            self._checked = True
+        found: list[memoryview] = []
+        each = self.facts.chunks
+        for shard in range(first // each, -(-stop // each)):
+            low, high = max(first - shard * each, 0), min(stop - shard * each, each)
+            index = self._index(shard)
+            wanted: list[Range] = []
+            for number in range(low, high):
+                start, size = (int(value) for value in index[number])
+                if MISSING in (start, size) or start + size > self.facts.shards[shard]:
+                    raise self._damaged(shard * each + number, "is not there")
+                LIMITS.check("bytes", size, self._place(shard * each + number))
+                wanted.append((start, size))
+            found += self.store.ranges(self._key(shard), wanted)
+        return found
+
+    def decode(self, number: int, encoded: memoryview) -> npt.NDArray[Any]:
+        """A chunk (rows, width), or (rows,), in memory that the thread's next chunk overwrites.
+
+        Raises:
+            FaceDiffError: if its checksum or its size is not what it must be.
+        """
+        blosc, crc32c = self._codecs
+        body = encoded[:-CHECKSUM]
+        if len(encoded) < HEADER.size + CHECKSUM or crc32c.value(bytes(body)) != int.from_bytes(
+            encoded[-CHECKSUM:], "little"
+        ):
+            raise self._damaged(number, "its checksum is wrong")
+        _, _, _, _, decoded, _, size = HEADER.unpack_from(body)
+        if decoded != self.facts.chunk_bytes or size != len(body):
+            raise self._damaged(number, f"expands to {decoded} bytes instead of {self.facts.chunk_bytes}")
+        scratch = getattr(self._scratch, "chunk", None)
+        if scratch is None:
+            shape = (self.facts.chunk, self.facts.width) if self.facts.width else (self.facts.chunk,)
+            scratch = self._scratch.chunk = np.empty(shape, np.dtype(self.facts.dtype).newbyteorder("<"))
+        try:
+            blosc.decompress(body, scratch)
+        except Exception as error:  # RuntimeError, and others of the wrapper
+            raise self._damaged(number, brief(error)) from error
+        return scratch
+
+    def read(self, first: int, stop: int) -> npt.NDArray[Any]:
+        """Rows ``first`` to ``stop``."""
+        width = (self.facts.width,) if self.facts.width else ()
+        rows = np.empty((max(0, stop - first), *width), self.facts.dtype)
+        chunk = self.facts.chunk
+        numbers = range(first // chunk, -(-stop // chunk)) if stop > first else range(0)
+        for number, encoded in zip(numbers, self.fetch(numbers.start, numbers.stop), strict=True):
+            low, high = max(first, number * chunk), min(stop, (number + 1) * chunk)
+            rows[low - first : high - first] = self.decode(number, encoded)[
+                low - number * chunk : high - number * chunk
+            ]
+        return rows
+
+    def _index(self, shard: int) -> npt.NDArray[np.uint64]:
+        """Offset and size of every chunk of a shard (chunks, 2), read once."""
+        with self._lock:
+            known = self._indices.get(shard)
+        if known is not None:
+            return known
+        size, length = self.facts.shards[shard], 16 * self.facts.chunks + CHECKSUM
+        if size < length:
+            raise FaceDiffError(f"{self.store.source}/{self._key(shard)}: is shorter than its own index; {DAMAGED}")
+        (content,) = self.store.ranges(self._key(shard), [(size - length, length)])
+        body = bytes(content[:-CHECKSUM])
+        if self._codecs[1].value(body) != int.from_bytes(content[-CHECKSUM:], "little"):
+            raise FaceDiffError(
+                f"{self.store.source}/{self._key(shard)}: the checksum of its index is wrong; {DAMAGED}"
+            )
+        index = np.frombuffer(body, "<u8").reshape(-1, 2)
+        with self._lock:
+            self._indices[shard] = index
+        return index
+
+    def _key(self, shard: int) -> str:
+        return f"{self.name}/{shard_key(shard, self.facts.width)}"
+
+    def _place(self, number: int) -> str:
+        shard, inner = divmod(number, self.facts.chunks)
+        return f"{self.store.source}/{self._key(shard)}: chunk {inner}"
+
+    def _damaged(self, number: int, what: str) -> FaceDiffError:
+        return FaceDiffError(f"{self._place(number)} {what}; {DAMAGED}")
+
+
+def shard_key(shard: int, width: int) -> str:
+    """Where a shard lies below its array, by Zarr's default encoding of keys."""
+    return f"c/{shard}/0" if width else f"c/{shard}"
+
+
+def chunks_of(rows: Sequence[int], chunk: int) -> dict[int, list[tuple[int, int]]]:
+    """For each chunk the rows in it that are wanted, in order, with their place in the result.
+
+    Example:
+        >>> chunks_of(range(24, 27), 25)
+        {0: [(24, 0)], 1: [(0, 1), (1, 2)]}
+    """
+    found: dict[int, list[tuple[int, int]]] = {}
+    for place, row in enumerate(rows):
+        number, inner = divmod(row, chunk)
+        found.setdefault(number, []).append((inner, place))
+    return found

@@ -1,0 +1,291 @@
+"""Where the bytes of a packed corpus come from: a folder, or any address that fsspec knows, kept on disk once read."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from facediff.data.packed.layout import DAMAGED, METADATA, STATE
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.utils.files import atomic, cache_dir
+from facediff.utils.limits import brief
+
+VARIABLE = "FACEDIFF_PACKED_CACHE_GB"
+USUAL_GB = 50.0
+"""Gigabytes of disk that chunks read from addresses may take, unless the variable says otherwise."""
+TOUCHED = 3600.0
+"""Seconds after which reading a kept chunk marks it as used; marking it each time would cost a write each time."""
+ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(::|://)")
+
+Range = tuple[int, int]
+"""First byte and number of bytes."""
+
+
+def address_of(source: str | Path) -> str | None:
+    """A text, or a path made of one, as the address that it is; None for a path of this machine.
+
+    Example:
+        >>> address_of("https://lab.example/biwi.zarr"), address_of("data/biwi.zarr")
+        ('https://lab.example/biwi.zarr', None)
+        >>> address_of(Path("s3://bucket/biwi.zarr"))
+        's3://bucket/biwi.zarr'
+    """
+    text = str(source)
+    if isinstance(source, Path):  # which makes one slash of two
+        text = re.sub(r"^([A-Za-z][A-Za-z0-9+.-]+):/(?!/)", r"\1://", text)
+    return text if ADDRESS.match(text) else None
+
+
+def is_packed(source: str | Path) -> bool:
+    """Whether a corpus is packed: an address, or a folder with the metadata of Zarr (or whose packing has begun)."""
+    if address_of(source) is not None:
+        return True
+    folder = Path(source).expanduser()
+    return (folder / METADATA).is_file() or (folder / STATE).is_file()
+
+
+class Store(Protocol):
+    """Bytes by key."""
+
+    source: str
+
+    def whole(self, key: str) -> bytes:
+        """All bytes of a small object."""
+
+    def ranges(self, key: str, wanted: Sequence[Range]) -> list[memoryview]:
+        """Some ranges of an object."""
+
+
+def open_store(source: str | Path, identity: str = "") -> Store:
+    """The store of a packed corpus.
+
+    Args:
+        source: folder or address.
+        identity: what the kept chunks of an address are filed under; nothing is kept if empty.
+    """
+    address = address_of(source)
+    if address is not None:
+        return Remote(address, None if not identity else ChunkCache(cache_dir() / "packed", identity))
+    return Folder(Path(source).expanduser())
+
+
+class Folder:
+    """A packed corpus on a disk.
+
+    Args:
+        root: its folder.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.source = str(root)
+
+    def whole(self, key: str) -> bytes:
+        """All bytes of a file."""
+        path = self.root / key
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {DAMAGED}") from error
+
+    def ranges(self, key: str, wanted: Sequence[Range]) -> list[memoryview]:
+        """Ranges of a file, those that follow one another in one read."""
+        path = self.root / key
+        found: list[memoryview] = []
+        try:
+            with path.open("rb", buffering=0) as stream:
+                for run in runs(wanted):
+                    stream.seek(run[0][0])
+                    found += split(stream.read(sum(size for _, size in run)), run, path)
+        except OSError as error:
+            raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {DAMAGED}") from error
+        return found
+
+
+class Remote:
+    """A packed corpus at an address; what was read once is read from the disk afterwards.
+
+    Args:
+        address: of the group, as fsspec has it.
+        cache: keeps what was read; None keeps nothing.
+    """
+
+    def __init__(self, address: str, cache: ChunkCache | None) -> None:
+        self.source = address.rstrip("/")
+        self.cache = cache
+        self._system: Any = None
+        self._process = 0
+        self._base = ""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Connections do not go to other processes."""
+        return {**self.__dict__, "_system": None}
+
+    def whole(self, key: str) -> bytes:
+        """All bytes of an object."""
+        return bytes(self._fetch(key, None, None))
+
+    def ranges(self, key: str, wanted: Sequence[Range]) -> list[memoryview]:
+        """Ranges of an object: kept ones from the disk, the others fetched, neighbours in one request."""
+        found: dict[Range, memoryview] = {}
+        for each in dict.fromkeys(wanted):
+            kept = None if self.cache is None else self.cache.get(key, each)
+            if kept is not None:
+                found[each] = kept
+        for run in runs([each for each in dict.fromkeys(wanted) if each not in found]):
+            start, end = run[0][0], run[-1][0] + run[-1][1]
+            for each, part in zip(run, split(self._fetch(key, start, end), run, f"{self.source}/{key}"), strict=True):
+                found[each] = part
+                if self.cache is not None:
+                    self.cache.put(key, each, part)
+        return [found[each] for each in wanted]
+
+    def _fetch(self, key: str, start: int | None, end: int | None) -> bytes:
+        where = f"{self.source}/{key}"
+        system = self._connected()
+        try:
+            content: bytes = system.cat_file(f"{self._base}/{key}", start=start, end=end)
+        except FileNotFoundError as error:
+            raise FaceDiffError(f"{where}: there is no such object; check the address") from error
+        except Exception as error:  # every file system has its own exceptions
+            raise FaceDiffError(
+                f"{where}: cannot be read ({brief(error)}); check the address, the connection and your access to it"
+            ) from error
+        return content
+
+    def _connected(self) -> Any:  # noqa: ANN401 - fsspec has no types
+        # A connection belongs to the process that made it: loader processes, forks of this one, make their own.
+        if self._system is None or self._process != os.getpid():
+            try:
+                import fsspec
+            except ImportError as error:
+                raise MissingExtraError("fsspec", "packed", "reading a corpus from an address") from error
+            try:
+                self._system, self._base = fsspec.core.url_to_fs(self.source, skip_instance_cache=True)
+            except (ImportError, ValueError) as error:
+                raise FaceDiffError(
+                    f"{self.source}: cannot be opened ({brief(error)}); install what fsspec names, or correct the "
+                    f"address"
+                ) from error
+            self._process = os.getpid()
+        return self._system
+
+
+def runs(wanted: Sequence[Range]) -> list[list[Range]]:
+    """Ranges in groups of which each follows the one before without a gap.
+
+    Example:
+        >>> runs([(0, 4), (4, 2), (9, 1)])
+        [[(0, 4), (4, 2)], [(9, 1)]]
+    """
+    found: list[list[Range]] = []
+    for each in wanted:
+        if found and sum(found[-1][-1]) == each[0]:
+            found[-1].append(each)
+        else:
+            found.append([each])
+    return found
+
+
+def split(content: bytes, run: Sequence[Range], source: object) -> list[memoryview]:
+    """The bytes of a run of ranges, one view for each.
+
+    Raises:
+        FaceDiffError: if there are fewer bytes than asked for, or more, as of a server that ignores ranges.
+    """
+    if len(content) != sum(size for _, size in run):
+        raise FaceDiffError(
+            f"{source}: gave {len(content)} bytes instead of {sum(size for _, size in run)} from byte {run[0][0]} on; "
+            f"it is cut short, or the server does not answer requests for ranges"
+        )
+    view = memoryview(content)
+    return [view[start - run[0][0] : start - run[0][0] + size] for start, size in run]
+
+
+class ChunkCache:
+    """Ranges that were read from addresses, one file each, of which the least recently used are removed.
+
+    Several processes may use it at the same time; anything in it may be removed at any time.
+
+    Args:
+        folder: of all packed corpora.
+        identity: of this one.
+    """
+
+    def __init__(self, folder: Path, identity: str) -> None:
+        self.folder = folder
+        self.identity = identity
+        self.limit = limit_bytes()
+        # Looking through the folder costs time: it is done at first, and whenever a tenth of the limit was added.
+        self._unseen = self.limit
+
+    def _path(self, key: str, wanted: Range) -> Path:
+        return self.folder / self.identity / "chunks" / key.replace("/", ".") / f"{wanted[0]}-{wanted[1]}"
+
+    def get(self, key: str, wanted: Range) -> memoryview | None:
+        """The bytes of a range; None if they are not kept."""
+        if not self.limit:
+            return None
+        path = self._path(key, wanted)
+        try:
+            content = path.read_bytes()
+            if time.time() - path.stat().st_mtime > TOUCHED:
+                os.utime(path)
+        except OSError:
+            return None
+        return memoryview(content) if len(content) == wanted[1] else None
+
+    def put(self, key: str, wanted: Range, content: memoryview) -> None:
+        """Keep the bytes of a range, if the disk takes them."""
+        if not self.limit:
+            return
+        try:
+            with atomic(self._path(key, wanted)) as temporary:
+                temporary.write_bytes(content)
+        except FaceDiffError:  # a full or protected disk: reading goes on without
+            self.limit = 0.0
+            return
+        self._unseen += len(content)
+        if self._unseen > self.limit / 10:
+            self._unseen = 0.0
+            self.trim()
+
+    def trim(self) -> None:
+        """Remove the files that were not used for the longest time, until nine tenths of the limit are left."""
+        kept: list[tuple[float, int, str]] = []
+        for folder, _, names in os.walk(self.folder):
+            if Path(folder).parent.name == "chunks":
+                for name in names:
+                    try:
+                        facts = os.stat(os.path.join(folder, name))
+                    except OSError:  # another process has removed it
+                        continue
+                    kept.append((facts.st_mtime, facts.st_size, os.path.join(folder, name)))
+        total = sum(size for _, size, _ in kept)
+        if total <= self.limit:
+            return
+        for _, size, path in sorted(kept):
+            if total <= 0.9 * self.limit:
+                break
+            Path(path).unlink(missing_ok=True)
+            total -= size
+
+
+def limit_bytes() -> float:
+    """Bytes that the cache may take, as the environment says.
+
+    Raises:
+        FaceDiffError: if the variable is no number from 0 on.
+    """
+    text = os.environ.get(VARIABLE, str(USUAL_GB))
+    try:
+        limit = float(text)
+    except ValueError:
+        limit = -1.0
+    if not 0 <= limit < float("inf"):
+        raise FaceDiffError(f"{VARIABLE}={text}: not a valid size; expected gigabytes, 0 to keep nothing")
+    return limit * 1e9

@@ -1,0 +1,116 @@
+"""The corpus folder that a packed corpus holds."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from facediff.data.corpus import read_templates
+from facediff.data.manifest import read_manifest
+from facediff.data.packed.layout import EXACT
+from facediff.data.packed.reader import PackedCorpus
+from facediff.errors import FaceDiffError
+from facediff.utils.files import atomic_folder, describe_files
+from facediff.utils.jobs import PerWorker, WorkerDied, processors, run_tasks
+from facediff.utils.plain_files import write_json
+
+
+def unpack(
+    source: str | Path,
+    out: Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = "",
+    quiet: bool = True,
+) -> int:
+    """Write the corpus folder that was packed; returns the number of its clips.
+
+    Motion is what was packed within the tolerance, and bit for bit where it was packed without loss; speech has the
+    same samples, every other file the same bytes. Checksums in ``manifest.json`` are those of what is written.
+
+    Args:
+        source: folder or address of the packed corpus.
+        out: the folder to make.
+        workers: processes; as many as there are processors if None.
+        scheduler: where tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
+        quiet: no progress bar.
+
+    Raises:
+        FaceDiffError: if the packed corpus is damaged, or the folder cannot be written; nothing is left then.
+    """
+    packed = PackedCorpus(source)
+    with atomic_folder(out) as folder:
+        packed.write_files(folder)
+        for name in ("vertices_npy", "wav"):
+            (folder / name).mkdir(exist_ok=True)
+        work = PerWorker(partial(_clip_writer, str(source), folder))
+        results = run_tasks(
+            work,
+            packed.names(),
+            workers=workers,
+            scheduler=scheduler,
+            writes=folder,
+            reads=packed.places,
+            progress="" if quiet else "unpacking",
+        )
+        with closing(results):
+            for name, died in results:
+                if isinstance(died, WorkerDied):
+                    raise FaceDiffError(
+                        f"clip {name}: writing it killed its process, perhaps for lack of memory; try --workers 1"
+                    )
+        _correct_manifest(folder, packed, workers)
+    return len(packed.names())
+
+
+def _clip_writer(source: str, folder: Path) -> Any:  # noqa: ANN401 - a partial
+    packed = PackedCorpus(source)
+    templates = {
+        name: face.numpy() for name, face in read_templates(folder / "templates.pkl", packed.record.n_vertices).items()
+    }
+    return partial(_write_clip, packed, folder, templates)
+
+
+def _write_clip(packed: PackedCorpus, folder: Path, templates: dict[str, Any], name: str) -> None:
+    import soundfile
+
+    clip, motion = packed.record.clips[name], packed.open(name)
+    if clip.identity not in templates:
+        raise FaceDiffError(f"{packed.source}: no template of {clip.identity}, needed by clip {name}; pack it again")
+    if clip.coding in EXACT:
+        vertices = motion.vertices()
+    else:
+        template = templates[clip.identity]
+        # Added in double precision: the sum is rounded once, to the type that the folder had.
+        vertices = (motion.offsets(range(clip.frames), template).astype(np.float64) + template).astype(clip.dtype)
+    np.save(folder / "vertices_npy" / f"{name}.npy", vertices.reshape(len(vertices), -1), allow_pickle=False)
+    sound, path = clip.sound, folder / "wav" / f"{name}.wav"
+    if sound.form == "flac":
+        samples = packed.samples(name, 0, sound.samples) << (32 - sound.bits)
+        soundfile.write(path, samples, sound.rate, subtype=f"PCM_{sound.bits}", format="WAV")
+    else:
+        path.write_bytes(packed.recording(name))
+
+
+def _correct_manifest(folder: Path, packed: PackedCorpus, workers: int | None) -> None:
+    manifest = read_manifest(folder)
+    files = manifest.get("files")
+    if not isinstance(files, dict):
+        return
+    # Names are compared with those that were written, since an untrusted manifest may name files elsewhere.
+    ours = {*packed.record.files, *(name for clip in packed.names() for name in _places(clip))}
+    there = [name for name in files if name in ours]
+    written = describe_files(folder, there, workers=workers or processors(), progress="")
+    if written != files:
+        changed = {name: facts for name, facts in written.items() if facts != files.get(name)}
+        manifest["files"] = {**files, **written}
+        manifest["packed"] = {"tolerance_mm": packed.record.tolerance, "changed": len(changed)}
+        write_json(folder / "manifest.json", manifest)
+
+
+def _places(clip: str) -> tuple[str, str]:
+    return f"vertices_npy/{clip}.npy", f"wav/{clip}.wav"
