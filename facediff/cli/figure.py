@@ -6,11 +6,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from facediff.cli.options import File, FileOrList, Folder, FrameRate, Output, View, check_folders, named_folders
+from facediff.cli.options import (
+    File,
+    FileOrList,
+    Folder,
+    FrameRate,
+    Output,
+    Scheduler,
+    View,
+    Workers,
+    check_folders,
+    named_folders,
+)
 from facediff.cli.parsing import Option, refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.jobs import check_scheduler
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -180,6 +192,8 @@ def heatmap(
     highest_mean: Highest = None,
     highest_std: Highest = None,
     view: View = "front",
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     files: FileOptions,
     page: PageOptions,
 ) -> None:
@@ -192,14 +206,26 @@ def heatmap(
         highest_mean: end of the mean's scale in the unit shown
         highest_std: end of the standard deviation's scale
         view: camera
+        workers: clips read at a time (default: as many as processors)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         files: what is drawn.
         page: how it is printed.
     """
+    check_scheduler(scheduler)
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_heatmap
 
-    chosen, highest = material.choose(clips), (highest_mean, highest_std)
-    report(page.output, draw_heatmap(material, chosen, page.output, paper=paper, view=view, highest=highest))
+    notes = draw_heatmap(
+        material,
+        material.choose(clips),
+        page.output,
+        paper=paper,
+        view=view,
+        highest=(highest_mean, highest_std),
+        workers=workers,
+        scheduler=scheduler,
+    )
+    report(page.output, notes)
 
 
 def error(
@@ -211,6 +237,8 @@ def error(
     highest_mean: Highest = None,
     highest_max: Highest = None,
     view: View = "front",
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     files: FileOptions,
     page: PageOptions,
 ) -> None:
@@ -224,6 +252,8 @@ def error(
         highest_mean: end of the mean's scale in the unit shown
         highest_max: end of the maximum's scale
         view: camera
+        workers: clips read at a time (default: as many as processors)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         files: what is drawn.
         page: how it is printed.
     """
@@ -232,6 +262,7 @@ def error(
         highest_mean=statistic == "max" and highest_mean is not None,
         highest_max=statistic == "mean" and highest_max is not None,
     )
+    check_scheduler(scheduler)
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_error
 
@@ -243,6 +274,8 @@ def error(
         view=view,
         statistic=statistic,
         highest=(highest_mean, highest_max),
+        workers=workers,
+        scheduler=scheduler,
     )
     report(page.output, notes)
 

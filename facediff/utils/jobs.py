@@ -219,6 +219,28 @@ def run_tasks(
             step()
 
 
+def in_order(
+    results: Iterable[tuple[Task, Result | WorkerDied]], tasks: Sequence[Task]
+) -> Iterator[tuple[Task, Result]]:
+    """Results in the order of the tasks, for sums whose last digit depends on it; tasks are hashable and different.
+
+    Raises:
+        FaceDiffError: if a task killed its worker.
+
+    Example:
+        >>> list(in_order([("b", 2), ("a", 1)], ["a", "b"]))
+        [('a', 1), ('b', 2)]
+    """
+    early: dict[Task, Result] = {}
+    waiting = deque(tasks)
+    for task, result in results:
+        if isinstance(result, WorkerDied):
+            raise FaceDiffError(f"{task}: killed its process, perhaps for lack of memory; use fewer --workers")
+        early[task] = result
+        while waiting and waiting[0] in early:
+            yield waiting[0], early.pop(waiting.popleft())
+
+
 def _results(
     work: Callable[[Task], Result], tasks: Sequence[Task], workers: int, mode: Mode
 ) -> Generator[tuple[Task, Result | WorkerDied]]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -24,6 +26,7 @@ from facediff.evaluation.figures.page import (
     wrapped,
 )
 from facediff.utils import ranges
+from facediff.utils.jobs import in_order, run_tasks
 
 HIGHEST = 70.0  # Largest height of a picture in mm
 BAR, BAR_SPACE = 2.5, 16.0  # Width of a colour bar, and of the bar with its numbers and label, in mm
@@ -44,10 +47,18 @@ class VertexMap:
     frames: int
 
 
-def motion_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, VertexMap], list[str]]:
+def motion_maps(
+    material: Material, clips: Sequence[str], *, workers: int | None = None, scheduler: str | None = ""
+) -> tuple[dict[str, VertexMap], list[str]]:
     """How far each vertex is from the identity's template, over all frames of the clips, of truth and methods.
 
     Where lengths differ, the frames that all have are used, so that the panels of a figure are comparable.
+
+    Args:
+        material: the clips' files.
+        clips: names of clips.
+        workers: clips at a time; as many as processors, or workers of a cluster, if None. Digits do not depend on it.
+        scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
 
     Returns:
         a map by name, the truth's first; and notes on frames that were left out.
@@ -55,17 +66,27 @@ def motion_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, Ver
     Raises:
         FaceDiffError: if a file cannot be used or a template is missing.
     """
-
-    def distances(clip: str, name: str, motions: Mapping[str, Tensor], frames: int) -> Iterator[Array]:
-        template = material.template(clip)
-        for part in chunks(motions[name], material.path(clip, name), frames):
-            yield np.linalg.norm(part - template, axis=2)
-
-    return _vertex_maps(material, clips, material.names, distances)
+    return _vertex_maps(material, clips, material.names, _from_template, workers, scheduler)
 
 
-def error_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, VertexMap], list[str]]:
+def _from_template(
+    material: Material, clip: str, name: str, motions: Mapping[str, Tensor], frames: int
+) -> Iterator[Array]:
+    template = material.template(clip)
+    for part in chunks(motions[name], material.path(clip, name), frames):
+        yield np.linalg.norm(part - template, axis=2)
+
+
+def error_maps(
+    material: Material, clips: Sequence[str], *, workers: int | None = None, scheduler: str | None = ""
+) -> tuple[dict[str, VertexMap], list[str]]:
     """How far each vertex is from the truth's, over all frames of the clips, of every method.
+
+    Args:
+        material: the clips' files.
+        clips: names of clips.
+        workers: as of :func:`motion_maps`.
+        scheduler: likewise.
 
     Returns:
         a map by method; and notes on frames that were left out.
@@ -73,40 +94,75 @@ def error_maps(material: Material, clips: Sequence[str]) -> tuple[dict[str, Vert
     Raises:
         FaceDiffError: if a file cannot be used.
     """
+    return _vertex_maps(material, clips, list(material.methods), _from_truth, workers, scheduler)
 
-    def distances(clip: str, name: str, motions: Mapping[str, Tensor], frames: int) -> Iterator[Array]:
-        true = chunks(motions[TRUTH], material.path(clip, TRUTH), frames)
-        for one, other in zip(chunks(motions[name], material.path(clip, name), frames), true, strict=True):
-            yield np.linalg.norm(one - other, axis=2)
 
-    return _vertex_maps(material, clips, list(material.methods), distances)
+def _from_truth(
+    material: Material, clip: str, name: str, motions: Mapping[str, Tensor], frames: int
+) -> Iterator[Array]:
+    true = chunks(motions[TRUTH], material.path(clip, TRUTH), frames)
+    for one, other in zip(chunks(motions[name], material.path(clip, name), frames), true, strict=True):
+        yield np.linalg.norm(one - other, axis=2)
+
+
+Distances = Callable[[Material, str, str, Mapping[str, Tensor], int], Iterator[Array]]
+"""Distances (n, V) of a clip (its name, a method's name, all motions, frames), a few frames at a time."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What some frames in a row add to the statistics of every vertex."""
+
+    frames: int
+    mean: Array  # (V,)
+    squares: Array  # sum of squared deviations from the mean (V,)
+    maximum: Array  # (V,)
+
+
+def _parts(
+    material: Material, distances: Distances, names: Sequence[str], task: tuple[int, str]
+) -> tuple[str, list[list[_Part]]]:
+    """What a clip, numbered since it may be asked for twice, adds, by name; and a note on frames that are left out."""
+    _, clip = task
+    motions = material.open(clip)
+    frames, note = shortest(motions)
+    parts: list[list[_Part]] = []
+    for name in names:
+        parts.append([])
+        for values in distances(material, clip, name, motions, frames):
+            mean = values.mean(0)
+            parts[-1].append(_Part(len(values), mean, ((values - mean) ** 2).sum(0), values.max(0)))
+    return f"{clip}: {note}" if note else "", parts
 
 
 def _vertex_maps(
     material: Material,
     clips: Sequence[str],
     names: Sequence[str],
-    distances: Callable[[str, str, Mapping[str, Tensor], int], Iterator[Array]],
+    distances: Distances,
+    workers: int | None,
+    scheduler: str | None,
 ) -> tuple[dict[str, VertexMap], list[str]]:
-    """Statistics by name of the distances (n, V) that a function gives for a clip, a few frames at a time."""
+    """Statistics by name of the distances that a function gives for a clip."""
     count = dict.fromkeys(names, 0)
     mean, squares, maximum = ({name: np.zeros(material.n_vertices) for name in names} for _ in range(3))
     notes = []
-    for clip in clips:
-        motions = material.open(clip)
-        frames, note = shortest(motions)
-        notes += [f"{clip}: {note}"] if note else []
-        for name in names:
-            for values in distances(clip, name, motions, frames):
+    work = partial(_parts, material, distances, names)
+    reads = {material.path(clip, name).parent for clip in clips for name in material.names}
+    tasks = list(enumerate(clips))
+    results = run_tasks(work, tasks, workers=workers, mode="threads", scheduler=scheduler, reads=sorted(reads))
+    with closing(results):
+        for _, (note, parts) in in_order(results, tasks):
+            notes += [note] if note else []
+            for name, part in ((name, part) for name, some in zip(names, parts, strict=True) for part in some):
                 # Chan, Golub and LeVeque's update (1983) of mean and sum of squared deviations: exact to rounding for
                 # any number of frames, where a difference of sums of squares is not.
-                before, count[name] = count[name], count[name] + len(values)
-                new_mean = values.mean(0)
-                apart = new_mean - mean[name]
-                weight = len(values) / count[name]
-                squares[name] += ((values - new_mean) ** 2).sum(0) + apart**2 * (before * weight)
+                before, count[name] = count[name], count[name] + part.frames
+                apart = part.mean - mean[name]
+                weight = part.frames / count[name]
+                squares[name] += part.squares + apart**2 * (before * weight)
                 mean[name] += apart * weight
-                maximum[name] = np.maximum(maximum[name], values.max(0))
+                maximum[name] = np.maximum(maximum[name], part.maximum)
     maps = {
         name: VertexMap(mean[name], np.sqrt(squares[name] / max(count[name], 1)), maximum[name], count[name])
         for name in names
@@ -123,6 +179,8 @@ def draw_heatmap(
     paper: Paper | None = None,
     view: str = "front",
     highest: tuple[ranges.Factor | None, ranges.Factor | None] = (None, None),
+    workers: ranges.Workers | None = None,
+    scheduler: str | None = "",
 ) -> list[str]:
     """Draw mean and standard deviation over time of each vertex's distance from the template, truth and methods.
 
@@ -133,6 +191,8 @@ def draw_heatmap(
         paper: width, resolution and font.
         view: a name in :data:`facediff.render.VIEWS`.
         highest: ends of the colour scales of mean and deviation, in the unit shown; the largest value if None.
+        workers: clips read at a time; as of :func:`motion_maps`.
+        scheduler: likewise.
 
     Returns:
         notes on what was left out.
@@ -142,7 +202,7 @@ def draw_heatmap(
     """
     check_output(output)
     material.mesh(clips)  # refuses before the work
-    maps, notes = motion_maps(material, clips)
+    maps, notes = motion_maps(material, clips, workers=workers, scheduler=scheduler)
     rows: list[Row] = [
         ("mean of motion", {name: each.mean for name, each in maps.items()}, highest[0]),
         ("std of motion", {name: each.deviation for name, each in maps.items()}, highest[1]),
@@ -161,6 +221,8 @@ def draw_error(
     view: str = "front",
     statistic: Statistic = "mean",
     highest: tuple[ranges.Factor | None, ranges.Factor | None] = (None, None),
+    workers: ranges.Workers | None = None,
+    scheduler: str | None = "",
 ) -> list[str]:
     """Draw how far each vertex is from the truth's, mean or maximum over frames, a column for each method.
 
@@ -169,7 +231,7 @@ def draw_error(
     """
     check_output(output)
     material.mesh(clips)  # refuses before the work
-    maps, notes = error_maps(material, clips)
+    maps, notes = error_maps(material, clips, workers=workers, scheduler=scheduler)
     rows: dict[str, Row] = {
         "mean": ("mean error", {name: each.mean for name, each in maps.items()}, highest[0]),
         "max": ("maximum error", {name: each.maximum for name, each in maps.items()}, highest[1]),
