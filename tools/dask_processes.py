@@ -61,10 +61,10 @@ class DaskProcesses:
         search = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
         with (self.folder / f"log{len(self.programs)}.txt").open("wb") as log:
             program = subprocess.Popen(
-                [sys.executable, "-m", "dask", *words],
+                [sys.executable, "-m", "facediff.utils.tethered", "dask", *words],
                 cwd=self.folder,
                 env={**os.environ, "PYTHONPATH": search},
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,  # which ends it with this process
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
@@ -97,3 +97,5 @@ class DaskProcesses:
         with suppress(ProcessLookupError):
             os.killpg(program.pid, signal.SIGKILL)
         program.wait()
+        if program.stdin is not None:
+            program.stdin.close()

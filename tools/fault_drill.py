@@ -16,6 +16,8 @@ Ctrl-C), ``full`` (a disk with room for a part of what the command writes), ``de
 files that may not be read) and ``damage`` (cut, flipped, empty or grown inputs and earlier outputs). ``fit`` is killed
 and resumed by ``--ckpt_path last`` until it ends; its curve and weights must equal an uninterrupted run's bit for bit.
 
+With ``--dask``, every command that takes ``--scheduler`` does its tasks on a Dask cluster of two workers.
+
 Most runs are forks of a process that has imported everything, which saves seconds each; ``--real`` rounds of each
 command are processes of their own. The small disk is a tmpfs, in a user namespace if need be; where neither is allowed,
 a limit on the size of files (``RLIMIT_FSIZE``) takes its place, and the report says so. The exit status is 1 if any
@@ -45,7 +47,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
+from tools.dask_processes import DaskProcesses  # noqa: E402
 from tools.drill_commands import DRILLS, FIT, Drill, write_inputs  # noqa: E402
 
 COUNTS = ("lost", "corrupt", "wrong", "left over", "ill-mannered")
@@ -976,6 +979,9 @@ def options(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--fit-stops", type=int, default=10, metavar="N", help="SIGTERM or Ctrl-C of fit")
     parser.add_argument("--real", type=int, default=0, metavar="N", help="of these, in interpreters of their own")
     parser.add_argument("--only", action="append", metavar="TEXT", help="commands whose name contains this; repeatable")
+    parser.add_argument(
+        "--dask", action="store_true", help="tasks run on a Dask cluster of two workers on the loopback"
+    )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="commands drilled at a time")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table there as well")
@@ -987,8 +993,13 @@ def main(words: Sequence[str] | None = None) -> int:
     args = options(words)
     started = time.monotonic()
     import_everything()
-    with tempfile.TemporaryDirectory(prefix="fault-drill-") as name:
+    with tempfile.TemporaryDirectory(prefix="fault-drill-") as name, ExitStack() as stack:
         folder = Path(name)
+        if args.dask:
+            for library in ("distributed", "cloudpickle"):
+                importlib.import_module(library)
+            cluster = stack.enter_context(DaskProcesses(folder / "dask"))
+            os.environ["DASK_SCHEDULER_ADDRESS"] = cluster.address
         inputs = folder / "inputs"
         inputs.mkdir()
         separately({"inputs": lambda: make_inputs(inputs, folder)}, 1, folder)
