@@ -285,6 +285,8 @@ def run_folder(
                     else:
                         states[task.source] = "made", f"{outcome.seconds:.1f} s"
                         print(f"[{count}/{len(to_do)}] {printable(task.output)}, {outcome.seconds:.1f} s", flush=True)
+            if is_cluster(scheduler):
+                remove_partial(output)  # of a worker that was lost on another machine
         finally:
             for task in tasks:
                 if task.source not in states and (state := _state_after_stop(task)):

@@ -205,7 +205,7 @@ def connected(scheduler: str, workers: int | None, tasks: int) -> Iterator[Any]:
 
 def reason(error: BaseException) -> str:
     """What an error of Dask's says, in a few words."""
-    text = " ".join(str(error.__cause__ or error).split()) or type(error).__name__
+    text = re.sub(r"in <.*?>: ", "", " ".join(str(error.__cause__ or error).split())) or type(error).__name__
     return text if len(text) <= 120 else f"{text[:120]}…"
 
 

@@ -22,7 +22,7 @@ from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import run_batch
 from facediff.utils.files import atomic, check_writable, describe_files, locked, remove_partial, same_sizes
-from facediff.utils.jobs import processors
+from facediff.utils.jobs import is_cluster, processors
 from facediff.utils.plain_files import parse_json, write_json
 from facediff.utils.progress import progress_bar
 
@@ -187,6 +187,8 @@ def _write_all(
             else:
                 clips[job.name] = outcome.result
             step()
+    if is_cluster(places["scheduler"]):
+        remove_partial(out, recursive=True)  # of a worker that was lost on another machine
     names = [*shared, *(file.relative_to(out).as_posix() for name in clips for file in clip_files(out, name))]
     files = describe_files(out, names, workers=workers or processors(), progress="" if quiet else "checksums")
     manifest = _manifest(plan, clips, failed, files)
