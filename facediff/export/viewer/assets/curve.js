@@ -47,8 +47,7 @@ class Curve extends Plot {
     for (const line of this.lines) {
       pen.strokeStyle = colour(`--line-${line.number + 1}`);
       pen.beginPath();
-      // A frame's value is drawn in the middle of the time in which the frame is shown.
-      line.values.forEach((value, frame) => pen.lineTo(this.x((frame + 0.5) / this.facts.frameRate), y(value)));
+      line.values.forEach((value, frame) => pen.lineTo(this.x(frame / this.facts.frameRate), y(value)));
       if (line.values.length === 1) pen.lineTo(this.x(this.seconds), y(line.values[0]));
       pen.stroke();
     }

@@ -26,7 +26,8 @@ class Lane extends Plot {
       made.addEventListener("click", action);
       return made;
     };
-    head.append(make("b", "", name), make("span", "what", this.known.unit), this.now);
+    head.append(make("b", "", name), this.now);
+    if (this.known.unit) head.append(make("span", "what", this.known.unit));
     if (!this.known.preview) head.append(make("span", "mark", "shows after a new run"));
     const tools = make("span", "lane-tools");
     tools.append(
@@ -240,12 +241,6 @@ class Lane extends Plot {
     const at = keys.indexOf(this.editor.selected);
     const words = at < 0 ? `${keys.length} keys` : `key ${at + 1} of ${keys.length}: ${sayKey(keys[at])}`;
     this.canvas.setAttribute("aria-label", `${this.name}, ${words}`);
-  }
-
-  /** Keys have the time at which a frame begins to be shown: here the cursor stands there. */
-  point(frame) {
-    this.shown = frame;
-    this.cursor.style.transform = `translateX(${this.x(frame / this.facts.frameRate)}px)`;
   }
 
   /** What changes from frame to frame. */

@@ -54,9 +54,9 @@ class Plot {
     return Object.assign(pen, { wide, high, colour: (name) => style.getPropertyValue(name).trim() });
   }
 
-  /** Move the cursor to a frame: it stands in the middle of the time in which the frame is shown. */
+  /** Move the cursor to a frame: it stands at the time from which the frame is shown, where keys and values of it are. */
   point(frame) {
     this.shown = frame;
-    this.cursor.style.transform = `translateX(${this.x((frame + 0.5) / this.facts.frameRate)}px)`;
+    this.cursor.style.transform = `translateX(${this.x(frame / this.facts.frameRate)}px)`;
   }
 }
