@@ -252,7 +252,19 @@ class ControlledFace:
         return procedural.move_head(animation, turns, shifts)
 
     def _with_direction(self, animation: Animation) -> Animation:
-        """The direction in the metadata, unless the model has followed it already and it stands there."""
-        if self.direction is None or METADATA in animation.metadata:
+        """The direction in the metadata, next to what the animation was made with; that a model follows is there."""
+        if self.direction is None:
             return animation
-        return replace(animation, metadata={**animation.metadata, METADATA: self.direction.text()})
+        name, made = METADATA, self.direction
+        if METADATA in animation.metadata:
+            try:
+                before = Direction.parse(animation.metadata[METADATA], METADATA)
+            except FaceDiffError:  # of a file from elsewhere
+                return animation
+            if set(made.keys) <= set(before.keys):
+                return animation
+            if set(made.channels) & set(before.channels):  # both have changed it, one after the other
+                name = f"{METADATA}, afterwards"
+            else:
+                made = Direction((*before.keys, *made.keys), METADATA)
+        return replace(animation, metadata={**animation.metadata, name: made.text()})

@@ -14,6 +14,7 @@ import pytest
 
 import facediff
 from facediff.animation import read_archive
+from facediff.cli.app import main
 from facediff.data.audio import read_speech
 from facediff.editing.controls import AnimationControls
 from facediff.editing.direction import CHANNELS, METADATA, Direction, Key, read_direction, text_shares
@@ -262,13 +263,24 @@ def test_command_follows_keys(workplace: Path) -> None:
     metadata = read_archive(Path("a.npz")).metadata
     assert metadata["style"] == "F1_e03, M2_e05"
     assert "acting" in metadata["procedural"]
+
+
+def test_command_names_what_is_wrong_and_writes_nothing(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("keys.json").write_text(json.dumps({"keys": rows("brows", "high")}))
-    made = subprocess.run(
-        [*command, "--direction", "keys.json", "-o", "b.npz"], capture_output=True, text=True, timeout=120, check=False
-    )
-    assert made.returncode == 2
-    assert "keys.json: row 1: value" in made.stderr
+    command = ["animate", "speech.wav", "--checkpoint", "demo/puppet.ckpt", "-o", "b.npz", "--direction"]
+    for given, named in (("keys.json", "keys.json: row 1: value"), ("none.json", "--direction none.json")):
+        assert main([*command, given]) == 2
+        assert named in capsys.readouterr().err
     assert not Path("b.npz").exists()
+
+
+def test_directions_add_up_in_the_metadata(model: facediff.Animator, speech: np.ndarray) -> None:
+    first, second = rows("expressivity", 0.2, 0.9), rows("brows", 0, 2)
+    made = model.animate(speech, 16_000, direction=first, **QUICK)
+    both = made.control(direction=second)
+    assert {*Direction.parse(both.metadata[METADATA], "m").channels} == {"expressivity", "brows"}
+    again = both.control(direction=second)
+    assert again.metadata[METADATA] == both.metadata[METADATA]
 
 
 PAGE = (Path(__file__).parents[2] / "docs" / "direction.md").read_text(encoding="utf-8")

@@ -6,15 +6,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from lightning.pytorch import Trainer
 
 from facediff.data import Assets, Sample, collate
+from facediff.editing.direction import Direction
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, load_model
 from facediff.models.adaptation import with_extra_identities
 from facediff.models.styles import style_from
+from facediff.pipelines.animator import Animator
 from tests.fakes.tiny import RATE, SEEN, UNSEEN, VERTICES, Tiny
 from tests.models.conftest import no_dropout
 
@@ -161,6 +164,23 @@ def test_rows_of_training_identities_may_be_mixed(method: str, make_method: Make
     for wrong in ("A:0.3,D:0.7", "reference.npy"):
         with pytest.raises(FaceDiffError, match="--style"):
             style_from(wrong, "A", model)
+
+
+def test_rows_crossfade_along_keys(method: str, make_method: MakeMethod) -> None:
+    model = with_assets(make_method(method, **({"noised": "offsets"} if method == "FaceDiffuser" else {})))
+    animator, options = Animator(model), {"identity": "A", "voice_gate": "off"}
+    speech = 0.1 * torch.randn(16_000, generator=torch.Generator().manual_seed(2)).numpy()
+    keys = [{"time": 0.2, "channel": "style", "value": "A"}, {"time": 0.6, "channel": "style", "value": "B"}]
+    if not model.own_styles():
+        with pytest.raises(FaceDiffError, match="channel style"):
+            animator.animate(speech, 16_000, direction=keys, **options)
+        return
+    made = animator.animate(speech, 16_000, direction=keys, **options).vertices
+    plain = {name: animator.animate(speech, 16_000, style=name, **options).vertices for name in "AB"}
+    shares = Direction.parse(keys, "keys").shares("style", np.arange(len(made)) / model.frame_rate)
+    expected = sum(shares[name][:, None, None] * plain[name] for name in "AB")
+    np.testing.assert_allclose(made, expected, atol=1e-5)
+    np.testing.assert_array_equal(made[0], plain["A"][0])
 
 
 def test_a_further_identity_leaves_the_others_as_they_are(method: str, make_method: MakeMethod) -> None:

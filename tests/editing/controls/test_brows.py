@@ -1,0 +1,69 @@
+"""Where brows are: on the built-in face, on a mesh of another topology, and where a file says it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from facediff.animation import Animation
+from facediff.editing.brows import brows_of
+from facediff.editing.controls import AnimationControls
+from facediff.editing.direction import Direction, Key
+from facediff.errors import FaceDiffError
+from facediff.synthetic.corpus import rig_of
+from facediff.synthetic.face import build_face
+
+
+def size(field: np.ndarray) -> float:
+    return float(np.linalg.norm(field, axis=-1).max())
+
+
+def test_brows_of_the_built_in_face_are_those_of_its_rig(make_animation: Callable[..., Animation]) -> None:
+    raised = make_animation(1, inner_brow_up=0.5, outer_brow_up=0.5)
+    offsets = raised.vertices[0] - raised.template
+    found = brows_of(raised.template, raised.faces, raised.regions, "m")
+    np.testing.assert_allclose(found.up * size(offsets) / 0.001, offsets, atol=1e-6)
+    assert [size(found.up), size(found.down)] == pytest.approx([0.001, 0.001])
+    where = np.linalg.norm(found.down, axis=-1) > 0.0005
+    assert found.down[where, 1].max() < 0, "down they go"
+
+
+def test_a_file_says_where_they_are(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    animation = make_animation(1)
+    named = [int(each) for each in animation.regions["upper_face"][:20]]
+    file = tmp_path / "eyes.json"
+    file.write_text(json.dumps({"brows": named}))
+    keys = Direction([Key(0, "brows", 3.0)])
+    made = AnimationControls(direction=keys, eyes=file).apply(animation)
+    moved = made.vertices[0] - animation.vertices[0]
+    np.testing.assert_allclose(moved[named], np.tile([0, 0.003, 0], (20, 1)), atol=1e-6)
+    assert not moved[animation.regions["lips"]].any()
+    arrays = tmp_path / "eyes.npz"
+    np.savez(arrays, brows=np.array(named))
+    again = AnimationControls(direction=keys, eyes=arrays).apply(animation)
+    np.testing.assert_array_equal(again.vertices, made.vertices)
+
+
+def test_a_mesh_without_a_face_is_asked_for_them() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    with pytest.raises(FaceDiffError, match="brows"):
+        brows_of(ball.vertices, ball.faces, {}, "m")
+    with pytest.raises(FaceDiffError, match="brows"):
+        brows_of(ball.vertices, None, {}, "m")
+
+
+@pytest.mark.slow
+def test_brows_are_carried_to_another_topology() -> None:
+    """On a finer mesh in centimetres they are the rig's own, interpolated."""
+    rig = rig_of("F1")
+    fine = trimesh.Trimesh(rig.neutral, build_face().faces, process=False).subdivide()
+    found = brows_of(100 * fine.vertices, fine.faces, {}, "cm")
+    own = brows_of(rig.neutral, build_face().faces, {}, "m")
+    count = len(rig.neutral)
+    np.testing.assert_allclose(found.up[:count], 100 * own.up, atol=0.01)
+    assert size(found.up) == pytest.approx(0.1)
