@@ -64,8 +64,6 @@ class Features:
 
     def lips(self, vertices: Array, count: int) -> Indices:
         """Vertices (count, 2) of the upper and the lower lip along the mouth, without its corners."""
-        from scipy.spatial import cKDTree
-
         at = np.linspace(0, SAMPLES - 1, count + 4).round().astype(int)[2:-2]
         sides = []
         for curve, seeds, code in (
@@ -74,8 +72,24 @@ class Features:
         ):
             own = seeds[self.codes[seeds] == code]
             own = own if len(own) else seeds
-            sides.append(own[cKDTree(vertices[own]).query(curve[at])[1]])
-        return np.stack(sides, axis=1)
+            sides.append((own, np.linalg.norm(vertices[own][None] - curve[at][:, None], axis=2)))
+        (upper, above), (lower, below) = sides
+        return np.array([facing(vertices, upper, one, lower, two) for one, two in zip(above, below, strict=True)])
+
+
+CHOICE = 6  # So many of the nearest vertices of each lip may be a pair's
+
+
+def facing(vertices: Array, upper: Indices, above: Array, lower: Indices, below: Array) -> Indices:
+    """Of vertices (N,) and (M,) that lie away (N,) and (M,) from a place, the two that face each other there.
+
+    They are those that are nearest to one another as well: on a coarse mesh the very nearest ones may lie far apart.
+    """
+    one, two = (np.argsort(away, kind="stable")[:CHOICE] for away in (above, below))
+    gaps = np.linalg.norm(vertices[upper[one]][:, None] - vertices[lower[two]][None], axis=2)
+    total = gaps + above[one][:, None] + below[two][None]
+    row, column = np.unravel_index(total.argmin(), total.shape)
+    return np.array([upper[one[row]], lower[two[column]]])
 
 
 @dataclass(frozen=True)
@@ -458,6 +472,8 @@ def _ways_from(graph: csr_array, starts: Indices, offsets: Array, limit: float) 
 
 MOUTH_REACH, EYE_REACH = 0.8, 0.5
 """How far from an opening its sides are told apart, as a share of its width."""
+ASIDE = 0.3, 0.7
+"""An opening further away from where the mouth is expected, across and up in its widths, is an eye or a nostril."""
 OPEN_MOUTH, OPEN_EYE = (0.35, 0.12), (0.7, 0.35)
 """How far apart the sides of an opening may stand at rest, and how far behind them its inside begins, as shares of its
 width. A socket is a hollow: what is inside of an eye lies deeper than that."""
@@ -489,6 +505,10 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
     if mouth is None or skin is None:
         return None
     mouth = seen.completed(mouth, width)
+    if isinstance(expected, Features):
+        away = np.abs(mouth.centre - known.centre)[:2] / width
+        if (away > ASIDE).any():
+            return None
     width = mouth.width
     x, y, _ = mouth.centre
     eyes: list[Opening | None] = []

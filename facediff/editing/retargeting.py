@@ -19,7 +19,7 @@ from facediff.editing.correspondence import (
     placed,
     refuse_other_mesh,
 )
-from facediff.editing.face_features import sides_of_pairs
+from facediff.editing.face_features import facing, sides_of_pairs
 from facediff.editing.fit_check import check_fit
 from facediff.editing.landmarks import Landmarks, common_landmarks, known_topology, read_landmarks
 from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
@@ -208,9 +208,6 @@ def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]
     return made if len(made) else None
 
 
-CHOICE = 6  # So many of the nearest vertices of each lip may be a pair's
-
-
 def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]) -> Indices:
     """For each pair (P, 2) of facing vertices of the source, a pair of the target's.
 
@@ -223,19 +220,16 @@ def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer])
     side = (correspondence.weights * sides[correspondence.corners]).sum(axis=1)
     rest = correspondence.similarity.inverse().apply(correspondence.target_vertices)
     made = np.empty((len(pairs), 2), np.int64)
-    for row, (upper, lower) in enumerate(np.asarray(pairs)):
-        chosen, costs = [], []
-        for vertex, sign in ((upper, 1.0), (lower, -1.0)):
-            away = np.linalg.norm(shown - source.vertices[vertex], axis=1)
-            # Lips touch at rest: a vertex of the other lip is nearer than none, but never nearer than one of the same.
-            away = away + source.size * (sign * side <= 0) + source.size * (correspondence.share <= 0)
-            near = np.argsort(away, kind="stable")[:CHOICE]
-            chosen.append(near)
-            costs.append(away[near])
-        gaps = np.linalg.norm(rest[chosen[0]][:, None] - rest[chosen[1]][None], axis=2)
-        total = gaps + costs[0][:, None] + costs[1][None]
-        one, two = np.unravel_index(total.argmin(), total.shape)
-        made[row] = chosen[0][one], chosen[1][two]
+    every = np.arange(len(rest))
+    for row, ends in enumerate(np.asarray(pairs)):
+        # Lips touch at rest: a vertex of the other lip is nearer than none, but never nearer than one of the same.
+        above, below = (
+            np.linalg.norm(shown - source.vertices[vertex], axis=1)
+            + source.size * (sign * side <= 0)
+            + source.size * (correspondence.share <= 0)
+            for vertex, sign in zip(ends, (1.0, -1.0), strict=True)
+        )
+        made[row] = facing(rest, every, above, every, below)
     return made
 
 

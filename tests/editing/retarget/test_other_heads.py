@@ -12,6 +12,7 @@ import trimesh
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
+from facediff.editing import face_features
 from facediff.editing.correspondence import Correspondence, correspond
 from facediff.editing.face_features import LOWER_LIP, UPPER_LIP, find_features
 from facediff.editing.fit_check import check_fit
@@ -19,7 +20,8 @@ from facediff.editing.retargeting import carry
 from facediff.mesh import Mesh
 from facediff.mesh.mesh import triangle_areas
 from facediff.synthetic.arkit import puppet_shapes
-from tests.fakes.heads import FAMILY, Head, talking
+from facediff.synthetic.rig import Shape
+from tests.fakes.heads import FAMILY, INTERIOR, Head, person, sealed_lips, talking
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +71,18 @@ def test_the_lips_of_the_puppet_are_found_without_being_told(animation: Animatio
     assert [eye is not None and eye.centre[:2] == pytest.approx([x, 0.0255], abs=0.003) for eye, x in zip(
         seen.eyes, (-0.032, 0.032), strict=True
     )] == [True, True]  # fmt: skip
+
+
+def test_an_eye_is_no_mouth(animation: Animation, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mask with holes for eyes and one skin over its mouth, laid so that the holes are about where the mouth is."""
+    seen = find_features(animation.template.astype(np.float64), animation.triangles.astype(np.int64))
+    assert seen is not None
+    vertices, faces = sealed_lips(*person(Shape(), *INTERIOR, "teeth", "eyeball", "pupil", "lid_inner", "ear"))
+    assert find_features(vertices, faces, seen) is None
+    moved = vertices + [0.01, seen.mouth.centre[1] - 0.0255, 0.0]
+    assert find_features(moved, faces, seen) is None
+    monkeypatch.setattr(face_features, "ASIDE", (9.0, 9.0))
+    assert find_features(moved, faces, seen) is not None
 
 
 def test_wrecks_are_named(animation: Animation) -> None:
