@@ -99,8 +99,7 @@ def correspond(
         marks.check(len(source.vertices), len(target.vertices))
     if source.vertices.shape == target.vertices.shape and np.array_equal(source.faces, target.faces):
         return _vertex_by_vertex(source, target)
-    if _volume(target) * _volume(source) < 0:  # triangles that run the other way round turn a mesh inside out
-        target = Surface(target.vertices, np.ascontiguousarray(target.faces[:, ::-1]))
+    target = run_alike(source, target)
     face = target if shown is None else Surface(target.vertices, target.faces[np.asarray(shown, np.int64)])
     back, features, seen = placed(source, face, marks)
     both = known = None if features is None or seen is None else (features, seen)
@@ -189,6 +188,13 @@ def _one_surface(source: Surface, laid: Surface) -> bool:
     some = used if len(used) <= 500 else np.random.default_rng(0).choice(used, 500, replace=False)
     there = nearest(source, laid.vertices[some], laid.normals[some], 0.0)
     return bool(np.median(there.distances) < SAME * source.size)
+
+
+def run_alike(source: Surface, target: Surface) -> Surface:
+    """The target with triangles that run round the same way as the source's; others turn a mesh inside out."""
+    if _volume(target) * _volume(source) >= 0:
+        return target
+    return Surface(target.vertices, np.ascontiguousarray(target.faces[:, ::-1]))
 
 
 def _volume(surface: Surface) -> float:

@@ -66,11 +66,10 @@ All but two are the vertices that SAiD publishes for the 68 landmarks of iBUG 30
 of the nose are vertices of the middle of the published template (github.com/yfeng95/DECA, ``data/head_template.obj``):
 the one that reaches furthest forward below the mouth, and the one at the height of the inner corners of the eyes. In
 that template left and right are mirror images of one another, and the others lie in its middle.
-"""
 
-UNPUBLISHED = {23370: "BIWI", 6172: "Multiface"}
-"""Topologies by their vertices for which no list of landmarks is published; Multiface's authors say that there is none
-(github.com/facebookresearch/multiface, issue 21). What their shape shows is found (:func:`landmarks_by_shape`)."""
+No list was found for BIWI (23370 vertices), and Multiface's authors say that there is none for theirs
+(github.com/facebookresearch/multiface, issue 21): of these meshes, :func:`landmarks_by_shape` finds what it can.
+"""
 
 
 def puppet_landmarks() -> dict[str, int]:

@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 
 from facediff.animation import Animation
+from facediff.editing.landmarks import puppet_landmarks
 from facediff.synthetic.face import EYE_CENTRE, build_face
 from facediff.synthetic.rig import CONTROLS, Shape, build_rig, lip_pairs
 
@@ -283,6 +284,25 @@ def whole_avatar() -> Head:
         hair=cleaned(shell, np.array(hair.faces)[keep[hair.faces].all(axis=1)]),
     )
     return laid(head, 100.0, turned(90, 0, 0), (0, 0, 150))
+
+
+def lower_face() -> Head:
+    """A mask that ends below the eyes, in another unit and far from any usual pose: it needs landmarks."""
+    vertices, faces = person(YOUNG, *INTERIOR, "teeth", "eyeball", "pupil", "lid_inner", "ear")
+    kept = (vertices[:, 2] > 0.03) & (vertices[:, 1] > -0.1) & (vertices[:, 1] < 0.005)
+    vertices, faces = cleaned(vertices, faces[kept[faces].all(axis=1)])
+    return laid(Head(*finer(vertices, faces)), 3.0, turned(20, 140, 0))
+
+
+LOWER_MARKS = ("chin", "mouth_corner_left", "mouth_corner_right", "nose_base", "upper_lip_top", "lower_lip_bottom")
+"""Landmarks that :func:`lower_face` shows."""
+
+
+def lower_face_marks(head: Head) -> dict[str, int]:
+    """The vertices of the head's named places: those nearest to the person's own."""
+    places = 3.0 * build_rig(YOUNG).neutral @ turned(20, 140, 0).T
+    found = puppet_landmarks()
+    return {name: int(np.linalg.norm(head.vertices - places[found[name]], axis=1).argmin()) for name in LOWER_MARKS}
 
 
 FAMILY: dict[str, Callable[[], Head]] = {

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.editing.correspondence import placed
+from facediff.editing.correspondence import placed, run_alike
 from facediff.editing.face_features import Features
 from facediff.editing.landmarks import (
     FORMAT,
@@ -36,8 +36,7 @@ from facediff.errors import FaceDiffError
 from facediff.export.format import outward
 from facediff.export.viewer.packing import Blobs, bounds, millimetres
 from facediff.export.viewer.page import assemble
-from facediff.mesh import Mesh
-from facediff.render.meshes import face_outward
+from facediff.mesh import Mesh, Similarity
 from facediff.utils.server import (
     OwnPagesOnly,
     RefusedError,
@@ -102,12 +101,15 @@ def picking_page(picking: Picking) -> list[str]:
     """The text of the page in pieces, in order. It loads nothing, and talks to its own server only."""
     source, target = picking.source, picking.target
     rest: Array = np.asarray(source.template, np.float64)
-    faces = source.triangles.astype(np.int64)
-    corners = face_outward(target.faces, target.vertices)
-    shown = (corners if picking.shown is None else corners[picking.shown]).astype(np.int64)
-    back, features, seen = placed(Surface(rest, faces), Surface(target.vertices, shown))
+    goal = Surface(rest, outward(source).astype(np.int64))
+    moved = run_alike(goal, Surface(target.vertices, target.faces.astype(np.int64)))
+    shown = moved.faces if picking.shown is None else moved.faces[picking.shown]
+    back, features, seen = placed(goal, Surface(target.vertices, shown))
+    if features is not None and not _as_wide(features, seen):
+        # No mouth is where the alignment expects it: a person knows best how the mesh lies in its file.
+        seen, back = None, _as_in_its_file(rest, target.vertices, shown)
     laid = back.apply(target.vertices)
-    known = known_landmarks(rest, faces)
+    known = known_landmarks(rest, goal.faces)
     of_target = known_topology(target.vertices)
     suggested = landmarks_by_shape(laid, shown, seen) if seen is not None and of_target is None else {}
     blobs = Blobs()
@@ -117,13 +119,13 @@ def picking_page(picking: Picking) -> list[str]:
             points.astype(np.float32)[None],
             points.astype(np.float32),
             25.0,
-            faces=triangles,
+            faces=triangles.astype(np.int32),
             unit=source.unit,
             colours=colours,
         )
         for name, points, triangles, colours in (
-            (picking.names[0], rest, source.triangles, source.colours),
-            (picking.names[1], laid, corners, target.colours),
+            (picking.names[0], rest, goal.faces, source.colours),
+            (picking.names[1], laid, moved.faces, target.colours),
         )
     ]
     facts = {
@@ -136,8 +138,10 @@ def picking_page(picking: Picking) -> list[str]:
         "suggested": suggested,
         "start": [] if picking.start is None else as_rows(picking.start),
         "sides": {
-            side: _side(animation, features, blobs)
-            for side, animation in zip(("source", "target"), animations, strict=True)
+            side: _side(animation, found, blobs)
+            for side, animation, found in zip(
+                ("source", "target"), animations, (features, features if seen is not None else None), strict=True
+            )
         },
     }
     return assemble(
@@ -151,13 +155,28 @@ def picking_page(picking: Picking) -> list[str]:
     )
 
 
+ALIKE = 0.4, 2.5  # widths of the mouth of a mesh that is laid well, in the source's
+
+
+def _as_wide(features: Features, seen: Features | None) -> bool:
+    return seen is not None and ALIKE[0] < seen.mouth.width / features.mouth.width < ALIKE[1]
+
+
+def _as_in_its_file(rest: Array, points: Array, faces: npt.NDArray[np.integer]) -> Similarity:
+    """A mesh with its own axes, as large as the source and in its place."""
+    low, high = points[np.unique(faces)].min(axis=0), points[np.unique(faces)].max(axis=0)
+    scale = float(np.ptp(rest, axis=0).max() / max((high - low).max(), np.finfo(float).tiny))
+    middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
+    return Similarity(np.eye(3), middle - scale * 0.5 * (low + high), scale)
+
+
 ABOUT = 1.5, 1.9, 0.55
 """Half width and half height of what is shown of a face, and how far its middle lies above the mouth's; in widths of
 the mouth."""
 
 
 def _side(animation: Animation, features: Features | None, blobs: Blobs) -> dict[str, Any]:
-    """One mesh, laid like the source, in mm."""
+    """One mesh, laid like the source, in mm; all of it is shown where no face was found."""
     scale = millimetres(animation)
     points = np.asarray(animation.template, np.float64) * scale
     whole_centre, whole_extent = bounds(animation)
@@ -174,7 +193,7 @@ def _side(animation: Animation, features: Features | None, blobs: Blobs) -> dict
         "name": animation.name,
         "vertices": len(points),
         "template": blobs.add(points.astype("<f4").tobytes()),
-        "faces": blobs.add(outward(animation).astype("<u4").tobytes()),
+        "faces": blobs.add(animation.triangles.astype("<u4").tobytes()),
         "colours": None if animation.colours is None else blobs.add(animation.colours.astype(np.uint8).tobytes()),
         "centre": centre,
         "extent": extent,

@@ -12,6 +12,7 @@ from trimesh.creation import icosphere
 
 from facediff.editing import retargeting
 from facediff.editing.correspondence import correspond
+from facediff.editing.fit_check import FitReport, check_fit
 from facediff.editing.landmarks import (
     FLAME,
     FLAME_VERTICES,
@@ -29,9 +30,10 @@ from facediff.editing.landmarks import (
 from facediff.editing.surface import Surface, nearest
 from facediff.editing.symmetry import Plane, symmetry_plane
 from facediff.errors import FaceDiffError
+from facediff.mesh import Mesh
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import Shape, build_rig, lip_pairs
-from tests.fakes.heads import LONG, ROUND, STRONG, YOUNG, talking, turned
+from tests.fakes.heads import LONG, ROUND, STRONG, YOUNG, lower_face, lower_face_marks, talking, turned
 
 FACE = build_face()
 
@@ -249,3 +251,26 @@ def test_named_landmarks_of_both_topologies_are_tried_where_the_result_is_refuse
         retargeting.retarget(animation, target, None, tmp_path / "own.csv", judge=lambda *_: None)
     assert given[0] is not None
     assert given[0].nearest_vertices.tolist() == [[124, 5]]
+
+
+@pytest.mark.slow
+def test_six_landmarks_cure_a_mask_that_is_refused_without() -> None:
+    head, animation = lower_face(), talking()
+    marks, mine = lower_face_marks(head), puppet_landmarks()
+    pairs = np.array([[mine[name], vertex] for name, vertex in marks.items()])
+
+    def report(landmarks: np.ndarray | None) -> FitReport:
+        found = correspond(animation.template, animation.triangles, head.vertices, head.faces, landmarks=landmarks)
+        return check_fit(animation, retargeting.carry(animation, found, Mesh(head.vertices, head.faces)), found)
+
+    assert not report(None).good
+    found = report(pairs)
+    assert found.good
+    assert found.lip_ratio is not None
+    assert found.lip_ratio < 0.2
+
+
+def test_the_manual_lists_the_names_with_their_vertices() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "own_mesh.md").read_text(encoding="utf-8")
+    for name, words in NAMES.items():
+        assert f"| `{name}` | {words} | {puppet_landmarks()[name]} | {FLAME[name]} |" in page

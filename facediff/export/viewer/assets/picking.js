@@ -104,7 +104,7 @@ class Side {
       });
     }
     for (const button of this.root.querySelectorAll("[data-turn]")) {
-      button.addEventListener("click", () => this.quarter(Number(button.dataset.turn)));
+      button.addEventListener("click", (event) => this.rotate(Number(button.dataset.turn), event.shiftKey ? 15 : 90));
     }
   }
 
@@ -137,14 +137,15 @@ class Side {
     Object.assign(this.cross.style, { left: `${100 * this.at[0]}%`, top: `${100 * this.at[1]}%` });
   }
 
-  /** Turn the mesh by a quarter about an axis through the middle of the whole mesh. */
-  quarter(axis) {
+  /** Turn the mesh by some degrees about an axis through the middle of the whole mesh. */
+  rotate(axis, degrees) {
     const [one, two] = [(axis + 1) % 3, (axis + 2) % 3];
     const { centre, extent } = this.facts.whole;
+    const c = Math.cos((degrees * Math.PI) / 180), s = Math.sin((degrees * Math.PI) / 180);
     const turn = (p) => {
       const a = p[one] - centre[one], b = p[two] - centre[two];
-      p[one] = centre[one] - b;
-      p[two] = centre[two] + a;
+      p[one] = centre[one] + c * a - s * b;
+      p[two] = centre[two] + s * a + c * b;
       return p;
     };
     const { positions } = this.face;
@@ -154,7 +155,8 @@ class Side {
     const normal = sub(turn([x + centre[0], y + centre[1], z + centre[2]]), centre);
     this.facts.plane = [...normal, dot(normal, origin)];
     this.facts.centre = turn([...this.facts.centre]);
-    for (const box of [extent, this.facts.extent]) [box[one], box[two]] = [box[two], box[one]];
+    for (let k = 0; k < 3; k++) extent[k] = 0;
+    for (let i = 0; i < positions.length; i++) extent[i % 3] = Math.max(extent[i % 3], Math.abs(positions[i] - centre[i % 3]));
     const whole = this.root.querySelector("[data-action=whole]");
     whole.setAttribute("aria-pressed", "true"); // where the face is now shows on the whole mesh
     this.frame(true);
