@@ -340,7 +340,9 @@ def tree(folder: Path) -> dict[str, str]:
 def fingerprint(path: Path) -> str:
     """A hash of a file's content without what a clock has written into it."""
     data = path.read_bytes()
-    if path.suffix == ".csv":
+    if path.suffix == ".log":
+        data = b""  # a diary of all runs, the interrupted ones too
+    elif path.suffix == ".csv":
         data = without_times(data)
     elif path.suffix == ".ckpt":
         with suppress(Exception):  # a damaged one is compared by its bytes
@@ -354,7 +356,19 @@ def fingerprint(path: Path) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
 
 
-CLOCKS = {"time", "seconds", "sec", "created", "date", "started", "modified", "throughput", "duration", "versions"}
+CLOCKS = {
+    "time",
+    "seconds",
+    "sec",
+    "created",
+    "date",
+    "started",
+    "modified",
+    "throughput",
+    "duration",
+    "versions",
+    "memory",
+}
 """Words in the names of what differs between two equal runs."""
 
 
