@@ -6,12 +6,12 @@ A packed corpus is a Zarr (version 3) group. Its attribute ``facediff`` is the r
   chunk, so that a window is read without any other clip. ``int16`` and ``int32`` hold offsets from the speaker's
   template in steps of twice the tolerance; ``float16``, ``float32`` and ``float64`` the bits of absolute vertices, for
   lossless packing. In each chunk the first row is stored as it is, and every further row as its difference from the
-  row before plus ``bias``, in whole numbers that wrap around.
+  row before, in whole numbers that wrap around.
 - ``templates``, (identities, 3V): the neutral faces, float32.
 - ``speech``, (bytes,): FLAC streams of at most ten seconds, so that a window of a long recording is decoded alone.
 - ``files``, (bytes,): every other file of the corpus folder as it was.
 
-All are sharded, and their chunks are compressed by Blosc (zstd after a byte shuffle) and end in a CRC-32C: ordinary
+All are sharded, and their chunks are compressed by Blosc (zstd after a bit shuffle) and end in a CRC-32C: ordinary
 codecs of Zarr, so that any of its implementations reads them.
 """
 
@@ -45,8 +45,6 @@ CODINGS: dict[str, Type] = {**QUANTISED, **EXACT}
 """Type of the stored whole numbers by the coding of a motion array."""
 ROOM = 250.0
 """Millimetres that offsets stored in 16 bits can reach at least; else they take 32."""
-BIAS = 128
-"""Added to differences. Most then lie in 0 … 255, and their upper bytes are all zero, whatever their sign."""
 SHARD_BYTES = 64 << 20
 """Bytes of a shard before compression, about: some twelve megabytes as an object in a store."""
 BLOB_CHUNK = 1 << 16
@@ -152,7 +150,6 @@ class Record:
         frame_rate: stored motion frames a second.
         tolerance: millimetres by which a coordinate may differ from what was packed; 0 for lossless packing.
         step: what one step of the stored offsets is, in the corpus's unit; 0 for lossless packing.
-        bias: added to differences from the row before.
         unit: the corpus's unit of length.
         chunk_seconds: length of a chunk, as asked.
         identities: rows of ``templates``.
@@ -167,7 +164,6 @@ class Record:
     frame_rate: float
     tolerance: float
     step: float
-    bias: int
     unit: str
     chunk_seconds: float
     identities: tuple[str, ...] = ()
@@ -274,7 +270,6 @@ def _record(plain: dict[str, Any], checks: _Checks) -> Record:
         frame_rate=checks.number(plain, "frame_rate", 0.1, 1000.0),
         tolerance=checks.number(plain, "tolerance", 0, 1e6),
         step=checks.number(plain, "step", 0, 1e6),
-        bias=checks.whole(plain, "bias", 0, 2**15),
         unit=checks.text(plain, "unit"),
         chunk_seconds=checks.number(plain, "chunk_seconds", 0, 1e6),
         identities=tuple(checks.text({"identity": name}, "identity") for name in identities),

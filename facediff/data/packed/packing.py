@@ -20,7 +20,6 @@ from facediff.data.audio import open_sound
 from facediff.data.corpus import read_templates
 from facediff.data.manifest import read_manifest
 from facediff.data.packed.layout import (
-    BIAS,
     BLOB_CHUNK,
     BLOB_SHARD,
     CODINGS,
@@ -61,6 +60,8 @@ FINEST = 0.001
 BITS = {"PCM_16": 16, "PCM_24": 24, "PCM_S8": 16, "PCM_U8": 16}
 """Bits of FLAC samples that hold those of a recording exactly, by the recording's form."""
 FLAC_CHANNELS, FLAC_RATE = 8, 655_350
+BLOCK = 1 << 20
+"""Bytes that are compressed together."""
 FRAMES = 8  # that are quantised at a time
 REMEDY = "run `facediff data check` on the folder, and correct or remove the clip"
 
@@ -284,7 +285,6 @@ class Plan:
             frame_rate=rate,
             tolerance=tolerance,
             step=step,
-            bias=BIAS,
             unit=named,
             chunk_seconds=chunk_seconds,
             identities=tuple(sorted(templates)),
@@ -299,7 +299,7 @@ class Plan:
         record = self.record
         return {
             **{name: getattr(record, name) for name in ("made_by", "corpus", "n_vertices", "frame_rate")},
-            **{name: getattr(record, name) for name in ("tolerance", "unit", "chunk_seconds", "bias")},
+            **{name: getattr(record, name) for name in ("tolerance", "unit", "chunk_seconds")},
             "clips": {name: [clip.coding, clip.frames] for name, clip in record.clips.items()},
         }
 
@@ -462,7 +462,7 @@ def _write(out: Path, root: Path, record: Record, task: Task) -> None:
             rows[last:padded] = rows[last - 1]  # which compresses to nothing
         for first in range(0, len(rows), facts.chunk):
             chunk = rows[first : first + facts.chunk]
-            chunk[1:] = chunk[1:] - chunk[:-1] + chunk.dtype.type(record.bias)
+            chunk[1:] = chunk[1:] - chunk[:-1]
         content = encoded(facts, rows)
     with atomic(out / task.target) as temporary:
         temporary.write_bytes(content)
@@ -583,8 +583,16 @@ def encoded(facts: ArrayFacts, rows: npt.NDArray[Any] | None) -> bytes:
         chunks=(facts.chunk, *width),
         dtype=facts.dtype,
         compressors=[
-            # One block as large as the chunk: smaller ones take longer to decode, higher levels too.
-            BloscCodec(typesize=itemsize, cname="zstd", clevel=1, shuffle="shuffle", blocksize=facts.chunk_bytes),
+            # Of differences the upper bits are all alike and the lowest are noise: sorted by bits, most of what zstd
+            # sees is either one byte repeated or kept as it is, and decodes in three quarters of the time that bytes
+            # sorted by place take. Smaller blocks and higher levels take longer, for the same size.
+            BloscCodec(
+                typesize=itemsize,
+                cname="zstd",
+                clevel=1,
+                shuffle="bitshuffle",
+                blocksize=min(facts.chunk_bytes, BLOCK),
+            ),
             Crc32cCodec(),
         ],
         fill_value=0,

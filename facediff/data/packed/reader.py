@@ -253,7 +253,7 @@ class PackedMotion:
         """Decode a chunk, and write the rows that are wanted to their places."""
         chunk = self.array.decode(number, encoded)
         exact = np.dtype(self.clip.coding) if self.clip.coding in EXACT else None
-        step, bias = np.float32(self.record.step), chunk.dtype.type(self.record.bias)
+        step = np.float32(self.record.step)
         places: dict[int, list[int]] = {}
         for row, place in wanted:
             places.setdefault(row, []).append(place)
@@ -261,7 +261,6 @@ class PackedMotion:
         for inner in range(max(places) + 1):
             if inner:
                 row += chunk[inner]
-                row -= bias
             for place in places.get(inner, ()):
                 if exact is None:
                     np.multiply(row, step, out=motion[place], casting="unsafe")
@@ -277,7 +276,6 @@ class PackedMotion:
         stop = -(-self.frames // facts.chunk)
         for number, encoded in enumerate(self.array.fetch(begin, begin + stop)):
             chunk = self.array.decode(begin + number, encoded)
-            chunk[1:] -= chunk.dtype.type(self.record.bias)
             np.cumsum(chunk, axis=0, dtype=chunk.dtype, out=chunk)
             place = number * facts.chunk
             rows[place : place + facts.chunk] = chunk[: self.frames - place]

@@ -70,7 +70,6 @@ RECORD = "attributes.facediff"
         (RECORD, "n_vertices", 25),
         (RECORD, "step", "0.1"),
         (RECORD, "step", float("nan")),
-        (RECORD, "bias", -1),
         (RECORD, "clips", {}),
         (RECORD, "arrays", []),
         (RECORD, "identities", [3]),

@@ -121,7 +121,7 @@ def test_zarr_reads_the_same_numbers(corpus: Path, packed: Path) -> None:
         begins = np.arange(len(rows)) % motion.chunks[0] == 0
         steps = np.zeros_like(rows)
         for t in range(len(rows)):  # the definition, as the documentation has it
-            steps[t] = rows[t] if begins[t] else steps[t - 1] + rows[t] - record["bias"]
+            steps[t] = rows[t] if begins[t] else steps[t - 1] + rows[t]
         steps = steps.astype(np.int16)
         face = faces[record["identities"].index(clip["identity"])]
         vertices = steps.reshape(len(rows), -1, 3) * record["step"] + face
