@@ -139,6 +139,17 @@ def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
     return None
 
 
+def share_folder(loggers: Sequence[Logger]) -> None:
+    """Let TensorBoard write into the folder that the first logger makes for a new run, if both count runs in one place.
+
+    Each logger takes the first number that is free when it is asked: the second would find the first one's folder.
+    """
+    for logger in loggers[1:]:
+        same = (logger.save_dir, logger.name) == (loggers[0].save_dir, loggers[0].name)
+        if isinstance(logger, TensorBoardLogger) and same and getattr(logger, "_version", None) is None:
+            logger._version = loggers[0].version
+
+
 def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any], words: Sequence[str]) -> bool:
     """Prepare the trainer's loggers; whether a run is continued in its folder.
 

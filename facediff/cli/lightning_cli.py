@@ -15,6 +15,7 @@ import urllib.request
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from traceback import walk_tb
 from typing import Annotated, Any, NoReturn
@@ -32,7 +33,7 @@ from omegaconf import OmegaConf
 from facediff import registry
 from facediff.callbacks import EpochLines, GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
-from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, resumable
+from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, resumable, share_folder
 from facediff.cli.configs import guard_configs
 from facediff.cli.trainer_options import explained, raised_in, sentence_of
 from facediff.data import SpeechMotionDataModule
@@ -289,11 +290,15 @@ class FaceDiffCLI(LightningCLI):
 
         Raises:
             ArgumentError: if the name is not that of a folder below that of all runs.
+            MissingExtraError: if a logger's package is not installed.
         """
         name = self._get(self.config, "name")
         if not name or not name.isprintable() or os.path.isabs(name) or ".." in Path(name).parts:
             raise ArgumentError({"name": name}, "expected the name of a folder for the runs", located=True)
-        settle_wandb_mode(self.config[str(self.subcommand)].trainer)
+        trainer = self.config[str(self.subcommand)].trainer
+        if logger_options(trainer, "TensorBoardLogger") is not None and not find_spec("tensorboard"):
+            raise MissingExtraError("tensorboard", "tensorboard", "logging to TensorBoard")
+        settle_wandb_mode(trainer)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:  # noqa: ANN401
         """Make the trainer; a callback of the config replaces the built-in one of its class."""
@@ -329,6 +334,8 @@ class FaceDiffCLI(LightningCLI):
         self.model.check_training(resumed=bool(content))
         if continue_run(trainer, path, content, sys.argv):
             self.config[str(self.subcommand)].ckpt_path = None  # the config that is saved describes the whole run
+        else:
+            share_folder(trainer.loggers)
         if path is not None:
             warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
             self.config_init[str(self.subcommand)].ckpt_path = str(path) if content else None
@@ -425,7 +432,7 @@ def settle_wandb_mode(trainer: Mapping[str, Any]) -> None:
     """
     from lightning.pytorch.utilities import rank_zero_only
 
-    options = wandb_options(trainer)
+    options = logger_options(trainer, "WandbLogger")
     if options is None or getattr(rank_zero_only, "rank", None):  # other processes of a run log nothing
         return
     try:
@@ -456,11 +463,11 @@ def settle_wandb_mode(trainer: Mapping[str, Any]) -> None:
     )
 
 
-def wandb_options(trainer: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Options of the first logger that is a WandbLogger; None if there is none."""
+def logger_options(trainer: Mapping[str, Any], kind: str) -> Mapping[str, Any] | None:
+    """Options of the first logger whose class has this name; None if there is none."""
     loggers = trainer.get("logger")
     for logger in loggers if isinstance(loggers, list) else [loggers]:
-        if str(getattr(logger, "class_path", "")).endswith("WandbLogger"):
+        if str(getattr(logger, "class_path", "")).endswith(kind):
             return dict(getattr(logger, "init_args", None) or {})
     return None
 

@@ -50,11 +50,43 @@ def check_trainer(options: Mapping[str, Any]) -> None:
         expected = mismatch(hint, options[name]) if name in options else None
         if expected is not None:
             raise ArgumentError({f"trainer.{name}": options[name]}, f"expected {expected}", located=True)
+    check_machine(options)
     devices, most = options.get("devices"), max(8, PROCESSES * (os.cpu_count() or 1))
     if options.get("accelerator") in ("cpu", "auto") and str(devices).isdecimal() and int(str(devices)) > most:
         raise ArgumentError(
             {"trainer.devices": devices},
             f"that many processes would be started; expected at most {most} on this machine's {os.cpu_count()} cores",
+            located=True,
+        )
+
+
+SHARDED = ("fsdp", "deepspeed", "modelparallel")
+"""What the names of strategies contain that spread one model over GPUs."""
+
+
+def check_machine(options: Mapping[str, Any]) -> None:
+    """Refuse GPUs that are not there, and strategies that need them.
+
+    Raises:
+        ArgumentError: naming the option.
+    """
+    import torch
+
+    accelerator, strategy = options.get("accelerator"), options.get("strategy")
+    if accelerator in ("gpu", "cuda") and not torch.cuda.is_available() and not torch.backends.mps.is_available():
+        raise ArgumentError(
+            {"trainer.accelerator": accelerator},
+            "this machine has no GPU that PyTorch can use; give --trainer.accelerator=cpu, or look at `nvidia-smi` and "
+            "at the build of PyTorch",
+            located=True,
+        )
+    path = strategy if isinstance(strategy, str) else getattr(strategy, "class_path", None) or type(strategy).__name__
+    name = str(path).rpartition(".")[2]
+    sharded = any(word in name.lower().replace("_", "") for word in SHARDED)
+    if sharded and (accelerator == "cpu" or not torch.cuda.is_available()):
+        raise ArgumentError(
+            {"trainer.strategy": name},
+            "spreads a model over GPUs, and this run has none; give --trainer.strategy=ddp, which needs none",
             located=True,
         )
 

@@ -112,6 +112,7 @@ class Bench:
         self.make_data = partial(Fake, root=str(args.root))
         self.budget = args.max_frames
         self.args = args
+        self.device = torch.device(getattr(args, "device", "cpu"))
         torch.manual_seed(0)
         tiny: dict[str, Any] = {"num_hidden_layers": 3, "num_attention_heads": 2, "hidden_size": 32}
         tiny |= {"intermediate_size": 64, "conv_dim": (16,) * 7, "num_conv_pos_embeddings": 16}
@@ -130,7 +131,7 @@ class Bench:
         )
         data = self.make_data()
         self.model.adopt(data.assets().with_motion_scale(data.motion_scale()))
-        self.model.train()
+        self.model.to(self.device).train()
         if not dropout:
             self._drop_nothing()
         self._optimizers: dict[bool, torch.optim.Optimizer] = {}
@@ -176,17 +177,22 @@ class Bench:
         for clip in data.clips("train"):
             audio = features.add(data.corpus, clip)
             if audio is not None:
-                features.put(clip, encoder.frozen_features(audio[None], torch.tensor([len(audio)]))[0][0])
+                lengths = torch.tensor([len(audio)], device=self.device)
+                features.put(clip, encoder.frozen_features(audio[None].to(self.device), lengths)[0][0].cpu())
         return features
 
     def step(self, way: Way) -> tuple[int, int]:
         """One training step with its batch read; clips and frames of it."""
-        batch = next(self.batches(way))
-        steps = self.model.process.draw_steps(len(batch), torch.device("cpu"))
+        return self.step_with(way, next(self.batches(way)))
+
+    def step_with(self, way: Way, batch: Batch) -> tuple[int, int]:
+        """One training step; clips and frames of its batch."""
+        batch = batch.to(self.device)
+        steps = self.model.process.draw_steps(len(batch), self.device)
         shape = batch.motion.flatten(2).shape
         self._compile(way.compiled)
-        noise = unit_noise(shape, torch.device("cpu")) if way.one_pass else torch.randn(shape)
-        with torch.autocast("cpu", torch.bfloat16, enabled=way.mixed):
+        noise = unit_noise(shape, self.device) if way.one_pass else torch.randn(shape, device=self.device)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=way.mixed):
             compute = self.model.losses_at if way.one_pass else self.one_by_one
             loss = compute(batch, steps, noise)["loss"]
         loss.backward()
@@ -196,6 +202,11 @@ class Bench:
         optimizer.step()
         optimizer.zero_grad()
         return len(batch), int(batch.frame_lengths.sum())
+
+    def finish(self) -> None:
+        """Wait until the device has done what it was given."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
 
     def _compile(self, wanted: bool) -> None:
         """What the callback CompiledTraining does, or the undoing of it."""
@@ -226,6 +237,7 @@ def in_turn(bench: Bench, ways: list[Way], rounds: int, clips: int) -> dict[str,
             for _ in range(1 if way.budget else clips):
                 start, busy = time.perf_counter(), time.process_time()
                 many, frames = bench.step(way)
+                bench.finish()
                 seconds = time.perf_counter() - start
                 if turn:
                     row["clips"] += many
