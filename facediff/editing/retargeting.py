@@ -26,6 +26,7 @@ from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, Similarity, read_mesh
+from facediff.mesh.flame import rotations
 from facediff.mesh.parts import named_triangles
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
@@ -129,6 +130,7 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh) ->
     )
     refuse_other_mesh("target mesh", target.vertices, target.faces, found.target_vertices, found.target_faces)
     animation.refuse_not_finite()
+    head, animation = animation.head, animation.still()
     rest = np.asarray(target.vertices, np.float64)
     neutral = np.asarray(animation.template, np.float64)
     vertices = np.empty((len(animation.vertices), len(rest), 3), np.float32)
@@ -136,9 +138,11 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh) ->
     for first in range(0, len(vertices), step):
         some = slice(first, first + step)
         vertices[some] = rest + carry_displacements(found, np.asarray(animation.vertices[some], np.float64) - neutral)
+    head = None if head is None else _carried_head(vertices, rest, head, found)
     return Animation(
         name=animation.name,
         vertices=vertices,
+        head=head,
         template=rest.astype(np.float32),
         frame_rate=animation.frame_rate,
         faces=np.asarray(target.faces, np.int32),
@@ -153,6 +157,27 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh) ->
             "carried": f"from a mesh of {len(neutral)} vertices to one of {len(rest)} by nearest points of its surface",
         },
     )
+
+
+NECK = 0.5  # Below a head, its motion as a whole fades over this share of the source's height: a body stands still
+
+
+def _carried_head(vertices: npt.NDArray[np.float32], rest: Array, head: Array, found: Correspondence) -> Array | None:
+    """Move vertices (T, V, 3) as a head does, eyes and hair included; the motion (T, 6), if all of them move so."""
+    own = found.similarity
+    turns = head[:, :3] @ own.rotation.T  # axes turn with the mesh
+    matrices = rotations(turns)
+    shifts = own.scale * head[:, 3:] @ own.rotation.T + own.translation - matrices @ own.translation
+    height = own.inverse().apply(rest)[:, 1]
+    low, high = found.source_vertices[:, 1].min(), found.source_vertices[:, 1].max()
+    share = np.clip(1.0 + (height - low) / (NECK * (high - low)), 0.0, 1.0)
+    whole = bool((share == 1).all())
+    for frame, matrix, shift, motion in zip(vertices, matrices, shifts, head, strict=True):
+        if motion.any():
+            moved = frame @ matrix.T + shift
+            frame[:] = moved if whole else frame + share[:, None] * (moved - frame)
+    shifts[~head.any(axis=1)] = 0.0
+    return np.concatenate([turns, shifts], axis=1) if whole else None
 
 
 def carry_displacements(correspondence: Correspondence, displacements: npt.NDArray[np.floating]) -> Array:

@@ -6,19 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from facediff.animation import Animation, read_archive, write_archive
 from facediff.cli.app import main
+from facediff.editing.correspondence import correspond
 from facediff.editing.face_features import find_features
 from facediff.editing.loose_pieces import loose_pieces
+from facediff.editing.retargeting import carry
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError
-from facediff.mesh import read_mesh
+from facediff.mesh import Mesh, read_mesh
 from facediff.mesh.glb_scene import placed_parts
 from facediff.mesh.parts import mesh_parts, named_triangles
 from tests.editing.retarget.test_avatar_round_trip import opened
 from tests.fakes.avatar import avatar_parts, write_avatar
-from tests.fakes.heads import joined, talking
+from tests.fakes.heads import joined, talking, turned
 
 OBJ = """v 0 0 0
 v 1 0 0
@@ -143,3 +146,35 @@ def test_a_whole_avatar_talks(
     assert np.ptp(lower, axis=0) == pytest.approx(0, abs=1e-6)
     assert np.linalg.norm(lower[0]) > 0.006
     assert moved["Tongue"] == pytest.approx(np.tile(lower[0], (len(moved["Tongue"]), 1)), abs=1e-6)
+
+
+def test_a_swaying_head_takes_its_parts_along_and_leaves_the_body(animation: Animation) -> None:
+    """Eyes and hair stand still on a head that stands still, and not in a head that turns."""
+    face = (np.float64(animation.template), animation.triangles.astype(np.int64))
+    box = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    low = face[0][:, 1].min()
+    hull = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]])
+    both = joined(
+        face=face, hat=(0.1 * box + [0, 0.15, 0], hull), body=(0.2 * box * [1, 0.5, 1] + [0, low - 0.5, 0], hull)
+    )
+    turn = turned(0, 0, 90)
+    points = 100 * both.vertices @ turn.T + [5.0, 0, 2]
+    head = np.zeros((2, 6))
+    head[1] = [0.0, 0.05, 0.02, 0.001, 0.0, 0.002]
+    matrix = Rotation.from_rotvec(head[1, :3]).as_matrix()
+    still = np.repeat(animation.template[None], 2, axis=0)
+    moved = still.copy()
+    moved[1] = still[1] @ matrix.T + head[1, 3:]
+    swaying = Animation("sway", moved, animation.template, 25.0, faces=animation.triangles, head=head)
+    found = correspond(*face, points, both.faces)
+    made = carry(swaying, found, Mesh(points, both.faces.astype(np.int32)))
+    expected = 100 * (both.vertices @ matrix.T + head[1, 3:]) @ turn.T + [5.0, 0, 2]
+    upper = slice(0, len(face[0]) + 8)
+    assert made.vertices[1, upper] == pytest.approx(expected[upper], abs=0.01)
+    assert made.vertices[1, upper.stop :] == pytest.approx(points[upper.stop :], abs=1e-5)
+    assert made.vertices[0] == pytest.approx(points, abs=1e-5)
+    assert made.head is None
+    some = Mesh(points[upper], both.faces[: -2 * len(hull) + len(hull)].astype(np.int32))
+    alone = carry(swaying, correspond(*face, some.vertices, some.faces), some)
+    assert alone.vertices[1] == pytest.approx(expected[upper], abs=0.01)
+    assert alone.still().vertices[1] == pytest.approx(points[upper], abs=1e-4)
