@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -274,6 +275,13 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def words_of(self, clip: Clip) -> str:
         """What a clip says: clips of which it is equal have the same words, so that they can be aligned in time."""
         return clip.words
+
+    def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]] | None:
+        """What gives further speech (S,) at 16 kHz by number, without motion; None if there is no more, as here.
+
+        An audio encoder may learn from it to hear more than the corpus's sentences (:mod:`facediff.models.hearing`).
+        """
+        return None
 
     def default_reference(self, clips: list[Clip]) -> Clip:
         """The one of an identity's clips whose style is used when no other is chosen."""

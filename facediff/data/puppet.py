@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -15,6 +18,7 @@ from facediff.data.corpus import Clip
 from facediff.data.datamodule import Count, SpeechMotionDataModule
 from facediff.mesh import Mesh
 from facediff.synthetic.face import build_face
+from facediff.synthetic.further_speech import further_speech
 from facediff.synthetic.rig import eyelid_pairs
 from facediff.synthetic.speakers import MOST_DRAWN, drawn_names
 from facediff.utils.files import cache_dir
@@ -115,6 +119,10 @@ class Puppet(SpeechMotionDataModule):
         if not seen:
             return None
         return "train" if clip.number in puppet.TRAIN_SENTENCES else "val"
+
+    def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]]:
+        """Words in random order by the speakers who are trained on."""
+        return partial(further_speech, identities=tuple(self.identities))
 
     def default_reference(self, clips: list[Clip]) -> Clip:
         """A clip in neutral mood."""

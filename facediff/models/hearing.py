@@ -25,7 +25,6 @@ from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.augmentation import Augmenter, Example, OfSpeech, read_augmentations
-from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
 from facediff.models.base import AnimationModel
 from facediff.models.layers import frame_mask
@@ -61,6 +60,8 @@ class HearingOptions:
         steps: training steps.
         batch_size: clips in a step.
         share: of the clips that are changed; the others are to sound as they did.
+        further: how many pieces of further speech are heard besides the clips, where the corpus has such
+            (:meth:`facediff.data.SpeechMotionDataModule.further_speech`); as often as the clips.
         moved: how far the weights go from the old ones (0) to those that were learnt (1).
         learning_rate: the highest; it rises over the first twentieth of the steps and falls as a cosine.
         seed: of all that is drawn.
@@ -71,6 +72,7 @@ class HearingOptions:
     steps: int = USUAL_VOICE_STEPS
     batch_size: int = 12
     share: float = 0.65
+    further: int = 1200
     moved: float = 0.85
     learning_rate: float = 1e-3
     seed: int = 0
@@ -110,7 +112,7 @@ def learn_voices(
         raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
     teacher = copy.deepcopy(student).eval().requires_grad_(False)
     before = [weight.detach().clone() for weight in weights]
-    pairs = _Pairs(data.corpus, data.clips("train"), Augmenter(augmentations), options)
+    pairs = _Pairs(data, Augmenter(augmentations), options)
     workers = min(options.workers, processors() - 1)
     loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
     optimiser = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.01)
@@ -169,8 +171,11 @@ class _Pairs(Dataset[tuple[Tensor, Tensor, Tensor]]):
     A batch follows from its number and the seed, whatever process makes it.
     """
 
-    def __init__(self, corpus: Corpus, clips: list[Clip], augmenter: Augmenter, options: HearingOptions) -> None:
-        self.corpus, self.clips, self.augmenter, self.options = corpus, clips, augmenter, options
+    def __init__(self, data: SpeechMotionDataModule, augmenter: Augmenter, options: HearingOptions) -> None:
+        # Not the data module itself, which may hold what no other process can be given.
+        self.corpus, self.clips, self.further = data.corpus, data.clips("train"), data.further_speech()
+        self.augmenter, self.options = augmenter, options
+        self._said: dict[int, npt.NDArray[np.float32]] = {}
 
     def __len__(self) -> int:
         """Number of batches."""
@@ -182,17 +187,25 @@ class _Pairs(Dataset[tuple[Tensor, Tensor, Tensor]]):
             raise IndexError(index)
         random = np.random.default_rng([self.options.seed, index])
         recorded, changed = [], []
-        for place in random.integers(len(self.clips), size=self.options.batch_size):
-            speech = self._speech(self.clips[int(place)], random)
+        for _ in range(self.options.batch_size):
+            speech = self._speech(random)
             recorded.append(speech)
             changed.append(self._changed(speech, random) if random.random() < self.options.share else speech)
         lengths = torch.tensor([len(speech) for speech in recorded])
         return _padded(recorded), _padded(changed), lengths
 
-    def _speech(self, clip: Clip, random: np.random.Generator) -> npt.NDArray[np.float32]:
-        """A clip, or a random window of it."""
-        frames = self.corpus.frames(clip)
+    def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:
+        """A clip or a piece of further speech, or a random window of it."""
         most = max(1, round(WINDOW * self.corpus.frame_rate))
+        if self.further is not None and self.options.further and random.random() < 0.5:
+            number = int(random.integers(self.options.further))
+            if number not in self._said:
+                self._said[number] = self.further(number)
+            said = self._said[number]
+            start = int(random.integers(max(1, len(said) - round(WINDOW * SAMPLE_RATE) + 1)))
+            return said[start : start + round(WINDOW * SAMPLE_RATE)]
+        clip = self.clips[int(random.integers(len(self.clips)))]
+        frames = self.corpus.frames(clip)
         start = int(random.integers(frames - most + 1)) if frames > most else 0
         return self.corpus.read_audio(clip, start, min(frames, start + most)).numpy()
 

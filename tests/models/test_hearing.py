@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -98,3 +100,26 @@ def test_what_cannot_be_learnt_is_refused(model: AnimationModel, tiny: Tiny) -> 
     model.speech_encoder.requires_grad_(False)
     with pytest.raises(FaceDiffError, match="audio_encoder"):
         learn_voices(model, tiny, FEW)
+
+
+class Talks(Tiny):
+    """A corpus with further speech, and a note of what was asked of it."""
+
+    asked: ClassVar[list[int]] = []
+
+    def further_speech(self) -> Callable[[int], np.ndarray]:
+        def tone(number: int) -> np.ndarray:
+            self.asked.append(number)
+            return np.sin(np.arange(8000 + number) / 9).astype(np.float32)
+
+        return tone
+
+
+def test_further_speech_is_heard_as_often_as_clips(make_model: Callable[..., AnimationModel], tiny_root: Path) -> None:
+    data = Talks(root=str(tiny_root))
+    learn_voices(make_model(), data, replace(FEW, steps=12, further=500))
+    assert 0 <= min(data.asked) < max(data.asked) < 500
+    assert 6 <= len(data.asked) <= 18  # of 24, without what is asked for a second time
+    data.asked.clear()
+    learn_voices(make_model(), data, replace(FEW, further=0))
+    assert not data.asked
