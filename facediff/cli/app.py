@@ -29,7 +29,7 @@ class Command:
 COMMANDS = {
     "demo": Command("facediff.cli.demo:demo", "make a corpus, train, test and render a talking face, in ten minutes"),
     "animate": Command("facediff.cli.animate:animate", "animate a face with a recording of speech"),
-    "adapt": Command("facediff.cli.adapt:adapt", "fine-tune a trained model on a new speaker"),
+    "adapt": Command("facediff.cli.adapt:adapt", "fine-tune a trained model on a new speaker, or on other voices"),
     "publish": Command("facediff.cli.publish:publish", "a trained model as a folder for others, and on the hub"),
     "import-checkpoint": Command(
         "facediff.cli.import_checkpoint:import_checkpoint", "make a model of a published method's own checkpoint"
