@@ -73,7 +73,7 @@ class HearingOptions:
     batch_size: int = 12
     share: float = 0.65
     further: int = 1200
-    moved: float = 0.85
+    moved: float = 0.65
     learning_rate: float = 1e-3
     seed: int = 0
     workers: int = 1
