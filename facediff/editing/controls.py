@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.limits import FRAME_RATES
 
 # What edits an animation is imported where it is asked for: most animations have no controls.
 if TYPE_CHECKING:
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from facediff.editing.eyes import Array
 
 
-UNCHECKED = 25.0
-"""Frame rate by which frames and timecodes of keys are read before that of the animation is known."""
+UNCHECKED = FRAME_RATES[1]
+"""Frame rate by which frames and timecodes of keys are read before that of the animation is known: any may be right."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,13 @@ Degrees = Annotated[float, Range(0, 10)]
 
 
 class Acting(ABC):
-    """Moves brows, head and lids with the speech."""
+    """Moves brows, head and lids with the speech.
+
+    Attributes:
+        look_ahead: seconds of speech after a frame that it hears at most before it acts it.
+    """
+
+    look_ahead: float = 0.0
 
     def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
         """Let every constructor refuse options that are out of range."""
@@ -135,6 +141,8 @@ class ProsodyActing(Acting):
         drift: degrees that the head slowly turns and tilts by while somebody speaks, at most.
         blinks: share of phrase ends with a blink.
     """
+
+    look_ahead = 1.5
 
     def __init__(
         self,
