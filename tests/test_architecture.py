@@ -41,10 +41,11 @@ ALLOWED: dict[str, set[str]] = {
     "models": {"version", "animation", "data", "metrics", "mesh", *BASE},
     "callbacks": {"version", "models", "data", "metrics", "mesh", "render", *BASE},
     "export": {"animation", "editing", "render", "mesh", *BASE},
+    "runtime": {"version", "animation", "data", "export", *BASE},
     "evaluation": {"data", "metrics", "mesh", "render", *BASE},
     "benchmark": {"version", "evaluation", "metrics", *BASE},
     "study": {"version", "animation", "data", "evaluation", "mesh", "render", *BASE},
-    "pipelines": {"version", "models", "data", "editing", "export", "animation", "mesh", *BASE},
+    "pipelines": {"version", "runtime", "models", "data", "editing", "export", "animation", "mesh", *BASE},
 }
 ALLOWED["cli"] = set(ALLOWED) - {"__main__"}
 # Packages that make do with these libraries in addition to the standard library.

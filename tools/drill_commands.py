@@ -116,6 +116,7 @@ DRILLS = [
         "author.pth --dataset vocaset --identities A,B,C --templates faces.pkl --audio-config audio.json -o made.ckpt",
         "author.pth --dataset vocaset --identities A,B,D --templates faces.pkl --audio-config audio.json -o made.ckpt",
     ),
+    Drill("export-model", "model.ckpt -o face-onnx"),
     Drill("publish", "model.ckpt face --license mit", also="test_scores.csv"),
     Drill(
         "style extract",

@@ -31,6 +31,9 @@ COMMANDS = {
     "animate": Command("facediff.cli.animate:animate", "animate a face with a recording of speech"),
     "adapt": Command("facediff.cli.adapt:adapt", "fine-tune a trained model on a new speaker, or on other voices"),
     "publish": Command("facediff.cli.publish:publish", "a trained model as a folder for others, and on the hub"),
+    "export-model": Command(
+        "facediff.cli.export_model:export_model", "a trained model as a folder that animates without PyTorch"
+    ),
     "import-checkpoint": Command(
         "facediff.cli.import_checkpoint:import_checkpoint", "make a model of a published method's own checkpoint"
     ),

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.registry import UnknownComponentError, checks_arguments, voice_gate
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.filters import RecursiveFilter
 from facediff.utils.ranges import Range
 
 Wave = npt.NDArray[np.floating]
@@ -162,15 +163,19 @@ class EnergyGate(VoiceGate):
         return _EnergyListener(self)
 
 
+SPEECH_BAND = (
+    (0.3979518861810659, 0.7959037723621318, 0.3979518861810659, 1.0, 0.44530146335179394, 0.21624043303098522),
+    (1.0, -2.0, 1.0, 1.0, -1.9167376370775666, 0.9201986372050089),
+)
+"""150 Hz to 5 kHz at 16 kHz: the sections of SciPy's ``butter(2, (150, 5000), "bandpass", fs=16000, output="sos")``."""
+
+
 class _EnergyListener(Listener):
     """Follows level, noise and loudest speech; what it decides for a step depends on steps up to look-ahead only."""
 
     def __init__(self, gate: EnergyGate) -> None:
-        from scipy.signal import butter
-
         self.gate = gate
-        self._band = butter(2, (150.0, 5000.0), "bandpass", fs=SAMPLE_RATE, output="sos")
-        self._state = np.zeros((len(self._band), 2))
+        self._band = RecursiveFilter(SPEECH_BAND)
         self._recent: deque[float] = deque(maxlen=SMOOTH)  # powers of the latest steps
         self._levels: deque[float] = deque(maxlen=LONG)  # smoothed levels of the latest steps
         self._waiting: deque[float] = deque()  # levels that are not decided yet
@@ -182,11 +187,9 @@ class _EnergyListener(Listener):
 
     def hear(self, steps: npt.NDArray[np.float64]) -> list[bool]:
         """Decide on steps that lie look-ahead before the latest."""
-        from scipy.signal import sosfilt
-
         if not len(steps):
             return []
-        band, self._state = sosfilt(self._band, steps.reshape(-1), zi=self._state)
+        band = self._band.feed(steps.reshape(-1))
         found = []
         for power in np.square(band.reshape(steps.shape)).mean(axis=1).tolist():
             self._follow(power)
@@ -368,6 +371,31 @@ def openness(speech: Wave, frames: int, frame_rate: float, gate: VoiceGate) -> n
     found = Openness(gate, frame_rate)
     parts = [found.feed(speech), found.finish(frames)]
     return np.concatenate(parts)[:frames]
+
+
+def toward_rest(
+    vertices: npt.NDArray[np.float32],
+    openness: npt.NDArray[np.float32],
+    template: npt.NDArray[np.float32],
+    weights: npt.NDArray[np.float32],
+) -> npt.NDArray[np.float32]:
+    """Vertices with the mouth as far at rest as the openness of their frames says.
+
+    Where it is 1 throughout, the vertices are returned as they are.
+
+    Args:
+        vertices: (T, V, 3).
+        openness: (T,), as :func:`openness` gives it.
+        template: (V, 3) the face at rest.
+        weights: (V,) how far each vertex goes to rest.
+    """
+    pausing = np.flatnonzero(openness < 1)
+    if not len(pausing):
+        return vertices
+    made = np.array(vertices, np.float32)
+    for frame in pausing:  # one at a time: all of them may be much memory
+        made[frame] -= (1 - openness[frame]) * weights[:, None] * (vertices[frame] - template)
+    return made
 
 
 # What is wrong with a recording.

@@ -16,6 +16,7 @@ from facediff.mesh.mesh import triangle_areas
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.plain_files import json_text, write_table
+from facediff.utils.without_scipy import has_scipy, solve_block_chain
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -503,12 +504,19 @@ def _step(problem: Problem, x: Array, slope: Array, direction: Array, held: Mask
 
 def _newton(problem: Problem, right: Array, free: Mask) -> Array:
     """Solve for the free variables, the others being zero: (T, K)."""
-    from scipy.linalg import solveh_banded
-
     frames, count = right.shape
     neighbours = np.full((frames, 1), 2.0)
     neighbours[0] -= 1
     neighbours[-1] -= 1
+    if not has_scipy():
+        both = free[:, :, None] & free[:, None]
+        blocks = np.where(both, problem.matrix, 0.0)
+        own = np.where(free, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
+        blocks[:, np.arange(count), np.arange(count)] = own
+        links = np.where(free[1:] & free[:-1], -problem.coupling, 0.0)
+        return np.where(free, solve_block_chain(blocks, links, np.where(free, right, 0.0)), 0.0)
+    from scipy.linalg import solveh_banded
+
     # M + c · (number of neighbours) on the block diagonal and −c next to it make a band of K below the diagonal, stored
     # as LAPACK expects it: the last axis counts how far below. The lower form is some twenty times faster than the
     # upper one, whose small products OpenBLAS spreads over threads. A variable that is held gets a row of the identity.

@@ -13,6 +13,7 @@ from facediff.editing.eyes import Array, Eyes, Indices, smooth_step
 from facediff.editing.procedural import EDITED, in_words, noted, room_for
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.ranges import Range
+from facediff.utils.without_scipy import nearest_distances
 
 ALL = "all"  # The name of all vertices that no other name is given for
 FALL_OFF = 0.06
@@ -156,8 +157,6 @@ def region_weights(
     fall_off: float | None = None,
 ) -> RegionWeights:
     """The weights of regions at every vertex; the arguments are those of :func:`region_factors`."""
-    from scipy.spatial import cKDTree
-
     check_factors(dict.fromkeys(names, 1.0), regions, name)
     places = np.asarray(template, np.float64)
     width = FALL_OFF * float(np.linalg.norm(np.ptp(places, axis=0))) if fall_off is None else fall_off
@@ -166,7 +165,7 @@ def region_weights(
     for row, region in zip(weights, named, strict=True):
         distances = np.full(len(places), np.inf)
         if len(regions[region]):  # a face that was carried to a mesh without the region has none
-            distances = cKDTree(places[regions[region]]).query(places, distance_upper_bound=width)[0]
+            distances = nearest_distances(places, places[regions[region]], width)
         row[:] = 1.0 - smooth_step(distances / max(width, 1e-12))
     # Where regions overlap, their weights are made to sum to one; without it, two factors of 1 would scale by 2.
     total = weights.sum(axis=0)

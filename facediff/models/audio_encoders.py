@@ -10,14 +10,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
-from facediff.models.layers import Frames, Share, Width, frame_mask, interpolate_frames
+from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.limits import quoted
@@ -53,16 +53,21 @@ class AudioEncoder(nn.Module, ABC):
     :meth:`frozen_key` and :meth:`frozen_features`, and takes their result as ``features`` and ``feature_lengths``,
     two further arguments of its :meth:`forward` that no other encoder is given.
 
+    Class attributes:
+        takes_padding: whether clips of several lengths are encoded together; else those of one length are.
+
     An encoder for which loudness matters calls :meth:`standardise`, so that a piece of a long recording is as loud as
     it is in the whole.
     """
 
-    _level: tuple[float, float] | None = None
+    takes_padding: ClassVar[bool] = True
+    _level: tuple[float, float] | tuple[Tensor, Tensor] | None = None
 
     @contextmanager
-    def at_level(self, mean: float, deviation: float) -> Iterator[None]:
+    def at_level(self, mean: float | Tensor, deviation: float | Tensor) -> Iterator[None]:
         """A context in which speech is standardised by this mean and standard deviation instead of its own."""
-        before, self._level = self._level, (mean, deviation)
+        before = self._level
+        self._level = (mean, deviation)  # type: ignore[assignment]
         try:
             yield
         finally:
@@ -234,13 +239,32 @@ class MelEncoder(AudioEncoder):
             # stands in the middle of 512 samples, a length that the Fourier transform is quick at.
             padded = nn.functional.pad(audio.float(), (self.n_fft // 2, self.n_fft // 2 + short))
             window = nn.functional.pad(self.window, (56, 56))
-            frames = padded.unfold(1, self.n_fft, self.hop) * window
-            power = torch.fft.rfft(frames).abs().square()
+            if exporting():
+                power = power_by_convolution(padded, window, self.hop)
+            else:
+                frames = padded.unfold(1, self.n_fft, self.hop) * window
+                power = torch.fft.rfft(frames).abs().square()
             spectrum = torch.log(power @ self.filters.T + 1e-5)
         steps = (lengths // self.hop).clamp(min=2)
         mask = frame_mask(steps, spectrum.shape[1])[..., None]
         # Shifted and scaled, so that what the first convolution gets of speech at unit variance lies around 0.
         return (spectrum + 2.0) / 4.0 * mask, steps
+
+
+def power_by_convolution(
+    padded: Float[Tensor, "batch samples"], window: Float[Tensor, " n_fft"], hop: int
+) -> Float[Tensor, "batch steps bins"]:
+    """Power spectra by the definition of the Fourier transform, as one convolution.
+
+    For graphs only: browsers' runtimes have no complex numbers, and every runtime has convolutions.
+    """
+    length = len(window)
+    # Whole turns are taken away while the numbers are whole: sines of large angles would lose digits.
+    turns = torch.outer(torch.arange(length // 2 + 1), torch.arange(length)) % length
+    angle = 2 * math.pi / length * turns.to(window)
+    kernel = torch.cat([angle.cos(), -angle.sin()]).to(window) * window
+    real, imaginary = nn.functional.conv1d(padded[:, None], kernel[:, None], stride=hop).chunk(2, dim=1)
+    return (real.square() + imaginary.square()).transpose(1, 2)
 
 
 class ConvBlock(nn.Module):
@@ -305,6 +329,7 @@ class HubertEncoder(AudioEncoder):
         MissingExtraError: if transformers is not installed.
     """
 
+    takes_padding = False
     checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere
 
     def __init__(
@@ -424,6 +449,9 @@ def with_edges(wave: Waves) -> Float[Tensor, "batch padded"]:
 
 def by_length(padded: Tensor, lengths: Tensor, encode: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
     """Encode clips of equal length together, without their padding; the padded results and their lengths."""
+    if exporting():
+        made = encode(padded)  # graphs take clips of one length, see ``takes_padding``
+        return made, torch.full_like(lengths, 1) * made.shape[1]
     # HuBERT normalises over time, so padding would change its features.
     parts: dict[int, Tensor] = {}
     for length in sorted(set(lengths.tolist())):
@@ -465,6 +493,7 @@ class CtcEncoder(AudioEncoder):
         MissingExtraError: if transformers is not installed.
     """
 
+    takes_padding = False
     checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere
 
     def __init__(

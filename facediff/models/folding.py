@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError
-from facediff.models.layers import Frames
+from facediff.models.layers import Frames, exporting
 from facediff.models.motion_space import Preconditioning
 
 SamplingSpace = Literal["folded", "vertices"]
@@ -34,6 +34,9 @@ State = Float[Tensor, "batch frames width"]
 ScaledMotion = Float[Tensor, "batch frames coordinates"]
 """Motion on the vertices, in the scale of the network."""
 
+Step = int | Int[Tensor, " batch"]
+"""A step counted from 0: one for all clips, or one for each."""
+
 Blend = Callable[[Tensor], Tensor]
 """From the features that the network gave in a step to those that are used."""
 
@@ -41,6 +44,11 @@ Blend = Callable[[Tensor], Tensor]
 def unchanged(features: Tensor) -> Tensor:
     """The blend of motion that continues no other."""
     return features
+
+
+def each_step(step: Step, rows: Tensor) -> Int[Tensor, " batch"]:
+    """The step of each row."""
+    return step if isinstance(step, Tensor) else torch.full((len(rows),), step, device=rows.device)
 
 
 @runtime_checkable
@@ -97,11 +105,11 @@ class Space(ABC):
         self.blend = blend
         self.shares = shares
 
-    def features(self, embedded: Frames, step: int) -> Frames:
+    def features(self, embedded: Frames, step: Step) -> Frames:
         """The network's last features of embedded noisy motion, guided, at a step counted from 0."""
         views = len(self.shares)
         rows = embedded if views == 1 else embedded.repeat(views, 1, 1)
-        steps = torch.full((len(rows),), step, device=rows.device)
+        steps = each_step(step, rows)
         features = self.network.core(rows, steps, self.conditions)
         if views == 1:
             return features
@@ -115,7 +123,7 @@ class Space(ABC):
         """From independent unit Gaussian noise to the image of unit Gaussian noise on vertices."""
 
     @abstractmethod
-    def denoise(self, state: State, step: int) -> State:
+    def denoise(self, state: State, step: Step) -> State:
         """The image of the predicted clean motion."""
 
     @abstractmethod
@@ -135,7 +143,7 @@ class VertexSpace(Space):
         """Unit noise as it is."""
         return unit
 
-    def denoise(self, state: State, step: int) -> State:
+    def denoise(self, state: State, step: Step) -> State:
         """M̂⁰."""
         return self.network.clean_motion(self.blend(self.features(self.network.embed(state), step)))
 
@@ -172,7 +180,7 @@ class FoldedSpace(Space):
         with torch.autocast(unit.device.type, enabled=False):
             return unit @ self.fold.root
 
-    def denoise(self, state: State, step: int) -> State:
+    def denoise(self, state: State, step: Step) -> State:
         """E M̂⁰ = E U h + E b."""
         # The bias e of the first map is no part of y, which would not obey the recursion with it.
         bias = self.network.embed.bias
@@ -225,10 +233,10 @@ class PreconditionedSpace(Space):
         """Unit noise as it is."""
         return unit
 
-    def denoise(self, state: State, step: int) -> State:
+    def denoise(self, state: State, step: Step) -> State:
         """M̂⁰."""
-        steps = torch.full((len(state),), step, device=state.device)
-        scaled = self.preconditioning.into[step] * state
+        steps = each_step(step, state)
+        scaled = self.preconditioning.into[steps][:, None] * state
         features = self.features(self.network.embed(scaled), step)
         # The prediction is blended, not the features: the noisy motion is a part of it.
         return self.blend(self.preconditioning.clean(state, self.network.clean_motion(features), steps))
@@ -341,6 +349,8 @@ class WeightCache(Generic[T]):
             compute: computes it.
         """
         # Tensors made in inference mode could not be used in training later.
+        if exporting() and self._value is not None:
+            return self._value  # of the run before; a graph holds it as a constant
         with torch.inference_mode(False), torch.no_grad(), torch.autocast(weights[0].device.type, enabled=False):
             seen = [projection(weight) for weight in weights]
             if self._value is None or key != self._key or not same(seen, self._seen):

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,9 @@ from facediff.data.windows import SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.utils import SAMPLE_RATE
+
+if TYPE_CHECKING:
+    from facediff.models.graphs import Graphs
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps an iteration, e.g. in a progress bar."""
@@ -487,6 +490,14 @@ class Inference(ABC):
     @abstractmethod
     def speech_encoder(self) -> AudioEncoder:
         """The audio encoder, which is told how loud a stream is."""
+
+    def graphs(self) -> Graphs:
+        """The model as graphs that run without PyTorch, with its present sampler; see :mod:`facediff.models.graphs`.
+
+        Raises:
+            FaceDiffError: if it cannot be exported.
+        """
+        raise FaceDiffError(f"{type(self).__name__}: cannot be exported yet; dual-path diffusion models can")
 
     @abstractmethod
     def encode_style(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Annotated, NamedTuple
 
 import torch
@@ -49,9 +52,30 @@ def frame_mask(lengths: Int[Tensor, " batch"], frames: int) -> FrameMask:
     return torch.arange(frames, device=lengths.device)[None, :] < lengths[:, None]
 
 
+def exporting() -> bool:
+    """Whether a graph is being recorded (:mod:`facediff.models.graphs`), which cannot depend on values."""
+    return torch.compiler.is_exporting()
+
+
+_most_frames: ContextVar[int | None] = ContextVar("most_frames", default=None)
+
+
+@contextmanager
+def of_frames(most: int) -> Iterator[None]:
+    """Within it, :func:`interpolate_frames` gives so many frames; else as many as the longest clip has.
+
+    A graph takes the number from the shape of an input, since it cannot depend on values.
+    """
+    token = _most_frames.set(most)
+    try:
+        yield
+    finally:
+        _most_frames.reset(token)
+
+
 def needed_mask(mask: FrameMask) -> FrameMask | None:
     """The mask, or None where nothing is padded; it looks at the values, so it waits for the device."""
-    return None if bool(mask.all()) else mask
+    return None if not exporting() and bool(mask.all()) else mask
 
 
 def interpolate_frames(
@@ -63,7 +87,8 @@ def interpolate_frames(
     (j + ½)·length/frames − ½, held at the ends. Padding neither enters nor is written: frames beyond a clip's
     own length are zero.
     """
-    frames = int(frame_lengths.max())
+    most = _most_frames.get()
+    frames = int(frame_lengths.max()) if most is None else most
     ratio = lengths.float() / frame_lengths.float()
     last = (lengths - 1)[:, None].float()
     # PyTorch's own interpolation has one ratio for the whole batch; here each clip has its own, so that its features do

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.voice_activity import Openness, VoiceGate
+from facediff.data.voice_activity import Openness, VoiceGate, toward_rest
 
 
 class MouthAtRest:
@@ -29,13 +29,9 @@ class MouthAtRest:
         regions: Mapping[str, npt.NDArray[np.integer]],
         frame_rate: float,
     ) -> None:
-        from facediff.editing.expressiveness import ALL, region_factors
-
         self.gate, self.frame_rate = gate, frame_rate
         self.template = np.asarray(template, np.float32)
-        # Everything that speech moves, fading into the upper face as regions fade elsewhere.
-        weights = region_factors(self.template, regions, {"upper_face": 0.0, ALL: 1.0})
-        self.weights = weights.astype(np.float32)[:, None]
+        self.weights = rest_weights(self.template, regions)
 
     def openness(self) -> Openness:
         """The openness of a recording that has not begun yet."""
@@ -43,10 +39,14 @@ class MouthAtRest:
 
     def apply(self, vertices: npt.NDArray[np.float32], openness: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Vertices (T, V, 3) with the mouth as far at rest as the openness (T,) says."""
-        pausing = np.flatnonzero(openness < 1)
-        if not len(pausing):
-            return vertices
-        made = np.array(vertices, np.float32)
-        for frame in pausing:  # one at a time: all of them may be much memory
-            made[frame] -= (1 - openness[frame]) * self.weights * (vertices[frame] - self.template)
-        return made
+        return toward_rest(vertices, openness, self.template, self.weights)
+
+
+def rest_weights(
+    template: npt.NDArray[np.floating], regions: Mapping[str, npt.NDArray[np.integer]]
+) -> npt.NDArray[np.float32]:
+    """How far each vertex (V,) of a neutral face (V, 3) goes to rest in pauses: all that speech moves."""
+    from facediff.editing.expressiveness import ALL, region_factors
+
+    # Fading into the upper face as regions fade elsewhere.
+    return region_factors(np.asarray(template, np.float32), regions, {"upper_face": 0.0, ALL: 1.0}).astype(np.float32)

@@ -61,6 +61,7 @@ BASES: dict[str, str] = {
     "adapt": "--checkpoint WORLD/model.ckpt --person C -o out.ckpt --epochs 1 --accelerator cpu --quiet",
     "import-checkpoint": "WORLD/author.pth --dataset vocaset --identities A,B,C --templates WORLD/faces.pkl "
     "--audio-config WORLD/audio.json -o out.ckpt",
+    "export-model": "WORLD/model.ckpt -o exported",
     "publish": "WORLD/model.ckpt published --license mit --languages en",
     "style extract": "B_e02 --checkpoint WORLD/model.ckpt -o style.npy",
     "view": "WORLD/clicks.npz -o page.html",

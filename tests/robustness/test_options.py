@@ -14,7 +14,15 @@ from facediff.cli.data import CORPORA
 from tests.robustness import options
 
 # Commands that read and write more get fewer command lines.
-EXAMPLES = {"animate": 16, "evaluate": 10, "data import-person": 8, "export": 14, "view": 10, "retarget": 8}
+EXAMPLES = {
+    "export-model": 2,
+    "animate": 16,
+    "evaluate": 10,
+    "data import-person": 8,
+    "export": 14,
+    "view": 10,
+    "retarget": 8,
+}
 LIGHTNING = ("fit", "validate", "test", "predict")
 
 

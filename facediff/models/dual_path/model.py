@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -53,6 +53,9 @@ from facediff.models.speaker_encoders import (
 )
 from facediff.utils import ranges
 from facediff.utils.ranges import Range, mismatch
+
+if TYPE_CHECKING:
+    from facediff.models.graphs import Graphs
 
 NumericScale = Annotated[float, Range(1e-6, 1e6)]
 NoiseScale = NumericScale | Literal["auto"]
@@ -462,6 +465,12 @@ class DualPathDiffusion(AnimationModel):
     ) -> Float[Tensor, "batch style_dim"]:
         """F_dyn of reference motions (eq. 2 to 9); of width 0 if the dynamic path is left out."""
         return self.network.dynamic_style(reference * self.scale, mask)
+
+    def graphs(self) -> Graphs:
+        """Audio encoder, denoising step and last map; the sampler as numbers."""
+        from facediff.models.graphs import graphs_of
+
+        return graphs_of(self)
 
     @torch.no_grad()
     def generate_clips(

@@ -1,0 +1,64 @@
+"""``facediff export-model``: a trained model as a folder that animates without PyTorch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from facediff.cli.options import File, OutputFolder
+from facediff.cli.parsing import Option
+from facediff.cli.process import tell
+from facediff.errors import FaceDiffError
+from facediff.utils import ranges
+
+
+def export_model(
+    model: Annotated[Path, Option(metavar="MODEL", reads=True)],
+    *,
+    output: OutputFolder,
+    precision: Literal["float32", "float16", "int8"] = "float32",
+    sampler: Annotated[str | None, Option(metavar="NAME")] = None,
+    steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
+    speech: File = None,
+) -> None:
+    """Write a model for ONNX Runtime: graphs, templates, styles, and a description.
+
+    The folder animates without PyTorch, in Python, on the command line (facediff-run) and in the browser. It is
+    compared with the model before it appears.
+
+    For example:
+      facediff export-model demo/puppet.ckpt -o puppet-onnx
+      facediff-run puppet-onnx speech.wav -o speech.glb
+
+    Args:
+        model: checkpoint (.ckpt)
+        output: folder to write
+        precision: how weights are stored: float32, float16, or int8 (the audio encoder's in 8 bits, the others in 16)
+        sampler: sampler of the exported model; the checkpoint's own by default
+        steps: its denoising steps
+        speech: recording that the folder is compared with the model on; a made-up sound by default
+    """
+    if output.exists():
+        raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
+    from facediff.pipelines.export_model import export_model as export
+    from facediff.pipelines.export_model import require_onnx
+
+    require_onnx()
+    samples = None
+    if speech is not None:
+        from facediff.pipelines.animate import read_recording
+
+        samples = read_recording(speech)
+
+    from facediff.models import load_model
+
+    loaded = load_model(model)
+    if sampler is not None or steps is not None:
+        loaded.choose_sampler(sampler, steps)
+    tell(f"recording the graphs of {type(loaded).__name__}, which takes a minute …")
+    made = export(loaded, output, precision=precision, speech=samples)
+    megabytes = sum(made.sizes.values()) / 1e6
+    tell(
+        f"wrote {output}: {megabytes:.1f} MB, {made.precision}; largest difference from PyTorch "
+        f"{made.check['largest_difference']:.1e} {made.unit}, {made.check['share_of_range']:.1e} of the motion's range"
+    )

@@ -1,0 +1,333 @@
+"""A trained model as a folder that animates without PyTorch: its graphs, its numbers, and a check against the model."""
+
+from __future__ import annotations
+
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description, read_folder
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.files import atomic_folder
+from facediff.utils.licences import licence_metadata
+from facediff.utils.plain_files import write_json
+from facediff.version import __version__
+
+if TYPE_CHECKING:
+    import onnx
+
+    from facediff.models.base import AnimationModel
+    from facediff.models.graphs import Graph, Graphs
+
+Precision = Literal["float32", "float16", "int8"]
+
+OPSET = 20
+"""Version of ONNX's operators; ONNX Runtime 1.17 and its web build know it."""
+
+SMALLEST = 4096
+"""Numbers of a weight that is worth storing in fewer bits; smaller ones stay exact."""
+
+TOLERANCE = 1e-4
+"""Largest difference from PyTorch in float32, as a share of the motion's range."""
+
+
+def export_model(
+    model: AnimationModel,
+    folder: Path,
+    *,
+    precision: Precision = "float32",
+    speech: npt.NDArray[np.float32] | None = None,
+) -> Description:
+    """Write a model as graphs for ONNX Runtime, with everything that animating needs.
+
+    Weights may be stored in 16 or 8 bits; they are widened when the graph is loaded, and everything is computed in
+    float32. In ``int8`` those of the audio encoder take 8 bits a number, with a scale for each output channel, and all
+    others 16.
+
+    Args:
+        model: a trained model with the sampler and the windows that the folder is to have.
+        folder: to write; it must not exist.
+        precision: how weights are stored.
+        speech: (S,) at 16 kHz that the folder is compared with the model on; noise bursts if None.
+
+    Returns:
+        the description, with the comparison in ``check``.
+
+    Raises:
+        FaceDiffError: if the model cannot be exported, or float32 differs from PyTorch by more than 1e-4 of the
+            motion's range.
+        MissingExtraError: if the packages for ONNX are not installed.
+    """
+    require_onnx()
+    graphs = model.graphs()
+    with atomic_folder(folder) as staged:
+        sizes, described = {}, {}
+        for part in graphs.parts:
+            document = record(part)
+            store_weights(document, precision if part.name == "speech" else min_precision(precision))
+            path = staged / f"{part.name}.onnx"
+            path.write_bytes(document.SerializeToString())
+            sizes[path.name] = path.stat().st_size
+            described[part.name] = described_ends(document)
+        arrays, styles, faces = arrays_of(model, graphs)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+        (staged / ARRAYS).write_bytes(buffer.getvalue())
+        sizes[ARRAYS] = len(buffer.getvalue())
+        description = describe(model, graphs, precision, sizes, described, styles, faces)
+        write_json(staged / DESCRIPTION, description.content())
+        read_folder(staged)  # what is written must be what is read
+        checked = replace(description, check=compare(model, staged, speech if speech is not None else trial_speech()))
+        share = checked.check["share_of_range"]
+        if precision == "float32" and not share <= TOLERANCE:
+            raise FaceDiffError(
+                f"{folder}: differs from PyTorch by {share:.1e} of the motion's range; expected at most {TOLERANCE:g}"
+            )
+        write_json(staged / DESCRIPTION, checked.content())
+    return checked
+
+
+def require_onnx() -> None:
+    """Refuse to begin without the packages.
+
+    Raises:
+        MissingExtraError: naming the extra.
+    """
+    import importlib.util
+
+    for package in ("onnx", "onnxscript", "onnxruntime"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtraError(package, "onnx", "exporting a model")
+
+
+def record(graph: Graph) -> onnx.ModelProto:
+    """Record a graph with PyTorch's exporter; axes of any length get the names that the graph gives them."""
+    import torch
+    from torch.export import Dim
+
+    shapes = tuple(dict.fromkeys(graph.axes.get(name, {}), Dim.DYNAMIC) for name in graph.inputs)
+    with quiet():
+        program = torch.onnx.export(
+            graph.module.eval(),
+            tuple(graph.inputs.values()),
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=list(graph.inputs),
+            output_names=list(graph.outputs),
+            dynamic_shapes=shapes,
+            verbose=False,
+        )
+    if program is None:
+        raise FaceDiffError(f"{graph.name}: PyTorch gave no graph; install the PyTorch that facediff was tested with")
+    document: onnx.ModelProto = program.model_proto
+    names: dict[str, str] = {}
+    for each in document.graph.input:
+        for axis, name in graph.axes.get(each.name, {}).items():
+            names.setdefault(each.type.tensor_type.shape.dim[axis].dim_param, name)
+    for each in [*document.graph.input, *document.graph.output, *document.graph.value_info]:
+        for dim in each.type.tensor_type.shape.dim:
+            if dim.dim_param:
+                dim.dim_param = names.get(dim.dim_param, "frames" if each.name in graph.outputs else dim.dim_param)
+    # Where the modules stand in the source says nothing to a reader of the file, and paths are nobody's business.
+    for node in document.graph.node:
+        node.ClearField("metadata_props")
+        node.ClearField("doc_string")
+    document.producer_name, document.producer_version = "facediff", __version__
+    return document
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without the exporter's remarks about packages that nobody needs here, and without checks of shapes.
+
+    While a graph is recorded, symbols stand for numbers. Where shapes are checked at run time, as in facediff's tests,
+    the checks would take them for wrong types.
+    """
+    from jaxtyping import config
+
+    checked = config.jaxtyping_disable
+    config.update("jaxtyping_disable", True)
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        config.update("jaxtyping_disable", checked)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def min_precision(precision: Precision) -> Precision:
+    """The precision of the graphs after the audio encoder, whose errors the steps add up."""
+    return "float16" if precision == "int8" else precision
+
+
+def store_weights(document: onnx.ModelProto, precision: Precision) -> None:
+    """Store large weights in fewer bits, each followed by a node that widens it.
+
+    Args:
+        document: changed in place.
+        precision: ``int8`` rounds to 255 steps for each place of the longest axis that a bias could belong to: the
+            output channels of convolutions and linear maps.
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    if precision == "float32":
+        return
+    graph = document.graph
+    nodes = []
+    for initializer in list(graph.initializer):
+        if initializer.data_type != TensorProto.FLOAT or int(np.prod(initializer.dims)) < SMALLEST:
+            continue
+        weight, name = numpy_helper.to_array(initializer), initializer.name
+        if precision == "float16" or weight.ndim < 2:
+            if float(np.abs(weight).max()) > float(np.finfo(np.float16).max):
+                continue
+            stored = [numpy_helper.from_array(weight.astype(np.float16), f"{name}_16")]
+            nodes.append(helper.make_node("Cast", [f"{name}_16"], [name], to=TensorProto.FLOAT))
+        else:
+            # A convolution's kernel has its output channels first, the right side of a product has them last.
+            axis = 0 if weight.ndim > 2 else weight.ndim - 1
+            others = tuple(place for place in range(weight.ndim) if place != axis)
+            scale = np.maximum(np.abs(weight).max(axis=others), 1e-12).astype(np.float32) / 127
+            along = scale.reshape([-1 if place == axis else 1 for place in range(weight.ndim)])
+            stored = [
+                numpy_helper.from_array(np.rint(weight / along).astype(np.int8), f"{name}_8"),
+                numpy_helper.from_array(scale, f"{name}_scale"),
+            ]
+            nodes.append(helper.make_node("DequantizeLinear", [each.name for each in stored], [name], axis=axis))
+        graph.initializer.remove(initializer)
+        graph.initializer.extend(stored)
+    for node in reversed(nodes):
+        graph.node.insert(0, node)
+
+
+def described_ends(document: onnx.ModelProto) -> dict[str, list[dict[str, Any]]]:
+    """Inputs and outputs of a graph: name, type and shape."""
+    from onnx import TensorProto
+
+    def end(each: onnx.ValueInfoProto) -> dict[str, Any]:
+        kind = each.type.tensor_type
+        shape = [dim.dim_param or dim.dim_value for dim in kind.shape.dim]
+        return {"name": each.name, "type": TensorProto.DataType.Name(kind.elem_type).lower(), "shape": shape}
+
+    return {
+        "inputs": [end(each) for each in document.graph.input],
+        "outputs": [end(each) for each in document.graph.output],
+    }
+
+
+def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDArray[Any]], list[str], list[str]]:
+    """What ``arrays.npz`` holds, and the names of its styles and faces."""
+    import torch
+
+    from facediff.pipelines.rest import rest_weights
+
+    assets = model.assets
+    faces = list(assets.templates)
+    regions = {name: np.asarray(indices, np.int64) for name, indices in assets.regions.items()}
+    templates = np.stack([np.asarray(assets.templates[name], np.float32) for name in faces])
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "templates": templates,
+        "rest_weights": np.stack([rest_weights(template, regions) for template in templates]),
+        **{f"region_{name}": indices for name, indices in regions.items()},
+    }
+    for name, kind in (("faces", np.int32), ("colours", np.uint8), ("inner_lip_pairs", np.int64)):
+        if (value := getattr(assets, name)) is not None:
+            arrays[name] = np.asarray(value, kind)
+    if graphs.noise is not None:
+        arrays["noise"] = graphs.noise.numpy()
+    styles: dict[str, npt.NDArray[np.float32]] = {}
+    with torch.inference_mode():
+        for name, reference in assets.references.items():
+            mask = torch.ones(1, len(reference.motion), dtype=torch.bool, device=model.device)
+            vector = model.encode_style(reference.motion.float()[None].to(model.device), mask)
+            styles[name] = vector[0].float().cpu().numpy()
+    if not styles:
+        raise FaceDiffError("styles: the checkpoint holds no reference motion; train with a corpus that gives one")
+    arrays["styles"] = np.stack(list(styles.values()))
+    return arrays, list(styles), faces
+
+
+def describe(
+    model: AnimationModel,
+    graphs: Graphs,
+    precision: Precision,
+    sizes: dict[str, int],
+    described: dict[str, dict[str, list[dict[str, Any]]]],
+    styles: list[str],
+    faces: list[str],
+) -> Description:
+    """What ``model.json`` says."""
+    assets, plan = model.assets, model.windows
+    return Description(
+        model=type(model).__name__,
+        facediff=__version__,
+        corpus=assets.corpus,
+        synthetic=assets.synthetic,
+        licences=licence_metadata(model.licences),
+        opset=OPSET,
+        precision=precision,
+        sizes=sizes,
+        graphs=described,
+        sample_rate=SAMPLE_RATE,
+        frame_rate=assets.frame_rate,
+        unit=assets.unit,
+        identities=list(assets.identities),
+        faces=faces,
+        styles=styles,
+        windows={name: float(value) for name, value in vars(plan).items()},
+        epsilon=graphs.epsilon,
+        equal_lengths=graphs.equal_lengths,
+        state=graphs.state,
+        kept=graphs.kept,
+        sampler=graphs.sampler,
+        steps=graphs.steps,
+        table=graphs.table,
+        last_step=graphs.last_step,
+        decoded=graphs.decoded,
+    )
+
+
+def compare(model: AnimationModel, folder: Path, speech: npt.NDArray[np.float32]) -> dict[str, Any]:
+    """The folder against the model on some speech: largest difference of a coordinate, alone and by the range."""
+    import torch
+
+    from facediff.runtime.model import RuntimeModel
+
+    runtime = RuntimeModel.open(folder)
+    face = runtime.description.faces[0]
+    style = face if face in runtime.description.styles else runtime.description.styles[0]
+    wanted = model.animate(
+        torch.from_numpy(speech).to(model.device), identity=face, style=model.assets.references[style], seed=3
+    ).vertices.numpy()
+    found = runtime.animate(speech, identity=face, style=style, seed=3, gate=None).vertices
+    span = float(np.ptp(wanted - runtime.arrays["templates"][0]))
+    difference = float(np.abs(found - wanted).max())
+    return {
+        "seconds": round(len(speech) / SAMPLE_RATE, 3),
+        "identity": face,
+        "largest_difference": difference,
+        "share_of_range": difference / max(span, 1e-12),
+    }
+
+
+def trial_speech() -> npt.NDArray[np.float32]:
+    """Two seconds of bursts of noise with a slow tone, for a comparison without a recording."""
+    time = np.arange(2 * SAMPLE_RATE) / SAMPLE_RATE
+    bursts = np.sin(2 * np.pi * 3 * time) > 0
+    sound = np.random.default_rng(0).normal(size=len(time)) * 0.05 + 0.2 * np.sin(2 * np.pi * 160 * time)
+    return (sound * bursts).astype(np.float32)

@@ -1,0 +1,222 @@
+"""The folder of an exported model: what is in it, writing its description, and reading it safely.
+
+``model.json`` says everything that is no array, ``arrays.npz`` holds templates, styles and regions, and each graph is a
+file of its own: ``speech.onnx``, ``step.onnx``, ``motion.onnx``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.windows import WindowPlan
+from facediff.errors import FaceDiffError
+from facediff.utils.arrays import read_arrays
+from facediff.utils.plain_files import load_json
+
+FORMAT = "facediff model"
+VERSION = 1
+DESCRIPTION = "model.json"
+ARRAYS = "arrays.npz"
+GRAPHS = ("speech", "step", "motion")
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+EXPECTED = "expected a folder that `facediff export-model` wrote"
+
+
+@dataclass(frozen=True)
+class Description:
+    """What ``model.json`` says.
+
+    Attributes:
+        model: class of the model.
+        facediff: version that wrote the folder.
+        corpus: that the model was trained on.
+        synthetic: whether that corpus was made by a program.
+        licences: of what the model is made of, by what they cover.
+        opset: of the graphs.
+        precision: how weights are stored: ``float32``, ``float16`` or ``int8``.
+        sizes: bytes of each file.
+        graphs: inputs and outputs of each graph: name, type and shape, with names for what may be of any length.
+        sample_rate: of the speech, in Hz.
+        frame_rate: of the motion.
+        unit: of length.
+        identities: training identities, in the order of the identity index.
+        faces: identities with a neutral face, in the order of the array ``templates``.
+        styles: names of the style vectors, in the order of the array ``styles``; a name of an identity is its default.
+        windows: how long speech is cut, as :class:`~facediff.data.windows.WindowPlan` takes it.
+        epsilon: added to the variance of speech before it is standardised.
+        equal_lengths: whether all clips of a batch must be of one length.
+        state: numbers in a frame of noisy motion.
+        kept: numbers in a frame by which windows of long speech are blended.
+        sampler: its name.
+        steps: the diffusion steps visited.
+        table: for each of them the factors of the noisy motion, of the last three predictions (latest first) and noise.
+        last_step: the step at which only the mean is left.
+        decoded: what the last graph is given: the ``sample`` or what was ``kept`` of the last step.
+        check: the comparison with PyTorch when the folder was written.
+    """
+
+    model: str
+    facediff: str
+    corpus: str
+    synthetic: bool
+    licences: dict[str, str]
+    opset: int
+    precision: str
+    sizes: dict[str, int]
+    graphs: dict[str, dict[str, list[dict[str, Any]]]]
+    sample_rate: int
+    frame_rate: float
+    unit: str
+    identities: list[str]
+    faces: list[str]
+    styles: list[str]
+    windows: dict[str, float]
+    epsilon: float
+    equal_lengths: bool
+    state: int
+    kept: int
+    sampler: str
+    steps: list[int]
+    table: list[list[float]]
+    last_step: int
+    decoded: str
+    check: dict[str, Any] = field(default_factory=dict)
+
+    def content(self) -> dict[str, Any]:
+        """What is written."""
+        return {"format": FORMAT, "version": VERSION, **asdict(self)}
+
+    @property
+    def plan(self) -> WindowPlan:
+        """How long speech is cut."""
+        return WindowPlan(**self.windows)
+
+
+KINDS: dict[str, type | tuple[type, ...]] = {
+    "str": str,
+    "bool": bool,
+    "int": int,
+    "float": (int, float),
+    "list": list,
+    "dict": dict,
+}
+
+
+def read_folder(folder: Path) -> tuple[Description, Arrays]:
+    """Description and arrays of an exported model.
+
+    Raises:
+        FaceDiffError: naming the file, if it is missing, damaged, or of another version.
+    """
+    if not folder.is_dir():
+        raise FaceDiffError(f"{folder}: no such folder; {EXPECTED}")
+    path = folder / DESCRIPTION
+    content = load_json(path, remedy=EXPECTED)
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise FaceDiffError(f"{path}: does not describe a model; {EXPECTED}")
+    if content.get("version") != VERSION:
+        raise FaceDiffError(
+            f"{path}: has version {str(content.get('version'))[:20]} of the format, this facediff reads {VERSION}; "
+            f"export the model again"
+        )
+    values: dict[str, Any] = {}
+    for each in fields(Description):
+        kind = KINDS[str(each.type).split("[")[0]]
+        value = content.get(each.name)
+        if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
+            raise FaceDiffError(
+                f"{path}: {each.name} is {str(value)[:40]}, expected {each.type}; export the model again"
+            )
+        values[each.name] = value
+    description = Description(**values)
+    _check(path, description)
+    for name in (*(f"{graph}.onnx" for graph in GRAPHS), ARRAYS):
+        size = (folder / name).stat().st_size if (folder / name).is_file() else None
+        if size != description.sizes.get(name):
+            found = "is missing" if size is None else f"has {size} bytes"
+            raise FaceDiffError(
+                f"{folder / name}: {found}, expected {description.sizes.get(name)}; copy or export the model again"
+            )
+    arrays = read_arrays(folder / ARRAYS)
+    _check_arrays(folder / ARRAYS, description, arrays)
+    return description, arrays
+
+
+def _check(path: Path, found: Description) -> None:
+    """Refuse numbers that cannot be."""
+
+    def refuse(name: str, expected: str) -> None:
+        raise FaceDiffError(f"{path}: {name} is {str(getattr(found, name))[:40]}, expected {expected}")
+
+    if found.sample_rate != 16_000:
+        refuse("sample_rate", "16000")
+    if not 1 <= found.frame_rate <= 1000:
+        refuse("frame_rate", "1 to 1000")
+    if not 0 < found.epsilon < 1:
+        refuse("epsilon", "more than 0, less than 1")
+    for name in ("state", "kept"):
+        if not 1 <= getattr(found, name) <= 10_000_000:
+            refuse(name, "1 to 10000000")
+    if not 1 <= len(found.steps) <= 100_000 or not all(isinstance(each, int) and each >= 0 for each in found.steps):
+        refuse("steps", "steps of the noise process")
+    rows = found.table
+    if len(rows) != len(found.steps) or not all(
+        isinstance(row, list) and len(row) == 5 and all(isinstance(number, int | float) for number in row)
+        for row in rows
+    ):
+        refuse("table", "five numbers for each step")
+    if found.decoded not in ("sample", "kept"):
+        refuse("decoded", "sample or kept")
+    for name in ("identities", "faces", "styles"):
+        if not all(isinstance(each, str) for each in getattr(found, name)):
+            refuse(name, "names")
+    if not found.faces:
+        refuse("faces", "one name at least")
+    try:
+        found.plan.in_frames(found.frame_rate)
+    except (FaceDiffError, TypeError) as error:
+        raise FaceDiffError(f"{path}: windows: {error}") from error
+
+
+def _check_arrays(path: Path, found: Description, arrays: Arrays) -> None:
+    """Refuse arrays that do not fit the description."""
+
+    def need(name: str, shape: tuple[int | None, ...], kinds: str) -> None:
+        if name not in arrays:
+            raise FaceDiffError(f"{path}: has no {name}; export the model again")
+        array = arrays[name]
+        fits = array.ndim == len(shape) and all(
+            want in (None, got) for want, got in zip(shape, array.shape, strict=True)
+        )
+        if not fits or array.dtype.kind not in kinds:
+            raise FaceDiffError(f"{path}: {name} is {array.dtype} {array.shape}; export the model again")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise FaceDiffError(f"{path}: {name} holds numbers that are not finite; export the model again")
+
+    need("templates", (len(found.faces), None, 3), "f")
+    vertices = arrays["templates"].shape[1]
+    need("styles", (len(found.styles), None), "f")
+    need("rest_weights", (len(found.faces), vertices), "f")
+    if "noise" in arrays:
+        need("noise", (found.state, found.state), "f")
+    if "faces" in arrays:
+        need("faces", (None, 3), "iu")
+    if "colours" in arrays:
+        need("colours", (vertices, 3), "u")
+    if "inner_lip_pairs" in arrays:
+        need("inner_lip_pairs", (None, 2), "iu")
+    for name in arrays:
+        if name.startswith("region_"):
+            need(name, (None,), "iu")
+        if name.startswith("region_") or name in ("faces", "inner_lip_pairs"):
+            indices = arrays[name]
+            if indices.size and not 0 <= int(indices.min()) <= int(indices.max()) < vertices:
+                raise FaceDiffError(f"{path}: {name} names vertices that do not exist; export the model again")

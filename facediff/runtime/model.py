@@ -1,0 +1,419 @@
+"""An exported model at work: the path from samples to vertices, of files and streams, with NumPy and ONNX Runtime."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation
+from facediff.data.audio import samples_for
+from facediff.data.voice_activity import EnergyGate, Openness, openness, toward_rest
+from facediff.data.windows import SpeechWindows, Window, WindowPlan
+from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.runtime.folder import GRAPHS, Arrays, Description, read_folder
+from facediff.runtime.noise import ClipNoise, WindowNoise
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Expressivity, Seed, mismatch
+from facediff.version import __version__
+
+if TYPE_CHECKING:
+    import onnxruntime  # type: ignore[import-untyped]
+
+Array = npt.NDArray[np.float32]
+
+NAME = "speech"
+"""What a clip is called where its noise is drawn; :meth:`facediff.models.inference.Inference.animate` calls it so."""
+
+
+class RuntimeModel:
+    """A model that ``facediff export-model`` wrote.
+
+    Args:
+        description: of the folder.
+        arrays: likewise.
+        sessions: the graphs by name.
+
+    Attributes:
+        description: what ``model.json`` says.
+        windows: how long speech is cut; may be changed at any time.
+    """
+
+    def __init__(
+        self, description: Description, arrays: Arrays, sessions: Mapping[str, onnxruntime.InferenceSession]
+    ) -> None:
+        self.description = description
+        self.arrays = arrays
+        self.windows = description.plan
+        self._sessions = sessions
+
+    @classmethod
+    def open(cls, folder: str | Path, *, threads: int = 0, providers: Sequence[str] | None = None) -> RuntimeModel:
+        """Read a folder of ``facediff export-model``.
+
+        Args:
+            folder: the folder.
+            threads: of the processor; as many as it has cores if 0.
+            providers: what computes, by ONNX Runtime's names; the processor if None.
+
+        Raises:
+            FaceDiffError: naming the file that is missing or damaged.
+            MissingExtraError: if ONNX Runtime is not installed.
+        """
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise MissingExtraError("onnxruntime", "runtime", "animating with an exported model") from error
+        folder = Path(folder)
+        description, arrays = read_folder(folder)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 3  # warnings are about optimisations that do not apply
+        sessions = {}
+        for name in GRAPHS:
+            path = folder / f"{name}.onnx"
+            try:
+                sessions[name] = onnxruntime.InferenceSession(
+                    path, options, providers=list(providers or ["CPUExecutionProvider"])
+                )
+            except Exception as error:  # ONNX Runtime's own errors share no base class
+                raise FaceDiffError(
+                    f"{path}: ONNX Runtime cannot read it ({str(error)[:80]}); export the model again"
+                ) from error
+        return cls(description, arrays, sessions)
+
+    @property
+    def frame_rate(self) -> float:
+        """Motion frames a second."""
+        return self.description.frame_rate
+
+    def animate(
+        self,
+        audio: Array,
+        *,
+        identity: str | None = None,
+        condition: str | None = None,
+        style: str | None = None,
+        seed: int = 0,
+        expressivity: float = 1.0,
+        gate: EnergyGate | None = EnergyGate(),  # noqa: B008 - it cannot be changed
+        name: str = NAME,
+    ) -> Animation:
+        """Animate a face with speech, as ``facediff animate`` does.
+
+        Args:
+            audio: speech (S,) at 16 kHz.
+            identity: whose face and identity; the first one trained on if None.
+            condition: the training identity that the model is conditioned on, where it is not that of the face.
+            style: name of a style in the folder; that of the face's identity if None.
+            seed: seed of the noise; equal seeds give the motion of PyTorch's processor.
+            expressivity: from the mean prediction (0) to a sample (1) and beyond (2).
+            gate: brings the mouth to rest in pauses; None for no gate.
+            name: of the animation.
+
+        Raises:
+            FaceDiffError: if a name is unknown, a number is out of range, or the speech is shorter than a frame.
+        """
+        face, conditions = self._face(identity, condition, style, seed, expressivity)
+        audio = np.ascontiguousarray(audio, np.float32)
+        if audio.ndim != 1 or not np.isfinite(audio).all():
+            raise FaceDiffError(f"audio: is {audio.dtype} {audio.shape}; expected finite samples (S,) at 16 kHz")
+        frames = round(len(audio) * self.frame_rate / SAMPLE_RATE)
+        if frames < 1:
+            raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s); give more of it")
+        if self.windows.in_one_pass(frames, self.frame_rate):
+            length = samples_for(frames, self.frame_rate)
+            speech = np.pad(audio[:length], (0, max(0, length - len(audio))))
+            # In the precision of the model, which standardises in float32.
+            mean = speech.mean(dtype=np.float32)
+            deviation = np.sqrt(np.square(speech - mean).mean(dtype=np.float32) + np.float32(self.description.epsilon))
+            features = self._features(speech, frames, float(mean), float(deviation))
+            sampling = _Sampling(self, conditions, None, 0)
+            offsets = sampling.run(features, ClipNoise(NAME, [seed]), ClipNoise(f"{NAME}/mean", [0]))
+        else:
+            stream = RuntimeStream(self, face, conditions, self.windows)
+            offsets = np.concatenate(list(stream.parts(audio, frames=frames)), 1)
+        vertices = offsets[0] + self.arrays["templates"][face]
+        if gate is not None:
+            opened = openness(audio, len(vertices), self.frame_rate, gate)
+            vertices = toward_rest(vertices, opened, self.arrays["templates"][face], self.arrays["rest_weights"][face])
+        return self.animation(vertices, face, audio, name, conditions, gate)
+
+    def stream(
+        self,
+        *,
+        identity: str | None = None,
+        condition: str | None = None,
+        style: str | None = None,
+        seed: int = 0,
+        expressivity: float = 1.0,
+        plan: WindowPlan | None = None,
+        gate: EnergyGate | None = EnergyGate(),  # noqa: B008 - it cannot be changed
+    ) -> RuntimeStream:
+        """Animate speech of any length while it arrives; the arguments are those of :meth:`animate`.
+
+        Args:
+            identity: as :meth:`animate` takes it.
+            condition: as :meth:`animate` takes it.
+            style: as :meth:`animate` takes it.
+            seed: as :meth:`animate` takes it.
+            expressivity: as :meth:`animate` takes it.
+            plan: how speech is cut; shorter windows give frames sooner. :attr:`windows` if None.
+            gate: as :meth:`animate` takes it.
+
+        Raises:
+            FaceDiffError: as :meth:`animate`.
+        """
+        face, conditions = self._face(identity, condition, style, seed, expressivity)
+        return RuntimeStream(self, face, conditions, plan or self.windows, gate)
+
+    def animation(
+        self,
+        vertices: Array,
+        face: int,
+        audio: Array | None,
+        name: str,
+        conditions: _Conditions,
+        gate: EnergyGate | None,
+    ) -> Animation:
+        """Vertices (T, V, 3) of a face with everything that exporters need."""
+        about, arrays = self.description, self.arrays
+        regions = {
+            key.removeprefix("region_"): value.astype(np.int64)
+            for key, value in arrays.items()
+            if key.startswith("region_")
+        }
+        metadata = {
+            "generator": f"facediff {__version__}",
+            "model": f"{about.model}, exported in {about.precision}",
+            "corpus": f"{about.corpus} (synthetic)" if about.synthetic else about.corpus,
+            **about.licences,
+            "identity": about.faces[face],
+            "style": conditions.style_name,
+            "seed": str(conditions.seed),
+            "sampler": f"{about.sampler}, {len(about.steps)} steps",
+        }
+        if gate is not None:
+            metadata["voice gate"] = "energy"
+        if conditions.expressivity != 1:
+            metadata["expressivity"] = f"{conditions.expressivity:g}"
+        optional = {key: arrays[key] for key in ("faces", "colours", "inner_lip_pairs") if key in arrays}
+        return Animation(
+            name=name,
+            vertices=np.ascontiguousarray(vertices, np.float32),
+            template=arrays["templates"][face],
+            frame_rate=about.frame_rate,
+            unit=about.unit,
+            speech=audio,
+            regions=regions,
+            metadata=metadata,
+            **cast(Any, optional),
+        )
+
+    def _face(
+        self, identity: str | None, condition: str | None, style: str | None, seed: int, expressivity: float
+    ) -> tuple[int, _Conditions]:
+        """The face's place among the templates, and what motion is conditioned on."""
+        about = self.description
+        chosen = identity if identity is not None else (about.identities or about.faces)[0]
+        if chosen not in about.faces:
+            raise FaceDiffError(f'identity: there is no "{chosen}": {choices(chosen, about.faces)}')
+        if condition is not None and condition not in about.identities:
+            raise FaceDiffError(
+                f'condition: the model was not trained on "{condition}": {choices(condition, about.identities)}'
+            )
+        name = style if style is not None else chosen
+        if name not in about.styles:
+            raise FaceDiffError(f'style: there is no "{name}": {choices(name, about.styles)}')
+        for option, value, kind in (("seed", seed, Seed), ("expressivity", expressivity, Expressivity)):
+            if (expected := mismatch(kind, value)) is not None:
+                raise FaceDiffError(f"{option} {value}: out of range; expected {expected}")
+        who = chosen if condition is None else condition
+        index = about.identities.index(who) if who in about.identities else -1
+        vector = self.arrays["styles"][about.styles.index(name)].astype(np.float32)
+        return about.faces.index(chosen), _Conditions(index, vector, name, seed, expressivity)
+
+    def _run(self, graph: str, inputs: Mapping[str, npt.NDArray[Any]]) -> list[Array]:
+        """Results of a graph, which may have no use for some of the inputs."""
+        session = self._sessions[graph]
+        wanted = {each.name for each in session.get_inputs()}
+        return cast(list[Array], session.run(None, {name: value for name, value in inputs.items() if name in wanted}))
+
+    def _features(self, speech: Array, frames: int, mean: float, deviation: float) -> Array:
+        """Speech (S,) to features (1, frames, dim)."""
+        return self._run(
+            "speech",
+            {
+                "audio": speech[None],
+                "mean": np.array([mean], np.float32),
+                "deviation": np.array([deviation], np.float32),
+                "samples": np.array([len(speech)], np.int64),
+                "mask": np.ones((1, frames), bool),
+            },
+        )[0]
+
+
+class _Conditions:
+    """What motion is conditioned on besides speech."""
+
+    def __init__(self, identity: int, style: Array, style_name: str, seed: int, expressivity: float) -> None:
+        self.identity = identity
+        self.style = style
+        self.style_name = style_name
+        self.seed = seed
+        self.expressivity = expressivity
+
+
+class _Sampling:
+    """One run of the sampler, of a clip or of a window that continues another.
+
+    Args:
+        model: the model.
+        conditions: what motion is conditioned on.
+        before: what the window before kept, one array for each evaluation of the network; None for nothing.
+        shared: frames that this window shares with it.
+
+    Attributes:
+        kept: what the next window is blended with, one array for each evaluation.
+    """
+
+    def __init__(
+        self, model: RuntimeModel, conditions: _Conditions, before: Sequence[Array] | None, shared: int
+    ) -> None:
+        self.model = model
+        self.conditions = conditions
+        self.before = before
+        self.shared = shared
+        self.kept: list[Array] = []
+
+    def run(self, features: Array, noise: ClipNoise | WindowNoise, of_mean: ClipNoise | WindowNoise) -> Array:
+        """Offsets from the template (1, frames, vertices, 3)."""
+        about, share = self.model.description, self.conditions.expressivity
+        mean = None
+        if share != 1:
+            # As the model's own mean: the prediction at the last step, averaged over a noise and its negative.
+            start = self._coloured(of_mean(features.shape[1], about.state))
+            ends = [self._decoded(self._evaluate(features, each, about.last_step)) for each in (start, -start)]
+            mean = (ends[0] + ends[1]) * np.float32(0.5)
+            if share == 0:
+                return mean
+        motion = self._decoded(self._loop(features, noise))
+        return motion if mean is None else np.asarray(mean + np.float32(share) * (motion - mean), np.float32)
+
+    def _loop(self, features: Array, noise: ClipNoise | WindowNoise) -> tuple[Array, Array]:
+        """The sampler's result, and what was kept of the last step."""
+        about = self.model.description
+        frames = features.shape[1]
+        noisy = self._coloured(noise(frames, about.state))
+        predictions: list[Array] = []
+        kept = noisy
+        for step, (of_noisy, first, second, third, of_noise) in zip(about.steps, about.table, strict=True):
+            prediction, kept = self._evaluate(features, noisy, step)
+            predictions = [prediction, *predictions][:3]
+            made = np.float32(of_noisy) * noisy
+            for factor, each in zip((first, second, third), predictions, strict=False):
+                if factor:
+                    made = made + np.float32(factor) * each
+            if of_noise:
+                made = made + np.float32(of_noise) * self._coloured(noise(frames, about.state))
+            noisy = made
+        return noisy, kept
+
+    def _evaluate(self, features: Array, noisy: Array, step: int) -> tuple[Array, Array]:
+        """The network's prediction at a step, blended with that of the window before."""
+        frames, about = features.shape[1], self.model.description
+        before, share = np.zeros((1, frames, about.kept), np.float32), np.ones((1, frames), np.float32)
+        if self.before is not None:
+            before[:, : self.shared] = self.before[len(self.kept)]
+            # 0 at the first shared frame, smooth at both ends: the rule of facediff.models.inference.crossfaded.
+            place = np.arange(self.shared, dtype=np.float32) / np.float32(self.shared)
+            share[:, : self.shared] = place * place * (3 - 2 * place)
+        prediction, kept = self.model._run(  # noqa: SLF001 - of this file
+            "step",
+            {
+                "features": features,
+                "mask": np.ones((1, frames), bool),
+                "identity": np.array([self.conditions.identity], np.int64),
+                "style": self.conditions.style[None],
+                "state": noisy,
+                "step": np.array([step], np.int64),
+                "before": before,
+                "share": share,
+            },
+        )
+        self.kept.append(kept)
+        return prediction, kept
+
+    def _decoded(self, result: tuple[Array, Array]) -> Array:
+        sample, kept = result
+        last = kept if self.model.description.decoded == "kept" else sample
+        return self.model._run("motion", {"sample": last})[0]  # noqa: SLF001 - of this file
+
+    def _coloured(self, unit: Array) -> Array:
+        root = self.model.arrays.get("noise")
+        return unit if root is None else unit @ root
+
+
+class RuntimeStream(SpeechWindows[Array]):
+    """Animates speech that arrives in pieces; see :class:`~facediff.data.windows.SpeechWindows`.
+
+    :meth:`feed` and :meth:`finish` give offsets (1, frames, vertices, 3) from the template, before any gate.
+
+    Args:
+        model: the model.
+        face: place of the face among the templates.
+        conditions: what motion is conditioned on.
+        plan: the windows.
+        gate: kept for who writes the frames; see :meth:`openness`.
+
+    Raises:
+        FaceDiffError: if the plan does not fit the frame rate.
+    """
+
+    def __init__(
+        self,
+        model: RuntimeModel,
+        face: int,
+        conditions: _Conditions,
+        plan: WindowPlan,
+        gate: EnergyGate | None = None,
+    ) -> None:
+        super().__init__(plan.in_frames(model.frame_rate), model.frame_rate)
+        self.model = model
+        self.face = face
+        self.conditions = conditions
+        self.gate = gate
+        self._tail: list[Array] | None = None
+
+    @property
+    def heard(self) -> int:
+        """Samples so far."""
+        return self._heard
+
+    def openness(self) -> Openness | None:
+        """The gate's openness of this speech, which has not begun yet; None without a gate."""
+        return None if self.gate is None else Openness(self.gate, self.model.frame_rate)
+
+    def generate(self, window: Window, speech: Array, frames: int, mean: float, deviation: float) -> Array:
+        """Motion of a window, blended in every step with the window before it."""
+        features = self.model._features(speech, frames, mean, deviation)  # noqa: SLF001 - of this file
+        features = np.ascontiguousarray(features[:, window.context : window.context + window.frames])
+        sampling = _Sampling(self.model, self.conditions, self._tail, window.shared)
+        noise = WindowNoise(NAME, window, [self.conditions.seed])
+        motion = sampling.run(features, noise, WindowNoise(f"{NAME}/mean", window, [0]))
+        self._tail = [kept[:, -window.kept :] for kept in sampling.kept]
+        return motion
+
+    def joined(self, parts: Sequence[Array]) -> Array:
+        """One array."""
+        vertices = self.model.arrays["templates"].shape[1]
+        return np.concatenate([np.zeros((1, 0, vertices, 3), np.float32), *parts], 1)
+
+
+def real_time_factor(seconds: float, speech: Array) -> float:
+    """Seconds of computing for each second of speech."""
+    return seconds / max(len(speech) / SAMPLE_RATE, math.ulp(1.0))

@@ -1,0 +1,113 @@
+"""The random numbers of PyTorch's processor, without PyTorch: equal seeds give the motion that the model gives."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.windows import Window
+
+Noise = npt.NDArray[np.float32]
+
+BLOCK = 16
+"""PyTorch makes 16 normal numbers of 16 uniform ones: 8 radii and 8 angles."""
+
+
+class NormalStream:
+    """Unit Gaussian numbers as ``torch.randn`` draws them on a processor.
+
+    Args:
+        seed: of ``torch.Generator().manual_seed``.
+
+    Example:
+        >>> NormalStream(0).draw((16,))[:2].round(4)
+        array([-1.1258, -1.1524], dtype=float32)
+    """
+
+    def __init__(self, seed: int) -> None:
+        # The same Mersenne twister, seeded by its authors' first rule, as PyTorch does it; of a larger seed PyTorch
+        # takes the lower 32 bits.
+        self._bits = np.random.MT19937()
+        self._bits._legacy_seeding(seed & 0xFFFFFFFF)
+
+    def draw(self, shape: tuple[int, ...]) -> Noise:
+        """The next numbers, 16 at least.
+
+        Raises:
+            ValueError: if there are fewer, which PyTorch draws by another rule.
+        """
+        count = int(np.prod(shape))
+        if count < BLOCK:
+            raise ValueError(f"{count} numbers: PyTorch draws fewer than {BLOCK} by another rule")
+        made = np.empty(count, np.float32)
+        whole = count - count % BLOCK
+        uniform = self._uniform(count)
+        made[:whole] = box_muller(uniform[:whole])
+        if whole < count:
+            # What is left over is not drawn by itself: the last 16 numbers are drawn again.
+            made[-BLOCK:] = box_muller(self._uniform(BLOCK))
+        return made.reshape(shape)
+
+    def _uniform(self, count: int) -> Noise:
+        raw = self._bits.random_raw(count)
+        return (raw & 0xFFFFFF).astype(np.float32) * np.float32(2.0**-24)
+
+
+def box_muller(uniform: Noise) -> Noise:
+    """Normal numbers of uniform ones in [0, 1), by blocks of 16 (Box and Muller 1958)."""
+    blocks = uniform.reshape(-1, 2, BLOCK // 2)
+    radius = np.sqrt(-2 * np.log(1 - blocks[:, 0]))
+    angle = np.float32(2 * np.pi) * blocks[:, 1]
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1).reshape(-1)
+
+
+def stream_of(name: str, seed: int) -> NormalStream:
+    """The stream of random numbers for a name and a seed, that of :func:`facediff.models.inference.noise_stream`."""
+    return NormalStream(zlib.crc32(name.encode()) + seed)
+
+
+class ClipNoise:
+    """Unit noise of a whole clip for several seeds, as :class:`facediff.models.inference.ClipNoise` draws it.
+
+    Args:
+        name: of the noise.
+        seeds: one for each sample.
+    """
+
+    def __init__(self, name: str, seeds: Sequence[int]) -> None:
+        self.streams = [stream_of(name, seed) for seed in seeds]
+
+    def __call__(self, frames: int, width: int) -> Noise:
+        """The next noise (seeds, frames, width)."""
+        return np.stack([stream.draw((frames, width)) for stream in self.streams])
+
+
+class WindowNoise:
+    """Unit noise of a window of long speech, as :class:`facediff.models.inference.WindowNoise` draws it.
+
+    Args:
+        name: of the noise.
+        window: which window.
+        seeds: one for each sample.
+    """
+
+    def __init__(self, name: str, window: Window, seeds: Sequence[int]) -> None:
+        self.window = window
+        self.new, self.old = (
+            [stream_of(f"{name}/{index}", seed) for seed in seeds] for index in (window.index, window.index - 1)
+        )
+
+    def __call__(self, frames: int, width: int) -> Noise:
+        """The next noise (seeds, frames, width); ``frames`` are those of the window."""
+        window = self.window
+        new = self._draw(self.new, window.index, width)[:, : window.frames - window.shared]
+        if not window.shared:
+            return new
+        return np.concatenate([self._draw(self.old, window.index - 1, width)[:, -window.shared :], new], 1)
+
+    def _draw(self, streams: Sequence[NormalStream], index: int, width: int) -> Noise:
+        frames = self.window.plan.hop if index else self.window.plan.frames
+        return np.stack([stream.draw((frames, width)) for stream in streams])

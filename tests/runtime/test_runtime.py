@@ -1,0 +1,292 @@
+"""Exported models: they give what the model gives, without PyTorch, and damaged folders are refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facediff import registry
+from facediff.data.voice_activity import EnergyGate
+from facediff.data.windows import Window, WindowPlan
+from facediff.errors import FaceDiffError
+from facediff.models import AnimationModel, DualPathDiffusion
+from facediff.models.graphs import update_table
+from facediff.models.inference import ClipNoise as ModelNoise
+from facediff.models.inference import WindowNoise as ModelWindowNoise
+from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler
+from facediff.pipelines.export_model import export_model
+from facediff.runtime import RuntimeModel
+from facediff.runtime.app import main
+from facediff.runtime.noise import ClipNoise, NormalStream, WindowNoise
+from tests.fakes.tiny import Tiny
+
+PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
+CPU = torch.device("cpu")
+
+pytest.importorskip("onnxscript")
+
+
+@pytest.mark.parametrize("count", [16, 17, 31, 64, 1000])
+def test_noise_is_that_of_pytorch(count: int) -> None:
+    for seed in (0, 7, 2**32 + 5):
+        generator, found = torch.Generator().manual_seed(seed), NormalStream(seed)
+        for _ in range(2):  # a second time from the same stream
+            wanted = torch.randn((count,), generator=generator).numpy()
+            np.testing.assert_allclose(found.draw((count,)), wanted, atol=2e-6)
+
+
+def test_noise_of_clips_and_windows_is_that_of_the_model() -> None:
+    like = torch.empty(2, 20, 8)
+    wanted = ModelNoise(["speech"] * 2, [20] * 2, [3, 4], CPU)(like).numpy()
+    np.testing.assert_allclose(ClipNoise("speech", [3, 4])(20, 8), wanted, atol=2e-6)
+    for index in (0, 1, 2):
+        window = Window(PLAN.in_frames(25.0), index, 30 if index < 2 else 17)
+        shown = torch.empty(1, window.frames, 8)
+        wanted = ModelWindowNoise("speech", window, [3], CPU)(shown).numpy()
+        np.testing.assert_allclose(WindowNoise("speech", window, [3])(window.frames, 8), wanted, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        partial(DdimSampler, steps=4),
+        partial(DdimSampler, steps=4, eta=0.5),
+        partial(DdpmSampler, steps=5),
+        partial(DpmSolverSampler, steps=6, order=3),
+        partial(DpmSolverSampler, steps=1),
+    ],
+)
+def test_table_of_updates_runs_the_sampler(make: Callable[..., Sampler]) -> None:
+    sampler = make(process=NoiseProcess(40))
+    noise = torch.randn(10, 3, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    drawn, again = iter(noise[1:]), iter(noise[1:])
+    wanted = sampler.run(lambda noisy, step: noisy.sin() + step / 40, noise[0], noise=lambda _: next(drawn))
+    noisy, predictions = noise[0], list[torch.Tensor]()
+    for step, (own, *factors, fresh) in zip(sampler.timesteps, update_table(sampler), strict=True):
+        predictions = [noisy.sin() + step / 40, *predictions][:3]
+        noisy = own * noisy + sum(f * p for f, p in zip(factors, predictions, strict=False))
+        noisy = noisy + fresh * next(again) if fresh else noisy
+    torch.testing.assert_close(noisy, wanted)
+
+
+@pytest.fixture(scope="module")
+def model(tiny_root: Path) -> AnimationModel:
+    """A tiny trained-like model with every part that an export has."""
+    return ready(tiny_root)
+
+
+def ready(root: Path, **options: object) -> AnimationModel:
+    from tests.fakes.tiny import SEEN, VERTICES
+
+    torch.manual_seed(0)
+    data = Tiny(root=str(root))
+    made = DualPathDiffusion(
+        **{
+            "n_vertices": VERTICES,
+            "identities": SEEN,
+            "frame_rate": 25.0,
+            "dim": 16,
+            "diffusion_steps": 40,
+            "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1),
+            "style_encoder": partial(registry.style_encoder.tcn_gru_transformer, num_layers=1),
+            "decoder": partial(registry.decoder.style_transformer, num_layers=1),
+            "sampler": partial(registry.sampler.dpm_solver, steps=3),
+            **options,
+        }
+    )
+    torch.nn.init.normal_(made.network.embed.bias)
+    made.adopt(data.assets().with_motion_scale(data.motion_scale()))
+    made.windows = PLAN
+    return made.eval()
+
+
+@pytest.fixture(scope="module")
+def folder(model: AnimationModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The model's folder."""
+    path = tmp_path_factory.mktemp("exported") / "tiny-onnx"
+    export_model(model, path)
+    return path
+
+
+def sound(seconds: float) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    loud = np.repeat(rng.random(int(seconds * 4) + 2), 4000)[: int(seconds * 16_000)]
+    return (0.2 * loud * rng.normal(size=len(loud))).astype(np.float32)
+
+
+def largest(found: np.ndarray, wanted: np.ndarray) -> float:
+    """The largest difference as a share of the motion's range."""
+    return float(np.abs(found - wanted).max() / np.ptp(wanted - wanted.mean(0)))
+
+
+@pytest.mark.parametrize("seconds", [0.5, 1.99, 4.3])  # in one pass, and by windows of which the last is short
+@pytest.mark.parametrize(("seed", "expressivity"), [(0, 1.0), (5, 1.5), (0, 0.0)])
+def test_folder_gives_what_the_model_gives(
+    model: AnimationModel, folder: Path, seconds: float, seed: int, expressivity: float
+) -> None:
+    speech = sound(seconds)
+    wanted = model.animate(torch.from_numpy(speech), identity="B", seed=seed, expressivity=expressivity)
+    runtime = RuntimeModel.open(folder)
+    found = runtime.animate(speech, identity="B", seed=seed, expressivity=expressivity, gate=None)
+    assert largest(found.vertices, wanted.vertices.numpy()) < 1e-4
+    assert found.metadata["identity"] == "B"
+    assert found.metadata["seed"] == str(seed)
+
+
+def test_stream_gives_what_the_file_gives(folder: Path) -> None:
+    runtime, speech = RuntimeModel.open(folder), sound(4.3)
+    stream = runtime.stream(identity="A", seed=2, gate=None)
+    pieces = [stream.feed(piece) for piece in np.split(speech, [1, 1000, 30_000, 30_001])]
+    made = np.concatenate([*pieces, stream.finish()], 1)[0] + runtime.arrays["templates"][stream.face]
+    assert np.array_equal(made, runtime.animate(speech, identity="A", seed=2, gate=None).vertices)
+
+
+def test_gate_holds_the_mouth_at_rest_in_silence(folder: Path) -> None:
+    runtime = RuntimeModel.open(folder)
+    still = runtime.animate(np.zeros(32_000, np.float32), gate=EnergyGate())
+    weights = runtime.arrays["rest_weights"][0]
+    assert np.allclose(still.vertices[:, weights == 1], still.template[weights == 1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"sampling_space": "vertices"},
+        {"motion_space": partial(registry.motion_space.components, count=6)},
+        {"sampler": partial(registry.sampler.ddpm, steps=4)},
+        {"style_encoder": registry.style_encoder.none, "fusion": registry.fusion.add},
+        {"decoder": registry.decoder.gru},
+    ],
+    ids=["vertices", "components", "ddpm", "no style", "gru"],
+)
+def test_other_parts_are_exported_too(tiny_root: Path, tmp_path: Path, options: dict[str, object]) -> None:
+    made = ready(tiny_root, **options)
+    if "motion_space" in options:
+        made.measure(Tiny(root=str(tiny_root)))  # type: ignore[operator]
+    check = export_model(made, tmp_path / "out").check
+    assert check["share_of_range"] < 1e-4
+
+
+@pytest.mark.slow
+def test_hubert_is_exported_too(tiny_root: Path, tmp_path: Path, hubert_source: Path) -> None:
+    made = ready(tiny_root, audio_encoder=partial(registry.audio_encoder.hubert, source=str(hubert_source)))
+    description = export_model(made, tmp_path / "out")
+    assert description.check["share_of_range"] < 1e-4
+    assert description.equal_lengths
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("precision", "bound"), [("float16", 0.02), ("int8", 0.1)])
+def test_fewer_bits_make_a_smaller_folder(
+    tiny_root: Path, tmp_path: Path, precision: str, bound: float, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facediff.pipelines.export_model.SMALLEST", 64)
+    description = export_model(ready(tiny_root), tmp_path / "out", precision=precision)  # type: ignore[arg-type]
+    assert 0 < description.check["share_of_range"] < bound
+    whole = json.loads((folder / "model.json").read_text())["sizes"]["speech.onnx"]
+    assert description.sizes["speech.onnx"] < whole
+
+
+def test_without_pytorch_the_command_animates(folder: Path, tmp_path: Path) -> None:
+    """A process in which torch, SciPy and Lightning cannot be imported."""
+    import soundfile
+
+    soundfile.write(tmp_path / "speech.wav", sound(1.0), 16_000)
+    program = (
+        "import sys\n"
+        "for name in ('torch', 'scipy', 'lightning', 'transformers', 'torchmetrics'): sys.modules[name] = None\n"
+        "from facediff.runtime.app import main\n"
+        "sys.exit(main(sys.argv[1:]))"
+    )
+    for name in ("out.npz", "out.glb", "out.html"):
+        words = [str(folder), str(tmp_path / "speech.wav"), "-o", str(tmp_path / name)]
+        done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+BROKEN = {
+    "no description": ("model.json", lambda path: path.unlink(), "model.json"),
+    "other json": ("model.json", lambda path: path.write_text("[]"), "model.json"),
+    "cut graph": ("step.onnx", lambda path: path.write_bytes(path.read_bytes()[:-9]), "step.onnx"),
+    "no arrays": ("arrays.npz", lambda path: path.unlink(), "arrays.npz"),
+    "no graph": (
+        "speech.onnx",
+        lambda path: path.write_bytes(b"\0" * path.stat().st_size),
+        "speech.onnx",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_damaged_folder_is_refused(case: str, folder: Path, tmp_path: Path) -> None:
+    name, spoil, named = BROKEN[case]
+    shutil.copytree(folder, tmp_path / "copy")
+    spoil(tmp_path / "copy" / name)
+    with pytest.raises(FaceDiffError, match=named):
+        RuntimeModel.open(tmp_path / "copy")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("frame_rate", 0),
+        ("table", [[1.0]]),
+        ("steps", []),
+        ("windows", {"seconds": -1}),
+        ("version", 99),
+        ("faces", []),
+        ("decoded", "maybe"),
+        ("state", True),
+        ("styles", ["only one"]),
+    ],
+)
+def test_impossible_description_is_refused(field: str, value: object, folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "copy")
+    path = tmp_path / "copy" / "model.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), field: value}))
+    with pytest.raises(FaceDiffError, match=r"model\.json|arrays\.npz"):
+        RuntimeModel.open(tmp_path / "copy")
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"identity": "Z"}, "identity"),
+        ({"condition": "Z"}, "condition"),
+        ({"style": "Z"}, "style"),
+        ({"seed": -1}, "seed"),
+        ({"expressivity": 3.0}, "expressivity"),
+    ],
+)
+def test_unknown_choice_is_refused(given: dict[str, object], named: str, folder: Path) -> None:
+    with pytest.raises(FaceDiffError, match=named):
+        RuntimeModel.open(folder).animate(sound(1.0), **given)  # type: ignore[arg-type]
+
+
+def test_command_says_errors_in_one_line(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "nowhere"), "speech.wav", "-o", str(tmp_path / "out.npz")]) == 2
+    assert main([str(folder), "-", "-o", str(tmp_path / "out.npz")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert "nowhere" in lines[0]
+    assert "-:" in lines[1]
+
+
+def test_model_that_cannot_be_exported_is_refused(tiny: Tiny, tmp_path: Path) -> None:
+    from facediff.models import StyleContentDisentanglement
+
+    made = StyleContentDisentanglement.__new__(StyleContentDisentanglement)
+    with pytest.raises(FaceDiffError, match="StyleContentDisentanglement"):
+        export_model(made, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
