@@ -16,7 +16,7 @@ def export_model(
     model: Annotated[Path, Option(metavar="MODEL", reads=True)],
     *,
     output: OutputFolder,
-    precision: Literal["float32", "float16", "int8"] = "float32",
+    weights: Literal["float32", "float16", "int8"] = "float32",
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
     steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
     speech: File = None,
@@ -33,7 +33,7 @@ def export_model(
     Args:
         model: checkpoint (.ckpt)
         output: folder to write
-        precision: how weights are stored: float32, float16, or int8 (the audio encoder's in 8 bits, the others in 16)
+        weights: how they are stored: float32, float16, or int8 (the audio encoder's in 8 bits, the others in 16)
         sampler: sampler of the exported model; the checkpoint's own by default
         steps: its denoising steps
         speech: recording that the folder is compared with the model on; a made-up sound by default
@@ -56,7 +56,7 @@ def export_model(
     if sampler is not None or steps is not None:
         loaded.choose_sampler(sampler, steps)
     tell(f"recording the graphs of {type(loaded).__name__}, which takes a minute …")
-    made = export(loaded, output, precision=precision, speech=samples)
+    made = export(loaded, output, precision=weights, speech=samples)
     megabytes = sum(made.sizes.values()) / 1e6
     tell(
         f"wrote {output}: {megabytes:.1f} MB, {made.precision}; largest difference from PyTorch "

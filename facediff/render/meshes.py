@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.utils.without_scipy import has_scipy
 
 Faces = npt.NDArray[np.int32]
 Float64 = npt.NDArray[np.float64]
@@ -83,20 +84,29 @@ class VertexSums:
     """
 
     def __init__(self, faces: Faces, n_vertices: int) -> None:
-        from scipy.sparse import csr_array
-
         corners = faces.ravel()
-        triangles = np.repeat(np.arange(len(faces)), 3)
-        self._at_vertices = csr_array((np.ones(len(corners)), (corners, triangles)), shape=(n_vertices, len(faces)))
+        self._corners, self._n_vertices = corners, n_vertices
         self.counts = np.maximum(np.bincount(corners, minlength=n_vertices), 1)[:, None]
 
     def __call__(self, values: Floats) -> Float64:
         """Sums (V, 3) of the triangles' values (F, 3)."""
+        if not has_scipy():
+            spread = np.repeat(np.asarray(values, np.float64), 3, axis=0)
+            return np.stack([np.bincount(self._corners, each, self._n_vertices) for each in spread.T], axis=1)
         return np.asarray(self._at_vertices @ values, dtype=np.float64)
 
     def mean_centres(self, vertices: Floats) -> Float64:
         """The mean (V, 3) of the centres of each vertex's triangles."""
         return np.asarray((self._neighbours @ vertices) / (3 * self.counts), dtype=np.float64)
+
+    @cached_property
+    def _at_vertices(self) -> Any:  # noqa: ANN401 - a sparse matrix of scipy
+        """Which triangles (F) each vertex (V) has."""
+        from scipy.sparse import csr_array
+
+        count = len(self._corners) // 3
+        triangles = np.repeat(np.arange(count), 3)
+        return csr_array((np.ones(len(triangles)), (self._corners, triangles)), shape=(self._n_vertices, count))
 
     @cached_property
     def _neighbours(self) -> Any:  # noqa: ANN401 - a sparse matrix of scipy

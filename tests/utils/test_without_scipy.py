@@ -8,6 +8,7 @@ from scipy.signal import butter, sosfilt
 from scipy.spatial import cKDTree
 
 from facediff.data.voice_activity import SPEECH_BAND
+from facediff.render.meshes import VertexSums
 from facediff.utils.filters import BLOCK, RecursiveFilter
 from facediff.utils.without_scipy import nearest_by_chunks, nearest_distances, solve_block_chain
 
@@ -51,3 +52,11 @@ def test_block_chain_equals_a_dense_solver(frames: int, count: int) -> None:
         dense[one, other] = dense[other, one] = link
     found = solve_block_chain(blocks, links, right)
     np.testing.assert_allclose(found.ravel(), np.linalg.solve(dense, right.ravel()))
+
+
+def test_sums_at_vertices_do_not_need_scipy(monkeypatch: pytest.MonkeyPatch) -> None:
+    faces = np.array([[0, 1, 2], [2, 1, 3], [3, 1, 0]], np.int32)
+    values = np.random.default_rng(3).normal(size=(3, 3))
+    wanted = VertexSums(faces, 5)(values)
+    monkeypatch.setattr("facediff.render.meshes.has_scipy", lambda: False)
+    np.testing.assert_allclose(VertexSums(faces, 5)(values), wanted)
