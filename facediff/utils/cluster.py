@@ -166,6 +166,8 @@ def own_environment() -> dict[str, str]:
 @contextmanager
 def quiet() -> Iterator[None]:
     """Keep Dask from logging what is reported as an error here."""
+    import distributed  # noqa: F401 - which chooses levels of its own when it is imported
+
     loggers = [logging.getLogger(name) for name in LOGGERS]
     before = [logger.level for logger in loggers]
     for logger in loggers:
@@ -206,6 +208,7 @@ def connected(scheduler: str, workers: int | None, tasks: int) -> Iterator[Any]:
 def reason(error: BaseException) -> str:
     """What an error of Dask's says, in a few words."""
     text = re.sub(r"in <.*?>: ", "", " ".join(str(error.__cause__ or error).split())) or type(error).__name__
+    text = text.partition("stderr: ")[2] or text  # of a program that failed
     return text if len(text) <= 120 else f"{text[:120]}…"
 
 
@@ -386,15 +389,45 @@ def slurm_cluster(scheduler: str, workers: int | None, tasks: int) -> Any:  # no
         import dask_jobqueue
 
         try:
-            found = dask_jobqueue.SLURMCluster(**options)
-            found.job_script()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of a dashboard at another port
+                found = dask_jobqueue.SLURMCluster(**options)
+                found.job_script()
         except (ValueError, TypeError, OSError, RuntimeError) as error:
             raise FaceDiffError(f"--scheduler {scheduler}: {reason(error)}; see docs/cluster.md") from error
         _clusters[scheduler] = found
-        atexit.register(found.close, timeout=5)
+        atexit.register(close_cluster, scheduler)
     per_job = found._dummy_job.worker_processes
     found.scale(n=max(per_job, min(workers or per_job, tasks)))
+    try:
+        check_jobs(found)
+    except (OSError, RuntimeError) as error:
+        close_cluster(scheduler)
+        raise FaceDiffError(f"--scheduler {scheduler}: a job cannot be started ({reason(error)})") from error
     return found
+
+
+def check_jobs(cluster: Any) -> None:  # noqa: ANN401
+    """Wait until jobs are submitted, and submit those again that were refused, of which dask-jobqueue only logs why.
+
+    Raises:
+        OSError: if there is no such program, likewise.
+        RuntimeError: with what ``sbatch`` said.
+    """
+    end = time.monotonic() + PATIENCE
+    while not set(cluster.worker_spec) <= set(cluster.workers) and time.monotonic() < end:
+        time.sleep(POLL / 4)
+    for job in list(cluster.workers.values()):
+        if job.status.name == "created":
+            cluster.sync(job.start)
+
+
+def close_cluster(scheduler: str) -> None:
+    """Cancel the jobs of a cluster; one whose jobs were refused cannot be closed in order."""
+    found = _clusters.pop(scheduler, None)
+    if found is not None:
+        with quiet(), suppress(Exception):
+            found.close(timeout=5)
 
 
 def slurm_options(scheduler: str) -> dict[str, Any]:

@@ -81,6 +81,7 @@ def test_threads_write_what_is_written_without_the_option(place: Path, capsys: p
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_a_cluster_of_other_processes_writes_the_same(place: Path, checkpoint: Path) -> None:
     """With one of its two workers killed between the commands."""
     pytest.importorskip("distributed")

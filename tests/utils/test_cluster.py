@@ -244,6 +244,12 @@ def test_without_slurm_its_program_is_named(monkeypatch: pytest.MonkeyPatch) -> 
         list(run_tasks(place, [0], scheduler="slurm:cores=1,memory=1GB"))
 
 
+def test_a_job_that_slurm_refuses_is_an_error(slurm: Path) -> None:
+    (slurm / "bin" / "sbatch").write_text("#!/bin/sh\necho 'sbatch: error: no such partition' >&2\nexit 1\n")
+    with pytest.raises(FaceDiffError, match=r"slurm:cores=1.*no such partition"):
+        list(run_tasks(place, [0], scheduler="slurm:cores=1,memory=1GB"))
+
+
 @pytest.mark.slow
 def test_tasks_run_in_jobs_of_slurm(slurm: Path) -> None:
     (slurm / "run").touch()
