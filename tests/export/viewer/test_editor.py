@@ -202,6 +202,7 @@ def test_preview_of_changed_keys_is_what_a_new_run_makes(show: Show) -> None:
     assert np.array_equal(np.reshape(page.evaluate(f"{frame}(31)"), (-1, 3)), before)
 
 
+@pytest.mark.slow  # a picture for every look
 def test_takes_are_compared_in_one_panel(show: Show) -> None:
     green = np.repeat(np.array([[20, 20, 220], [20, 220, 20], [20, 220, 20]], np.uint8), 4, axis=0)
     page = show([clicks(name="A"), clicks(name="a"), replace(clicks(name="B"), colours=green)], width=600, height=500)
@@ -262,7 +263,10 @@ def test_a_take_is_downloaded_as_an_archive_that_the_command_line_reads(show: Sh
     head = np.linspace(0, 0.1, 6 * FRAMES).reshape(FRAMES, 6)
     animation = replace(directed(name="wäre/es: so?"), unit="cm", head=head)
     page = show([clicks(), animation])
-    page.evaluate("(downloads.click(), taken.value = '1')")
+    keys = "document.getElementById('take-keys').disabled"
+    assert page.evaluate(f"(downloads.click(), {keys})")  # the first take has none
+    page.evaluate("(taken.value = '1', taken.dispatchEvent(new Event('change')))")
+    assert not page.evaluate(keys)
     click = "document.getElementById('take-motion').click()"
     path = downloaded(page, tmp_path / "taken", lambda: page.evaluate(click))
     assert path.name == "wäre_es_ so_.npz"

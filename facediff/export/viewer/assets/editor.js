@@ -232,7 +232,10 @@ class Editor {
   showCommand() {
     const { metadata } = this.facts.animations[this.number];
     const words = ["facediff", "animate", "SPEECH.wav", "--checkpoint", quoted(metadata.checkpoint ?? "CHECKPOINT")];
-    for (const name of ["identity", "seed"]) if (metadata[name]) words.push(`--${name}`, quoted(metadata[name]));
+    const directed = this.direction.of("style").length > 0; // then the style of the take is not one for all of it
+    for (const name of directed ? ["identity", "seed"] : ["identity", "style", "seed"]) {
+      if (/^[\w.-]+$/.test(metadata[name] ?? "")) words.push(`--${name}`, metadata[name]); // not "zoe (not trained on)"
+    }
     words.push("--direction", quoted(this.fileOf(this.number)), "-o", "take.html");
     find("command").textContent = words.join(" ");
   }

@@ -94,6 +94,7 @@ class Takes {
     find("take-glb").addEventListener("click", () => this.motion("glb"));
     find("take-sound").addEventListener("click", () => this.sound());
     find("take-keys").addEventListener("click", () => player.editor.save(this.number));
+    find("taken").addEventListener("change", () => this.choose());
     find("downloads").addEventListener("click", () => this.open());
   }
 
@@ -105,8 +106,13 @@ class Takes {
   open() {
     find("taken").value = this.player.comparison.seen[0];
     find("takes-said").textContent = "";
-    find("take-keys").disabled = this.player.editor.directions.every(({ keys }) => !keys.length);
+    this.choose();
     find("takes").showModal();
+  }
+
+  /** Another take may have no keys. */
+  choose() {
+    find("take-keys").disabled = !this.player.editor.directions[this.number].keys.length;
   }
 
   /** Download the chosen take as a file of a kind. */
