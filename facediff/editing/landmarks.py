@@ -305,7 +305,9 @@ DIGITS = 18  # of a whole number that fits into 64 bits
 EXAMPLE = "`source vertex,target vertex`, counted from 0, or a name of both such as `nose_tip,4034`"
 
 
-def read_landmarks(path: Path, source: Known | None = None, target: Known | None = None) -> Landmarks:
+def read_landmarks(
+    path: Path, source: Known | None = None, target: Known | None = None, counts: tuple[int, int] | None = None
+) -> Landmarks:
     """Pairs of places from a file: a CSV of two columns, or JSON as :func:`write_landmarks` writes it.
 
     Args:
@@ -313,15 +315,16 @@ def read_landmarks(path: Path, source: Known | None = None, target: Known | None
             on the mesh; the other side may be a vertex or the same name.
         source: named places of the source; None for none.
         target: of the target.
+        counts: vertices of both meshes, which a .json must have been picked on; None if they are not known.
 
     Raises:
-        FaceDiffError: if the file is missing or damaged, or a name is not known on the mesh.
+        FaceDiffError: if the file is missing or damaged, belongs to other meshes, or a name is not known on the mesh.
     """
     if path.suffix.lower() == ".json":
         content = load_json(
             path, remedy=f"expected landmarks, as `facediff retarget --pick` saves them, or CSV lines {EXAMPLE}"
         )
-        return parse_landmarks(content, path, source, target)
+        return parse_landmarks(content, path, source, target, counts)
     names, found = [], []
     for number, line in enumerate(read_table(path, remedy="expected a CSV of vertex pairs"), 1):
         words = [word.strip() for word in line if word.strip()]
@@ -331,7 +334,9 @@ def read_landmarks(path: Path, source: Known | None = None, target: Known | None
         if len(words) == 1 and named:
             words = words * 2
         if len(words) != 2 or not all(word in NAMES or _whole(word) for word in words):
-            raise FaceDiffError(f"{path}: line {number} is {','.join(line)}; expected {EXAMPLE}")
+            wrong = next((word for word in words if word.isidentifier() and word not in NAMES), None)
+            remedy = f'there is no name "{wrong}": {choices(wrong, NAMES)}' if wrong else f"expected {EXAMPLE}"
+            raise FaceDiffError(f"{path}: line {number} is {','.join(line)}; {remedy}")
         row = [
             int(word) if _whole(word) else _vertex_of(word, known, side, path)
             for word, known, side in zip(words, (source, target), ("source", "target"), strict=True)

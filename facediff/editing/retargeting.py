@@ -90,7 +90,7 @@ def retarget(
     landmarks = None
     if landmarks_path is not None:
         both = known_topology(animation.template), known_topology(mesh.vertices)
-        landmarks = read_landmarks(landmarks_path, *both)
+        landmarks = read_landmarks(landmarks_path, *both, (len(animation.template), len(mesh.vertices)))
     shown = named_triangles(mesh_path, parts) if parts else None
 
     def attempt(marks: Landmarks | None) -> tuple[Animation, Correspondence]:

@@ -271,8 +271,9 @@ def pick_landmarks(
     begin = start if start is not None else file if file.exists() else None
     given = None
     if begin is not None:
-        given = read_landmarks(begin, known_topology(source.template), known_topology(target.vertices))
-        given.check(len(source.template), len(target.vertices))
+        counts = len(source.template), len(target.vertices)
+        given = read_landmarks(begin, known_topology(source.template), known_topology(target.vertices), counts)
+        given.check(*counts)
     picking = Picking(source, target, names, file, given, shown)
     page = "".join(picking_page(picking))
     return run_server(lambda stop: make_app(picking, page, names_of(host), stop), host=host, port=port, ready=ready)

@@ -163,6 +163,18 @@ def test_names_stand_for_vertices_where_the_topology_is_known(tmp_path: Path) ->
     assert read_landmarks(tmp_path / "a.json", known).nearest_vertices.tolist() == [[124, 4034]]
 
 
+def test_landmarks_of_other_meshes_and_names_that_are_none_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "marks.json"
+    write_landmarks(path, some(), 1008, 42)
+    assert len(read_landmarks(path, counts=(1008, 42))) == 2
+    for counts, mesh in (((1008, 43), "target mesh of 42"), ((42, 42), "source mesh of 1008")):
+        with pytest.raises(FaceDiffError, match=mesh):
+            read_landmarks(path, counts=counts)
+    (tmp_path / "a.csv").write_text("source,target\nnose_tpi,4\n")
+    with pytest.raises(FaceDiffError, match="nose_tip"):
+        read_landmarks(tmp_path / "a.csv", known_topology(FACE.vertices))
+
+
 WRONG = {
     "no object": [1],
     "no format": {"landmarks": []},
