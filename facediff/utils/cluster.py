@@ -423,9 +423,15 @@ def check_jobs(cluster: Any) -> None:  # noqa: ANN401
 
 
 def close_cluster(scheduler: str) -> None:
-    """Cancel the jobs of a cluster; one whose jobs were refused cannot be closed in order."""
+    """Cancel the jobs of a cluster."""
     found = _clusters.pop(scheduler, None)
     if found is not None:
+        # Jobs that were refused are not there to be cancelled, which dask-jobqueue would insist on.
+        for name, job in list(found.workers.items()):
+            if job.status.name == "created":
+                found._created.discard(job)
+                found.worker_spec.pop(name, None)
+                found.workers.pop(name, None)
         with quiet(), suppress(Exception):
             found.close(timeout=5)
 
