@@ -405,8 +405,13 @@ def regions(
     root = root.expanduser()
     if not root.is_dir():
         raise FaceDiffError(f"{root}: no such folder; expected a corpus folder with a mesh and regions/")
+    from facediff.data.packed.stores import is_packed
     from facediff.evaluation.figures.regions import draw_regions
 
     find_own_module(corpus)
+    if is_packed(root):
+        from facediff.data.packed.reader import PackedCorpus
+
+        root = PackedCorpus(root).folder
     lines = draw_regions(root, output, corpus=corpus, lips=lips, upper_face=upper_face, size=size)
     tell(*lines, f"written: {output}")

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -343,3 +344,25 @@ def test_the_check_understands_packed_corpora(corpus: Path, packed: Path) -> Non
     assert (other.splits, other.subjects, other.regions) == (plain.splits, plain.subjects, plain.regions)
     assert {finding.kind for finding in other.findings} - {finding.kind for finding in plain.findings} == {"packed"}
     assert str(packed) in json.dumps(other.state())
+
+
+def test_the_regions_of_a_packed_corpus_are_drawn(packed: Path, tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    from facediff.cli.data import regions
+
+    regions(packed, output=tmp_path / "regions.png", corpus=TINY, size=64)
+    assert (tmp_path / "regions.png").stat().st_size
+
+
+def test_packed_scores_are_those_of_the_folder(
+    corpus: Path, packed: Path, make_model: Callable[..., Any], make_trainer: Callable[..., Any]
+) -> None:
+    plain, other = (
+        make_trainer().test(make_model(motion_scale="none"), datamodule=Tiny(root=str(root)), verbose=False)
+        for root in (corpus, packed)
+    )
+    for one, two in zip(plain, other, strict=True):
+        for name in ("test_a/mve", "test_a/lve", "test_b/lve"):
+            if name in one:
+                assert two[name] == pytest.approx(one[name], rel=1e-4)
+    assert any("lve" in name for scores in plain for name in scores)
