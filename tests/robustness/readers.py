@@ -288,6 +288,12 @@ def read_targets(path: Path) -> object:
     return read_shape_files(path)
 
 
+def read_parts(path: Path) -> object:
+    from facediff.mesh.parts import mesh_parts
+
+    return mesh_parts(path)
+
+
 def add_motion(path: Path) -> object:
     from facediff.export.glb_added import add_to_glb
     from tests.fakes.clicks import clicks
@@ -860,6 +866,7 @@ READERS = {
     **{suffix: Reader(f".{suffix}", mesh, read_a_mesh) for suffix in ("obj", "ply", "stl", "off", "glb")},
     "shapes, a folder": Reader(".obj", mesh, shape_folder),
     "shapes, glb": Reader(".glb", targets, read_targets),
+    "parts of a mesh, obj": Reader(".obj", mesh, read_parts),
     "mesh that an animation is added to, glb": Reader(".glb", targets, add_motion),
     "eyes": Reader(".json", eyes, read_the_eyes),
     "eyes, shapes": Reader(".json", blinks, read_the_eyes),
