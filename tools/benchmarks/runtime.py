@@ -2,10 +2,11 @@
 
     python tools/benchmarks/runtime.py demo/puppet.ckpt
 
-installs tools/runtime in a fresh environment, exports the model in float32, float16 and int8, and runs the command there on
-test recordings of the model's corpus. The table has for each precision: megabytes of the folder; seconds from the start of
-the process to the written file of a recording; seconds of computing for each second of speech; the largest difference
-from PyTorch as a share of the motion's range; and the lip vertex error on test A as a multiple of PyTorch's.
+installs tools/runtime in a fresh environment, exports the model in float32, float16 and int8, and animates a test
+recording of the model's corpus there. The table has for each precision: megabytes of the folder; seconds from the start
+of the process to the written file of that recording; seconds of computing for each second of speech; the largest
+difference from PyTorch as a share of the motion's range; and the lip vertex error on the first test split as a multiple
+of PyTorch's.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class FaceFormer(OffsetModel):
 
     Args:
         options: those of :class:`OffsetModel`, of the other methods with this decoder, see
-            :class:`AutoregressiveModel`, and of every model.
+            :class:`~facediff.models.published.autoregressive.AutoregressiveModel`, and of every model.
     """
 
     # wav2vec 2.0 base as transformers had it in 2021; all but the convolutions is trained, with masks and layer drop.

@@ -50,7 +50,8 @@ class TalkingStyle(OffsetModel):
         style_attention: as published, the attention over the components of a speaker's row sees them as items of a
             batch, each with itself as the only key (``one_key``), so that its weights are 1 whatever it learns; over
             all ``components``, as is meant, it has something to weigh.
-        options: those of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
+        options: those of the other methods with this decoder, see
+            :class:`~facediff.models.published.autoregressive.AutoregressiveModel`, and of every model.
     """
 
     # HuBERT large; all but the convolutions is trained, with masks and layer drop.
