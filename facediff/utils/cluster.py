@@ -467,7 +467,12 @@ def slurm_options(scheduler: str) -> dict[str, Any]:
         if name not in known or not equals:
             raise FaceDiffError(f"--scheduler {scheduler}: there is no option {name!r}: {choices(name, sorted(known))}")
         # A walltime such as 01:30:00 is a number to YAML.
-        options[name] = value if re.fullmatch(r"[\d:-]+:[\d:]+", value) else yaml.safe_load(value)
+        try:
+            options[name] = value if re.fullmatch(r"[\d:-]+:[\d:]+", value) else yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise FaceDiffError(
+                f"--scheduler {scheduler}: {name} is {value!r}; expected a number, a text, or a list such as [a, b]"
+            ) from error
     configured = dask.config.get("jobqueue.slurm", {})
     if options.get("processes", configured.get("processes")) is None:
         options["processes"] = options.get("cores", configured.get("cores"))

@@ -148,6 +148,41 @@ def read_a_benchmark_plan(path: Path) -> object:
     return read_outline(path.parent)
 
 
+def graphs_and_arrays(folder: Path) -> dict[str, int]:
+    """What lies next to an exported model's description; the sizes of the files."""
+    from facediff.runtime.folder import ARRAYS, GRAPHS
+
+    for graph in GRAPHS:
+        (folder / f"{graph}.onnx").write_bytes(b"graph")
+    arrays = {"templates": np.zeros((1, 4, 3), np.float32), "styles": np.zeros((1, 2), np.float32)}
+    np.savez(folder / ARRAYS, **arrays, rest_weights=np.ones((1, 4), np.float32))
+    return {name: (folder / name).stat().st_size for name in (*(f"{graph}.onnx" for graph in GRAPHS), ARRAYS)}
+
+
+def exported_model(path: Path) -> None:
+    from facediff.runtime.folder import Description
+
+    sizes = graphs_and_arrays(path.parent)
+    windows = {"seconds": 4.0, "overlap": 1.0, "before": 2.0, "after": 0.5, "above": 10.0}
+    description = Description(
+        **{"model": "Model", "facediff": "1", "corpus": "tiny", "synthetic": True, "licences": {}, "opset": 20},
+        **{"precision": "float32", "sizes": sizes, "graphs": {}, "sample_rate": 16_000, "frame_rate": 25.0},
+        **{"unit": "m", "identities": ["A"], "faces": ["A"], "styles": ["A"], "windows": windows, "epsilon": 1e-7},
+        **{"equal_lengths": False, "state": 8, "kept": 8, "sampler": "ddim", "steps": [0], "last_step": 0},
+        **{"table": [[0.0, 1.0, 0.0, 0.0, 0.0]], "decoded": "sample"},
+    )
+    path.write_text(json.dumps(description.content(), allow_nan=False))
+
+
+def read_an_exported_model(path: Path) -> object:
+    from facediff.runtime.folder import read_folder
+
+    if path.is_file() and path.name != "model.json":
+        shutil.copy(path, path.with_name("model.json"))
+    graphs_and_arrays(path.parent)
+    return read_folder(path.parent)
+
+
 def benchmark_cell(path: Path) -> None:
     from tests.fakes.benchmark import results
 
@@ -853,6 +888,7 @@ def _output_to(stream: object) -> object:
 READERS = {
     "plan": Reader(".yaml", plan, read_plan),
     "benchmark, plan": Reader(".json", benchmark_plan, read_a_benchmark_plan),
+    "exported model": Reader(".json", exported_model, read_an_exported_model),
     "benchmark, cell": Reader(".json", benchmark_cell, read_a_benchmark_cell),
     "provenance": Reader(".json", provenance, read_a_provenance),
     "answers of a rater": Reader(".json", answers, read_the_answers),

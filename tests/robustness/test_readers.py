@@ -53,6 +53,7 @@ NOT_FROM_ELSEWHERE = {
     "facediff/render": "writes",
     "facediff/models/styles.py:given_face": "hands files over to the readers of meshes and arrays",
     "facediff/models/published/importing.py:read_value": "a word of the command line",
+    "facediff/utils/cluster.py:slurm_options": "a word of the command line",
     "facediff/benchmark/published.py": "part of the package",
     "facediff/benchmark/running.py": "what a command of our own has just written",
     "facediff/benchmark/writing.py:replace_block": "a page of text, which is not decoded",
