@@ -52,7 +52,7 @@ def adapt(
         checkpoint: trained model (.ckpt)
         person: folder that `facediff data import-person` wrote, or the name of a speaker of the corpus who was not
             trained on and has clips that belong to no split
-        voices: let the audio encoder learn other voices, rooms and noise, in so many steps (350 if no number); modes,
+        voices: let the audio encoder learn other voices, rooms and noise, in so many steps (600 if no number); modes,
             epochs and rates are those of --person
         augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
             docs/voices.md)

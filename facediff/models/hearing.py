@@ -71,9 +71,9 @@ class HearingOptions:
     augmentations: Sequence[str] = OTHER_VOICES
     steps: int = USUAL_VOICE_STEPS
     batch_size: int = 12
-    share: float = 0.65
+    share: float = 0.5
     further: int = 1200
-    moved: float = 0.65
+    moved: float = 0.85
     learning_rate: float = 1e-3
     seed: int = 0
     workers: int = 1

@@ -269,7 +269,7 @@ SwayAngle = Annotated[float, Range(0, 15, above=True)]
 USUAL_SWAY = 2.0
 """Degrees where no number is given."""
 Tolerance = Annotated[float, Range(1e-15, 1)]
-USUAL_VOICE_STEPS = 350
+USUAL_VOICE_STEPS = 600
 """Training steps in which an audio encoder learns other voices where no number is given."""
 Vertices = Annotated[int, Range(1, 2_000_000)]
 Window = Annotated[float, Range(0.01, 600)]
