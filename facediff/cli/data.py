@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Scheduler, Size, Workers
 from facediff.cli.parsing import Group, Option, Parameter, Parameters, parameters_of, parse
@@ -228,6 +228,7 @@ def pack(
     corpus: Corpus = None,
     tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.01,
     lossless: bool = False,
+    exact: Literal["test", "none"] = "test",
     unit: Annotated[str | None, Option(metavar="U")] = None,
     chunk_seconds: Annotated[ranges.ChunkLength, Option(metavar="S")] = 0.5,
     workers: Workers = None,
@@ -245,6 +246,7 @@ def pack(
         corpus: what the folder is: biwi, vocaset, mead3d, puppet, or package.module.Class
         tolerance: by how many millimetres a stored coordinate may differ, at most
         lossless: keep the motion bit for bit, at about half its size
+        exact: keep test clips and their style references bit for bit, so that scores stay the same; or none
         unit: the corpus's unit of length, m, cm, mm or a number of metres (default: that of its manifest.json, or the
             corpus's own)
         chunk_seconds: motion is read in pieces of this length
@@ -264,6 +266,7 @@ def pack(
             corpus=corpus,
             tolerance=tolerance,
             lossless=lossless,
+            exact=exact,
             unit=unit,
             chunk_seconds=chunk_seconds,
             workers=workers,

@@ -310,6 +310,15 @@ class ReferencePolicy:
         alike = [c for c in others if all(c.attributes.get(k) == target.attributes.get(k) for k in self.same)]
         return alike or others
 
+    def evaluated(self, target: Clip) -> Clip:
+        """The one that serves ``target`` in evaluation; it follows from the target's name.
+
+        Raises:
+            FaceDiffError: as :meth:`eligible` does.
+        """
+        eligible = self.eligible(target)
+        return eligible[zlib.crc32(target.name.encode()) % len(eligible)]
+
 
 Aligner = Callable[[Tensor, int, Tensor, int], Tensor]
 """For each frame of one recording that of another which goes with it, indices (frames,). It takes the speech
@@ -471,12 +480,12 @@ class MotionDataset(Dataset[Sample]):
         return start, start + longest
 
     def _reference(self, clip: Clip, random: torch.Generator) -> Clip:
-        if self.training and self.policy.choice == "self":
+        if not self.training:
+            return self.policy.evaluated(clip)
+        if self.policy.choice == "self":
             return clip
-        eligible = self.policy.eligible(clip, any_mood=self.training and self.policy.choice == "any_mood")
-        if self.training:
-            return eligible[int(torch.randint(len(eligible), (), generator=random))]
-        return eligible[zlib.crc32(clip.name.encode()) % len(eligible)]
+        eligible = self.policy.eligible(clip, any_mood=self.policy.choice == "any_mood")
+        return eligible[int(torch.randint(len(eligible), (), generator=random))]
 
     def _features(self, clip: Clip, start: int, stop: int, frames: int) -> Tensor | None:
         """The steps of the whole clip's features that lie in frames ``start`` to ``stop``."""

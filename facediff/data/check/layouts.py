@@ -342,7 +342,7 @@ def _view_of_module(module: Module, root: Path, split: str | None) -> View:
         frame_rate=module.frame_rate,
         stored_frame_rate=module.stored_frame_rate or module.frame_rate,
         parse=module.parse_name,
-        split_of={way: _instance(module, root, way).split_of for way in (ways if split is None else [split])},
+        split_of={way: instance(module, root, way).split_of for way in (ways if split is None else [split])},
         identities=list(module.identities),
         expected=module.expected_clips(),
         mesh_files=module.mesh_files,
@@ -353,7 +353,12 @@ def _view_of_module(module: Module, root: Path, split: str | None) -> View:
     )
 
 
-def _instance(module: Module, root: Path, way: str | None) -> SpeechMotionDataModule:
+def instance(module: Module, root: Path, way: str | None) -> SpeechMotionDataModule:
+    """The data module of a folder, for one of the ways in which the corpus is split.
+
+    Raises:
+        FaceDiffError: if it needs further parameters.
+    """
     options: dict[str, Any] = {} if way is None else {"split": way}
     try:
         return module(root=str(root), **options)

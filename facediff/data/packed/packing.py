@@ -6,12 +6,12 @@ import hashlib
 import io
 import json
 from collections.abc import Iterable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +49,12 @@ from facediff.utils.jobs import WorkerDied, run_tasks
 from facediff.utils.limits import LIMITS
 from facediff.utils.plain_files import load_json, write_json
 from facediff.utils.units import metres_per_unit
+
+if TYPE_CHECKING:
+    from facediff.data.check.layouts import View
+
+Exact = Literal["test", "none"]
+"""Clips of which every bit is kept: those that scores are computed from, or none."""
 
 LOCK = ".pack.lock"
 PARTS = "parts"
@@ -140,6 +146,7 @@ def pack(
     corpus: str | None = None,
     tolerance: float = 0.01,
     lossless: bool = False,
+    exact: Exact = "test",
     unit: str | None = None,
     chunk_seconds: float = 0.5,
     workers: int | None = None,
@@ -157,6 +164,8 @@ def pack(
         corpus: name or import path of the corpus; found out if None.
         tolerance: millimetres by which a coordinate may differ, at most.
         lossless: keep every bit of the motion.
+        exact: which clips keep every bit all the same: ``test`` for those of the test splits and the style references
+            of each, so that scores do not change; or ``none``.
         unit: the corpus's unit of length; that of its manifest or its data module if None.
         chunk_seconds: length of the pieces in which motion is read.
         workers: processes; as many as there are processors if None.
@@ -180,7 +189,9 @@ def pack(
     if out.resolve().is_relative_to(root.resolve()):
         raise FaceDiffError(f"{out}: lies in the corpus folder {root}; choose a folder outside it")
     require_zarr("packing a corpus")
-    plan = Plan.of(root, corpus, 0.0 if lossless else tolerance, unit, chunk_seconds)
+    if exact not in get_args(Exact):
+        raise FaceDiffError(f"--exact {exact}: unknown; expected one of {', '.join(get_args(Exact))}")
+    plan = Plan.of(root, corpus, 0.0 if lossless else tolerance, unit, chunk_seconds, exact)
     check_writable(out / STATE)
     with locked(out / LOCK, "facediff data pack"):
         return _carry_out(plan, out, workers, scheduler, quiet)
@@ -219,7 +230,9 @@ class Plan:
     bytes: int
 
     @classmethod
-    def of(cls, root: Path, corpus: str | None, tolerance: float, unit: str | None, chunk_seconds: float) -> Plan:
+    def of(
+        cls, root: Path, corpus: str | None, tolerance: float, unit: str | None, chunk_seconds: float, exact: Exact
+    ) -> Plan:
         """Look through a corpus folder.
 
         Raises:
@@ -242,7 +255,8 @@ class Plan:
         coding = "int16" if step * millimetres * np.iinfo(np.int16).max >= ROOM else "int32"
         templates = read_templates(root / "templates.pkl", view.n_vertices)
         clips, arrays, left_out, size, seen = {}, {}, [], 0, hashlib.sha256()
-        rows = 0
+        rows = dict.fromkeys(CODINGS, 0)
+        kept = scored_clips(root, view) if tolerance and exact == "test" else frozenset()
         sounds = {path.stem: path for path in sorted((root / "wav").glob("*.wav"))}
         motions = {
             path.stem: path
@@ -263,10 +277,10 @@ class Plan:
                 raise FaceDiffError(
                     f"{root / 'templates.pkl'}: no template for {clip.identity}, needed by clip {name}; {REMEDY}"
                 )
-            own = coding if tolerance else vertices.dtype.name
+            own = coding if tolerance and name not in kept else vertices.dtype.name
             nothing = Sound(0, (), "flac", 16_000, 1, 1, 16)
-            clips[name] = PackedClip(name, clip.identity, own, vertices.dtype.name, rows, len(vertices), nothing)
-            rows += -(-len(vertices) // chunk) * chunk
+            clips[name] = PackedClip(name, clip.identity, own, vertices.dtype.name, rows[own], len(vertices), nothing)
+            rows[own] += -(-len(vertices) // chunk) * chunk
             for each in (path, sounds[name]):
                 facts = each.stat()
                 size += facts.st_size
@@ -277,7 +291,9 @@ class Plan:
         for own in sorted({clip.coding for clip in clips.values()}):
             dtype = CODINGS[own]
             chunks = max(1, SHARD_BYTES // (chunk * width * dtype.itemsize))
-            arrays[f"motion_{own}"] = ArrayFacts(dtype.name, rows, width, chunk, min(chunks, -(-rows // chunk)), ())
+            arrays[f"motion_{own}"] = ArrayFacts(
+                dtype.name, rows[own], width, chunk, min(chunks, rows[own] // chunk), ()
+            )
         record = Record(
             made_by=_version(),
             corpus=view.corpus,
@@ -324,6 +340,23 @@ class Plan:
                 )
         for clip in self.record.clips.values():
             yield Task(f"{PARTS}/{clip.name}", sound=self.root / "wav" / f"{clip.name}.wav")
+
+
+def scored_clips(root: Path, view: View) -> frozenset[str]:
+    """Clips that scores are computed from: those of the test splits, and the style reference of each."""
+    from facediff.data.check.layouts import by_name, instance
+
+    found: set[str] = set()
+    if view.data_module is None:  # a person's folder, which is read next to a corpus and never packed with one
+        return frozenset()
+    for way in view.split_of:
+        data = instance(by_name(view.data_module, view.n_vertices), root, way)
+        policy = data.reference_policy()
+        for clip in (clip for split in data.test_splits for clip in data.clips(split)):
+            found.add(clip.name)
+            with suppress(FaceDiffError):  # without a reference it cannot be scored
+                found.add(policy.evaluated(clip).name)
+    return frozenset(found)
 
 
 def _other_files(root: Path) -> tuple[str, ...]:

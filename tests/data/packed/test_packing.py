@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from facediff.data import Biwi
 from facediff.data.check import check
 from facediff.data.corpus import read_templates
 from facediff.data.packed import packing
-from facediff.data.packed.packing import pack
 from facediff.data.packed.reader import PackedCorpus
 from facediff.data.packed.unpacking import unpack
 from facediff.data.prepare.runner import write_templates
@@ -28,6 +28,7 @@ from tests.fakes.tiny import VERTICES, Tiny, write_tiny
 
 TINY = "tests.fakes.tiny.Tiny"
 MM = 0.001
+pack = partial(packing.pack, exact="none")
 
 
 @pytest.fixture(scope="module")
@@ -208,6 +209,31 @@ def test_batches_of_packed_and_plain_agree_in_loader_processes(corpus: Path, pac
     assert torch.equal(twin.assets().templates["A"], plain.assets().templates["A"])
     assert twin.motion_scale() == pytest.approx(plain.motion_scale(), rel=1e-4)
     assert (twin.root / "phonemes" / "A_e01.csv").is_file()
+
+
+def test_what_scores_are_computed_from_keeps_every_bit(corpus: Path, tmp_path: Path) -> None:
+    packing.pack(corpus, tmp_path / "out.zarr", corpus=TINY, workers=1)
+    plain, other = (Tiny(root=str(root)) for root in (corpus, tmp_path / "out.zarr"))
+    codings = {name: clip.coding for name, clip in other.packed.record.clips.items()} if other.packed else {}
+    scored: set[str] = set()
+    for split in ("test_a", "test_b"):
+        for one, twin in zip(plain.dataset(split), other.dataset(split), strict=True):
+            assert (one.name, one.reference_name) == (twin.name, twin.reference_name)
+            for kind in ("motion", "reference", "audio", "template"):
+                assert torch.equal(getattr(one, kind), getattr(twin, kind))
+            scored |= {one.name, one.reference_name}
+    assert codings == {name: "float32" if name in scored else "int16" for name in codings}
+    assert len(scored) < len(codings)
+    # Each array holds the rows of its own clips only.
+    assert sum(facts.rows for name, facts in other.packed.record.arrays.items() if name.startswith("motion")) == sum(
+        -(-clip.frames // 12) * 12 for clip in other.packed.record.clips.values()
+    )
+    assert unpack(tmp_path / "out.zarr", tmp_path / "back", workers=1) == len(codings)
+    for name, coding in codings.items():
+        was, now = (np.load(root / "vertices_npy" / f"{name}.npy") for root in (corpus, tmp_path / "back"))
+        assert np.array_equal(was, now) == (coding == "float32")
+    with pytest.raises(FaceDiffError, match="exact"):
+        packing.pack(corpus, tmp_path / "more.zarr", corpus=TINY, exact="all")  # type: ignore[arg-type]
 
 
 class MiniBiwi(Biwi):
