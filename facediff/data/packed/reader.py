@@ -170,9 +170,10 @@ class PackedCorpus:
         for number in range(first // each, -(-stop // each)):
             encoded = self._arrays["speech"].read(int(places[number]), int(places[number + 1])).tobytes()
             expected = min(each, sound.samples - number * each)
-            piece = self._decoded(encoded, name, expected)
             low, high = max(first, number * each), min(stop, number * each + expected)
-            found[low - first : high - first] = piece[low - number * each : high - number * each]
+            found[low - first : high - first] = self._decoded(
+                encoded, name, expected, low - number * each, high - number * each
+            )
         return found >> (32 - sound.bits)
 
     def recording(self, name: str) -> bytes:
@@ -180,14 +181,17 @@ class PackedCorpus:
         sound = self.record.clips[name].sound
         return self._arrays["speech"].read(sound.first, sound.first + sum(sound.pieces)).tobytes()
 
-    def _decoded(self, encoded: bytes, name: str, expected: int) -> npt.NDArray[np.int32]:
+    def _decoded(self, encoded: bytes, name: str, expected: int, low: int, high: int) -> npt.NDArray[np.int32]:
+        """Samples ``low`` to ``high`` of a stream that has ``expected``; what lies around them is not decoded."""
         sound = self.record.clips[name].sound
         with open_sound(io.BytesIO(encoded), self._speech_of(name)) as file:
             declared = (file.format, file.frames, file.channels, file.samplerate)
             wanted = ("FLAC", expected, sound.channels, sound.rate)
             if declared == wanted:
-                piece: npt.NDArray[np.int32] = file.read(expected, dtype="int32", always_2d=True)
-                if len(piece) == expected:
+                if low:
+                    file.seek(low)
+                piece: npt.NDArray[np.int32] = file.read(high - low, dtype="int32", always_2d=True)
+                if len(piece) == high - low:
                     return piece
         raise FaceDiffError(f"{self._speech_of(name)} is not what the record says; {REMEDY}")
 
@@ -263,7 +267,8 @@ class PackedMotion:
                 row += chunk[inner]
             for place in places.get(inner, ()):
                 if exact is None:
-                    np.multiply(row, step, out=motion[place], casting="unsafe")
+                    np.copyto(motion[place], row)  # and then in place: a fifth quicker than at once
+                    motion[place] *= step
                 else:
                     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused
                         np.copyto(motion[place], row.view(exact), casting="same_kind")

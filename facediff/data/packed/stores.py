@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from facediff.data.packed.layout import DAMAGED, METADATA, STATE
+from facediff.data.packed.web import WebServer
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.files import atomic, cache_dir
 from facediff.utils.limits import brief
@@ -117,6 +118,7 @@ class Remote:
     def __init__(self, address: str, cache: ChunkCache | None) -> None:
         self.source = address.rstrip("/")
         self.cache = cache
+        self._web = WebServer(self.source) if WebServer.serves(self.source) else None
         self._system: Any = None
         self._process = 0
         self._base = ""
@@ -144,8 +146,14 @@ class Remote:
                     self.cache.put(key, each, part)
         return [found[each] for each in wanted]
 
-    def _fetch(self, key: str, start: int | None, end: int | None) -> bytes:
+    def _fetch(self, key: str, start: int | None, end: int | None) -> bytes | bytearray:
         where = f"{self.source}/{key}"
+        try:
+            found = None if self._web is None else self._web.get(key, start, end)
+        except FileNotFoundError as error:
+            raise FaceDiffError(f"{where}: there is no such object; check the address") from error
+        if found is not None:
+            return found
         system = self._connected()
         try:
             content: bytes = system.cat_file(f"{self._base}/{key}", start=start, end=end)
@@ -191,7 +199,7 @@ def runs(wanted: Sequence[Range]) -> list[list[Range]]:
     return found
 
 
-def split(content: bytes, run: Sequence[Range], source: object) -> list[memoryview]:
+def split(content: bytes | bytearray, run: Sequence[Range], source: object) -> list[memoryview]:
     """The bytes of a run of ranges, one view for each.
 
     Raises:

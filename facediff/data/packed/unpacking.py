@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -91,7 +92,9 @@ def _write_clip(packed: PackedCorpus, folder: Path, templates: dict[str, Any], n
     sound, path = clip.sound, folder / "wav" / f"{name}.wav"
     if sound.form == "flac":
         samples = packed.samples(name, 0, sound.samples) << (32 - sound.bits)
-        soundfile.write(path, samples, sound.rate, subtype=f"PCM_{sound.bits}", format="WAV")
+        stream = io.BytesIO()  # since libsndfile does not say that a disk is full
+        soundfile.write(stream, samples, sound.rate, subtype=f"PCM_{sound.bits}", format="WAV")
+        path.write_bytes(stream.getvalue())
     else:
         path.write_bytes(packed.recording(name))
 

@@ -18,6 +18,7 @@ from facediff.data.check import check
 from facediff.data.packed.packing import pack
 from facediff.data.packed.stores import ChunkCache
 from facediff.data.packed.unpacking import unpack
+from facediff.data.packed.web import WebServer
 from facediff.errors import FaceDiffError
 from facediff.utils.files import describe_files
 from tests.fakes.tiny import Tiny, write_tiny
@@ -30,12 +31,21 @@ class Ranges(http.server.SimpleHTTPRequestHandler):
 
     protocol_version = "HTTP/1.1"
     sent: list[tuple[str, int]] = []  # noqa: RUF012
+    clients: set[object] = set()  # noqa: RUF012
 
     def do_GET(self) -> None:  # noqa: N802
+        self.clients.add(self.client_address)
+        if self.path.startswith("/moved/"):
+            self.send_response(302)
+            self.send_header("Location", self.path.removeprefix("/moved"))
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
         path = Path(self.translate_path(self.path))
         if not path.is_file():
             self.send_error(404)
             return
+        self.close_connection = "hasty" in self.path  # without a word, as servers do that were idle for too long
         content, asked = path.read_bytes(), re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
         if asked:
             content = content[int(asked[1]) : int(asked[2]) + 1]
@@ -91,6 +101,46 @@ def test_a_window_costs_its_chunks_only(served: tuple[Path, str]) -> None:
     ((path, size),) = Ranges.sent  # two chunks in one request
     assert path.endswith("motion_int16/c/0/0")
     assert size < shard / 5
+
+
+def test_windows_share_a_connection(served: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FACEDIFF_PACKED_CACHE_GB", "0")
+    corpus = Tiny(root=served[1]).corpus
+    clip = corpus.clips["B_e04"]
+    corpus.read_motion(clip, 0, 1)
+    Ranges.sent.clear()
+    Ranges.clients.clear()
+    for start in range(10):
+        corpus.read_motion(clip, start, start + 5)
+    assert len(Ranges.sent) == 10
+    assert len(Ranges.clients) == 1
+
+
+@pytest.mark.parametrize("place", ["moved/corpus.zarr", "hasty.zarr", "corpus.zarr/"])
+def test_servers_that_answer_otherwise(served: tuple[Path, str], place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FACEDIFF_PACKED_CACHE_GB", "0")
+    root, address = served
+    if not (root / "hasty.zarr").exists():
+        (root / "hasty.zarr").symlink_to(root / "corpus.zarr")
+    near, far = Tiny(root=str(root / "corpus.zarr")), Tiny(root=f"{address.rpartition('/')[0]}/{place}")
+    for one, other in zip(near.dataset("train"), far.dataset("train"), strict=True):
+        assert torch.equal(one.motion, other.motion)
+
+
+def test_which_addresses_are_read_without_fsspec(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("http_proxy", "https_proxy", "all_proxy", "no_proxy"):
+        monkeypatch.delenv(name, raising=False)
+        monkeypatch.delenv(name.upper(), raising=False)
+    assert WebServer.serves("https://lab.example/biwi.zarr")
+    for other in (
+        "s3://b/c.zarr",
+        "http://me:word@lab.example/c.zarr",
+        "http://lab.example/c.zarr?key=3",
+        "http://[x/c",
+    ):
+        assert not WebServer.serves(other)
+    monkeypatch.setenv("https_proxy", "http://proxy.example:8080")
+    assert not WebServer.serves("https://lab.example/biwi.zarr")
 
 
 def test_loader_processes_connect_for_themselves(served: tuple[Path, str]) -> None:

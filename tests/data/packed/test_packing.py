@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from collections.abc import Callable
@@ -309,6 +310,33 @@ def test_what_is_there_is_not_written_again(corpus: Path, packed: Path, monkeypa
     monkeypatch.setattr(packing, "_write", None)
     assert pack(corpus, packed, corpus=TINY, workers=1).written == 0
     assert describe_files(packed) == before
+
+
+@pytest.mark.parametrize("place", ["motion_int16/c/0/0", "speech/zarr.json"])
+def test_what_is_there_and_was_damaged_since_is_refused(corpus: Path, packed: Path, tmp_path: Path, place: str) -> None:
+    out = Path(shutil.copytree(packed, tmp_path / "corpus.zarr"))
+    with (out / place).open("ab") as stream:
+        stream.write(b" ")
+    with pytest.raises(FaceDiffError, match=place):
+        pack(corpus, out, corpus=TINY, workers=1)
+    (out / place).unlink()
+    with pytest.raises(FaceDiffError, match=place):
+        pack(corpus, out, corpus=TINY, workers=1)
+
+
+def test_a_full_disk_ends_unpacking_in_one_sentence(
+    packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, content: bytes) -> int:
+        if path.suffix == ".wav":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return original(path, content)
+
+    original = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises((FaceDiffError, OSError), match="No space left"):
+        unpack(packed, tmp_path / "back", workers=1)
+    assert not (tmp_path / "back").exists()
 
 
 def test_other_options_and_other_folders_are_refused(corpus: Path, packed: Path, tmp_path: Path) -> None:

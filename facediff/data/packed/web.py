@@ -1,0 +1,137 @@
+"""Ranges of objects on a web server, over connections that stay open.
+
+fsspec reads them as well, and whatever this module leaves to it. For a window of motion its event loop and its copies
+take longer than the transfer from a near server.
+"""
+
+from __future__ import annotations
+
+import http.client
+import os
+import socket
+import ssl
+from threading import local
+from typing import Any
+from urllib.parse import SplitResult, quote, urlsplit
+from urllib.request import getproxies, proxy_bypass
+
+SECONDS = 60.0
+"""Time without an answer after which a request is given up."""
+
+
+class WebServer:
+    """Objects below a plain ``http`` or ``https`` address.
+
+    Args:
+        address: of the folder.
+    """
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self._reset()
+
+    def _reset(self) -> None:
+        self._open, self._process = local(), os.getpid()
+        self._all: list[http.client.HTTPConnection] = []
+
+    def close(self) -> None:
+        """Close what every thread has opened."""
+        for each in self._all:
+            each.close()
+
+    def __del__(self) -> None:
+        """Close."""
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Connections do not go to other processes."""
+        return {"address": self.address}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Connect anew."""
+        self.__init__(**state)  # type: ignore[misc]
+
+    @staticmethod
+    def serves(address: str) -> bool:
+        """Whether an address is one for this class: without a login, a query, or a proxy on the way."""
+        try:
+            parts = urlsplit(address)
+            plain = parts.scheme in ("http", "https") and parts.hostname and not (parts.username or parts.query)
+            _ = parts.port
+        except ValueError:
+            return False
+        return bool(plain and (parts.scheme not in getproxies() or proxy_bypass(parts.netloc)))
+
+    def get(self, key: str, start: int | None, stop: int | None) -> bytes | bytearray | None:
+        """Bytes ``start`` to ``stop`` of an object, or all; None for whatever is not a plain answer.
+
+        Raises:
+            FileNotFoundError: if the server says that there is no such object.
+        """
+        for fresh in (False, True):
+            try:
+                return self._asked(key, start, stop, fresh)
+            except (http.client.HTTPException, OSError) as error:
+                if isinstance(error, FileNotFoundError):
+                    raise
+                self._forget()  # the server may have closed a connection that was not used for a while
+        return None
+
+    def _asked(self, key: str, start: int | None, stop: int | None, fresh: bool) -> bytes | bytearray | None:
+        parts = urlsplit(self.address)
+        connection = self._connection(parts, fresh)
+        asked = {} if start is None or stop is None else {"Range": f"bytes={start}-{stop - 1}"}
+        connection.request("GET", f"{parts.path}/{quote(key)}", headers=asked)
+        answer = connection.getresponse()
+        if (
+            answer.status == (206 if asked else 200)
+            and answer.length is not None
+            and not answer.getheader("Content-Encoding")
+        ):
+            if not asked:
+                return answer.read()
+            if start is not None and stop is not None and answer.length == stop - start:
+                return _filled(answer, stop - start)
+        status = answer.status
+        self._forget()  # what is left of the answer may be long
+        if status == 404:
+            raise FileNotFoundError(key)
+        return None
+
+    def _connection(self, parts: SplitResult, fresh: bool) -> http.client.HTTPConnection:
+        if self._process != os.getpid():
+            self.close()  # closes no more than this process's own hold of those that it was forked with
+            self._reset()
+        found: http.client.HTTPConnection | None = getattr(self._open, "connection", None)
+        if found is None or fresh:
+            host = parts.hostname or ""
+            found = (
+                http.client.HTTPSConnection(host, parts.port, timeout=SECONDS, context=ssl.create_default_context())
+                if parts.scheme == "https"
+                else http.client.HTTPConnection(host, parts.port, timeout=SECONDS)
+            )
+            self._open.connection = found
+            self._all.append(found)
+            found.connect()
+            # Requests are small, and nothing is gained by waiting for more to send.
+            found.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return found
+
+    def _forget(self) -> None:
+        found = getattr(self._open, "connection", None)
+        self._open.connection = None
+        if found is not None:
+            found.close()
+            self._all.remove(found)
+
+
+def _filled(answer: http.client.HTTPResponse, size: int) -> bytearray:
+    content = bytearray(size)
+    view, place = memoryview(content), 0
+    while place < size:
+        got = answer.readinto(view[place:])
+        if not got:
+            raise http.client.IncompleteRead(bytes(content[:place]), size - place)
+        place += got
+    answer.read()  # its end, so that the connection can be used again
+    return content
