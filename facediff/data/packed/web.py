@@ -18,8 +18,8 @@ from urllib.request import getproxies, proxy_bypass
 QUICK = getattr(socket, "TCP_QUICKACK", None)
 """Linux's option to confirm at once what has come; it wears off.
 
-Without it a simple server, which keeps its last bytes back until all others are confirmed, and this machine, which waits
-for more before it confirms, can wait 40 ms for each other.
+Without it a simple server, which keeps its last bytes back until all others are confirmed, and this machine, which
+waits for more before it confirms, can wait 40 ms for each other.
 """
 BLOCK = 1 << 20
 """Bytes that are received at a time."""
