@@ -275,6 +275,7 @@ def _together(
                     running[pool.submit(work, waiting[0])] = waiting[0]
                 waiting.popleft()
             done, _ = wait(running, return_when=FIRST_COMPLETED)
+            _raise_first_error(running, done)
             for future in done:
                 if not isinstance(future.exception(), BrokenProcessPool):
                     yield running.pop(future), future.result()
@@ -287,6 +288,16 @@ def _together(
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _raise_first_error(running: Collection[Future[Any]], done: Collection[Future[Any]]) -> None:
+    """Raise the error of the first task that failed, in the order of the tasks, and not of the quickest to fail."""
+    for place, future in enumerate(running):
+        if future in done and isinstance(future.exception(), Exception):
+            wait(list(running)[: place + 1])
+            for earlier in list(running)[: place + 1]:
+                if not isinstance(earlier.exception(), BrokenProcessPool):
+                    earlier.result()
 
 
 _busy: set[int] = set()  # threads that are doing a task

@@ -67,6 +67,7 @@ print(json.dumps([plain, found, calls, late]))
 """
 
 
+@pytest.mark.slow
 def test_compiled_training_gives_the_same_losses_weights_and_names(tiny_root: Path) -> None:
     # In a process of its own, without the checks of shapes, which cannot be traced.
     command = [sys.executable, "-c", PROGRAM, tiny_root]

@@ -338,6 +338,7 @@ def test_preview_in_wandb_has_videos_and_a_growing_table(
     assert all(row[2]["_type"] == "video-file" and row[4] > 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_preview_of_the_last_bundled_config_counts(tiny_root: Path, tmp_path: Path) -> None:
     words = ["--config", "configs/experiment/puppet.yaml", "--config", "configs/callbacks/preview.yaml"]
     words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--model.dim=16", "--trainer.max_steps=1"]

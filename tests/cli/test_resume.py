@@ -91,6 +91,7 @@ def test_a_run_stopped_by_an_error_and_a_signal_continues_in_its_folder(
     assert "ckpt_path: null" in (run / "config.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_a_run_without_a_checkpoint_begins_again_and_no_run_is_an_error(
     fit: Fit, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,6 +173,7 @@ def test_checkpoints_can_be_switched_off(fit: Fit, tmp_path: Path, monkeypatch: 
     assert not list(tmp_path.rglob("*.ckpt"))
 
 
+@pytest.mark.slow
 def test_a_users_own_callbacks_and_loggers_come_with_a_last_checkpoint(
     fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,6 +39,7 @@ def write(root: Path) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_the_published_config_trains_and_animates(
     tmp_path: Path, ctc_source: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -236,7 +236,7 @@ def trained(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) 
 def test_principal_motion_is_that_of_the_spread_frames(
     frames: int, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("facediff.data.datamodule.FRAMES", frames)
+    monkeypatch.setattr("facediff.data.measuring.FRAMES", frames)
     tiny.setup("fit")
     stack = []
     for clip in tiny.clips("train"):

@@ -249,6 +249,7 @@ def test_a_batch_takes_the_keys_of_each_recording(workplace: Path, capsys: pytes
         animate_folder(options, **run)
 
 
+@pytest.mark.slow
 def test_command_follows_keys(workplace: Path) -> None:
     Path("keys.json").write_text(json.dumps({"keys": rows("style", "F1_e03", "M2_e05") + rows("brows", 0, 3)}))
     command = [sys.executable, "-m", "facediff", "animate", "speech.wav", "--checkpoint", "demo/puppet.ckpt"]

@@ -36,7 +36,17 @@ def test_every_command_is_tried() -> None:
     assert tried == set(COMMANDS)
 
 
-@pytest.mark.parametrize("name", [name for name in options.BASES if not name.startswith("data prepare")])
+SLOW = {"export-model"}  # records graphs
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
+        for name in options.BASES
+        if not name.startswith("data prepare")
+    ],
+)
 def test_the_usual_command_line_is_valid(name: str, world: Path, tmp_path: Path) -> None:
     assert options.obey(world, name, options.BASES[name].split(), tmp_path / "run") == (0, "")
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -111,8 +113,18 @@ def ready(root: Path, **options: object) -> AnimationModel:
 
 @pytest.fixture(scope="module")
 def folder(model: AnimationModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The model's folder."""
-    path = tmp_path_factory.mktemp("exported") / "tiny-onnx"
+    """The model's folder; of all processes that run these tests, one exports it."""
+    whole_run = tmp_path_factory.getbasetemp()
+    shared = whole_run.parent if "PYTEST_XDIST_WORKER" in os.environ else whole_run
+    path = shared / "tiny-onnx"
+    lock = shared / "tiny-onnx.lock"
+    try:
+        lock.touch(exist_ok=False)
+    except FileExistsError:
+        for _ in range(1200):
+            if path.exists():
+                return path
+            time.sleep(0.1)
     export_model(model, path)
     return path
 

@@ -207,6 +207,7 @@ def test_arrays_are_read_in_one_place_only() -> None:
             ):
                 found.append(f"{file.relative_to(PACKAGE)}:{node.lineno} calls {owner}.{name}")
             loads = owner in ("pickle", "torch", "joblib") and name in ("load", "loads")
-            if loads and file.name not in ("torch_files.py", "checkpoint.py"):
+            # What goes between the processes of a cluster is pickled by Dask anyway, see the top of cluster.py.
+            if loads and file.name not in ("torch_files.py", "checkpoint.py", "cluster.py"):
                 found.append(f"{file.relative_to(PACKAGE)}:{node.lineno} calls {owner}.{name}")
     assert not found, "\n".join(found)

@@ -47,7 +47,7 @@ from facediff.utils.arrays import open_vertices
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
 from facediff.utils.jobs import WorkerDied, run_tasks
 from facediff.utils.limits import LIMITS
-from facediff.utils.plain_files import load_json, write_json
+from facediff.utils.plain_files import load_json, parse_json, write_json
 from facediff.utils.units import metres_per_unit
 
 if TYPE_CHECKING:
@@ -449,7 +449,7 @@ def _finish(plan: Plan, out: Path) -> Record:
     clips, place = {}, 0
     for name, clip in plan.record.clips.items():
         with (out / PARTS / name).open("rb") as stream:
-            sound = Sound(**{**json.loads(stream.readline()), "first": place})
+            sound = Sound(**{**parse_json(stream.readline(), out / STATE), "first": place})
         clips[name] = replace(clip, sound=replace(sound, pieces=tuple(sound.pieces)))
         place += sum(sound.pieces)
     speech = ((out / PARTS / name).read_bytes().partition(b"\n")[2] for name in clips)
@@ -585,7 +585,7 @@ def encode_speech(path: Path) -> bytes:
             soundfile.write(stream, block, rate, format="FLAC", subtype=f"PCM_{bits}")
             pieces.append(stream.getvalue())
     sound = Sound(0, tuple(map(len, pieces)), form, rate, channels, samples, bits)
-    return json.dumps(asdict(sound)).encode() + b"\n" + b"".join(pieces)
+    return json.dumps(asdict(sound), allow_nan=False).encode() + b"\n" + b"".join(pieces)
 
 
 # Zarr's files, made by the zarr package.

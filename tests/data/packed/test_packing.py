@@ -238,6 +238,7 @@ def test_what_scores_are_computed_from_keeps_every_bit(corpus: Path, tmp_path: P
 
 
 class MiniBiwi(Biwi):
+    corpus_name = "mini-biwi"  # "biwi" with so few vertices would be found by other tests too
     n_vertices = VERTICES
 
 
