@@ -8,7 +8,6 @@ from pathlib import Path
 SCRIPT = Path(__file__).parents[2] / "tools" / "benchmarks" / "loading.py"
 
 
-@pytest.mark.slow
 def test_a_toy_run_reads_all_clips_and_prints_ratios() -> None:
     words = ["--clips=3", "--frames=30", "--vertices=200", "--window=10", "--epochs=2", "--only=windows of 10 with"]
     done = subprocess.run([sys.executable, SCRIPT, *words], capture_output=True, text=True, check=False, timeout=200)
