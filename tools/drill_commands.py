@@ -62,6 +62,8 @@ class Drill:
         label: tells two drills of one command apart.
         pieces: whether the output grows file by file, and the next run continues it.
         also: inputs that the words do not mention.
+        once: whether the command refuses a folder that is there, so that a kill after its last step is followed by a
+            refusal of what is whole.
     """
 
     command: str
@@ -70,6 +72,7 @@ class Drill:
     label: str = ""
     pieces: bool = False
     also: str = ""
+    once: bool = False
 
     @property
     def name(self) -> str:
@@ -116,8 +119,8 @@ DRILLS = [
         "author.pth --dataset vocaset --identities A,B,C --templates faces.pkl --audio-config audio.json -o made.ckpt",
         "author.pth --dataset vocaset --identities A,B,D --templates faces.pkl --audio-config audio.json -o made.ckpt",
     ),
-    Drill("export-model", "model.ckpt -o face-onnx"),
-    Drill("publish", "model.ckpt face --license mit", also="test_scores.csv"),
+    Drill("export-model", "model.ckpt -o face-onnx", once=True),
+    Drill("publish", "model.ckpt face --license mit", also="test_scores.csv", once=True),
     Drill(
         "style extract",
         "A_e01.npy --checkpoint model.ckpt -o style.npy",
@@ -204,7 +207,7 @@ DRILLS = [
     Drill("data prepare", "vocaset vocaset out --workers 1 --quiet", label="vocaset", pieces=True),
     Drill("data prepare", "mead3d mead3d out --flame flame.pkl --workers 1 --quiet", label="mead3d", pieces=True),
     Drill("data pack", f"corpus corpus.zarr --corpus {TINY} --workers 1 --quiet", pieces=True),
-    Drill("data unpack", "packed.zarr back --workers 1 --quiet"),
+    Drill("data unpack", "packed.zarr back --workers 1 --quiet", once=True),
     Drill("data regions", f"corpus --corpus {TINY} --size 64 -o a.png", f"corpus --corpus {TINY} --size 80 -o a.png"),
     Drill(
         "data import-person",
