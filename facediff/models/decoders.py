@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple, Protocol, cast
+from typing import Annotated, ClassVar, NamedTuple, Protocol, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,6 +24,7 @@ from facediff.models.layers import (
     Rotation,
     Share,
     Width,
+    exporting,
     needed_mask,
 )
 from facediff.registry import decoder
@@ -34,7 +35,13 @@ Tokens = Float[Tensor, "batch tokens style_dim"]
 
 
 class Decoder(nn.Module, ABC):
-    """Fused features F_fused and style tokens F_s to features that one linear map turns into clean motion."""
+    """Fused features F_fused and style tokens F_s to features that one linear map turns into clean motion.
+
+    Class attributes:
+        graph_takes_padding: whether an exported graph may decode clips of several lengths together.
+    """
+
+    graph_takes_padding: ClassVar[bool] = True
 
     def prepare(self, style: Tokens, mask: FrameMask) -> object:
         """What stays the same over the denoising steps, computed once a clip; None if there is nothing.
@@ -239,6 +246,8 @@ class GruDecoder(Decoder):
         dropout: dropout between recurrent layers.
     """
 
+    graph_takes_padding = False
+
     def __init__(
         self,
         *,
@@ -272,6 +281,9 @@ class GruDecoder(Decoder):
             prepared: as :meth:`prepare` gives it.
         """
         lengths, scale, shift = self.prepare(style, mask) if prepared is None else prepared
+        if exporting():
+            # Graphs know no packed sequences: they take clips of one length, see ``graph_takes_padding``.
+            return torch.addcmul(shift, self.norm(self.gru(fused)[0] + fused), scale)
         # Packed, so that the backward direction starts at a clip's own last frame and not in its padding.
         packed = pack_padded_sequence(fused, lengths, batch_first=True, enforce_sorted=False)
         hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])
@@ -280,4 +292,5 @@ class GruDecoder(Decoder):
     def prepare(self, style: Tokens, mask: FrameMask) -> GruConstants:
         """The lengths, for which the device must be waited for, and the modulation by the style."""
         scale, shift = self.modulation(style.mean(1, keepdim=True)).chunk(2, dim=-1)
-        return GruConstants(mask.sum(1).cpu(), 1 + scale, shift)
+        lengths = mask.sum(1)
+        return GruConstants(lengths if exporting() else lengths.cpu(), 1 + scale, shift)

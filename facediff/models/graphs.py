@@ -55,7 +55,8 @@ class Graphs:
     Attributes:
         parts: the graphs.
         epsilon: added to the variance of speech before it is standardised.
-        equal_lengths: whether all clips of a batch must be of one length, since the audio encoder knows no padding.
+        equal_lengths: whether all clips of a batch must be of one length, since the audio encoder or the decoder knows
+            no padding.
         state: numbers in a frame of noisy motion.
         kept: numbers in a frame of what windows of long speech are blended by.
         sampler: its name.
@@ -254,7 +255,7 @@ def graphs_of(model: DualPathDiffusion) -> Graphs:
     return Graphs(
         parts=[speech, step, last],
         epsilon=1e-7,
-        equal_lengths=not network.audio_encoder.takes_padding,
+        equal_lengths=not (network.audio_encoder.takes_padding and network.decoder.graph_takes_padding),
         state=state,
         kept=kept,
         sampler=type(sampler).__name__,

@@ -19,6 +19,7 @@ from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description, read_folde
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic_folder
 from facediff.utils.licences import licence_metadata
+from facediff.utils.limits import brief
 from facediff.utils.plain_files import write_json
 from facediff.version import __version__
 
@@ -115,17 +116,23 @@ def record(graph: Graph) -> onnx.ModelProto:
     from torch.export import Dim
 
     shapes = tuple(dict.fromkeys(graph.axes.get(name, {}), Dim.DYNAMIC) for name in graph.inputs)
-    with quiet():
-        program = torch.onnx.export(
-            graph.module.eval(),
-            tuple(graph.inputs.values()),
-            dynamo=True,
-            opset_version=OPSET,
-            input_names=list(graph.inputs),
-            output_names=list(graph.outputs),
-            dynamic_shapes=shapes,
-            verbose=False,
-        )
+    try:
+        with quiet():
+            program = torch.onnx.export(
+                graph.module.eval(),
+                tuple(graph.inputs.values()),
+                dynamo=True,
+                opset_version=OPSET,
+                input_names=list(graph.inputs),
+                output_names=list(graph.outputs),
+                dynamic_shapes=shapes,
+                verbose=False,
+            )
+    except Exception as error:  # whatever a component of anybody's does while it is recorded
+        raise FaceDiffError(
+            f"{graph.name}: PyTorch cannot record this part of the model as a graph ({brief(error)}); "
+            f"choose components that do not depend on values, or report it"
+        ) from error
     if program is None:
         raise FaceDiffError(f"{graph.name}: PyTorch gave no graph; install the PyTorch that facediff was tested with")
     document: onnx.ModelProto = program.model_proto
