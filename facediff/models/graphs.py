@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError
 from facediff.models.dual_path.network import Conditions
+from facediff.models.folding import unchanged
 from facediff.models.layers import of_frames
 
 if TYPE_CHECKING:
@@ -241,9 +242,10 @@ def graphs_of(model: DualPathDiffusion) -> Graphs:
     )
     with torch.no_grad():
         step.module(*step.inputs.values())  # what follows from the weights alone is computed here, not in the graph
-        root = model._space(  # noqa: SLF001 - a part of the model
-            _nothing(step.inputs), lambda features: features
-        ).noise(torch.eye(state)[None])[0]
+        root = None
+        if folded:  # else noise is used as it is, and the unit matrix of all coordinates would take gigabytes
+            space = model._space(_nothing(step.inputs), unchanged)  # noqa: SLF001 - a part of the model
+            root = space.noise(torch.eye(state)[None])[0]
     decoded: Literal["sample", "kept"] = "kept" if folded else "sample"
     last = Graph(
         "motion",
@@ -263,7 +265,7 @@ def graphs_of(model: DualPathDiffusion) -> Graphs:
         table=table,
         last_step=model.process.steps - 1,
         decoded=decoded,
-        noise=root if folded else None,
+        noise=root,
     )
 
 
