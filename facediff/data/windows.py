@@ -90,6 +90,18 @@ class WindowPlan:
             )
         return FramePlan(frames, overlap, round(self.before * frame_rate), round(self.after * frame_rate))
 
+    def chosen(self, seconds: float | None, overlap: float | None) -> WindowPlan:
+        """The same with the lengths that somebody asked for; None keeps what is usual.
+
+        Raises:
+            FaceDiffError: if a length is impossible.
+        """
+        length = self.seconds if seconds is None else seconds
+        shared = min(self.overlap, length / 2) if overlap is None else overlap
+        # Who asks for windows gets them, also of a model that else takes speech of any length in one pass.
+        above = self.above if seconds is None else min(self.above, WindowPlan.above)
+        return replace(self, seconds=length, overlap=shared, above=above)
+
     def in_one_pass(self, frames: int, frame_rate: float) -> bool:
         """Whether so many frames are few enough to be animated in one pass."""
         return frames <= self.above * frame_rate

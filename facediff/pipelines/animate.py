@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -155,7 +155,6 @@ class AnimationPipeline:
         model: AnimationModel | None = None,
         style: StyleLike | None = None,
     ) -> None:
-        from facediff.data.windows import WindowPlan
         from facediff.models import load_model
         from facediff.models.styles import style_from
 
@@ -179,12 +178,7 @@ class AnimationPipeline:
             self.model.choose_sampler(options.sampler, options.steps)
         if options.guidance is not None:
             self.model.choose_guidance(options.guidance_scales)
-        usual = self.model.windows
-        seconds = usual.seconds if options.window is None else options.window
-        overlap = min(usual.overlap, seconds / 2) if options.overlap is None else options.overlap
-        # Who asks for windows gets them, also of a model that else takes speech of any length in one pass.
-        above = usual.above if options.window is None else min(usual.above, WindowPlan.above)
-        self.model.windows = replace(usual, seconds=seconds, overlap=overlap, above=above)
+        self.model.windows = self.model.windows.chosen(options.window, options.overlap)
         self.model.windows.in_frames(self.model.frame_rate)
         self.identity = options.identity or self.model.identities[0]
         self.model.check_condition(options.condition)

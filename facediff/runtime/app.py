@@ -12,7 +12,6 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from facediff.data.voice_activity import EnergyGate, toward_rest
-from facediff.data.windows import WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.runtime.model import RuntimeModel, RuntimeStream, real_time_factor
 from facediff.version import __version__
@@ -94,22 +93,12 @@ def run(options: argparse.Namespace) -> None:
         check_export(output, shapes)
     model = RuntimeModel.open(options.model, threads=options.threads)
     if options.window is not None or options.overlap is not None:
-        usual = model.windows
-        seconds = usual.seconds if options.window is None else options.window
-        overlap = min(usual.overlap, seconds / 2) if options.overlap is None else options.overlap
-        above = usual.above if options.window is None else min(usual.above, WindowPlan.above)
-        model.windows = WindowPlan(seconds, overlap, usual.before, usual.after, above)
+        model.windows = model.windows.chosen(options.window, options.overlap)
         model.windows.in_frames(model.frame_rate)
     gate = None if options.no_voice_gate else EnergyGate()
+    choices = {name: getattr(options, name) for name in ("identity", "condition", "style", "seed", "expressivity")}
     if streamed:
-        stream = model.stream(
-            identity=options.identity,
-            condition=options.condition,
-            style=options.style,
-            seed=options.seed,
-            expressivity=options.expressivity,
-            gate=gate,
-        )
+        stream = model.stream(**choices, gate=gate)
         for frames in animated(stream, sys.stdin.buffer):
             sys.stdout.buffer.write(np.ascontiguousarray(frames, "<f4").tobytes())
             sys.stdout.buffer.flush()
@@ -119,16 +108,7 @@ def run(options: argparse.Namespace) -> None:
 
     speech = read_speech(Path(options.speech))
     before = time.perf_counter()
-    animation = model.animate(
-        speech,
-        identity=options.identity,
-        condition=options.condition,
-        style=options.style,
-        seed=options.seed,
-        expressivity=options.expressivity,
-        gate=gate,
-        name=Path(options.speech).stem,
-    )
+    animation = model.animate(speech, **choices, gate=gate, name=Path(options.speech).stem)
     seconds = time.perf_counter() - before
     written = write_animations(output, [animation], shapes)
     print(f"wrote {', '.join(map(str, written))}: {real_time_factor(seconds, speech):.2f} s a second of speech")
