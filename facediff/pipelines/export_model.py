@@ -243,20 +243,21 @@ def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDAr
     """What ``arrays.npz`` holds, and the names of its styles and faces."""
     import torch
 
+    from facediff.pipelines.animate import facts_of
     from facediff.pipelines.rest import rest_weights
 
     assets = model.assets
-    faces = list(assets.templates)
-    regions = {name: np.asarray(indices, np.int64) for name, indices in assets.regions.items()}
+    faces, facts = list(assets.templates), facts_of(assets)
+    regions = facts["regions"]
     templates = np.stack([np.asarray(assets.templates[name], np.float32) for name in faces])
     arrays: dict[str, npt.NDArray[Any]] = {
         "templates": templates,
         "rest_weights": np.stack([rest_weights(template, regions) for template in templates]),
         **{f"region_{name}": indices for name, indices in regions.items()},
     }
-    for name, kind in (("faces", np.int32), ("colours", np.uint8), ("inner_lip_pairs", np.int64)):
-        if (value := getattr(assets, name)) is not None:
-            arrays[name] = np.asarray(value, kind)
+    for name in ("faces", "colours", "inner_lip_pairs"):
+        if facts[name] is not None:
+            arrays[name] = facts[name]
     if graphs.noise is not None:
         arrays["noise"] = graphs.noise.numpy()
     styles: dict[str, npt.NDArray[np.float32]] = {}

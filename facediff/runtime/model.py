@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -257,15 +258,15 @@ class RuntimeModel:
         )[0]
 
 
+@dataclass(frozen=True)
 class _Conditions:
     """What motion is conditioned on besides speech."""
 
-    def __init__(self, identity: int, style: Array, style_name: str, seed: int, expressivity: float) -> None:
-        self.identity = identity
-        self.style = style
-        self.style_name = style_name
-        self.seed = seed
-        self.expressivity = expressivity
+    identity: int
+    style: Array
+    style_name: str
+    seed: int
+    expressivity: float
 
 
 class _Sampling:
