@@ -184,24 +184,42 @@ class Kind:
         """
         text = text.replace(" ", "")
         name, _, rest = text.partition(":")
+        words = (word.partition("=") for word in filter(None, rest.split(",")))
+        pairs = [(option, value) for option, _, value in words]
+        return name, self.options(name, pairs, f"{self.kind} {text}", hidden)
+
+    def options(
+        self, name: str, pairs: Sequence[tuple[str, str]], shown: str, hidden: Set[str] = frozenset()
+    ) -> dict[str, Any]:
+        """The options of a component as its constructor takes them; a value is of the kind of its default.
+
+        Args:
+            name: of the component.
+            pairs: options and their values, as typed.
+            shown: what errors call the whole.
+            hidden: options that cannot be chosen this way.
+
+        Raises:
+            UnknownComponentError: if nothing has the name; the message names the nearest.
+            FaceDiffError: if there is no such option, or its value is of another kind.
+        """
         known = {
             option: parameter.default
             for option, parameter in inspect.signature(self.get(name)).parameters.items()
             if parameter.default is not inspect.Parameter.empty and option not in hidden
         }
         options = {}
-        for word in filter(None, rest.split(",")):
-            option, equals, value = word.partition("=")
+        for option, value in pairs:
             if option not in known:
                 offered = choices(option, known) if known else "it has none"
-                raise FaceDiffError(f"{self.kind} {text}: {name} has no option {option!r}: {offered}")
-            if not equals or not value:
-                raise FaceDiffError(f"{self.kind} {text}: option {option} has no value; write {option}=VALUE")
+                raise FaceDiffError(f"{shown}: {name} has no option {option!r}: {offered}")
+            if not value:
+                raise FaceDiffError(f"{shown}: option {option} has no value; write {option}=VALUE")
             try:
                 options[option] = _value(value, known[option])
             except ValueError as error:
-                raise FaceDiffError(f"{self.kind} {text}: option {option} is {value!r}; expected {error}") from error
-        return name, options
+                raise FaceDiffError(f"{shown}: option {option} is {value!r}; expected {error}") from error
+        return options
 
     def unknown(self, name: str) -> str:
         """The sentence for a name that does not exist: the nearest one, then all."""
@@ -281,6 +299,12 @@ export_format = Kind(
     "a file format that animations are written in",
     aliases=False,
 )
+receiver = Kind(
+    "receiver",
+    "facediff.live.receivers",
+    "where frames of a live performance go, by the scheme of an address",
+    aliases=False,
+)
 
 COMPONENTS: dict[str, Kind] = {
     kind.kind: kind
@@ -299,7 +323,7 @@ COMPONENTS: dict[str, Kind] = {
 
 KINDS: dict[str, Kind] = {
     **COMPONENTS,
-    **{kind.kind: kind for kind in (model, corpus, metric, augmentation, voice_gate, acting, export_format)},
+    **{kind.kind: kind for kind in (model, corpus, metric, augmentation, voice_gate, acting, export_format, receiver)},
 }
 """Everything that can be chosen by name."""
 

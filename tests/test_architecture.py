@@ -42,6 +42,7 @@ ALLOWED: dict[str, set[str]] = {
     "callbacks": {"version", "models", "data", "metrics", "mesh", "render", *BASE},
     "export": {"animation", "editing", "render", "mesh", *BASE},
     "runtime": {"version", "animation", "data", "export", *BASE},
+    "live": {"version", "runtime", "animation", "data", "editing", "export", "mesh", *BASE},
     "evaluation": {"data", "metrics", "mesh", "render", *BASE},
     "benchmark": {"version", "evaluation", "metrics", *BASE},
     "study": {"version", "animation", "data", "evaluation", "mesh", "render", *BASE},

@@ -1,0 +1,19 @@
+"""Live performance: speech that is heard now, to a face that moves now, in engines, browsers and other programs.
+
+Needs no PyTorch: what animates is an exported model (:mod:`facediff.runtime`), or whatever gives frames for speech.
+"""
+
+from typing import TYPE_CHECKING
+
+from facediff.utils.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from facediff.live.frames import Address as Address
+    from facediff.live.frames import LiveFrame as LiveFrame
+    from facediff.live.frames import Performance as Performance
+    from facediff.live.frames import Receiver as Receiver
+    from facediff.live.frames import open_receiver as open_receiver
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__, {"frames": "Address LiveFrame Performance Receiver open_receiver read_address"}
+)

@@ -1,0 +1,238 @@
+"""What a live performance sends, and what receives it: frames, the face that they move, receivers and their addresses.
+
+A receiver is registered under the kind ``receiver`` by the scheme of its address: ``vmc://127.0.0.1:39539`` is sent by
+the class that is registered as ``vmc``. Its constructor takes the :class:`Address`, and options with defaults, which
+the address gives as ``?option=value``.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+from urllib.parse import parse_qsl, urlsplit
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.registry import UnknownComponentError, checks_arguments, receiver
+from facediff.utils import SAMPLE_RATE
+
+Array = npt.NDArray[np.float32]
+
+OPTION = "--to"
+"""The option of the commands that names a receiver."""
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """One frame of a performance, on its way out.
+
+    Attributes:
+        index: its number; numbers of dropped frames are missing.
+        time: seconds of speech, from the start, at which the frame begins.
+        heard: :func:`time.monotonic` when the last sample within the frame had arrived.
+        vertices: offsets from the neutral face (V, 3), in the performance's unit.
+        weights: of the performance's blendshapes (len(shapes),), from 0 to 1; None if no receiver needs them.
+        dropped: frames that were dropped so far, before this one.
+    """
+
+    index: int
+    time: float
+    heard: float
+    vertices: Array
+    weights: Array | None = None
+    dropped: int = 0
+
+    @property
+    def lag(self) -> float:
+        """Seconds since its speech was heard."""
+        return time.monotonic() - self.heard
+
+
+@dataclass(frozen=True)
+class Performance:
+    """What stays the same while somebody performs.
+
+    Attributes:
+        frame_rate: frames a second.
+        neutral: the face at rest (V, 3).
+        faces: its triangles (F, 3); empty if the model has none.
+        unit: of length: ``m``, ``mm`` …
+        subject: name of the face in the receiving program.
+        shapes: names of the blendshapes, in the order of :attr:`LiveFrame.weights`.
+        sample_rate: of speech, in Hz.
+        colours: of the vertices (V, 3), bytes of sRGB; None if there are none.
+        speech: whether receivers that can play speech shall do so.
+        metadata: licence, model and corpus, for programs that show them.
+    """
+
+    frame_rate: float
+    neutral: Array
+    faces: npt.NDArray[np.int32]
+    unit: str = "m"
+    subject: str = "facediff"
+    shapes: tuple[str, ...] = ()
+    sample_rate: int = SAMPLE_RATE
+    colours: npt.NDArray[np.uint8] | None = None
+    speech: bool = False
+    metadata: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a receiver is.
+
+    Attributes:
+        text: as typed.
+        scheme: the receiver's name.
+        host: of ``scheme://host:port``; None if not given.
+        port: likewise, or of ``scheme:port``.
+        path: what else follows the scheme: a file, or ``-``; empty if nothing does.
+        options: what follows the question mark.
+    """
+
+    text: str
+    scheme: str
+    host: str | None = None
+    port: int | None = None
+    path: str = ""
+    options: dict[str, str] = field(default_factory=dict)
+
+
+class Receiver(ABC):
+    """Sends frames to a program, a file or a page.
+
+    Its methods but :meth:`status` are called from one thread.
+
+    Args:
+        address: where it is.
+
+    Attributes:
+        name: what reports call it; the text of its address.
+        needs_weights: whether it sends blendshapes: :attr:`LiveFrame.weights` is there then.
+    """
+
+    needs_weights: bool = False
+
+    def __init__(self, address: Address) -> None:
+        self.address = address
+        self.name = address.text
+
+    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+        """Let every constructor refuse options that are out of range."""
+        super().__init_subclass__(**words)
+        if "__init__" in vars(cls):
+            cls.__init__ = checks_arguments(cls.__init__, "receiver")  # type: ignore[method-assign]
+
+    @abstractmethod
+    def open(self, performance: Performance) -> None:
+        """Make what the performance is sent through: a socket, a file, a server.
+
+        A program that does not listen yet is no error: it is tried again with every frame.
+
+        Raises:
+            FaceDiffError: if it cannot work at all: the port is taken, the file cannot be written.
+        """
+
+    @abstractmethod
+    def send(self, frame: LiveFrame) -> None:
+        """Send a frame, within a few milliseconds.
+
+        A receiver that is gone is counted and tried again; nothing that the other side does is an exception here.
+        """
+
+    def hear(self, speech: Array, start: float) -> None:  # noqa: B027 - most receivers are deaf
+        """Take speech (n,) from 0 to 1 of full scale at the performance's rate, for receivers that play it.
+
+        Called as soon as the speech has been heard: earlier than its frames.
+
+        Args:
+            speech: the samples.
+            start: seconds from the start at which they begin, on the clock of :attr:`LiveFrame.time`.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of everything; may be called twice."""
+
+    def status(self) -> str:
+        """A few words for the report: clients, bytes, frames that were lost; empty if there is nothing to report."""
+        return ""
+
+
+def read_address(text: str) -> Address:
+    """An address: ``scheme://host:port?option=value``, ``scheme:port``, ``scheme:file``, or the scheme alone.
+
+    Raises:
+        FaceDiffError: if it is malformed.
+
+    Example:
+        >>> read_address("livelink://127.0.0.1:11111?subject=Ann").port
+        11111
+        >>> read_address("browser:8080").port, read_address("jsonl:-").path
+        (8080, '-')
+    """
+
+    def refuse(problem: str) -> FaceDiffError:
+        return FaceDiffError(
+            f"{OPTION} {text}: {problem}; expected scheme://HOST:PORT, scheme:FILE or a scheme alone, and options "
+            f"as ?name=value&name=value"
+        )
+
+    scheme, colon, rest = text.partition(":")
+    if not colon:
+        scheme, question, rest = text.partition("?")
+        rest = question + rest
+    if re.fullmatch(r"[a-z][a-z0-9_]*", scheme) is None:
+        raise refuse(f"{scheme!r} is no scheme")
+    rest, _, query = rest.partition("?")
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query), max_num_fields=20)
+    except ValueError:
+        raise refuse(f"{query!r} are no options") from None
+    host, port, path = None, None, rest
+    if rest.startswith("//"):
+        try:
+            parts = urlsplit(f"{scheme}:{rest}")
+            host, port, path = parts.hostname, parts.port, parts.path.removeprefix("/")
+        except ValueError:
+            raise refuse("the host or the port is wrong") from None
+        if parts.username is not None or parts.fragment or not host:
+            raise refuse("the host is wrong")
+    elif rest.isdecimal():
+        port, path = int(rest), ""
+    if port is not None and not 0 < port <= 65_535:
+        raise refuse(f"port {port} does not exist")
+    return Address(text, scheme, host, port, path, dict(pairs))
+
+
+def open_receiver(text: str) -> Receiver:
+    """The receiver at an address, which is not open yet.
+
+    Raises:
+        FaceDiffError: if the address is malformed, nothing has its scheme, or an option is unknown or impossible.
+    """
+    address = read_address(text)
+    try:
+        made = receiver.get(address.scheme)
+    except UnknownComponentError as error:
+        raise FaceDiffError(f"{OPTION} {text}: {error}") from error
+    options = receiver.options(address.scheme, list(address.options.items()), f"{OPTION} {text}")
+    return cast(Receiver, made(address, **options))
+
+
+def open_receivers(texts: Sequence[str]) -> list[Receiver]:
+    """The receivers at several addresses, none of which is given twice.
+
+    Raises:
+        FaceDiffError: as :func:`open_receiver`.
+    """
+    for place, text in enumerate(texts):
+        if text in texts[:place]:
+            raise FaceDiffError(f"{OPTION} {text}: is given twice; give every receiver once")
+    return [open_receiver(text) for text in texts]
