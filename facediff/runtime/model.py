@@ -1,10 +1,12 @@
-"""An exported model at work: the path from samples to vertices, of files and streams, with NumPy and ONNX Runtime."""
+"""An exported model at work: the path from samples to vertices, of files and streams, with NumPy and ONNX Runtime.
+
+What generates the motion of a clip or of a window is in ``sampling.py``.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -18,6 +20,7 @@ from facediff.data.windows import SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.runtime.folder import GRAPHS, Arrays, Description, read_folder
 from facediff.runtime.noise import ClipNoise, WindowNoise
+from facediff.runtime.sampling import Conditions, Sampling
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Expressivity, Seed, mismatch
 from facediff.version import __version__
@@ -133,7 +136,7 @@ class RuntimeModel:
             mean = speech.mean(dtype=np.float32)
             deviation = np.sqrt(np.square(speech - mean).mean(dtype=np.float32) + np.float32(self.description.epsilon))
             features = self._features(speech, frames, float(mean), float(deviation))
-            sampling = _Sampling(self, conditions, None, 0)
+            sampling = Sampling(self, conditions, None, 0)
             offsets = sampling.run(features, ClipNoise(NAME, [seed]), ClipNoise(f"{NAME}/mean", [0]))
         else:
             stream = RuntimeStream(self, face, conditions, self.windows)
@@ -178,7 +181,7 @@ class RuntimeModel:
         face: int,
         audio: Array | None,
         name: str,
-        conditions: _Conditions,
+        conditions: Conditions,
         gate: EnergyGate | None,
     ) -> Animation:
         """Vertices (T, V, 3) of a face with everything that exporters need."""
@@ -217,7 +220,7 @@ class RuntimeModel:
 
     def _face(
         self, identity: str | None, condition: str | None, style: str | None, seed: int, expressivity: float
-    ) -> tuple[int, _Conditions]:
+    ) -> tuple[int, Conditions]:
         """The face's place among the templates, and what motion is conditioned on."""
         about = self.description
         chosen = identity if identity is not None else (about.identities or about.faces)[0]
@@ -236,9 +239,9 @@ class RuntimeModel:
         who = chosen if condition is None else condition
         index = about.identities.index(who) if who in about.identities else -1
         vector = self.arrays["styles"][about.styles.index(name)].astype(np.float32)
-        return about.faces.index(chosen), _Conditions(index, vector, name, seed, expressivity)
+        return about.faces.index(chosen), Conditions(index, vector, name, seed, expressivity)
 
-    def _run(self, graph: str, inputs: Mapping[str, npt.NDArray[Any]]) -> list[Array]:
+    def run(self, graph: str, inputs: Mapping[str, npt.NDArray[Any]]) -> list[Array]:
         """Results of a graph, which may have no use for some of the inputs."""
         session = self._sessions[graph]
         wanted = {each.name for each in session.get_inputs()}
@@ -246,7 +249,7 @@ class RuntimeModel:
 
     def _features(self, speech: Array, frames: int, mean: float, deviation: float) -> Array:
         """Speech (S,) to features (1, frames, dim)."""
-        return self._run(
+        return self.run(
             "speech",
             {
                 "audio": speech[None],
@@ -256,107 +259,6 @@ class RuntimeModel:
                 "mask": np.ones((1, frames), bool),
             },
         )[0]
-
-
-@dataclass(frozen=True)
-class _Conditions:
-    """What motion is conditioned on besides speech."""
-
-    identity: int
-    style: Array
-    style_name: str
-    seed: int
-    expressivity: float
-
-
-class _Sampling:
-    """One run of the sampler, of a clip or of a window that continues another.
-
-    Args:
-        model: the model.
-        conditions: what motion is conditioned on.
-        before: what the window before kept, one array for each evaluation of the network; None for nothing.
-        shared: frames that this window shares with it.
-
-    Attributes:
-        kept: what the next window is blended with, one array for each evaluation.
-    """
-
-    def __init__(
-        self, model: RuntimeModel, conditions: _Conditions, before: Sequence[Array] | None, shared: int
-    ) -> None:
-        self.model = model
-        self.conditions = conditions
-        self.before = before
-        self.shared = shared
-        self.kept: list[Array] = []
-
-    def run(self, features: Array, noise: ClipNoise | WindowNoise, of_mean: ClipNoise | WindowNoise) -> Array:
-        """Offsets from the template (1, frames, vertices, 3)."""
-        about, share = self.model.description, self.conditions.expressivity
-        mean = None
-        if share != 1:
-            # As the model's own mean: the prediction at the last step, averaged over a noise and its negative.
-            start = self._coloured(of_mean(features.shape[1], about.state))
-            ends = [self._decoded(self._evaluate(features, each, about.last_step)) for each in (start, -start)]
-            mean = (ends[0] + ends[1]) * np.float32(0.5)
-            if share == 0:
-                return mean
-        motion = self._decoded(self._loop(features, noise))
-        return motion if mean is None else np.asarray(mean + np.float32(share) * (motion - mean), np.float32)
-
-    def _loop(self, features: Array, noise: ClipNoise | WindowNoise) -> tuple[Array, Array]:
-        """The sampler's result, and what was kept of the last step."""
-        about = self.model.description
-        frames = features.shape[1]
-        noisy = self._coloured(noise(frames, about.state))
-        predictions: list[Array] = []
-        kept = noisy
-        for step, (of_noisy, first, second, third, of_noise) in zip(about.steps, about.table, strict=True):
-            prediction, kept = self._evaluate(features, noisy, step)
-            predictions = [prediction, *predictions][:3]
-            made = np.float32(of_noisy) * noisy
-            for factor, each in zip((first, second, third), predictions, strict=False):
-                if factor:
-                    made = made + np.float32(factor) * each
-            if of_noise:
-                made = made + np.float32(of_noise) * self._coloured(noise(frames, about.state))
-            noisy = made
-        return noisy, kept
-
-    def _evaluate(self, features: Array, noisy: Array, step: int) -> tuple[Array, Array]:
-        """The network's prediction at a step, blended with that of the window before."""
-        frames, about = features.shape[1], self.model.description
-        before, share = np.zeros((1, frames, about.kept), np.float32), np.ones((1, frames), np.float32)
-        if self.before is not None:
-            before[:, : self.shared] = self.before[len(self.kept)]
-            # 0 at the first shared frame, smooth at both ends: the rule of facediff.models.inference.crossfaded.
-            place = np.arange(self.shared, dtype=np.float32) / np.float32(self.shared)
-            share[:, : self.shared] = place * place * (3 - 2 * place)
-        prediction, kept = self.model._run(  # noqa: SLF001 - of this file
-            "step",
-            {
-                "features": features,
-                "mask": np.ones((1, frames), bool),
-                "identity": np.array([self.conditions.identity], np.int64),
-                "style": self.conditions.style[None],
-                "state": noisy,
-                "step": np.array([step], np.int64),
-                "before": before,
-                "share": share,
-            },
-        )
-        self.kept.append(kept)
-        return prediction, kept
-
-    def _decoded(self, result: tuple[Array, Array]) -> Array:
-        sample, kept = result
-        last = kept if self.model.description.decoded == "kept" else sample
-        return self.model._run("motion", {"sample": last})[0]  # noqa: SLF001 - of this file
-
-    def _coloured(self, unit: Array) -> Array:
-        root = self.model.arrays.get("noise")
-        return unit if root is None else unit @ root
 
 
 class RuntimeStream(SpeechWindows[Array]):
@@ -379,7 +281,7 @@ class RuntimeStream(SpeechWindows[Array]):
         self,
         model: RuntimeModel,
         face: int,
-        conditions: _Conditions,
+        conditions: Conditions,
         plan: WindowPlan,
         gate: EnergyGate | None = None,
     ) -> None:
@@ -403,7 +305,7 @@ class RuntimeStream(SpeechWindows[Array]):
         """Motion of a window, blended in every step with the window before it."""
         features = self.model._features(speech, frames, mean, deviation)  # noqa: SLF001 - of this file
         features = np.ascontiguousarray(features[:, window.context : window.context + window.frames])
-        sampling = _Sampling(self.model, self.conditions, self._tail, window.shared)
+        sampling = Sampling(self.model, self.conditions, self._tail, window.shared)
         noise = WindowNoise(NAME, window, [self.conditions.seed])
         motion = sampling.run(features, noise, WindowNoise(f"{NAME}/mean", window, [0]))
         self._tail = [kept[:, -window.kept :] for kept in sampling.kept]
