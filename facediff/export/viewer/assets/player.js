@@ -17,9 +17,6 @@ async function readFace(facts, animation) {
   };
 }
 
-/** A picture is still when neither the camera nor what it shows was changed by hand for this long. */
-const STILL_MS = 200;
-
 class Player {
   constructor(facts, faces, ramp, wav) {
     Object.assign(this, { facts, faces });

@@ -65,6 +65,8 @@ const EDGE = [0.05, 0.06, 0.1, 0.55];
 /** Pixels of the screen for one of the page, at most: more are not visible in motion, and slow a laptop down. */
 const SHARPEST = 2;
 const COARSEST = 0.4;
+/** A picture is still when neither the camera nor what it shows was changed by hand for this long. */
+const STILL_MS = 200;
 
 /** Whether there is WebGL 2, and whether the processor does its work. */
 function graphics() {
