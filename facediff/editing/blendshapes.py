@@ -10,21 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.editing.bounded import Problem, minimise, minimise_sparse
 from facediff.editing.shapes import ARKIT, ROTATIONS, ShapeSet, absent_from, beyond_arkit, live_link_name, mirror_pairs
 from facediff.errors import FaceDiffError, choices
 from facediff.mesh.mesh import triangle_areas
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.plain_files import json_text, write_table
-from facediff.utils.without_scipy import has_scipy, solve_block_chain
 
 Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 CHUNK_BYTES = 32 * 2**20
 AROUND = 1 / 15  # Seconds before and after a shape's work in which it is free to fade
 VISIBLE_MM = 0.2  # A residual that nobody sees is none, however small the motion
-ACTIVE = 1e-3  # Share of the cost of a weight above which a shape is at work
 STATED_RATE = 30.0  # Frames a second for which the smoothness is stated
 
 
@@ -217,25 +215,16 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
             f"shapes of the same mesh, or carry them over with `facediff blendshapes --carry`"
         )
     head, animation = animation.head, animation.still()
-    moving = _moving(animation, shapes, options)
-    # In weights times the root of each shape's energy, the matrix of the problem has ones on its diagonal.
-    scale = np.sqrt(moving.energy)
-    weighted = moving.deltas * np.repeat(moving.area, 3) / scale[:, None]
+    moving = moving_shapes(animation, shapes, options)
+    terms = objective(moving, shapes, options, animation.frame_rate)
     products, square = [], 0.0
     for _, moved in _displacements(animation, moving):
-        products.append(moved.reshape(len(moved), -1) @ weighted.T)
+        products.append(moved.reshape(len(moved), -1) @ terms.projection.T)
         square += float(np.square(moved).sum())
     right = np.concatenate(products)
     amplitude = float(np.sqrt(square / (len(animation.vertices) * len(moving.vertices))))
-    matrix = weighted @ (moving.deltas / scale[:, None]).T + options.ridge * np.eye(len(scale))
-    for left, other in mirror_pairs(tuple(shapes.names[k] for k in moving.places)):
-        cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[other] ** 2)
-        row = np.zeros(len(scale))
-        row[left], row[other] = 1.0 / scale[left], -1.0 / scale[other]
-        matrix += cost * np.outer(row, row)
-    # A movement that takes as many seconds takes more steps at a higher frame rate, each the smaller.
-    coupling = options.smoothness * (animation.frame_rate / STATED_RATE) ** 2
-    problem = Problem(0.5 * (matrix + matrix.T), right, coupling, options.lower * scale, options.upper * scale)
+    scale = terms.scale
+    problem = Problem(terms.matrix, right, terms.coupling, options.lower * scale, options.upper * scale)
     tolerance = options.tolerance * scale
     if options.sparsity > 0:
         around = max(1, round(AROUND * animation.frame_rate))
@@ -311,7 +300,7 @@ def key_frames(values: Array, tolerance: float) -> npt.NDArray[np.int64]:
 
 
 @dataclass(frozen=True)
-class _Moving:
+class Moving:
     """The shapes that move something, on the vertices that count."""
 
     places: npt.NDArray[np.int64]  # (K,) which of the set's shapes these are
@@ -321,7 +310,37 @@ class _Moving:
     energy: Array  # (K,) weighted mean square of each
 
 
-def _moving(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> _Moving:
+@dataclass(frozen=True)
+class Objective:
+    """What is minimised: ½ Σ xᵀ M x − Σ (P v)ᵀ x + ½ c Σ ‖x_t − x_{t−1}‖² in x, weights times `scale`."""
+
+    scale: Array  # (K,) root of each shape's energy: with it, M has ones on its diagonal
+    projection: Array  # P (K, 3N), of the displacements v of the vertices that count
+    matrix: Array  # M (K, K)
+    coupling: float  # c
+
+
+def objective(moving: Moving, shapes: ShapeSet, options: SolveOptions, frame_rate: float) -> Objective:
+    """The terms that do not depend on the motion."""
+    scale = np.sqrt(moving.energy)
+    projection = moving.deltas * np.repeat(moving.area, 3) / scale[:, None]
+    matrix = projection @ (moving.deltas / scale[:, None]).T + options.ridge * np.eye(len(scale))
+    for left, other in mirror_pairs(tuple(shapes.names[k] for k in moving.places)):
+        cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[other] ** 2)
+        row = np.zeros(len(scale))
+        row[left], row[other] = 1.0 / scale[left], -1.0 / scale[other]
+        matrix += cost * np.outer(row, row)
+    # A movement that takes as many seconds takes more steps at a higher frame rate, each the smaller.
+    coupling = options.smoothness * (frame_rate / STATED_RATE) ** 2
+    return Objective(scale, projection, 0.5 * (matrix + matrix.T), coupling)
+
+
+def moving_shapes(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> Moving:
+    """The shapes of a set that move vertices which count.
+
+    Raises:
+        FaceDiffError: if the region is unknown, or no shape moves anything.
+    """
     used = np.arange(len(animation.template))
     if options.region is not None:
         if not animation.regions:
@@ -345,7 +364,7 @@ def _moving(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> _M
         raise FaceDiffError(
             f"{animation.name}: no shape moves any vertex that counts; give other shapes or another region"
         )
-    return _Moving(places, used, area, deltas[places], energy[places])
+    return Moving(places, used, area, deltas[places], energy[places])
 
 
 def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Array:
@@ -354,7 +373,7 @@ def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integ
     return np.bincount(faces.ravel(), thirds, len(vertices)).astype(np.float64)
 
 
-def _displacements(animation: Animation, moving: _Moving) -> Iterator[tuple[slice, Array]]:
+def _displacements(animation: Animation, moving: Moving) -> Iterator[tuple[slice, Array]]:
     """Displacements (frames, N, 3) from the template, some frames at a time; refuses what is not finite."""
     step = max(1, CHUNK_BYTES // (24 * len(animation.template)))
     for first in range(0, len(animation.vertices), step):
@@ -367,7 +386,7 @@ def _displacements(animation: Animation, moving: _Moving) -> Iterator[tuple[slic
         yield slice(first, first + len(chunk)), moved
 
 
-def _residuals(animation: Animation, moving: _Moving, values: Array) -> tuple[Array, Array]:
+def _residuals(animation: Animation, moving: Moving, values: Array) -> tuple[Array, Array]:
     """Root mean square and maximum (T,) over the vertices of the distances that are left."""
     rms, most = [], []
     for frames, moved in _displacements(animation, moving):
@@ -375,160 +394,6 @@ def _residuals(animation: Animation, moving: _Moving, values: Array) -> tuple[Ar
         rms.append(np.sqrt(square.mean(axis=-1)))
         most.append(np.sqrt(square.max(axis=-1)))
     return np.concatenate(rms), np.concatenate(most)
-
-
-# A box-bounded quadratic program over all frames, solved by projected Newton steps. scipy's bounded solvers either know
-# no banded matrices or stop far from the 1e-8 that is promised for weights; its banded Cholesky solver takes the steps.
-
-SUFFICIENT = 1e-4  # Share of the promised decrease that a step must bring (Armijo)
-SHORTEST = 1e-12
-NEAR = 1e-3  # How near a bound counts as on it, at most; less near the solution
-JITTER = 1e-10  # Added to the diagonal, which is one, of the matrix of a step only: dependent shapes leave it singular
-
-
-@dataclass(frozen=True)
-class Problem:
-    """½ Σ_t x_tᵀ M x_t − Σ_t r_tᵀ x_t + ½ c Σ_t ‖x_t − x_{t−1}‖², lower ≤ x_t ≤ upper; float64 throughout."""
-
-    matrix: Array  # M (K, K), symmetric, positive semi-definite, with a diagonal of about one
-    right: Array  # r (T, K)
-    coupling: float  # c, not negative
-    lower: Array  # (K,) or (T, K)
-    upper: Array  # (K,) or (T, K)
-
-    def clip(self, x: Array) -> Array:
-        """The nearest point of the box."""
-        return np.clip(x, self.lower, self.upper)
-
-    def gradient(self, x: Array) -> Array:
-        """Of the objective, (T, K)."""
-        slope = x @ self.matrix - self.right
-        step = self.coupling * np.diff(x, axis=0)
-        slope[1:] += step
-        slope[:-1] -= step
-        return slope
-
-    def change(self, slope: Array, moved: Array) -> float:
-        """How the objective changes when x with this gradient moves; free of the cancellation of a difference."""
-        curve = (moved @ self.matrix * moved).sum() + self.coupling * np.square(np.diff(moved, axis=0)).sum()
-        return float((slope * moved).sum() + 0.5 * curve)
-
-    def residual(self, x: Array) -> Array:
-        """|x − clip(x − gradient)|, (T, K): zero exactly where the optimality (KKT) conditions hold."""
-        return np.abs(x - self.clip(x - self.gradient(x)))
-
-
-def minimise_sparse(
-    problem: Problem, cost: Array, tolerance: Array, max_iterations: int, *, frames_around: int
-) -> tuple[Array, bool]:
-    """The box's point of least value with few shapes at work in each frame.
-
-    The sum Σ_t Σ_k cost_k |x_tk| is added to the objective, which keeps shapes at 0 that gain less than they cost. It
-    also takes something from all others. The second problem, without the sum and with those shapes held at 0, gives it
-    back (Meinshausen, "Relaxed Lasso", Computational Statistics & Data Analysis 2007).
-
-    Returns:
-        x (T, K), and whether the residual of the second problem meets the tolerance (K,).
-    """
-    chosen = _least_sum(problem, cost, tolerance, max_iterations)
-    # A shape that is at work in a frame is free in those around it, or its curve would begin and end with a jump.
-    window = np.lib.stride_tricks.sliding_window_view
-    reach = np.pad(np.abs(chosen) > ACTIVE * cost, ((frames_around, frames_around), (0, 0)))
-    active = window(reach, 2 * frames_around + 1, axis=0).any(axis=-1)
-    lower = np.where(active, problem.lower, np.clip(0.0, problem.lower, problem.upper))
-    upper = np.where(active, problem.upper, np.clip(0.0, problem.lower, problem.upper))
-    return minimise(replace(problem, lower=lower, upper=upper), tolerance, max_iterations)
-
-
-def _least_sum(problem: Problem, cost: Array, tolerance: Array, max_iterations: int) -> Array:
-    """The solution with Σ_t Σ_k cost_k |x_tk| added to the objective, (T, K)."""
-    if (problem.lower >= 0).all():
-        return minimise(replace(problem, right=problem.right - cost), tolerance, max_iterations)[0]
-    # Where weights have both signs, each is a positive part less a negative one, whose sum is its size.
-    parts = Problem(
-        np.block([[problem.matrix, -problem.matrix], [-problem.matrix, problem.matrix]]),
-        np.concatenate([problem.right - cost, -problem.right - cost], axis=1),
-        problem.coupling,
-        np.maximum(np.concatenate([problem.lower, -problem.upper]), 0.0),
-        np.maximum(np.concatenate([problem.upper, -problem.lower]), 0.0),
-    )
-    found, _ = minimise(parts, np.concatenate([tolerance, tolerance]), max_iterations)
-    positive, negative = np.split(found, 2, axis=1)
-    return positive - negative
-
-
-def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[Array, bool]:
-    """The box's point of least value.
-
-    Bertsekas, "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 1982:
-    variables on a bound whose gradient pushes outwards follow the gradient, the others take Newton's step; both are
-    clipped to the box, and the step is shortened until the objective falls enough, which makes it converge from
-    anywhere. The free variables of all frames are solved for together.
-
-    Returns:
-        x (T, K), and whether its :meth:`Problem.residual` meets the tolerance (K,).
-    """
-    x = problem.clip(_newton(problem, problem.right, np.ones(problem.right.shape, bool)))
-    widths = problem.upper - problem.lower
-    width = float(widths[widths > 0].min(initial=1.0))
-    for _ in range(max_iterations):
-        left = problem.residual(x)
-        if (left <= tolerance).all():
-            return x, True
-        slope = problem.gradient(x)
-        # A set of held variables that changed with every step would keep the steps short: near a bound counts as on it.
-        # The distance that counts as near shrinks with the residual, so that the solution is not affected.
-        near = min(NEAR * width, float(left.max()))
-        held = ((x <= problem.lower + near) & (slope > 0)) | ((x >= problem.upper - near) & (slope < 0))
-        direction = np.where(held, -slope, _newton(problem, -slope, ~held))
-        following = _step(problem, x, slope, direction, held)
-        if following is None:
-            break
-        x = following
-    return x, bool((problem.residual(x) <= tolerance).all())
-
-
-def _step(problem: Problem, x: Array, slope: Array, direction: Array, held: Mask) -> Array | None:
-    """The longest sufficient step along the clipped direction; None where rounding lets the objective fall no more."""
-    length = 1.0
-    promise = -float((slope * direction)[~held].sum())
-    while length > SHORTEST:
-        following = problem.clip(x + length * direction)
-        moved = following - x
-        wanted = length * promise - float((slope * moved)[held].sum())
-        if problem.change(slope, moved) <= -SUFFICIENT * wanted:
-            return following if moved.any() else None
-        length /= 2
-    return None
-
-
-def _newton(problem: Problem, right: Array, free: Mask) -> Array:
-    """Solve for the free variables, the others being zero: (T, K)."""
-    frames, count = right.shape
-    neighbours = np.full((frames, 1), 2.0)
-    neighbours[0] -= 1
-    neighbours[-1] -= 1
-    if not has_scipy():
-        both = free[:, :, None] & free[:, None]
-        blocks = np.where(both, problem.matrix, 0.0)
-        own = np.where(free, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
-        blocks[:, np.arange(count), np.arange(count)] = own
-        links = np.where(free[1:] & free[:-1], -problem.coupling, 0.0)
-        return np.where(free, solve_block_chain(blocks, links, np.where(free, right, 0.0)), 0.0)
-    from scipy.linalg import solveh_banded
-
-    # M + c · (number of neighbours) on the block diagonal and −c next to it make a band of K below the diagonal, stored
-    # as LAPACK expects it: the last axis counts how far below. The lower form is some twenty times faster than the
-    # upper one, whose small products OpenBLAS spreads over threads. A variable that is held gets a row of the identity.
-    rows = max(count, 2) + 1  # scipy fails on a single variable with a narrower band
-    band = np.zeros((frames, count, rows))
-    band[:, :, 0] = np.where(free, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
-    for d in range(1, count):
-        band[:, :-d, d] = np.where(free[:, d:] & free[:, :-d], np.diagonal(problem.matrix, d), 0.0)
-    band[:-1, :, count] = np.where(free[1:] & free[:-1], -problem.coupling, 0.0)
-    goal = np.where(free, right, 0.0).ravel()
-    solved = solveh_banded(band.reshape(-1, rows).T, goal, overwrite_ab=True, lower=True, check_finite=False)
-    return np.where(free, solved.reshape(frames, count), 0.0)
 
 
 # Weights as CSV, with a JSON file next to the table for what a table cannot say.

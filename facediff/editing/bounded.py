@@ -1,0 +1,264 @@
+"""Least squares within bounds: quadratic programs whose variables have a least and a greatest value.
+
+Two solvers: :func:`minimise` for all frames of a motion in one problem, and :class:`Pivoting` for one frame after the
+other, each of which is nearly the last one.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.utils.without_scipy import has_scipy, solve_block_chain
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+ACTIVE = 1e-3  # Share of the cost of a weight above which a shape is at work
+
+# A box-bounded quadratic program over all frames, solved by projected Newton steps. scipy's bounded solvers either know
+# no banded matrices or stop far from the 1e-8 that is promised for weights; its banded Cholesky solver takes the steps.
+
+SUFFICIENT = 1e-4  # Share of the promised decrease that a step must bring (Armijo)
+SHORTEST = 1e-12
+NEAR = 1e-3  # How near a bound counts as on it, at most; less near the solution
+JITTER = 1e-10  # Added to the diagonal, which is one, of the matrix of a step only: dependent shapes leave it singular
+
+
+@dataclass(frozen=True)
+class Problem:
+    """½ Σ_t x_tᵀ M x_t − Σ_t r_tᵀ x_t + ½ c Σ_t ‖x_t − x_{t−1}‖², lower ≤ x_t ≤ upper; float64 throughout."""
+
+    matrix: Array  # M (K, K), symmetric, positive semi-definite, with a diagonal of about one
+    right: Array  # r (T, K)
+    coupling: float  # c, not negative
+    lower: Array  # (K,) or (T, K)
+    upper: Array  # (K,) or (T, K)
+
+    def clip(self, x: Array) -> Array:
+        """The nearest point of the box."""
+        return np.clip(x, self.lower, self.upper)
+
+    def gradient(self, x: Array) -> Array:
+        """Of the objective, (T, K)."""
+        slope = x @ self.matrix - self.right
+        step = self.coupling * np.diff(x, axis=0)
+        slope[1:] += step
+        slope[:-1] -= step
+        return slope
+
+    def change(self, slope: Array, moved: Array) -> float:
+        """How the objective changes when x with this gradient moves; free of the cancellation of a difference."""
+        curve = (moved @ self.matrix * moved).sum() + self.coupling * np.square(np.diff(moved, axis=0)).sum()
+        return float((slope * moved).sum() + 0.5 * curve)
+
+    def residual(self, x: Array) -> Array:
+        """|x − clip(x − gradient)|, (T, K): zero exactly where the optimality (KKT) conditions hold."""
+        return np.abs(x - self.clip(x - self.gradient(x)))
+
+
+def minimise_sparse(
+    problem: Problem, cost: Array, tolerance: Array, max_iterations: int, *, frames_around: int
+) -> tuple[Array, bool]:
+    """The box's point of least value with few shapes at work in each frame.
+
+    The sum Σ_t Σ_k cost_k |x_tk| is added to the objective, which keeps shapes at 0 that gain less than they cost. It
+    also takes something from all others. The second problem, without the sum and with those shapes held at 0, gives it
+    back (Meinshausen, "Relaxed Lasso", Computational Statistics & Data Analysis 2007).
+
+    Returns:
+        x (T, K), and whether the residual of the second problem meets the tolerance (K,).
+    """
+    chosen = minimise_sum(problem, cost, tolerance, max_iterations)
+    # A shape that is at work in a frame is free in those around it, or its curve would begin and end with a jump.
+    window = np.lib.stride_tricks.sliding_window_view
+    reach = np.pad(np.abs(chosen) > ACTIVE * cost, ((frames_around, frames_around), (0, 0)))
+    active = window(reach, 2 * frames_around + 1, axis=0).any(axis=-1)
+    lower = np.where(active, problem.lower, np.clip(0.0, problem.lower, problem.upper))
+    upper = np.where(active, problem.upper, np.clip(0.0, problem.lower, problem.upper))
+    return minimise(replace(problem, lower=lower, upper=upper), tolerance, max_iterations)
+
+
+def minimise_sum(problem: Problem, cost: Array, tolerance: Array, max_iterations: int) -> Array:
+    """The solution with Σ_t Σ_k cost_k |x_tk| added to the objective, (T, K)."""
+    if (problem.lower >= 0).all():
+        return minimise(replace(problem, right=problem.right - cost), tolerance, max_iterations)[0]
+    # Where weights have both signs, each is a positive part less a negative one, whose sum is its size.
+    parts = Problem(
+        np.block([[problem.matrix, -problem.matrix], [-problem.matrix, problem.matrix]]),
+        np.concatenate([problem.right - cost, -problem.right - cost], axis=1),
+        problem.coupling,
+        np.maximum(np.concatenate([problem.lower, -problem.upper]), 0.0),
+        np.maximum(np.concatenate([problem.upper, -problem.lower]), 0.0),
+    )
+    found, _ = minimise(parts, np.concatenate([tolerance, tolerance]), max_iterations)
+    positive, negative = np.split(found, 2, axis=1)
+    return positive - negative
+
+
+def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[Array, bool]:
+    """The box's point of least value.
+
+    Bertsekas, "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 1982:
+    variables on a bound whose gradient pushes outwards follow the gradient, the others take Newton's step; both are
+    clipped to the box, and the step is shortened until the objective falls enough, which makes it converge from
+    anywhere. The free variables of all frames are solved for together.
+
+    Returns:
+        x (T, K), and whether its :meth:`Problem.residual` meets the tolerance (K,).
+    """
+    x = problem.clip(_newton(problem, problem.right, np.ones(problem.right.shape, bool)))
+    widths = problem.upper - problem.lower
+    width = float(widths[widths > 0].min(initial=1.0))
+    for _ in range(max_iterations):
+        left = problem.residual(x)
+        if (left <= tolerance).all():
+            return x, True
+        slope = problem.gradient(x)
+        # A set of held variables that changed with every step would keep the steps short: near a bound counts as on it.
+        # The distance that counts as near shrinks with the residual, so that the solution is not affected.
+        near = min(NEAR * width, float(left.max()))
+        held = ((x <= problem.lower + near) & (slope > 0)) | ((x >= problem.upper - near) & (slope < 0))
+        direction = np.where(held, -slope, _newton(problem, -slope, ~held))
+        following = _step(problem, x, slope, direction, held)
+        if following is None:
+            break
+        x = following
+    return x, bool((problem.residual(x) <= tolerance).all())
+
+
+def _step(problem: Problem, x: Array, slope: Array, direction: Array, held: Mask) -> Array | None:
+    """The longest sufficient step along the clipped direction; None where rounding lets the objective fall no more."""
+    length = 1.0
+    promise = -float((slope * direction)[~held].sum())
+    while length > SHORTEST:
+        following = problem.clip(x + length * direction)
+        moved = following - x
+        wanted = length * promise - float((slope * moved)[held].sum())
+        if problem.change(slope, moved) <= -SUFFICIENT * wanted:
+            return following if moved.any() else None
+        length /= 2
+    return None
+
+
+def _newton(problem: Problem, right: Array, free: Mask) -> Array:
+    """Solve for the free variables, the others being zero: (T, K)."""
+    frames, count = right.shape
+    neighbours = np.full((frames, 1), 2.0)
+    neighbours[0] -= 1
+    neighbours[-1] -= 1
+    if not has_scipy():
+        both = free[:, :, None] & free[:, None]
+        blocks = np.where(both, problem.matrix, 0.0)
+        own = np.where(free, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
+        blocks[:, np.arange(count), np.arange(count)] = own
+        links = np.where(free[1:] & free[:-1], -problem.coupling, 0.0)
+        return np.where(free, solve_block_chain(blocks, links, np.where(free, right, 0.0)), 0.0)
+    from scipy.linalg import solveh_banded
+
+    # M + c · (number of neighbours) on the block diagonal and −c next to it make a band of K below the diagonal, stored
+    # as LAPACK expects it: the last axis counts how far below. The lower form is some twenty times faster than the
+    # upper one, whose small products OpenBLAS spreads over threads. A variable that is held gets a row of the identity.
+    rows = max(count, 2) + 1  # scipy fails on a single variable with a narrower band
+    band = np.zeros((frames, count, rows))
+    band[:, :, 0] = np.where(free, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
+    for d in range(1, count):
+        band[:, :-d, d] = np.where(free[:, d:] & free[:, :-d], np.diagonal(problem.matrix, d), 0.0)
+    band[:-1, :, count] = np.where(free[1:] & free[:-1], -problem.coupling, 0.0)
+    goal = np.where(free, right, 0.0).ravel()
+    solved = solveh_banded(band.reshape(-1, rows).T, goal, overwrite_ab=True, lower=True, check_finite=False)
+    return np.where(free, solved.reshape(frames, count), 0.0)
+
+
+# One frame at a time. Which variables lie on a bound changes little from frame to frame. Once that is known, what is
+# left is a linear system, whose inverse is kept for the next frame with the same free variables.
+
+MISSED = 1e-10  # How far a variable may lie beyond its bound, or a slope on the wrong side of zero: rounding
+PATIENCE = 3  # Exchanges of all wrong variables that may fail to make them fewer
+KEPT = 64  # Inverses
+
+
+class Pivoting:
+    """Minimises ½ xᵀ M x − rᵀ x within lower ≤ x ≤ upper for many r (K,), quickly where they differ little.
+
+    Júdice & Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear complementarity
+    problems", Computers & Operations Research 1994, for variables with two bounds: each is free or on one of its
+    bounds; those that break a condition change sides all together, and one at a time where that does not make them
+    fewer. It begins with the sides of the last solution. Should it not end, :func:`minimise` solves the frame.
+
+    Args:
+        matrix: M (K, K), symmetric, positive semi-definite, with a diagonal of about one.
+        max_iterations: exchanges for one r.
+
+    Example:
+        >>> solver = Pivoting(np.array([[1.0, 0.5], [0.5, 1.0]]))
+        >>> solver.solve(np.array([1.0, -1.0]), np.zeros(2), np.ones(2)).tolist()
+        [1.0, 0.0]
+    """
+
+    def __init__(self, matrix: Array, max_iterations: int = 200) -> None:
+        self.matrix = matrix
+        self.max_iterations = max_iterations
+        # Positive definite, so that the solution is one, also where shapes depend on one another.
+        self._solvable = matrix + JITTER * np.eye(len(matrix))
+        self._inverses: OrderedDict[bytes, Array] = OrderedDict()
+        self._side = np.zeros(len(matrix), np.int8)  # -1 on the lower bound, 1 on the upper one, 0 between them
+
+    def solve(self, right: Array, lower: Array, upper: Array) -> Array:
+        """The point (K,) of least value; a variable whose bounds are equal stays there.
+
+        Args:
+            right: r (K,).
+            lower: least values (K,).
+            upper: greatest values (K,).
+        """
+        side = np.where(upper <= lower, -1, self._side).astype(np.int8)
+        fewest, patience = len(side) + 1, PATIENCE
+        for _ in range(self.max_iterations):
+            x = self._at(side, right, lower, upper)
+            slope = self.matrix @ x - right
+            below, above = (side == 0) & (x < lower - MISSED), (side == 0) & (x > upper + MISSED)
+            freed = ((side < 0) & (slope < -MISSED)) | ((side > 0) & (slope > MISSED))
+            wrong = np.flatnonzero(below | above | (freed & (upper > lower)))
+            if not len(wrong):
+                self._side = side
+                return np.clip(x, lower, upper)
+            if len(wrong) < fewest:
+                fewest, patience = len(wrong), PATIENCE
+            elif patience:
+                patience -= 1
+            else:
+                wrong = wrong[-1:]
+            changed = np.where(below, -1, np.where(above, 1, 0)).astype(np.int8)
+            side[wrong] = changed[wrong]
+        return self._carefully(right, lower, upper)
+
+    def _at(self, side: npt.NDArray[np.int8], right: Array, lower: Array, upper: Array) -> Array:
+        """The variables, those on a bound there and the free ones where their slope is zero."""
+        x = np.where(side < 0, lower, upper)
+        free = side == 0
+        if not free.any():
+            return x
+        x[free] = 0.0
+        goal = (right - self.matrix @ x)[free]
+        key = free.tobytes()
+        inverse = self._inverses.get(key)
+        block = self._solvable[np.ix_(free, free)]
+        if inverse is None:
+            inverse = self._inverses[key] = np.asarray(np.linalg.inv(block), np.float64)
+            if len(self._inverses) > KEPT:
+                self._inverses.popitem(last=False)
+        else:
+            self._inverses.move_to_end(key)
+        found = inverse @ goal
+        x[free] = found + inverse @ (goal - block @ found)  # once more for what rounding left
+        return x
+
+    def _carefully(self, right: Array, lower: Array, upper: Array) -> Array:
+        problem = Problem(self.matrix, right[None], 0.0, lower, upper)
+        found = minimise(problem, np.full(len(right), MISSED), self.max_iterations)[0][0]
+        self._side = np.where(found <= lower, -1, np.where(found >= upper, 1, 0)).astype(np.int8)
+        return found

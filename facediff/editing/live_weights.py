@@ -1,0 +1,130 @@
+"""Weights of blendshapes frame by frame, while the face still moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation, metres_per_unit
+from facediff.editing.blendshapes import AROUND, SolveOptions, moving_shapes, objective
+from facediff.editing.bounded import ACTIVE, Pivoting, Problem, minimise_sum
+from facediff.editing.shapes import ShapeSet
+from facediff.errors import FaceDiffError
+from facediff.utils import ranges
+
+Array = npt.NDArray[np.float64]
+
+
+class FrameSolver:
+    """Solves for the weights of one frame after the other, in well under 2 ms for 52 shapes of 5 023 vertices.
+
+    The objective, the bounds and the options are those of :func:`~facediff.editing.blendshapes.solve`. That knows the
+    whole motion; here, the future is not known yet:
+
+    - A frame is held near the last one only, whose weights are final; the face at rest goes before the first one.
+    - A shape that gains less than it costs is at 0 until the frame in which it begins to work. It fades for as long as
+      there; it does not begin before.
+
+    What is constant is computed once: the matrix of the shapes, the projection of vertices on them (a frame's only
+    product over vertices), and the inverses of its parts, see :class:`~facediff.editing.bounded.Pivoting`.
+
+    Args:
+        shapes: K shapes of the face's topology.
+        frame_rate: frames a second.
+        faces: triangles (F, 3) by whose areas vertices count; None to count all alike.
+        regions: vertices by name, for ``options.region``.
+        unit: of length, for :meth:`residual_mm`.
+        options: the usual ones if None; `residual_limit` has no meaning here.
+
+    Raises:
+        FaceDiffError: if the region is unknown or no shape moves anything.
+
+    Example:
+        >>> rest = np.random.default_rng(0).normal(size=(9, 3))
+        >>> solver = FrameSolver(ShapeSet(("jawOpen",), rest, np.full((1, 9, 3), 0.01)), frame_rate=30.0)
+        >>> [solver.solve(np.full((9, 3), offset)).round(3).tolist() for offset in (0.0, 0.005, 0.02)]
+        [[0.0], [0.49], [1.0]]
+    """
+
+    def __init__(
+        self,
+        shapes: ShapeSet,
+        frame_rate: ranges.FrameRate,
+        *,
+        faces: npt.NDArray[np.int32] | None = None,
+        regions: Mapping[str, npt.NDArray[np.int64]] | None = None,
+        unit: str = "m",
+        options: SolveOptions | None = None,
+    ) -> None:
+        self.shapes = shapes
+        self.options = options = options or SolveOptions()
+        rest = shapes.neutral.astype(np.float32)
+        face = Animation("shapes", rest[None], rest, frame_rate, faces=faces, regions=dict(regions or {}), unit=unit)
+        self._moving = moving = moving_shapes(face, shapes, options)
+        terms = objective(moving, shapes, options, frame_rate)
+        self._scale, self._coupling = terms.scale, terms.coupling
+        matrix = terms.matrix + terms.coupling * np.eye(len(terms.scale))
+        self._lower, self._upper = options.lower * terms.scale, options.upper * terms.scale
+        self._rest = np.clip(np.zeros(len(terms.scale)), self._lower, self._upper)
+        self._cost = options.sparsity * terms.scale
+        self._sum, self._final = (Pivoting(matrix, options.max_iterations) for _ in range(2))
+        self._fading = max(1, round(AROUND * frame_rate))
+        # Vertices that no shape moves add nothing to a product.
+        moved = (terms.projection.reshape(len(matrix), -1, 3) != 0).any(axis=(0, 2))
+        self._used = moving.vertices[moved]
+        self._projection = np.ascontiguousarray(
+            terms.projection.reshape(len(matrix), -1, 3)[:, moved].reshape(len(matrix), -1)
+        )
+        self._all = len(self._used) == len(rest)
+        self._millimetres = 1000.0 * metres_per_unit(unit)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin another motion, with the face at rest."""
+        self._last = self._rest
+        self._idle = np.full(len(self._scale), self._fading + 1)
+
+    def solve(self, offsets: npt.NDArray[np.floating]) -> Array:
+        """The weights (K,) of the next frame, in the order of the shapes' names.
+
+        Args:
+            offsets: (V, 3) of the vertices from the neutral face.
+
+        Raises:
+            FaceDiffError: if they have another shape or are not finite.
+        """
+        if offsets.shape != self.shapes.neutral.shape:
+            raise FaceDiffError(
+                f"frame: has offsets of shape {offsets.shape}; expected {self.shapes.neutral.shape} as the shapes have"
+            )
+        used = offsets if self._all else offsets[self._used]
+        right = self._projection @ used.reshape(-1).astype(np.float64)
+        if not np.isfinite(right).all():
+            raise FaceDiffError("frame: holds NaN or infinity; generate the motion again")
+        right += self._coupling * self._last
+        lower, upper = self._lower, self._upper
+        if self.options.sparsity > 0:
+            at_work = np.abs(self._least_sum(right)) > ACTIVE * self._cost
+            self._idle = np.where(at_work, 0, self._idle + 1)
+            resting = self._idle > self._fading
+            lower, upper = np.where(resting, self._rest, lower), np.where(resting, self._rest, upper)
+        self._last = self._final.solve(right, lower, upper)
+        weights = np.full(len(self.shapes.names), np.clip(0.0, self.options.lower, self.options.upper))
+        # Division may lead past a bound by a rounding error.
+        weights[self._moving.places] = np.clip(self._last / self._scale, self.options.lower, self.options.upper)
+        return weights
+
+    def _least_sum(self, right: Array) -> Array:
+        """The solution with what the use of shapes costs added to the objective."""
+        if (self._lower >= 0).all():
+            return self._sum.solve(right - self._cost, self._lower, self._upper)
+        problem = Problem(self._sum.matrix, right[None], 0.0, self._lower, self._upper)
+        return minimise_sum(problem, self._cost, self.options.tolerance * self._scale, self.options.max_iterations)[0]
+
+    def residual_mm(self, offsets: npt.NDArray[np.floating], weights: Array) -> float:
+        """Root-mean-square distance over the vertices that count that weights (K,) leave of offsets (V, 3), in mm."""
+        moving = self._moving
+        left = np.asarray(offsets, np.float64)[moving.vertices].reshape(-1) - weights[moving.places] @ moving.deltas
+        return self._millimetres * float(np.sqrt(np.square(left).sum() / len(moving.vertices)))
