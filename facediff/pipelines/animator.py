@@ -573,7 +573,7 @@ def mono(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
     import numpy as np
 
     if isinstance(chunk, bytes):
-        from facediff.pipelines.stream import samples_of
+        from facediff.data.pcm import samples_of
 
         if len(chunk) % 2:
             raise FaceDiffError(f"chunks: one has {len(chunk)} bytes, half a sample too much; give 16-bit samples")

@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
+from facediff.data.pcm import pcm
 from facediff.errors import FaceDiffError
 from facediff.pipelines.animate import AnimationOptions, AnimationPipeline
 from facediff.utils import SAMPLE_RATE
@@ -21,10 +22,6 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
     from torch import Tensor
-
-
-CHUNK = 0.02
-"""Seconds of speech that are read at a time, at most."""
 
 
 def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_000, seed: int = 0) -> None:
@@ -247,32 +244,6 @@ def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
         yield read
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.read) -> Iterator[npt.NDArray[np.float32]]:
-    """Pieces (n,) of speech, full scale 1, as 16-bit mono samples (little endian) of ``rate`` come in.
-
-    ``read`` works as ``os.read``; half a sample at the end is dropped.
-    """
-    rest, first = b"", True
-    # A read of a pipe gives what is there, at least one byte, and nothing at its end.
-    while data := read(source.fileno(), max(2, round(CHUNK * rate) * 2)):
-        if first and data[:4] in (b"RIFF", b"fLaC", b"OggS"):
-            raise FaceDiffError(
-                "standard input holds a sound file, not samples; give the file by name without --stream, or only its "
-                "samples (ffmpeg -i FILE -f s16le -ac 1 -ar 16000 -)"
-            )
-        data, first = rest + data, False
-        whole = len(data) // 2 * 2
-        rest = data[whole:]
-        yield samples_of(data[:whole])
-
-
-def samples_of(data: bytes) -> npt.NDArray[np.float32]:
-    """16-bit samples (little endian) as (n,) with full scale 1."""
-    import numpy as np
-
-    return (np.frombuffer(data, "<i2") / 32768).astype(np.float32)
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,16 +10,16 @@ from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
-from facediff.data.voice_activity import EnergyGate, toward_rest
+from facediff.data.pcm import pcm
+from facediff.data.voice_activity import EnergyGate
 from facediff.errors import FaceDiffError
-from facediff.runtime.model import RuntimeModel, RuntimeStream, real_time_factor
+from facediff.runtime.gated import GatedStream
+from facediff.runtime.model import RuntimeModel, real_time_factor
+from facediff.utils import SAMPLE_RATE
 from facediff.version import __version__
 
 if TYPE_CHECKING:
     from facediff.export.format import ExportOptions
-
-PIECE = 3200
-"""Samples that are read at a time from standard input: a fifth of a second."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -98,7 +97,7 @@ def run(options: argparse.Namespace) -> None:
     gate = None if options.no_voice_gate else EnergyGate()
     choices = {name: getattr(options, name) for name in ("identity", "condition", "style", "seed", "expressivity")}
     if streamed:
-        stream = model.stream(**choices, gate=gate)
+        stream = GatedStream(model.stream(**choices, gate=gate))
         for frames in animated(stream, sys.stdin.buffer):
             sys.stdout.buffer.write(np.ascontiguousarray(frames, "<f4").tobytes())
             sys.stdout.buffer.flush()
@@ -121,37 +120,16 @@ def export_options(options: argparse.Namespace) -> ExportOptions:
     return ExportOptions(shapes=options.shapes)
 
 
-def animated(stream: RuntimeStream, source: IO[bytes]) -> Iterator[np.ndarray]:
+def animated(stream: GatedStream, source: IO[bytes]) -> Iterator[np.ndarray]:
     """Vertices (frames, V, 3) of samples that arrive, as soon as they are certain."""
-    openness, rest = stream.openness(), np.zeros(0, np.float32)
-    arrays, face = stream.model.arrays, stream.face
-    template, weights = arrays["templates"][face], arrays["rest_weights"][face]
-    waiting: list[np.ndarray] = []  # frames whose openness is not known yet
-    left = b""
-    ended = False
-    while not ended:
-        data = os.read(source.fileno(), 2 * PIECE)
-        ended = not data
-        data, left = left + data, b""
-        if len(data) % 2:
-            data, left = data[:-1], data[-1:]
-        samples = np.frombuffer(data, "<i2").astype(np.float32) * np.float32(1 / 32_768)
-        if ended:
-            if not stream.heard:
-                return
-            motion = stream.finish()
-        else:
-            motion = stream.feed(samples)
-        waiting.extend(motion[0] + template)
-        if openness is not None:
-            rest = np.concatenate([rest, openness.finish(stream.frames) if ended else openness.feed(samples)])
-        ready = len(waiting) if openness is None else min(len(waiting), len(rest))
-        if ready:
-            frames = np.stack(waiting[:ready])
-            del waiting[:ready]
-            if openness is not None:
-                frames, rest = toward_rest(frames, rest[:ready], template, weights), rest[ready:]
+    heard = False
+    for samples in pcm(source, SAMPLE_RATE):
+        heard = True
+        frames = stream.feed(samples)
+        if len(frames):
             yield frames
+    if heard:
+        yield stream.finish()
 
 
 if __name__ == "__main__":

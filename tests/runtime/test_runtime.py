@@ -28,6 +28,7 @@ from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler,
 from facediff.pipelines.export_model import export_model
 from facediff.runtime import RuntimeModel
 from facediff.runtime.app import main
+from facediff.runtime.gated import GatedStream
 from facediff.runtime.noise import ClipNoise, NormalStream, WindowNoise
 from tests.fakes.tiny import Tiny
 
@@ -160,6 +161,18 @@ def test_stream_gives_what_the_file_gives(folder: Path) -> None:
     pieces = [stream.feed(piece) for piece in np.split(speech, [1, 1000, 30_000, 30_001])]
     made = np.concatenate([*pieces, stream.finish()], 1)[0] + runtime.arrays["templates"][stream.face]
     assert np.array_equal(made, runtime.animate(speech, identity="A", seed=2, gate=None).vertices)
+
+
+def test_gated_stream_gives_what_the_file_gives(folder: Path) -> None:
+    runtime = RuntimeModel.open(folder)
+    speech = np.concatenate([np.zeros(20_000, np.float32), sound(2.0), np.zeros(20_000, np.float32)])
+    stream = GatedStream(runtime.stream(identity="A", seed=2))
+    made = np.concatenate([*map(stream.feed, np.split(speech, [1, 9000, 40_000])), stream.finish()])
+    wanted = runtime.animate(speech, identity="A", seed=2).vertices
+    assert np.abs(made - wanted).max() < 1e-6 * np.ptp(wanted)
+    assert np.abs(made - runtime.animate(speech, identity="A", seed=2, gate=None).vertices).max() > 1e-4 * np.ptp(
+        wanted
+    )
 
 
 def test_gate_holds_the_mouth_at_rest_in_silence(folder: Path) -> None:

@@ -1,0 +1,48 @@
+"""Raw samples: 16 bits, mono, little endian, as recorders and players send them through pipes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from typing import IO
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+
+CHUNK = 0.02
+"""Seconds of speech that are read at a time, at most."""
+
+SOUND_FILES = (b"RIFF", b"fLaC", b"OggS")
+"""Beginnings of sound files, which are no samples."""
+
+
+def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.read) -> Iterator[npt.NDArray[np.float32]]:
+    """Pieces (n,) of speech, full scale 1, as 16-bit mono samples (little endian) of ``rate`` come in.
+
+    Args:
+        source: a file with a descriptor.
+        rate: samples a second.
+        read: works as ``os.read``; half a sample at the end is dropped.
+
+    Raises:
+        FaceDiffError: if a sound file comes in.
+    """
+    rest, first = b"", True
+    # A read of a pipe gives what is there, at least one byte, and nothing at its end.
+    while data := read(source.fileno(), max(2, round(CHUNK * rate) * 2)):
+        if first and data[:4] in SOUND_FILES:
+            raise FaceDiffError(
+                "standard input holds a sound file, not samples; give the file by its name, or only its samples "
+                "(ffmpeg -i FILE -f s16le -ac 1 -ar 16000 -)"
+            )
+        data, first = rest + data, False
+        whole = len(data) // 2 * 2
+        rest = data[whole:]
+        yield samples_of(data[:whole])
+
+
+def samples_of(data: bytes) -> npt.NDArray[np.float32]:
+    """16-bit samples (little endian) as (n,) with full scale 1."""
+    return np.frombuffer(data, "<i2").astype(np.float32) / np.float32(32_768)
