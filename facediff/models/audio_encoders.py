@@ -7,7 +7,7 @@ import json
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from facediff.data.frame_clock import CONVOLUTIONS, convolved
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
 from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
@@ -39,9 +40,6 @@ Lengths = Int[Tensor, " batch"]
 StepRule = Literal["features", "features_cut", "hidden", "hidden_cut"]
 """Where the published methods leave a pretrained network's 50 steps a second: its ``features``, what the convolutions
 give, or its last ``hidden`` states are interpolated to the steps wanted, or (``…_cut``) cut after them."""
-
-CONVOLUTIONS = ((10, 5), (3, 2), (3, 2), (3, 2), (3, 2), (2, 2), (2, 2))
-"""Kernels and strides of the convolutions of wav2vec 2.0 and HuBERT."""
 
 
 class AudioEncoder(nn.Module, ABC):
@@ -97,7 +95,11 @@ class AudioEncoder(nn.Module, ABC):
 
         The published methods count their frames by them, whatever encoder takes the network's place.
         """
-        return convolved(samples, CONVOLUTIONS)
+        return convolved(samples, self.convolutions())
+
+    def convolutions(self) -> tuple[tuple[int, int], ...]:
+        """Kernel and stride of each of these convolutions."""
+        return CONVOLUTIONS
 
     def at_steps(
         self, audio: Waves, audio_lengths: Lengths, steps: Lengths, rule: StepRule, *cached: Tensor
@@ -159,17 +161,6 @@ class AudioEncoderFactory(Protocol):
     def __call__(self, *, dim: int) -> AudioEncoder:
         """Make one with ``dim`` output channels."""
         ...
-
-
-def convolved(samples: int, layers: Iterable[tuple[int, int]]) -> int:
-    """Steps that convolutions without padding, each of a kernel and a stride, make of so many samples; at least 0.
-
-    >>> convolved(16_000, CONVOLUTIONS)
-    49
-    """
-    for kernel, stride in layers:
-        samples = max(0, (samples - kernel) // stride + 1)
-    return samples
 
 
 def standardise(audio: Waves, lengths: Lengths, epsilon: float = 1e-7) -> Waves:

@@ -22,10 +22,10 @@ from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, collate
 from facediff.data.audio import samples_for
+from facediff.data.frame_clock import FrameClock
 from facediff.data.windows import SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoder
-from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:
     from facediff.models.graphs import Graphs
@@ -82,7 +82,7 @@ class Inference(ABC):
 
     Class attributes:
         samples: whether motion depends on random noise, by a sampler that :meth:`choose_sampler` changes.
-        hears_all: whether the model counts its frames by itself (:meth:`frames_of`) and hears all samples of a
+        hears_all: whether the model counts its frames by itself (:attr:`clock`) and hears all samples of a
             recording; else speech is cut or filled up to whole frames.
         chosen: attributes that the methods ``choose_…`` change, and :meth:`choosing` restores.
 
@@ -265,9 +265,14 @@ class Inference(ABC):
                     start += part.shape[1]
         return motion
 
+    @property
+    def clock(self) -> FrameClock:
+        """How the model counts its frames."""
+        return FrameClock(self.frame_rate)
+
     def frames_of(self, samples: int) -> int:
         """Frames that the model gives for speech of so many samples at 16 kHz; 0 if it is too short for one."""
-        return round(samples * self.frame_rate / SAMPLE_RATE)
+        return self.clock.frames(samples)
 
     def check_condition(self, condition: str | None) -> None:
         """Refuse to be conditioned on a speaker that the model was not trained on.
@@ -497,7 +502,9 @@ class Inference(ABC):
         Raises:
             FaceDiffError: if it cannot be exported.
         """
-        raise FaceDiffError(f"{type(self).__name__}: cannot be exported yet; dual-path diffusion models can")
+        raise FaceDiffError(
+            f"{type(self).__name__}: has no graphs and cannot be exported; a model that can overrides graphs()"
+        )
 
     @abstractmethod
     def encode_style(

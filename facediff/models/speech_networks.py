@@ -22,7 +22,6 @@ from facediff.models.audio_encoders import (
     StepRule,
     Waves,
     by_length,
-    convolved,
     fingerprint,
     load_typed,
     with_edges,
@@ -110,10 +109,10 @@ class Wav2Vec2Encoder(AudioEncoder):
         if mask is not None and not network.config.apply_spec_augment:
             mask.requires_grad_(False)
 
-    def steps_of(self, samples: int) -> int:
-        """Steps that the network's own convolutions make of so many samples."""
+    def convolutions(self) -> tuple[tuple[int, int], ...]:
+        """Those of the network's own configuration."""
         settings = self.network.config
-        return convolved(samples, zip(settings.conv_kernel, settings.conv_stride, strict=True))
+        return tuple(zip(settings.conv_kernel, settings.conv_stride, strict=True))
 
     def frozen_key(self) -> str | None:
         """A hash of the convolutions' weights, the configuration, and how speech is standardised."""

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
+from facediff.data.frame_clock import FrameClock
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay, MotionScale
@@ -115,11 +116,10 @@ class PublishedModel(AnimationModel):
         """Steps at 50 a second that a pretrained network gives for so many samples."""
         return self.audio_encoder.steps_of(samples)
 
-    def frames_of(self, samples: int) -> int:
-        """Frames that the method gives for speech of so many samples."""
-        steps = self.steps_of(samples)
-        # In this very order and in floating point, as the projects compute it: 205 steps give 122 frames, not 123.
-        return steps // 2 if self.pairs else int((steps / 50.0) * self.frame_rate)
+    @property
+    def clock(self) -> FrameClock:
+        """By the steps of the speech network."""
+        return FrameClock(self.frame_rate, "pairs" if self.pairs else "steps", self.audio_encoder.convolutions())
 
     def plan_long_speech(self, long_speech: LongSpeech) -> None:
         """Choose what is done with speech beyond the published tables: by windows only where that is chosen."""

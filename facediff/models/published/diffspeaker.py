@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
+from facediff.data.frame_clock import FrameClock
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
@@ -160,9 +161,10 @@ class DiffSpeaker(DiffusionModel):
 
     # Frames, speech and the speaker.
 
-    def frames_of(self, samples: int) -> int:
-        """Frames that the method gives for speech of so many samples, at any frame rate in floating point."""
-        return int((self.steps_of(samples) / 50.0) * self.frame_rate)
+    @property
+    def clock(self) -> FrameClock:
+        """By the steps of the speech network, at any frame rate."""
+        return FrameClock(self.frame_rate, "steps", self.audio_encoder.convolutions())
 
     def tested_frames(self, batch: Batch) -> list[int]:
         """As many as the truth has, as in the published test."""

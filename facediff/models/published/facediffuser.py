@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
+from facediff.data.frame_clock import FrameClock, Rule
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.folding import WeightCache
@@ -111,10 +112,11 @@ class FaceDiffuser(DiffusionModel):
 
     # Frames.
 
-    def frames_of(self, samples: int) -> int:
-        """A frame less than the speech lasts, in floating point as published; at most as many as pairs of steps."""
-        frames = int(samples / SAMPLE_RATE * self.frame_rate) - 1
-        return min(frames, self.steps_of(samples) // 2) if self.pairs else frames
+    @property
+    def clock(self) -> FrameClock:
+        """A frame less than the speech lasts; at most as many as pairs of steps."""
+        rule: Rule = "seconds_or_pairs" if self.pairs else "seconds"
+        return FrameClock(self.frame_rate, rule, self.audio_encoder.convolutions())
 
     def tested_frames(self, batch: Batch) -> list[int]:
         """As many as the truth has where speech lasts as long, as the published test does."""

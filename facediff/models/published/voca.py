@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
+from facediff.data.frame_clock import FrameClock
 from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.deepspeech import DeepSpeechEncoder, network_of
@@ -26,7 +27,6 @@ from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Width, frame_mask
 from facediff.models.published.base import PublishedModel, SpeakerTable, masked_mean
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, dataset_facts, recogniser
-from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 from facediff.utils.tensorflow_files import read_graph
 
@@ -99,14 +99,10 @@ class Voca(PublishedModel):
 
     # Frames.
 
-    def rows_of(self, samples: int) -> int:
-        """Rows of speech, of which a frame takes one, or every so many."""
-        # In this very order, as published; half a row is rounded to an even number.
-        return round(samples / SAMPLE_RATE * (self.frame_rate * self.rows_per_frame))
-
-    def frames_of(self, samples: int) -> int:
+    @property
+    def clock(self) -> FrameClock:
         """At the published 60 frames a second, as many as rows; else every so many of them, from the first on."""
-        return -(-self.rows_of(samples) // self.rows_per_frame)
+        return FrameClock(self.frame_rate, "rows", rows=self.rows_per_frame)
 
     def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
         """Frames of each clip for which there is speech."""
@@ -115,7 +111,9 @@ class Voca(PublishedModel):
 
     def hear(self, batch: Batch, most: int) -> Float[Tensor, "batch frames channels rows"]:
         """The window of speech around each of so many frames; what lies before or after the speech is zero."""
-        rows = torch.tensor([max(1, self.rows_of(int(n))) for n in batch.audio_lengths], device=batch.audio.device)
+        rows = torch.tensor(
+            [max(1, self.clock.row_count(int(n))) for n in batch.audio_lengths], device=batch.audio.device
+        )
         cached = batch.cached_features or ()
         rate = self.frame_rate * self.rows_per_frame
         heard = self.audio_encoder.at_rate(batch.audio, batch.audio_lengths, rows, rate, *cached)
