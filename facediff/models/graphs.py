@@ -1,14 +1,17 @@
 """The parts of a model as computation graphs that run without PyTorch, for the ONNX format.
 
-A model is exported in three graphs, and what is constant goes along as plain numbers. ``speech`` is its audio encoder.
-``step`` predicts clean motion from noisy motion once; the loop over the steps is a table of numbers
-(:func:`update_table`), since every linear sampler is one. ``motion`` turns the result into vertices. The loop is left
-out of the graphs on purpose: recording ten steps one after the other takes ten times as long, and the file would hold
-the network ten times.
+Every exported model has a graph ``speech``, which hears, and a graph ``motion``, which gives vertices. A model that
+generates all frames at once (``direct``) has nothing else. One that samples has ``step`` between them, which predicts
+clean motion from noisy motion once; the loop over the steps is a table of numbers (:func:`update_table`), since every
+linear sampler is one. The loop is left out of the graphs on purpose: recording ten steps one after the other takes ten
+times as long, and the file would hold the network ten times. What is constant goes along as plain numbers.
+
+Here is what all models share; each method has its own graphs next to its network.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -16,18 +19,29 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from facediff.data.frame_clock import FrameClock
 from facediff.errors import FaceDiffError
-from facediff.models.dual_path.network import Conditions
-from facediff.models.folding import unchanged
+from facediff.models.audio_encoders import Lengths, Waves
 from facediff.models.layers import of_frames
 
 if TYPE_CHECKING:
-    from facediff.models.audio_encoders import AudioEncoder
-    from facediff.models.dual_path.model import DualPathDiffusion
+    from facediff.models.base import AnimationModel
     from facediff.models.samplers import Sampler
 
 Axes = dict[int, str]
 """Which axes of an input have any length: ``batch``, ``samples``, ``frames``."""
+
+BATCH: Axes = {0: "batch"}
+FRAMES: Axes = {0: "batch", 1: "frames"}
+
+StyleSource = Literal["reference", "identity", "none"]
+"""What a style is: a vector of a reference motion, a training identity, or nothing that the model knows."""
+
+Blending = Literal["steps", "motion"]
+"""Where windows of long speech go over into one another: in every denoising step, or in the motion."""
+
+NoiseOf = Literal["clip", "seed"]
+"""What noise depends on: the clip's name and the seed, or the seed alone."""
 
 
 @dataclass(frozen=True)
@@ -50,28 +64,24 @@ class Graph:
 
 
 @dataclass(frozen=True)
-class Graphs:
-    """A whole model as graphs and numbers.
+class SamplingLoop:
+    """What is done with the graph ``step``.
 
     Attributes:
-        parts: the graphs.
-        epsilon: added to the variance of speech before it is standardised.
-        equal_lengths: whether all clips of a batch must be of one length, since the audio encoder or the decoder knows
-            no padding.
         state: numbers in a frame of noisy motion.
-        kept: numbers in a frame of what windows of long speech are blended by.
+        drawn: numbers in a frame of the unit noise that the loop starts from.
+        kept: numbers in a frame of the graph's second result.
         sampler: its name.
         steps: the diffusion steps that are visited.
         table: for each of them, the numbers of :func:`update_table`.
-        last_step: the step at which only the mean is left.
+        last_step: the step at which only the mean is left; −1 where the model predicts none.
         decoded: what the last graph decodes: the ``sample``, or the ``kept`` numbers of the last step.
         noise: what unit noise is multiplied by before use, (state, state); None for nothing.
+        noise_of: what noise depends on.
     """
 
-    parts: list[Graph]
-    epsilon: float
-    equal_lengths: bool
     state: int
+    drawn: int
     kept: int
     sampler: str
     steps: list[int]
@@ -79,6 +89,32 @@ class Graphs:
     last_step: int
     decoded: Literal["sample", "kept"]
     noise: Float[Tensor, "state state"] | None
+    noise_of: NoiseOf
+
+
+@dataclass(frozen=True)
+class Graphs:
+    """A whole model as graphs and numbers.
+
+    Attributes:
+        parts: the graphs.
+        equal_lengths: whether all clips of a batch must be of one length, since a part of the model knows no padding.
+        blending: how windows of long speech are joined.
+        clock: how the model counts its frames.
+        style: what a style is.
+        epsilon: added to the variance of speech before it is standardised.
+        longest: frames at most of what is animated in one pass; 0 for any number.
+        sampling: of a model that samples.
+    """
+
+    parts: list[Graph]
+    equal_lengths: bool
+    blending: Blending
+    clock: FrameClock
+    style: StyleSource
+    epsilon: float = 1e-7
+    longest: int = 0
+    sampling: SamplingLoop | None = None
 
 
 def update_table(sampler: Sampler) -> list[list[float]]:
@@ -113,12 +149,39 @@ def update_table(sampler: Sampler) -> list[list[float]]:
     return table
 
 
-class SpeechGraph(nn.Module):
-    """Speech to one feature per frame of motion."""
+@dataclass(frozen=True)
+class Speech:
+    """What a model hears of a batch.
 
-    def __init__(self, encoder: AudioEncoder) -> None:
+    Attributes:
+        audio: at 16 kHz, padded.
+        audio_lengths: valid samples of each clip.
+        cached_features: of the encoder's frozen part; a graph has none.
+    """
+
+    audio: Waves
+    audio_lengths: Lengths
+    cached_features: None = None
+
+
+Hear = Callable[[Speech, Int[Tensor, " batch"], int], Tensor]
+"""Features of speech for a number of frames of each clip, and the largest of these numbers."""
+
+
+class SpeechGraph(nn.Module):
+    """Speech to one feature per frame of motion.
+
+    Args:
+        model: whose parameters are used.
+        hear: makes the features.
+        steps_of: from a number of frames to the audio encoder's steps.
+    """
+
+    def __init__(self, model: AnimationModel, hear: Hear, steps_of: Callable[[int], int]) -> None:
         super().__init__()
-        self.encoder = encoder
+        self.model = model
+        self.hear = hear
+        self.steps_of = steps_of
 
     def forward(
         self,
@@ -127,7 +190,7 @@ class SpeechGraph(nn.Module):
         deviation: Float[Tensor, " batch"],
         samples: Int[Tensor, " batch"],
         mask: Bool[Tensor, "batch frames"],
-    ) -> Float[Tensor, "batch frames dim"]:
+    ) -> Float[Tensor, "batch frames *width"]:
         """Encode.
 
         Args:
@@ -137,150 +200,23 @@ class SpeechGraph(nn.Module):
             samples: valid ones of each clip.
             mask: True on each clip's frames of motion.
         """
-        with self.encoder.at_level(mean[:, None], deviation[:, None]), of_frames(mask.shape[1]):
-            features: Tensor = self.encoder(audio, samples, mask.sum(1))
-        return features
+        level = self.model.speech_encoder.at_level(mean[:, None], deviation[:, None])
+        with level, of_frames(self.steps_of(mask.shape[1])):
+            return self.hear(Speech(audio, samples), mask.sum(1), mask.shape[1])
 
 
-class StepGraph(nn.Module):
-    """Noisy motion to clean motion at one step, under speech, identity and style."""
-
-    def __init__(self, model: DualPathDiffusion) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(
-        self,
-        features: Float[Tensor, "batch frames dim"],
-        mask: Bool[Tensor, "batch frames"],
-        identity: Int[Tensor, " batch"],
-        style: Float[Tensor, "batch style_dim"],
-        state: Float[Tensor, "batch frames state"],
-        step: Int[Tensor, " batch"],
-        before: Float[Tensor, "batch frames kept"],
-        share: Float[Tensor, "batch frames"],
-    ) -> tuple[Tensor, Tensor]:
-        """The prediction, and what the next window of long speech takes as ``before``.
-
-        Args:
-            features: of the speech.
-            mask: True on valid frames.
-            identity: indices, −1 for unknown.
-            style: F_dyn.
-            state: the noisy motion.
-            step: counted from 0.
-            before: what the window before kept, in the frames that this one shares with it.
-            share: of this window in each frame, 1 where nothing is shared.
-        """
-        network, kept = self.model.network, list[Tensor]()
-        tokens = network.style_tokens(torch.cat([network.identity_encoder(identity), style], dim=-1))
-
-        def blend(now: Tensor) -> Tensor:
-            kept.append(torch.lerp(before, now, share[..., None]))
-            return kept[0]
-
-        space = self.model._space(Conditions(features, tokens, mask), blend)  # noqa: SLF001 - a part of the model
-        return space.denoise(state, step), kept[0]
+def one_each(frames: int) -> int:
+    """As many steps as frames."""
+    return frames
 
 
-class MotionGraph(nn.Module):
-    """The end of sampling to offsets from the template."""
-
-    def __init__(self, model: DualPathDiffusion, decoded: Literal["sample", "kept"]) -> None:
-        super().__init__()
-        self.model = model
-        self.decoded = decoded
-
-    def forward(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames vertices 3"]:
-        """In the unit of the corpus."""
-        model = self.model
-        scaled = model.network.clean_motion(sample) if self.decoded == "kept" else sample
-        return model.motion_space.decode(scaled) / model.scale
-
-
-BATCH: Axes = {0: "batch"}
-FRAMES: Axes = {0: "batch", 1: "frames"}
-
-
-def graphs_of(model: DualPathDiffusion) -> Graphs:
-    """A dual-path model with its present sampler as graphs and numbers.
-
-    Raises:
-        FaceDiffError: if its sampler is not linear, or conditions are guided.
-    """
-    if [*model.views()] != [()]:
-        raise FaceDiffError("guidance: a guided model cannot be exported; set all scales to 1")
-    network, sampler = model.network, model.sampler
-    table = update_table(sampler)
-    preconditioned = model.motion_space.preconditioning is not None
-    folded = model.sampling_space == "folded" and not preconditioned
-    batch, frames, width = 2, 50, network.embed.in_features
-    dim = network.embed.out_features
-    state = dim if folded else width
-    kept = width if preconditioned else dim
-    speech = speech_graph(network.audio_encoder, model.frame_rate)
-    style = sum(network.style_encoder.token_dims)
-    mask = torch.ones(batch, frames, dtype=torch.bool)
-    step = Graph(
-        "step",
-        StepGraph(model),
-        {
-            "features": torch.zeros(batch, frames, dim),
-            "mask": mask,
-            "identity": torch.zeros(batch, dtype=torch.long),
-            "style": torch.zeros(batch, style),
-            "state": torch.zeros(batch, frames, state),
-            "step": torch.zeros(batch, dtype=torch.long),
-            "before": torch.zeros(batch, frames, kept),
-            "share": torch.ones(batch, frames),
-        },
-        {
-            **dict.fromkeys(("features", "mask", "state", "before", "share"), FRAMES),
-            **dict.fromkeys(("identity", "style", "step"), BATCH),
-        },
-        ("prediction", "kept"),
-    )
-    with torch.no_grad():
-        step.module(*step.inputs.values())  # what follows from the weights alone is computed here, not in the graph
-        root = None
-        if folded:  # else noise is used as it is, and the unit matrix of all coordinates would take gigabytes
-            space = model._space(_nothing(step.inputs), unchanged)  # noqa: SLF001 - a part of the model
-            root = space.noise(torch.eye(state)[None])[0]
-    decoded: Literal["sample", "kept"] = "kept" if folded else "sample"
-    last = Graph(
-        "motion",
-        MotionGraph(model, decoded),
-        {"sample": torch.zeros(batch, frames, kept if folded else state)},
-        {"sample": FRAMES},
-        ("offsets",),
-    )
-    return Graphs(
-        parts=[speech, step, last],
-        epsilon=1e-7,
-        equal_lengths=not (network.audio_encoder.takes_padding and network.decoder.graph_takes_padding),
-        state=state,
-        kept=kept,
-        sampler=type(sampler).__name__,
-        steps=list(sampler.timesteps),
-        table=table,
-        last_step=model.process.steps - 1,
-        decoded=decoded,
-        noise=root,
-    )
-
-
-def speech_graph(encoder: AudioEncoder, frame_rate: float) -> Graph:
-    """The graph of an audio encoder.
-
-    Args:
-        encoder: any.
-        frame_rate: of the motion; example values only.
-    """
-    batch, seconds = 2, 2
-    samples, frames = 16_000 * seconds, round(frame_rate * seconds)
+def speech_graph(model: AnimationModel, hear: Hear, steps_of: Callable[[int], int] = one_each) -> Graph:
+    """The graph that hears; see :class:`SpeechGraph` for the arguments."""
+    batch, samples = 2, 32_000
+    frames = model.clock.frames(samples)
     return Graph(
         "speech",
-        SpeechGraph(encoder),
+        SpeechGraph(model, hear, steps_of),
         {
             "audio": torch.randn(batch, samples, generator=torch.Generator().manual_seed(0)),
             "mean": torch.zeros(batch),
@@ -297,6 +233,8 @@ def speech_graph(encoder: AudioEncoder, frame_rate: float) -> Graph:
     )
 
 
-def _nothing(inputs: dict[str, Tensor]) -> Conditions:
-    """Conditions of example values."""
-    return Conditions(inputs["features"], inputs["features"][:, :1], inputs["mask"])
+def features_of(speech: Graph) -> Tensor:
+    """What the graph that hears makes of its example values."""
+    with torch.no_grad():
+        made: Tensor = speech.module.eval()(*speech.inputs.values())
+    return made

@@ -62,7 +62,7 @@ _most_frames: ContextVar[int | None] = ContextVar("most_frames", default=None)
 
 @contextmanager
 def of_frames(most: int) -> Iterator[None]:
-    """Within it, :func:`interpolate_frames` gives so many frames; else as many as the longest clip has.
+    """Within it, the longest clip has so many frames, or steps of the audio encoder; see :func:`longest`.
 
     A graph takes the number from the shape of an input, since it cannot depend on values.
     """
@@ -71,6 +71,22 @@ def of_frames(most: int) -> Iterator[None]:
         yield
     finally:
         _most_frames.reset(token)
+
+
+def longest(lengths: Int[Tensor, " batch"]) -> int:
+    """The largest of some lengths; while a graph is recorded, what :func:`of_frames` says."""
+    most = _most_frames.get()
+    return int(lengths.max()) if most is None else most
+
+
+def sliding(
+    x: Float[Tensor, "batch steps channels"], size: int, stride: int, count: int
+) -> Float[Tensor, "batch count channels size"]:
+    """So many windows over time, each ``stride`` steps after the one before; the last must end within the steps."""
+    if exporting():  # graphs know no strided views
+        places = torch.arange(count, device=x.device)[:, None] * stride + torch.arange(size, device=x.device)
+        return x[:, places].transpose(2, 3)
+    return x.unfold(1, size, stride)[:, :count]
 
 
 def needed_mask(mask: FrameMask) -> FrameMask | None:
@@ -87,8 +103,7 @@ def interpolate_frames(
     (j + ½)·length/frames − ½, held at the ends. Padding neither enters nor is written: frames beyond a clip's
     own length are zero.
     """
-    most = _most_frames.get()
-    frames = int(frame_lengths.max()) if most is None else most
+    frames = longest(frame_lengths)
     ratio = lengths.float() / frame_lengths.float()
     last = (lengths - 1)[:, None].float()
     # PyTorch's own interpolation has one ratio for the whole batch; here each clip has its own, so that its features do

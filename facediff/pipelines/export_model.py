@@ -26,8 +26,11 @@ from facediff.version import __version__
 if TYPE_CHECKING:
     import onnx
 
+    from facediff.data import Reference
+    from facediff.data.frame_clock import FrameClock
     from facediff.models.base import AnimationModel
     from facediff.models.graphs import Graph, Graphs
+    from facediff.models.inference import Style
 
 Precision = Literal["float32", "float16", "int8"]
 
@@ -36,6 +39,9 @@ OPSET = 20
 
 SMALLEST = 4096
 """Numbers of a weight that is worth storing in fewer bits; smaller ones stay exact."""
+
+ENDLESS = 1e9
+"""Seconds that stand for no limit, since JSON knows no infinity."""
 
 TOLERANCE = 1e-4
 """Largest difference from PyTorch in float32, as a share of the motion's range."""
@@ -258,18 +264,30 @@ def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDAr
     for name in ("faces", "colours", "inner_lip_pairs"):
         if facts[name] is not None:
             arrays[name] = facts[name]
-    if graphs.noise is not None:
-        arrays["noise"] = graphs.noise.numpy()
+    if graphs.sampling is not None and graphs.sampling.noise is not None:
+        arrays["noise"] = graphs.sampling.noise.numpy()
+    if graphs.style != "reference":
+        return arrays, list(assets.identities) if graphs.style == "identity" else [], faces
     styles: dict[str, npt.NDArray[np.float32]] = {}
     with torch.inference_mode():
-        for name, reference in assets.references.items():
-            mask = torch.ones(1, len(reference.motion), dtype=torch.bool, device=model.device)
-            vector = model.encode_style(reference.motion.float()[None].to(model.device), mask)
-            styles[name] = vector[0].float().cpu().numpy()
+        for name in model.styled_identities():
+            styles[name] = style_vector(model, model.default_style(name))
     if not styles:
         raise FaceDiffError("styles: the checkpoint holds no reference motion; train with a corpus that gives one")
     arrays["styles"] = np.stack(list(styles.values()))
     return arrays, list(styles), faces
+
+
+def style_vector(model: AnimationModel, style: Reference | Style) -> npt.NDArray[np.float32]:
+    """The vector of a style."""
+    import torch
+
+    vector = getattr(style, "vector", None)
+    if vector is None:
+        motion = style.motion.float()[None].to(model.device)  # type: ignore[union-attr]
+        vector = model.encode_style(motion, torch.ones(1, motion.shape[1], dtype=torch.bool, device=model.device))[0]
+    found: npt.NDArray[np.float32] = vector.float().cpu().numpy()
+    return found
 
 
 def describe(
@@ -282,7 +300,7 @@ def describe(
     faces: list[str],
 ) -> Description:
     """What ``model.json`` says."""
-    assets, plan = model.assets, model.windows
+    assets, plan, loop = model.assets, model.windows, graphs.sampling
     return Description(
         model=type(model).__name__,
         facediff=__version__,
@@ -299,17 +317,32 @@ def describe(
         identities=list(assets.identities),
         faces=faces,
         styles=styles,
-        windows={name: float(value) for name, value in vars(plan).items()},
+        windows={name: min(float(value), ENDLESS) for name, value in vars(plan).items()},
         epsilon=graphs.epsilon,
         equal_lengths=graphs.equal_lengths,
-        state=graphs.state,
-        kept=graphs.kept,
-        sampler=graphs.sampler,
-        steps=graphs.steps,
-        table=graphs.table,
-        last_step=graphs.last_step,
-        decoded=graphs.decoded,
+        state=loop.state if loop else 0,
+        kept=loop.kept if loop else 0,
+        sampler=loop.sampler if loop else "",
+        steps=loop.steps if loop else [],
+        table=loop.table if loop else [],
+        last_step=loop.last_step if loop else -1,
+        decoded=loop.decoded if loop else "sample",
+        generation="sampled" if loop else "direct",
+        blending=graphs.blending,
+        clock=clock_facts(graphs.clock),
+        style_source=graphs.style,
+        longest=graphs.longest,
+        drawn=loop.drawn if loop else 0,
+        noise_of=loop.noise_of if loop else "clip",
     )
+
+
+def clock_facts(clock: FrameClock) -> dict[str, Any]:
+    """A clock as ``model.json`` says it; what its rule has no use for is left out."""
+    facts: dict[str, Any] = {"rule": clock.rule}
+    if clock.rule in ("steps", "pairs", "seconds_or_pairs"):
+        facts["convolutions"] = [list(layer) for layer in clock.convolutions]
+    return facts | ({"rows": clock.rows} if clock.rule == "rows" else {})
 
 
 def compare(model: AnimationModel, folder: Path, speech: npt.NDArray[np.float32]) -> dict[str, Any]:
@@ -319,11 +352,14 @@ def compare(model: AnimationModel, folder: Path, speech: npt.NDArray[np.float32]
     from facediff.runtime.model import RuntimeModel
 
     runtime = RuntimeModel.open(folder)
-    face = runtime.description.faces[0]
-    style = face if face in runtime.description.styles else runtime.description.styles[0]
-    wanted = model.animate(
-        torch.from_numpy(speech).to(model.device), identity=face, style=model.assets.references[style], seed=3
-    ).vertices.numpy()
+    about = runtime.description
+    face = about.faces[0]
+    style, chosen = None, None
+    if about.style_source == "reference":
+        style = face if face in about.styles else about.styles[0]
+        chosen = model.default_style(style)
+    heard = torch.from_numpy(speech).to(model.device)
+    wanted = model.animate(heard, identity=face, style=chosen, seed=3).vertices.numpy()
     found = runtime.animate(speech, identity=face, style=style, seed=3, gate=None).vertices
     span = float(np.ptp(wanted - runtime.arrays["templates"][0]))
     difference = float(np.abs(found - wanted).max())

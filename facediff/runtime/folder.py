@@ -1,19 +1,21 @@
 """The folder of an exported model: what is in it, writing its description, and reading it safely.
 
 ``model.json`` says everything that is no array, ``arrays.npz`` holds templates, styles and regions, and each graph is a
-file of its own: ``speech.onnx``, ``step.onnx``, ``motion.onnx``.
+file of its own: ``speech.onnx`` and ``motion.onnx`` of every model, ``step.onnx`` of one that samples, ``start.onnx``
+where its loop starts from more than noise, ``style.onnx`` of one that takes styles from motion.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.frame_clock import FrameClock, Rule
 from facediff.data.windows import WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import read_arrays
@@ -23,7 +25,11 @@ FORMAT = "facediff model"
 VERSION = 1
 DESCRIPTION = "model.json"
 ARRAYS = "arrays.npz"
-GRAPHS = ("speech", "step", "motion")
+NEEDED = {"sampled": ("speech", "step", "motion"), "direct": ("speech", "motion")}
+"""Graphs that every folder has, by the kind of generation."""
+
+OPTIONAL = {"sampled": ("start", "style"), "direct": ("style",)}
+"""Graphs that some folders have besides."""
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -60,6 +66,14 @@ class Description:
         table: for each of them the factors of the noisy motion, of the last three predictions (latest first) and noise.
         last_step: the step at which only the mean is left.
         decoded: what the last graph is given: the ``sample`` or what was ``kept`` of the last step.
+        generation: ``sampled``, by a loop over ``step``; or ``direct``, by ``motion`` alone. In a direct model, what is
+            said of the loop is 0, empty, and ``last_step`` −1, as in a model that predicts no mean.
+        blending: where windows go over into one another: in all ``steps`` of the loop, or in the ``motion``.
+        clock: how the model counts frames, as :class:`~facediff.data.frame_clock.FrameClock` takes it.
+        style_source: what a style is: of a ``reference`` motion; a training ``identity``; ``none`` if there are none.
+        longest: frames at most of what is animated in one pass; 0 for any number.
+        drawn: numbers in a frame of the noise that the loop starts from; ``state`` if 0.
+        noise_of: what noise depends on: the ``clip`` and the seed, or the ``seed``.
         check: the comparison with PyTorch when the folder was written.
     """
 
@@ -88,6 +102,13 @@ class Description:
     table: list[list[float]]
     last_step: int
     decoded: str
+    generation: str = "sampled"
+    blending: str = "steps"
+    clock: dict[str, Any] = field(default_factory=lambda: {"rule": "rounded"})
+    style_source: str = "reference"
+    longest: int = 0
+    drawn: int = 0
+    noise_of: str = "clip"
     check: dict[str, Any] = field(default_factory=dict)
 
     def content(self) -> dict[str, Any]:
@@ -98,6 +119,14 @@ class Description:
     def plan(self) -> WindowPlan:
         """How long speech is cut."""
         return WindowPlan(**self.windows)
+
+    @property
+    def frame_clock(self) -> FrameClock:
+        """How the model counts its frames."""
+        facts = dict(self.clock)
+        if "convolutions" in facts:
+            facts["convolutions"] = tuple((kernel, stride) for kernel, stride in facts["convolutions"])
+        return FrameClock(self.frame_rate, **facts)
 
 
 KINDS: dict[str, type | tuple[type, ...]] = {
@@ -130,6 +159,8 @@ def read_folder(folder: Path) -> tuple[Description, Arrays]:
     values: dict[str, Any] = {}
     for each in fields(Description):
         kind = KINDS[str(each.type).split("[")[0]]
+        if each.name not in content and (each.default_factory is not MISSING or each.default is not MISSING):
+            continue  # of a folder written before there were models of this kind
         value = content.get(each.name)
         if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
             raise FaceDiffError(
@@ -138,7 +169,7 @@ def read_folder(folder: Path) -> tuple[Description, Arrays]:
         values[each.name] = value
     description = Description(**values)
     _check(path, description)
-    for name in (*(f"{graph}.onnx" for graph in GRAPHS), ARRAYS):
+    for name in (*(f"{graph}.onnx" for graph in description.graphs), ARRAYS):
         size = (folder / name).stat().st_size if (folder / name).is_file() else None
         if size != description.sizes.get(name):
             found = "is missing" if size is None else f"has {size} bytes"
@@ -162,10 +193,23 @@ def _check(path: Path, found: Description) -> None:
         refuse("frame_rate", "1 to 1000")
     if not 0 < found.epsilon < 1:
         refuse("epsilon", "more than 0, less than 1")
-    for name in ("state", "kept"):
-        if not 1 <= getattr(found, name) <= 10_000_000:
-            refuse(name, "1 to 10000000")
-    if not 1 <= len(found.steps) <= 100_000 or not all(isinstance(each, int) and each >= 0 for each in found.steps):
+    for name, words in (
+        ("generation", tuple(NEEDED)),
+        ("blending", ("steps", "motion")),
+        ("style_source", ("reference", "identity", "none")),
+        ("noise_of", ("clip", "seed")),
+    ):
+        if getattr(found, name) not in words:
+            refuse(name, " or ".join(words))
+    needed, optional = NEEDED[found.generation], OPTIONAL[found.generation]
+    if not {*needed} <= {*found.graphs} <= {*needed, *optional}:
+        refuse("graphs", ", ".join(needed))
+    sampled = found.generation == "sampled"
+    for name, least in (("state", 1), ("kept", 1), ("drawn", 0), ("longest", 0)):
+        if not (least if sampled else 0) <= getattr(found, name) <= 10_000_000:
+            refuse(name, f"{least} to 10000000")
+    least = 1 if sampled else 0
+    if not least <= len(found.steps) <= 100_000 or not all(isinstance(each, int) and each >= 0 for each in found.steps):
         refuse("steps", "steps of the noise process")
     rows = found.table
     if len(rows) != len(found.steps) or not all(
@@ -180,10 +224,31 @@ def _check(path: Path, found: Description) -> None:
             refuse(name, "names")
     if not found.faces:
         refuse("faces", "one name at least")
+    _check_clock(refuse, found)
     try:
         found.plan.in_frames(found.frame_rate)
     except (FaceDiffError, TypeError) as error:
         raise FaceDiffError(f"{path}: windows: {error}") from error
+
+
+def _check_clock(refuse: Callable[[str, str], None], found: Description) -> None:
+    """Refuse a clock that cannot be."""
+
+    def whole(value: object, most: int) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most
+
+    clock = found.clock
+    layers = clock.get("convolutions", [])
+    fits = (
+        {*clock} <= {"rule", "rows", "convolutions"}
+        and clock.get("rule") in get_args(Rule)
+        and whole(clock.get("rows", 1), 1000)
+        and isinstance(layers, list)
+        and len(layers) <= 64
+        and all(isinstance(each, list) and len(each) == 2 and all(whole(n, 10_000) for n in each) for each in layers)
+    )
+    if not fits:
+        refuse("clock", f"a rule ({', '.join(get_args(Rule))}) with rows and convolutions")
 
 
 def _check_arrays(path: Path, found: Description, arrays: Arrays) -> None:
@@ -203,7 +268,8 @@ def _check_arrays(path: Path, found: Description, arrays: Arrays) -> None:
 
     need("templates", (len(found.faces), None, 3), "f")
     vertices = arrays["templates"].shape[1]
-    need("styles", (len(found.styles), None), "f")
+    if found.style_source == "reference":
+        need("styles", (len(found.styles), None), "f")
     need("rest_weights", (len(found.faces), vertices), "f")
     if "noise" in arrays:
         need("noise", (found.state, found.state), "f")

@@ -6,7 +6,7 @@ What generates the motion of a clip or of a window is in ``sampling.py``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -18,9 +18,8 @@ from facediff.data.audio import samples_for
 from facediff.data.voice_activity import EnergyGate, Openness, openness, toward_rest
 from facediff.data.windows import SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, MissingExtraError, choices
-from facediff.runtime.folder import GRAPHS, Arrays, Description, read_folder
-from facediff.runtime.noise import ClipNoise, WindowNoise
-from facediff.runtime.sampling import Conditions, Sampling
+from facediff.runtime.folder import Arrays, Description, read_folder
+from facediff.runtime.sampling import NAME, Conditions, Heard, clip_motion, window_motion
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Expressivity, Seed, mismatch
 from facediff.version import __version__
@@ -30,9 +29,6 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float32]
 
-NAME = "speech"
-"""What a clip is called where its noise is drawn; :meth:`facediff.models.inference.Inference.animate` calls it so."""
-
 
 class RuntimeModel:
     """A model that ``facediff export-model`` wrote.
@@ -40,20 +36,24 @@ class RuntimeModel:
     Args:
         description: of the folder.
         arrays: likewise.
-        sessions: the graphs by name.
+        load: opens a graph by its name.
 
     Attributes:
         description: what ``model.json`` says.
+        clock: how the model counts its frames.
         windows: how long speech is cut; may be changed at any time.
     """
 
     def __init__(
-        self, description: Description, arrays: Arrays, sessions: Mapping[str, onnxruntime.InferenceSession]
+        self, description: Description, arrays: Arrays, load: Callable[[str], onnxruntime.InferenceSession]
     ) -> None:
         self.description = description
+        self.clock = description.frame_clock
         self.arrays = arrays
         self.windows = description.plan
-        self._sessions = sessions
+        self._load = load
+        # What encodes styles is opened where it is needed: most animations take a style by its name.
+        self._sessions = {name: load(name) for name in description.graphs if name != "style"}
 
     @classmethod
     def open(cls, folder: str | Path, *, threads: int = 0, providers: Sequence[str] | None = None) -> RuntimeModel:
@@ -77,18 +77,19 @@ class RuntimeModel:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.log_severity_level = 3  # warnings are about optimisations that do not apply
-        sessions = {}
-        for name in GRAPHS:
+
+        def load(name: str) -> onnxruntime.InferenceSession:
             path = folder / f"{name}.onnx"
             try:
-                sessions[name] = onnxruntime.InferenceSession(
+                return onnxruntime.InferenceSession(
                     path, options, providers=list(providers or ["CPUExecutionProvider"])
                 )
             except Exception as error:  # ONNX Runtime's own errors share no base class
                 raise FaceDiffError(
                     f"{path}: ONNX Runtime cannot read it ({str(error)[:80]}); export the model again"
                 ) from error
-        return cls(description, arrays, sessions)
+
+        return cls(description, arrays, load)
 
     @property
     def frame_rate(self) -> float:
@@ -126,18 +127,16 @@ class RuntimeModel:
         audio = np.ascontiguousarray(audio, np.float32)
         if audio.ndim != 1 or not np.isfinite(audio).all():
             raise FaceDiffError(f"audio: is {audio.dtype} {audio.shape}; expected finite samples (S,) at 16 kHz")
-        frames = round(len(audio) * self.frame_rate / SAMPLE_RATE)
+        frames = self.clock.frames(len(audio))
         if frames < 1:
             raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s); give more of it")
         if self.windows.in_one_pass(frames, self.frame_rate):
-            length = samples_for(frames, self.frame_rate)
+            length = samples_for(frames, self.frame_rate) if self.clock.rule == "rounded" else len(audio)
             speech = np.pad(audio[:length], (0, max(0, length - len(audio))))
             # In the precision of the model, which standardises in float32.
             mean = speech.mean(dtype=np.float32)
             deviation = np.sqrt(np.square(speech - mean).mean(dtype=np.float32) + np.float32(self.description.epsilon))
-            features = self._features(speech, frames, float(mean), float(deviation))
-            sampling = Sampling(self, conditions, None, 0)
-            offsets = sampling.run(features, ClipNoise(NAME, [seed]), ClipNoise(f"{NAME}/mean", [0]))
+            offsets = clip_motion(self, Heard(speech, frames, float(mean), float(deviation)), conditions)
         else:
             stream = RuntimeStream(self, face, conditions, self.windows)
             offsets = np.concatenate(list(stream.parts(audio, frames=frames)), 1)
@@ -197,10 +196,11 @@ class RuntimeModel:
             "corpus": f"{about.corpus} (synthetic)" if about.synthetic else about.corpus,
             **about.licences,
             "identity": about.faces[face],
-            "style": conditions.style_name,
-            "seed": str(conditions.seed),
-            "sampler": f"{about.sampler}, {len(about.steps)} steps",
+            **({} if about.style_source == "none" else {"style": conditions.style_name}),
+            **({"seed": str(conditions.seed)} if about.generation == "sampled" else {}),
         }
+        if about.generation == "sampled":
+            metadata["sampler"] = f"{about.sampler}, {len(about.steps)} steps"
         if gate is not None:
             metadata["voice gate"] = "energy"
         if conditions.expressivity != 1:
@@ -230,32 +230,67 @@ class RuntimeModel:
             raise FaceDiffError(
                 f'condition: the model was not trained on "{condition}": {choices(condition, about.identities)}'
             )
-        name = style if style is not None else chosen
-        if name not in about.styles:
-            raise FaceDiffError(f'style: there is no "{name}": {choices(name, about.styles)}')
+        who = chosen if condition is None else condition
+        if about.style_source == "none" and style is not None:
+            raise FaceDiffError(f"style: {about.model} knows no speaking styles; omit the option")
+        # Where the model's identities are its styles, the one that it is conditioned on is the style.
+        usual = chosen if about.style_source == "reference" else who
+        name = style if style is not None else usual
+        if style is not None or about.style_source == "reference":
+            self._require_style(name)
         for option, value, kind in (("seed", seed, Seed), ("expressivity", expressivity, Expressivity)):
             if (expected := mismatch(kind, value)) is not None:
                 raise FaceDiffError(f"{option} {value}: out of range; expected {expected}")
-        who = chosen if condition is None else condition
+        if expressivity != 1 and about.last_step < 0:
+            raise FaceDiffError(f"expressivity: {about.model} predicts no mean of its motion; omit the option")
+        face = about.faces.index(chosen)
+        vector = np.zeros(0, np.float32)
+        if about.style_source == "reference":
+            vector = self.arrays["styles"][about.styles.index(name)].astype(np.float32)
+        elif style is not None:
+            who = style
         index = about.identities.index(who) if who in about.identities else -1
-        vector = self.arrays["styles"][about.styles.index(name)].astype(np.float32)
-        return about.faces.index(chosen), Conditions(index, vector, name, seed, expressivity)
+        template = self.arrays["templates"][face].astype(np.float32)
+        return face, Conditions(index, vector, name, template, seed, expressivity)
+
+    def _require_style(self, name: str) -> None:
+        """Refuse a style that the folder has not."""
+        known = self.description.styles
+        if name not in known:
+            raise FaceDiffError(f'style: there is no "{name}": {choices(name, known)}')
+
+    def has(self, graph: str) -> bool:
+        """Whether the folder has such a graph."""
+        return graph in self.description.graphs
 
     def run(self, graph: str, inputs: Mapping[str, npt.NDArray[Any]]) -> list[Array]:
         """Results of a graph, which may have no use for some of the inputs."""
+        if graph not in self._sessions:
+            self._sessions[graph] = self._load(graph)
         session = self._sessions[graph]
         wanted = {each.name for each in session.get_inputs()}
         return cast(list[Array], session.run(None, {name: value for name, value in inputs.items() if name in wanted}))
 
-    def _features(self, speech: Array, frames: int, mean: float, deviation: float) -> Array:
-        """Speech (S,) to features (1, frames, dim)."""
+    def own_frames(self, heard: Heard) -> int:
+        """How many frames the model gives for speech, at least 1; its own number where it counts by itself."""
+        frames = heard.frames if self.clock.rule == "rounded" else max(1, self.clock.frames(len(heard.speech)))
+        longest = self.description.longest
+        if longest and frames > longest:
+            raise FaceDiffError(
+                f"speech: {frames / self.frame_rate:.1f} s are {frames} frames, and {self.description.model} was made "
+                f"for {longest} at most ({longest / self.frame_rate:g} s); animate it in windows (--window 4)"
+            )
+        return frames
+
+    def features(self, heard: Heard, frames: int) -> Array:
+        """Speech to features (1, frames, …)."""
         return self.run(
             "speech",
             {
-                "audio": speech[None],
-                "mean": np.array([mean], np.float32),
-                "deviation": np.array([deviation], np.float32),
-                "samples": np.array([len(speech)], np.int64),
+                "audio": heard.speech[None],
+                "mean": np.array([heard.mean], np.float32),
+                "deviation": np.array([heard.deviation], np.float32),
+                "samples": np.array([len(heard.speech)], np.int64),
                 "mask": np.ones((1, frames), bool),
             },
         )[0]
@@ -302,13 +337,9 @@ class RuntimeStream(SpeechWindows[Array]):
         return None if self.gate is None else Openness(self.gate, self.model.frame_rate)
 
     def generate(self, window: Window, speech: Array, frames: int, mean: float, deviation: float) -> Array:
-        """Motion of a window, blended in every step with the window before it."""
-        features = self.model._features(speech, frames, mean, deviation)  # noqa: SLF001 - of this file
-        features = np.ascontiguousarray(features[:, window.context : window.context + window.frames])
-        sampling = Sampling(self.model, self.conditions, self._tail, window.shared)
-        noise = WindowNoise(NAME, window, [self.conditions.seed])
-        motion = sampling.run(features, noise, WindowNoise(f"{NAME}/mean", window, [0]))
-        self._tail = [kept[:, -window.kept :] for kept in sampling.kept]
+        """Motion of a window, which continues the window before it."""
+        heard = Heard(speech, frames, mean, deviation)
+        motion, self._tail = window_motion(self.model, heard, window, self.conditions, self._tail)
         return motion
 
     def joined(self, parts: Sequence[Array]) -> Array:

@@ -85,6 +85,21 @@ class ClipNoise:
         return np.stack([stream.draw((frames, width)) for stream in self.streams])
 
 
+class SeedNoise:
+    """Unit noise of a clip that depends on the seed alone, as the published methods draw it.
+
+    Args:
+        seed: of the clip.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.stream = NormalStream(seed)
+
+    def __call__(self, frames: int, width: int) -> Noise:
+        """The next noise (1, frames, width)."""
+        return self.stream.draw((frames, width))[None]
+
+
 class WindowNoise:
     """Unit noise of a window of long speech, as :class:`facediff.models.inference.WindowNoise` draws it.
 

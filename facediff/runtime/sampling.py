@@ -1,20 +1,27 @@
-"""The loop over the denoising steps of an exported model: the sampler's table of numbers, run with NumPy."""
+"""What generates the motion of an exported model: its graphs, and the sampler's table of numbers, run with NumPy."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.runtime.noise import ClipNoise, WindowNoise
+from facediff.data.windows import Window
+from facediff.runtime.noise import ClipNoise, SeedNoise, WindowNoise
 
 if TYPE_CHECKING:
     from facediff.runtime.model import RuntimeModel
 
 Array = npt.NDArray[np.float32]
+
+NAME = "speech"
+"""What a clip is called where its noise is drawn; :meth:`facediff.models.inference.Inference.animate` calls it so."""
+
+Draw = Callable[[int, int], Array]
+"""Unit noise (1, frames, width) for a number of frames and a width."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +31,91 @@ class Conditions:
     identity: int
     style: Array
     style_name: str
+    template: Array
     seed: int
     expressivity: float
+
+
+@dataclass(frozen=True)
+class Heard:
+    """Speech as a clip or a window hears it.
+
+    Attributes:
+        speech: samples (S,).
+        frames: how many it lasts.
+        mean: of all speech so far.
+        deviation: likewise.
+    """
+
+    speech: Array
+    frames: int
+    mean: float
+    deviation: float
+
+
+def clip_motion(model: RuntimeModel, heard: Heard, conditions: Conditions) -> Array:
+    """Offsets from the template (1, frames, vertices, 3) of a whole clip."""
+    about = model.description
+    features = model.features(heard, model.own_frames(heard))
+    if about.generation == "direct":
+        made = model.run("motion", {"features": features, **conditioned(features, conditions)})[0]
+    elif about.noise_of == "seed":
+        noise = SeedNoise(conditions.seed)  # such a model predicts no mean, so there is no other noise
+        made = Sampling(model, conditions, None, 0).run(features, noise, noise)
+    else:
+        noises = ClipNoise(NAME, [conditions.seed]), ClipNoise(f"{NAME}/mean", [0])
+        made = Sampling(model, conditions, None, 0).run(features, *noises)
+    if made.shape[1] == heard.frames:
+        return made
+    # A model that counts its frames by itself may give fewer than the speech lasts: its last one is held.
+    return made[:, np.minimum(np.arange(heard.frames), made.shape[1] - 1)]
+
+
+def window_motion(
+    model: RuntimeModel, heard: Heard, window: Window, conditions: Conditions, before: Sequence[Array] | None
+) -> tuple[Array, list[Array]]:
+    """Offsets of a window of long speech, which continues another.
+
+    Args:
+        model: the model.
+        heard: the window's speech, with some before and after it.
+        window: which of its frames are wanted.
+        conditions: what motion is conditioned on.
+        before: what the window before handed over; None for the first.
+
+    Returns:
+        the motion, and what to hand over to the next window.
+    """
+    wanted = slice(window.context, window.context + window.frames)
+    if model.description.blending == "motion":
+        motion = clip_motion(model, heard, conditions)[:, wanted]
+        if before is not None:
+            share = crossfade(window.shared)[:, None, None]
+            blended = before[0] + share * (motion[:, : window.shared] - before[0])
+            motion = np.concatenate([blended, motion[:, window.shared :]], 1)
+        return motion, [motion[:, -window.kept :]]
+    features = np.ascontiguousarray(model.features(heard, heard.frames)[:, wanted])
+    sampling = Sampling(model, conditions, before, window.shared)
+    noise = WindowNoise(NAME, window, [conditions.seed])
+    motion = sampling.run(features, noise, WindowNoise(f"{NAME}/mean", window, [0]))
+    return motion, [kept[:, -window.kept :] for kept in sampling.kept]
+
+
+def conditioned(features: Array, conditions: Conditions) -> dict[str, npt.NDArray[Any]]:
+    """What every graph after the first is given; each takes what it has a use for."""
+    return {
+        "mask": np.ones((1, features.shape[1]), bool),
+        "identity": np.array([conditions.identity], np.int64),
+        "style": conditions.style[None],
+        "template": conditions.template[None],
+    }
+
+
+def crossfade(shared: int) -> Array:
+    """The new window's share in each shared frame: the rule of :func:`facediff.models.inference.crossfaded`."""
+    # 0 at the first shared frame, smooth at both ends.
+    place = np.arange(shared, dtype=np.float32) / np.float32(shared)
+    return np.asarray(place * place * (3 - 2 * place), np.float32)
 
 
 class Sampling:
@@ -50,25 +140,28 @@ class Sampling:
         self.shared = shared
         self.kept: list[Array] = []
 
-    def run(self, features: Array, noise: ClipNoise | WindowNoise, of_mean: ClipNoise | WindowNoise) -> Array:
+    def run(self, features: Array, noise: Draw, of_mean: Draw) -> Array:
         """Offsets from the template (1, frames, vertices, 3)."""
         about, share = self.model.description, self.conditions.expressivity
+        frames, width = features.shape[1], about.drawn or about.state
         mean = None
         if share != 1:
             # As the model's own mean: the prediction at the last step, averaged over a noise and its negative.
-            start = self._coloured(of_mean(features.shape[1], about.state))
-            ends = [self._decoded(self._evaluate(features, each, about.last_step)) for each in (start, -start)]
+            unit = of_mean(frames, width)
+            ends = [
+                self._decoded(self._evaluate(features, self._start(each), about.last_step), each)
+                for each in (unit, -unit)
+            ]
             mean = (ends[0] + ends[1]) * np.float32(0.5)
             if share == 0:
                 return mean
-        motion = self._decoded(self._loop(features, noise))
+        unit = noise(frames, width)
+        motion = self._decoded(self._loop(features, self._start(unit), noise), unit)
         return motion if mean is None else np.asarray(mean + np.float32(share) * (motion - mean), np.float32)
 
-    def _loop(self, features: Array, noise: ClipNoise | WindowNoise) -> tuple[Array, Array]:
+    def _loop(self, features: Array, noisy: Array, noise: Draw) -> tuple[Array, Array]:
         """The sampler's result, and what was kept of the last step."""
         about = self.model.description
-        frames = features.shape[1]
-        noisy = self._coloured(noise(frames, about.state))
         predictions: list[Array] = []
         kept = noisy
         for step, (of_noisy, first, second, third, of_noise) in zip(about.steps, about.table, strict=True):
@@ -79,7 +172,7 @@ class Sampling:
                 if factor:
                     made = made + np.float32(factor) * each
             if of_noise:
-                made = made + np.float32(of_noise) * self._coloured(noise(frames, about.state))
+                made = made + np.float32(of_noise) * self._coloured(noise(features.shape[1], about.state))
             noisy = made
         return noisy, kept
 
@@ -89,16 +182,12 @@ class Sampling:
         before, share = np.zeros((1, frames, about.kept), np.float32), np.ones((1, frames), np.float32)
         if self.before is not None:
             before[:, : self.shared] = self.before[len(self.kept)]
-            # 0 at the first shared frame, smooth at both ends: the rule of facediff.models.inference.crossfaded.
-            place = np.arange(self.shared, dtype=np.float32) / np.float32(self.shared)
-            share[:, : self.shared] = place * place * (3 - 2 * place)
+            share[:, : self.shared] = crossfade(self.shared)
         prediction, kept = self.model.run(
             "step",
             {
                 "features": features,
-                "mask": np.ones((1, frames), bool),
-                "identity": np.array([self.conditions.identity], np.int64),
-                "style": self.conditions.style[None],
+                **conditioned(features, self.conditions),
                 "state": noisy,
                 "step": np.array([step], np.int64),
                 "before": before,
@@ -108,10 +197,14 @@ class Sampling:
         self.kept.append(kept)
         return prediction, kept
 
-    def _decoded(self, result: tuple[Array, Array]) -> Array:
+    def _decoded(self, result: tuple[Array, Array], unit: Array) -> Array:
         sample, kept = result
         last = kept if self.model.description.decoded == "kept" else sample
-        return self.model.run("motion", {"sample": last})[0]
+        return self.model.run("motion", {"sample": last, "noise": unit})[0]
+
+    def _start(self, unit: Array) -> Array:
+        """The noisy motion that the loop starts from."""
+        return self.model.run("start", {"noise": unit})[0] if self.model.has("start") else self._coloured(unit)
 
     def _coloured(self, unit: Array) -> Array:
         root = self.model.arrays.get("noise")

@@ -468,7 +468,7 @@ class DualPathDiffusion(AnimationModel):
 
     def graphs(self) -> Graphs:
         """Audio encoder, denoising step and last map; the sampler as numbers."""
-        from facediff.models.graphs import graphs_of
+        from facediff.models.dual_path.graphs import graphs_of
 
         return graphs_of(self)
 

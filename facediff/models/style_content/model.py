@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -37,6 +37,9 @@ from facediff.models.style_content.losses import (
 )
 from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
 from facediff.utils.ranges import Range
+
+if TYPE_CHECKING:
+    from facediff.models.graphs import Graphs
 
 SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
 """Terms that the speech network has as well, by the name ``speech_<term>``."""
@@ -379,6 +382,12 @@ class StyleContentDisentanglement(AnimationModel):
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Offsets from the template, zero on padding, of content and style that may be of different speakers."""
         return self.decode_scaled(content, style, mask) / self.scale * mask[..., None, None]
+
+    def graphs(self) -> Graphs:
+        """Speech to content, and content with a style to motion."""
+        from facediff.models.style_content.graphs import graphs_of
+
+        return graphs_of(self)
 
     def generate_clips(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoder
-from facediff.models.layers import Attention, FeedForward
+from facediff.models.graphs import Speech
+from facediff.models.layers import Attention, FeedForward, sliding
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.speaker_encoders import StyleEncoder
 
@@ -93,12 +94,23 @@ class DisentanglementNetwork(nn.Module):
 
     def content_of_speech(self, batch: Batch) -> Float[Tensor, "batch frames content_dim"]:
         """Content of a batch's speech, or of cached features of it."""
-        cached = batch.cached_features or ()
+        return self.content_of(batch, batch.frame_lengths, batch.motion.shape[1])
+
+    def content_of(
+        self, heard: Batch | Speech, lengths: Int[Tensor, " batch"], frames: int
+    ) -> Float[Tensor, "batch frames content_dim"]:
+        """Content of speech, of so many frames each."""
+        cached = heard.cached_features or ()
         # The encoder gives features at any rate, as if motion had so many frames.
-        ratio = self.speech_rate / self.frame_rate
-        steps = (batch.frame_lengths * ratio).round().long().clamp_min(1) if ratio != 1 else batch.frame_lengths
-        features = self.audio_encoder(batch.audio, batch.audio_lengths, steps, *cached)
-        return self.speech_content(features, batch.motion.shape[1], ratio)
+        steps = (lengths * self.ratio).round().long().clamp_min(1) if self.ratio != 1 else lengths
+        features = self.audio_encoder(heard.audio, heard.audio_lengths, steps, *cached)
+        made: Tensor = self.speech_content(features, frames, self.ratio, steps)
+        return made
+
+    @property
+    def ratio(self) -> float:
+        """Speech features a frame."""
+        return self.speech_rate / self.frame_rate
 
 
 class MotionDecoder(nn.Module):
@@ -222,7 +234,11 @@ class WindowedTransformer(nn.Module):
         self.out = nn.Sequential(nn.LayerNorm(dim), nn.Linear(dim, out_dim))
 
     def windows(
-        self, features: Float[Tensor, "batch steps dim"], frames: int | None = None, ratio: float = 1.0
+        self,
+        features: Float[Tensor, "batch steps dim"],
+        frames: int | None = None,
+        ratio: float = 1.0,
+        lengths: Int[Tensor, " batch"] | None = None,
     ) -> Float[Tensor, "batch frames window dim"]:
         """Each frame's neighbours, zeros past the ends.
 
@@ -230,19 +246,25 @@ class WindowedTransformer(nn.Module):
             features: of the speech.
             frames: frames of motion; as many as features if None.
             ratio: features a frame.
+            lengths: valid features of each clip; those of the longest if None.
         """
         after = self.window - 1 - self.before
         padded = nn.functional.pad(features, (0, 0, self.before, after))
-        around = padded.unfold(1, self.window, 1)
+        around = sliding(padded, self.window, 1, features.shape[1])
         if ratio != 1 or frames not in (None, features.shape[1]):
             count = features.shape[1] if frames is None else frames
             middles = ((torch.arange(count, device=features.device) + 0.5) * ratio).floor().long()
             # Rounding may leave a clip one feature short of its last frame's.
-            around = around[:, middles.clamp_max(features.shape[1] - 1)]
+            last = middles.new_tensor(features.shape[1]) if lengths is None else lengths.max()
+            around = around[:, torch.minimum(middles, last - 1)]
         return around.transpose(2, 3)
 
     def forward(
-        self, features: Float[Tensor, "batch steps in_dim"], frames: int | None = None, ratio: float = 1.0
+        self,
+        features: Float[Tensor, "batch steps in_dim"],
+        frames: int | None = None,
+        ratio: float = 1.0,
+        lengths: Int[Tensor, " batch"] | None = None,
     ) -> Float[Tensor, "batch frames out_dim"]:
         """Content of every frame; features are zero on padding, which then is like the silence past a clip's end.
 
@@ -250,9 +272,10 @@ class WindowedTransformer(nn.Module):
             features: of the speech.
             frames: frames of motion; as many as features if None.
             ratio: features a frame.
+            lengths: valid features of each clip; those of the longest if None.
         """
         # Every frame's window is a sequence of its own, so that long clips cost time in proportion to their length.
-        windows = self.windows(features, frames, ratio)
+        windows = self.windows(features, frames, ratio, lengths)
         x = self.embed(windows.flatten(0, 1)) + self.positions
         for layer in self.layers:
             x = layer(x, x)

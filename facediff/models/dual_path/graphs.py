@@ -1,0 +1,152 @@
+"""A dual-path model as graphs: audio encoder, one denoising step, last map; see :mod:`facediff.models.graphs`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff.errors import FaceDiffError
+from facediff.models.dual_path.network import Conditions
+from facediff.models.folding import unchanged
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, speech_graph, update_table
+
+if TYPE_CHECKING:
+    from facediff.models.dual_path.model import DualPathDiffusion
+
+
+class StepGraph(nn.Module):
+    """Noisy motion to clean motion at one step, under speech, identity and style."""
+
+    def __init__(self, model: DualPathDiffusion) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch frames dim"],
+        mask: Bool[Tensor, "batch frames"],
+        identity: Int[Tensor, " batch"],
+        style: Float[Tensor, "batch style_dim"],
+        state: Float[Tensor, "batch frames state"],
+        step: Int[Tensor, " batch"],
+        before: Float[Tensor, "batch frames kept"],
+        share: Float[Tensor, "batch frames"],
+    ) -> tuple[Tensor, Tensor]:
+        """The prediction, and what the next window of long speech takes as ``before``.
+
+        Args:
+            features: of the speech.
+            mask: True on valid frames.
+            identity: indices, −1 for unknown.
+            style: F_dyn.
+            state: the noisy motion.
+            step: counted from 0.
+            before: what the window before kept, in the frames that this one shares with it.
+            share: of this window in each frame, 1 where nothing is shared.
+        """
+        network, kept = self.model.network, list[Tensor]()
+        tokens = network.style_tokens(torch.cat([network.identity_encoder(identity), style], dim=-1))
+
+        def blend(now: Tensor) -> Tensor:
+            kept.append(torch.lerp(before, now, share[..., None]))
+            return kept[0]
+
+        space = self.model._space(Conditions(features, tokens, mask), blend)  # noqa: SLF001 - a part of the model
+        return space.denoise(state, step), kept[0]
+
+
+class MotionGraph(nn.Module):
+    """The end of sampling to offsets from the template."""
+
+    def __init__(self, model: DualPathDiffusion, decoded: Literal["sample", "kept"]) -> None:
+        super().__init__()
+        self.model = model
+        self.decoded = decoded
+
+    def forward(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames vertices 3"]:
+        """In the unit of the corpus."""
+        model = self.model
+        scaled = model.network.clean_motion(sample) if self.decoded == "kept" else sample
+        return model.motion_space.decode(scaled) / model.scale
+
+
+def graphs_of(model: DualPathDiffusion) -> Graphs:
+    """A dual-path model with its present sampler as graphs and numbers.
+
+    Raises:
+        FaceDiffError: if its sampler is not linear, or conditions are guided.
+    """
+    if [*model.views()] != [()]:
+        raise FaceDiffError("guidance: a guided model cannot be exported; set all scales to 1")
+    network, sampler = model.network, model.sampler
+    table = update_table(sampler)
+    preconditioned = model.motion_space.preconditioning is not None
+    folded = model.sampling_space == "folded" and not preconditioned
+    batch, frames, width = 2, 50, network.embed.in_features
+    dim = network.embed.out_features
+    state = dim if folded else width
+    kept = width if preconditioned else dim
+    encoder = network.audio_encoder
+    speech = speech_graph(model, lambda heard, frames, _: encoder(heard.audio, heard.audio_lengths, frames))
+    style = sum(network.style_encoder.token_dims)
+    mask = torch.ones(batch, frames, dtype=torch.bool)
+    step = Graph(
+        "step",
+        StepGraph(model),
+        {
+            "features": torch.zeros(batch, frames, dim),
+            "mask": mask,
+            "identity": torch.zeros(batch, dtype=torch.long),
+            "style": torch.zeros(batch, style),
+            "state": torch.zeros(batch, frames, state),
+            "step": torch.zeros(batch, dtype=torch.long),
+            "before": torch.zeros(batch, frames, kept),
+            "share": torch.ones(batch, frames),
+        },
+        {
+            **dict.fromkeys(("features", "mask", "state", "before", "share"), FRAMES),
+            **dict.fromkeys(("identity", "style", "step"), BATCH),
+        },
+        ("prediction", "kept"),
+    )
+    with torch.no_grad():
+        step.module(*step.inputs.values())  # what follows from the weights alone is computed here, not in the graph
+        root = None
+        if folded:  # else noise is used as it is, and the unit matrix of all coordinates would take gigabytes
+            space = model._space(_nothing(step.inputs), unchanged)  # noqa: SLF001 - a part of the model
+            root = space.noise(torch.eye(state)[None])[0]
+    decoded: Literal["sample", "kept"] = "kept" if folded else "sample"
+    last = Graph(
+        "motion",
+        MotionGraph(model, decoded),
+        {"sample": torch.zeros(batch, frames, kept if folded else state)},
+        {"sample": FRAMES},
+        ("offsets",),
+    )
+    return Graphs(
+        parts=[speech, step, last],
+        equal_lengths=not (encoder.takes_padding and network.decoder.graph_takes_padding),
+        blending="steps",
+        clock=model.clock,
+        style="reference",
+        sampling=SamplingLoop(
+            state=state,
+            drawn=state,
+            kept=kept,
+            sampler=type(sampler).__name__,
+            steps=list(sampler.timesteps),
+            table=table,
+            last_step=model.process.steps - 1,
+            decoded=decoded,
+            noise=root,
+            noise_of="clip",
+        ),
+    )
+
+
+def _nothing(inputs: dict[str, Tensor]) -> Conditions:
+    """Conditions of example values."""
+    return Conditions(inputs["features"], inputs["features"][:, :1], inputs["mask"])

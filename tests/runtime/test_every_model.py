@@ -1,0 +1,107 @@
+"""Every model that has graphs: the runtime makes of them what the model makes.
+
+Recording a graph takes seconds, so the quick tests run the graphs' modules as they are, in place of ONNX Runtime; the
+slow ones export them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from facediff import registry
+from facediff.data.windows import WindowPlan
+from facediff.errors import FaceDiffError
+from facediff.models import AnimationModel, StyleContentDisentanglement
+from facediff.models.graphs import Graph
+from facediff.pipelines.export_model import arrays_of, describe, export_model
+from facediff.runtime import RuntimeModel
+from tests.fakes.tiny import RATE, SEEN, UNSEEN, VERTICES, Tiny
+from tests.runtime.test_runtime import sound
+
+PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
+MEL = partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0)
+SIZES: dict[str, Any] = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": float(RATE), "audio_encoder": MEL}
+
+CASES: dict[str, Callable[[], AnimationModel]] = {
+    "style content": partial(StyleContentDisentanglement, **SIZES, dim=16, content_dim=16),
+    "style content at 50": partial(StyleContentDisentanglement, **SIZES, dim=16, content_dim=16, speech_rate=50),
+    "style content at 12.5": partial(StyleContentDisentanglement, **SIZES, dim=16, content_dim=16, speech_rate=12.5),
+}
+
+
+@dataclass
+class Session:
+    """A graph as ONNX Runtime would run it, by PyTorch."""
+
+    graph: Graph
+
+    def get_inputs(self) -> list[Any]:
+        return [type("Input", (), {"name": name}) for name in self.graph.inputs]
+
+    def run(self, _: None, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+        assert {*inputs} == {*self.graph.inputs}
+        with torch.inference_mode():
+            made = self.graph.module(*(torch.from_numpy(inputs[name]) for name in self.graph.inputs))
+        return [each.numpy() for each in (made if isinstance(made, tuple) else (made,))]
+
+
+def ready(case: str, root: Path) -> AnimationModel:
+    torch.manual_seed(0)
+    made, data = CASES[case](), Tiny(root=str(root))
+    for parameter in made.parameters():
+        if parameter.requires_grad and not parameter.any():
+            torch.nn.init.normal_(parameter, std=0.1)
+    made.adopt(data.assets().with_motion_scale(data.motion_scale()))
+    made.attach_mesh()
+    return made.eval()
+
+
+def in_eager(model: AnimationModel) -> RuntimeModel:
+    """The runtime over the graphs' own modules."""
+    graphs = model.graphs()
+    parts = {part.name: part for part in graphs.parts}
+    arrays, styles, faces = arrays_of(model, graphs)
+    about = describe(model, graphs, "float32", {}, dict.fromkeys(parts, {}), styles, faces)
+    return RuntimeModel(about, arrays, lambda name: Session(parts[name]))
+
+
+def assert_alike(runtime: RuntimeModel, model: AnimationModel, seconds: float, identity: str, seed: int) -> None:
+    runtime.windows = model.windows = PLAN
+    speech = sound(seconds)
+    wanted = model.animate(torch.from_numpy(speech), identity=identity, seed=seed).vertices.numpy()
+    found = runtime.animate(speech, identity=identity, seed=seed, gate=None).vertices
+    assert found.shape == wanted.shape
+    span = np.ptp(wanted - model.assets.template(identity).numpy())
+    assert np.abs(found - wanted).max() / span < 1e-4
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_runtime_gives_what_the_model_gives(case: str, tiny_root: Path) -> None:
+    model = ready(case, tiny_root)
+    runtime = in_eager(model)
+    for seconds, identity in ((0.3, "B"), (1.013, UNSEEN), (4.317, "A")):  # the last one by windows
+        assert_alike(runtime, model, seconds, identity, seed=5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_exported_folder_gives_what_the_model_gives(case: str, tiny_root: Path, tmp_path: Path) -> None:
+    model = ready(case, tiny_root)
+    assert export_model(model, tmp_path / "out").check["share_of_range"] < 1e-4
+    runtime = RuntimeModel.open(tmp_path / "out")
+    for seconds, identity in ((0.3, "B"), (4.317, UNSEEN)):
+        assert_alike(runtime, model, seconds, identity, seed=5)
+
+
+def test_direct_model_has_no_samples_around_a_mean(tiny_root: Path) -> None:
+    runtime = in_eager(ready("style content", tiny_root))
+    with pytest.raises(FaceDiffError, match="expressivity"):
+        runtime.animate(sound(1.0), expressivity=0.5)
