@@ -1,0 +1,105 @@
+"""Live Link Face: the datagrams that Epic's app of this name sends to Unreal Engine.
+
+One datagram for each frame; numbers are big-endian (network order), as senders and decoders in public state them:
+
+======================  ==========  ===================================================================
+field                   bytes       meaning
+======================  ==========  ===================================================================
+version                 1           6
+device                  4 + n       length, and a text that tells senders apart, here a UUID
+subject                 4 + n       length, and the name of the face in Live Link
+frame number            4           of the timecode: frames since midnight
+part of a frame         4           float from 0 to below 1
+frame rate              4 + 4       numerator and denominator
+count                   1           61
+values                  61 × 4      floats: 52 weights from 0 to 1, yaw, pitch and roll of head and eyes
+======================  ==========  ===================================================================
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+import uuid
+from fractions import Fraction
+
+from facediff.editing.shapes import ARKIT, ROTATIONS
+from facediff.errors import FaceDiffError
+from facediff.live.frames import OPTION, Address, LiveFrame, Performance
+from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
+from facediff.registry import receiver
+
+VERSION = 6
+LONGEST_NAME = 64
+DAY = 24 * 3600
+
+
+def _swapped(names: tuple[str, ...]) -> tuple[str, ...]:
+    """ARKit's names in the order of the datagram, in which left goes before right for jaw and mouth too."""
+    order = list(names)
+    for left, right in (("jawLeft", "jawRight"), ("mouthLeft", "mouthRight")):
+        first = min(order.index(left), order.index(right))
+        order[first : first + 2] = [left, right]
+    return tuple(order)
+
+
+ORDER = _swapped(ARKIT)
+"""Names of the 52 weights in the order of the values. The app's recordings (.csv) have another one."""
+
+
+@receiver.register("livelink")
+class LiveLink(UdpReceiver):
+    """Unreal Engine's Live Link Face: weights of ARKit's shapes by UDP.
+
+    The timecode begins at the time of day at which the first frame is sent and goes on with the numbers of the frames:
+    where frames were dropped, numbers are missing. Rotations of head and eyes are 0.
+
+    Args:
+        address: ``livelink://HOST:PORT``; this machine's port 11111 by default.
+        subject: name of the face in Live Link; that of the performance if empty.
+        device: what tells this sender from others; one that is always the same for a subject if empty.
+    """
+
+    default_port = 11_111
+
+    def __init__(self, address: Address, *, subject: str = "", device: str = "") -> None:
+        super().__init__(address)
+        self.subject, self.device = subject, device
+        self._first: int | None = None
+
+    def open(self, performance: Performance) -> None:
+        """Make the socket and the parts of the datagram that stay the same.
+
+        Raises:
+            FaceDiffError: if the host is unknown, the face has no shapes of ARKit's, or a name cannot be sent.
+        """
+        self._weights = ArkitWeights(performance, self.address, ORDER)
+        subject = self.subject or performance.subject
+        device = self.device or str(uuid.uuid5(uuid.NAMESPACE_DNS, f"{subject}.facediff"))
+        for option, text in (("subject", subject), ("device", device)):
+            if not text.isascii() or not text.isprintable() or not 1 <= len(text) <= LONGEST_NAME:
+                raise FaceDiffError(
+                    f"{OPTION} {self.name}: {option} is {text!r}; expected 1 to {LONGEST_NAME} characters of ASCII"
+                )
+        self._rate = Fraction(performance.frame_rate).limit_denominator(1001)
+        self._head = bytes([VERSION])
+        for text in (device, subject):
+            self._head += struct.pack(">i", len(text)) + text.encode("ascii")
+        self._first = None
+        super().open(performance)
+
+    def datagrams(self, frame: LiveFrame) -> list[bytes]:
+        """The datagram of a frame."""
+        if self._first is None:
+            self._first = int(seconds_of_day() * self._rate) - frame.index
+        number = (self._first + frame.index) % int(DAY * self._rate)
+        values = [*self._weights.of(frame).tolist(), *(0.0 for _ in ROTATIONS)]
+        rate = self._rate.numerator, self._rate.denominator
+        return [self._head + struct.pack(f">ifiiB{len(values)}f", number, 0.0, *rate, len(values), *values)]
+
+
+def seconds_of_day() -> float:
+    """Seconds since midnight by this machine's clock, in its time zone."""
+    now = time.time()
+    local = time.localtime(now)
+    return local.tm_hour * 3600 + local.tm_min * 60 + local.tm_sec + now % 1

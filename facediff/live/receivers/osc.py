@@ -1,0 +1,142 @@
+"""Open Sound Control by UDP: the VMC protocol of avatar programs, and plain addresses for everything else.
+
+OSC 1.0 (Wright, "The Open Sound Control 1.0 specification", 2002): a message is an address, the types of its arguments
+and the arguments, each filled up to whole words of 4 bytes; a bundle is messages that belong together. The VMC protocol
+(https://protocol.vmc.info/english) says which messages a program sends that moves an avatar.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+
+from facediff.editing.shapes import ARKIT, live_link_name
+from facediff.errors import FaceDiffError, choices
+from facediff.live.frames import OPTION, Address, LiveFrame, Performance
+from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
+from facediff.registry import receiver
+
+MOST_BYTES = 1400
+"""Of a datagram: more would be split on the way, and lost where one of its parts is lost."""
+BUNDLE = b"#bundle\0" + struct.pack(">Q", 1)  # the time tag 1 means at once
+
+
+def message(address: str, *arguments: int | float | str) -> bytes:
+    r"""One OSC message; whole numbers and floats take 32 bits.
+
+    Example:
+        >>> message("/a", 1)
+        b'/a\x00\x00,i\x00\x00\x00\x00\x00\x01'
+    """
+    types, body = ",", b""
+    for argument in arguments:
+        if isinstance(argument, str):
+            types, body = types + "s", body + _text(argument)
+        elif isinstance(argument, int):
+            types, body = types + "i", body + struct.pack(">i", argument)
+        else:
+            types, body = types + "f", body + struct.pack(">f", argument)
+    return _text(address) + _text(types) + body
+
+
+def _text(text: str) -> bytes:
+    """A text that ends with a zero byte and is filled up to a whole number of words."""
+    data = text.encode("ascii")
+    return data + b"\0" * (4 - len(data) % 4)
+
+
+def bundles(messages: Sequence[bytes], most_bytes: int = MOST_BYTES) -> Iterator[bytes]:
+    """Messages in as few bundles as hold them, in their order, each of at most so many bytes."""
+    current = BUNDLE
+    for each in messages:
+        if len(current) + 4 + len(each) > most_bytes and current != BUNDLE:
+            yield current
+            current = BUNDLE
+        current += struct.pack(">i", len(each)) + each
+    yield current
+
+
+class _Osc(UdpReceiver):
+    """What both protocols share: the messages of a frame, in bundles."""
+
+    def open(self, performance: Performance) -> None:
+        """Make the socket.
+
+        Raises:
+            FaceDiffError: if the host is unknown or the face has no shapes of ARKit's.
+        """
+        self._weights = ArkitWeights(performance, self.address)
+        super().open(performance)
+
+    @abstractmethod
+    def messages(self, frame: LiveFrame) -> list[bytes]:
+        """The messages of a frame, in their order."""
+
+    def datagrams(self, frame: LiveFrame) -> list[bytes]:
+        """The bundles of a frame."""
+        return list(bundles(self.messages(frame)))
+
+
+NAMES = ("perfect_sync", "arkit")
+
+
+@receiver.register("vmc")
+class Vmc(_Osc):
+    """Avatars by the VMC protocol: VSeeFace, Warudo, VMagicMirror and others; weights of "perfect sync" shapes.
+
+    A frame is ``/VMC/Ext/OK 1``, ``/VMC/Ext/T seconds``, a ``/VMC/Ext/Blend/Val name weight`` for each of ARKit's 52
+    shapes, and ``/VMC/Ext/Blend/Apply``, in bundles of at most 1 400 bytes.
+
+    Args:
+        address: ``vmc://HOST:PORT``; this machine's port 39539 by default.
+        names: ``perfect_sync`` for JawOpen …, as avatars with perfect sync name their shapes; ``arkit`` for jawOpen ….
+    """
+
+    default_port = 39_539
+
+    def __init__(self, address: Address, *, names: str = "perfect_sync") -> None:
+        super().__init__(address)
+        if names not in NAMES:
+            raise FaceDiffError(f"{OPTION} {self.name}: names is {names!r}; {choices(names, NAMES)}")
+        shown = [live_link_name(name) if names == "perfect_sync" else name for name in ARKIT]
+        # All but the weight, which is the last word.
+        self._parts = [message("/VMC/Ext/Blend/Val", name, 0.0)[:-4] for name in shown]
+        self._ready, self._apply = message("/VMC/Ext/OK", 1), message("/VMC/Ext/Blend/Apply")
+
+    def messages(self, frame: LiveFrame) -> list[bytes]:
+        """The messages of a frame, in their order."""
+        weights = self._weights.of(frame).tolist()
+        values = [part + struct.pack(">f", weight) for part, weight in zip(self._parts, weights, strict=True)]
+        return [self._ready, message("/VMC/Ext/T", float(frame.time)), *values, self._apply]
+
+
+@receiver.register("osc")
+class Osc(_Osc):
+    """Plain OSC addresses, for TouchDesigner, Max, Pure Data and one's own programs.
+
+    A frame is ``/facediff/frame index seconds lag dropped`` (a whole number, two floats, a whole number) and a
+    ``/facediff/weight/jawOpen weight`` for each of ARKit's 52 shapes, in bundles of at most 1 400 bytes.
+
+    Args:
+        address: ``osc://HOST:PORT``; this machine's port 9000 by default.
+        prefix: in place of ``/facediff``.
+    """
+
+    default_port = 9_000
+
+    def __init__(self, address: Address, *, prefix: str = "/facediff") -> None:
+        super().__init__(address)
+        if re.fullmatch(r"(/[A-Za-z0-9_.-]+){1,8}", prefix) is None or len(prefix) > 100:
+            raise FaceDiffError(
+                f"{OPTION} {self.name}: prefix is {prefix!r}; expected parts of an OSC address, as in /facediff"
+            )
+        self._frame = f"{prefix}/frame"
+        self._parts = [message(f"{prefix}/weight/{name}", 0.0)[:-4] for name in ARKIT]
+
+    def messages(self, frame: LiveFrame) -> list[bytes]:
+        """The messages of a frame, in their order."""
+        weights = self._weights.of(frame).tolist()
+        head = message(self._frame, frame.index, float(frame.time), float(frame.lag), frame.dropped)
+        return [head, *(part + struct.pack(">f", each) for part, each in zip(self._parts, weights, strict=True))]

@@ -1,0 +1,298 @@
+"""What receivers share: hosts, datagrams, servers' sockets, and queues that never make a performance wait."""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import socket
+import threading
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import ClassVar, Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.editing.shapes import ARKIT
+from facediff.errors import FaceDiffError
+from facediff.live.frames import OPTION, Address, LiveFrame, Performance, Receiver
+
+Item = TypeVar("Item")
+
+log = logging.getLogger("facediff.live")
+"""What goes wrong on the way and ends nothing; without a handler, Python writes it to standard error."""
+
+THIS_MACHINE = "127.0.0.1"
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host is this machine itself, which nobody else reaches or hears.
+
+    Example:
+        >>> [is_loopback(host) for host in ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.0.7")]
+        [True, True, True, False, False]
+    """
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def endpoint(address: Address, default_port: int, *, listens: bool = False) -> tuple[str, int]:
+    """Host and port of an address: this machine unless another one is named, which is reported.
+
+    Args:
+        address: of the receiver.
+        default_port: where none is given.
+        listens: whether others connect to it.
+
+    Raises:
+        FaceDiffError: if the address has a path.
+    """
+    if address.path:
+        raise FaceDiffError(
+            f"{OPTION} {address.text}: has no path; expected {address.scheme}://HOST:PORT with options as ?name=value"
+        )
+    host, port = address.host or THIS_MACHINE, address.port or default_port
+    if not is_loopback(host):
+        others = "other machines can read the frames there" if listens else "frames leave this machine"
+        log.warning("%s: %s, unencrypted", address.text, others)
+    return host, port
+
+
+class Datagrams:
+    """Sends UDP datagrams to one place, and knows whether somebody listens there.
+
+    Args:
+        address: of the receiver, for reports.
+        host: name or number of the machine.
+        port: of the program on it.
+
+    Raises:
+        FaceDiffError: if the host is unknown or cannot be reached at all.
+    """
+
+    def __init__(self, address: Address, host: str, port: int) -> None:
+        self.address = address
+        self.sent = self.refused = self.lost = 0
+        self._listened, self._closed = True, False
+        try:
+            family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            self._socket = socket.socket(family, kind, protocol)
+        except (OSError, UnicodeError) as error:
+            raise _unreachable(address, error) from error
+        try:
+            self._socket.setblocking(False)
+            # A connected socket hears of datagrams that nobody took.
+            self._socket.connect(place)
+        except OSError as error:
+            self._socket.close()
+            raise _unreachable(address, error) from error
+
+    def send(self, parts: Sequence[bytes]) -> None:
+        """Send the datagrams of one frame; what cannot be sent is counted."""
+        if self._closed:
+            return
+        refused = lost = False
+        for part in parts:
+            try:
+                try:
+                    self._socket.send(part)
+                except ConnectionRefusedError:  # an earlier one's; this one has not been sent yet
+                    refused = True
+                    self._socket.send(part)
+            except ConnectionRefusedError:
+                refused = True
+            except OSError:  # no way there now, or the queue is full
+                lost = True
+        self.refused += refused
+        self.lost += lost
+        self.sent += not (refused or lost)
+        self._report(listened=not refused)
+
+    def _report(self, *, listened: bool) -> None:
+        if self._listened and not listened:
+            log.warning("%s: nobody listens there; frames are sent on until somebody does", self.address.text)
+        self._listened = listened
+
+    def status(self) -> str:
+        """What was sent, and what was not."""
+        words = [f"{self.sent} frames sent"]
+        words += [f"{self.refused} refused: nobody listened"] if self.refused else []
+        words += [f"{self.lost} lost"] if self.lost else []
+        return ", ".join(words)
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._closed = True
+        self._socket.close()
+
+
+def _unreachable(address: Address, error: Exception) -> FaceDiffError:
+    reason = getattr(error, "strerror", None) or str(error)
+    return FaceDiffError(f"{OPTION} {address.text}: cannot be reached ({reason}); check the host and the network")
+
+
+class UdpReceiver(Receiver):
+    """Sends each frame's weights in datagrams.
+
+    Args:
+        address: ``scheme://HOST:PORT``; this machine and the protocol's usual port if they are not given.
+
+    Attributes:
+        default_port: the protocol's usual one.
+    """
+
+    needs_weights = True
+    default_port: ClassVar[int]
+
+    def __init__(self, address: Address) -> None:
+        super().__init__(address)
+        self.host, self.port = endpoint(address, self.default_port)
+        self._sending: Datagrams | None = None
+
+    def open(self, performance: Performance) -> None:
+        """Make the socket; whether somebody listens shows when frames are sent.
+
+        Raises:
+            FaceDiffError: if the host is unknown.
+        """
+        self.close()
+        self._sending = Datagrams(self.address, self.host, self.port)
+
+    @abstractmethod
+    def datagrams(self, frame: LiveFrame) -> Sequence[bytes]:
+        """What is sent for a frame, each part by itself."""
+
+    def send(self, frame: LiveFrame) -> None:
+        """Send a frame."""
+        if self._sending is not None:
+            self._sending.send(self.datagrams(frame))
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        if self._sending is not None:
+            self._sending.close()
+
+    def status(self) -> str:
+        """Frames that were sent and refused."""
+        return "" if self._sending is None else self._sending.status()
+
+
+def listen(address: Address, host: str, port: int) -> socket.socket:
+    """A socket that others connect to.
+
+    Raises:
+        FaceDiffError: naming the address, if the port is taken or the host is not this machine's.
+    """
+    listening = None
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        listening = socket.socket(found[0], found[1], found[2])
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(found[4])
+        listening.listen(16)
+    except (OSError, UnicodeError) as error:
+        if listening is not None:
+            listening.close()
+        reason = getattr(error, "strerror", None) or str(error)
+        raise FaceDiffError(
+            f"{OPTION} {address.text}: port {port} of {host} cannot be listened at ({reason}); give another port as "
+            f"{address.scheme}:PORT"
+        ) from error
+    return listening
+
+
+class Outbox(Generic[Item]):
+    """A short queue that a thread of its own empties; where that is too slow, the oldest items are dropped.
+
+    Args:
+        take: what is done with each item, in the thread; an :class:`OSError` from it ends the thread.
+        most: items that may wait.
+        name: of the thread.
+        first: what is taken before all else, and never dropped.
+    """
+
+    def __init__(self, take: Callable[[Item], object], most: int, name: str, first: Item | None = None) -> None:
+        self._take = take
+        self._first = first
+        self._most = most
+        self._waiting: deque[Item] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+        self.given = self.dropped = 0
+        self.failure: OSError | None = None
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, item: Item) -> None:
+        """Hand an item over, without waiting."""
+        with self._changed:
+            self.given += 1
+            if self._closed or self.failure is not None:
+                self.dropped += 1
+                return
+            if len(self._waiting) >= self._most:
+                self._waiting.popleft()
+                self.dropped += 1
+            self._waiting.append(item)
+            self._changed.notify()
+
+    def _run(self) -> None:
+        try:
+            if self._first is not None:
+                self._take(self._first)
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._waiting or self._closed)
+                    if not self._waiting:
+                        return
+                    item = self._waiting.popleft()
+                self._take(item)
+        except OSError as error:
+            with self._changed:
+                self.failure = error
+                self.dropped += len(self._waiting)
+                self._waiting.clear()
+
+    def close(self, seconds: float = 1.0) -> None:
+        """Take what still waits, if that does not take longer than so many seconds."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        if self._thread is not threading.current_thread():
+            self._thread.join(seconds)
+
+
+class ArkitWeights:
+    """Weights of a frame under ARKit's names, in a protocol's order; 0 where the face has no such shape.
+
+    Args:
+        performance: whose shapes they are.
+        address: of the receiver, for errors.
+        order: the names as the protocol has them.
+
+    Raises:
+        FaceDiffError: if the face has none of the shapes.
+    """
+
+    def __init__(self, performance: Performance, address: Address, order: Sequence[str] = ARKIT) -> None:
+        place = {name: index for index, name in enumerate(performance.shapes)}
+        known = [(index, place[name]) for index, name in enumerate(order) if name in place]
+        if not known:
+            raise FaceDiffError(
+                f"{OPTION} {address.text}: sends the weights of ARKit's 52 shapes, and the face has none; give shapes "
+                f"under ARKit's names"
+            )
+        self._to, self._from = (np.array(column) for column in zip(*known, strict=True))
+        self._count = len(order)
+
+    def of(self, frame: LiveFrame) -> npt.NDArray[np.float32]:
+        """The weights (len(order),); 0 for a frame without any."""
+        found = np.zeros(self._count, np.float32)
+        if frame.weights is not None:
+            found[self._to] = frame.weights[self._from]
+        return found

@@ -1,0 +1,193 @@
+"""JSON lines: their schema, files that appear whole, and clients that come, go and are slow."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.editing.shapes import ARKIT
+from facediff.errors import FaceDiffError
+from facediff.live.receivers.json_lines import MOST_CLIENTS
+from tests.live.conftest import FRAME_RATE, VERTICES, Opened, at_rate, frame, weights_of
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        return int(listening.getsockname()[1])
+
+
+def connect(port: int) -> socket.socket:
+    client = socket.create_connection(("127.0.0.1", port), timeout=5)
+    client.settimeout(5)
+    return client
+
+
+def lines(client: socket.socket) -> list[dict[str, object]]:
+    """All lines until the other side closes."""
+    with client, client.makefile("rb") as stream:
+        return [json.loads(each) for each in stream]
+
+
+def wait_for(receiver: object, words: str) -> None:
+    for _ in range(500):
+        if words in receiver.status():  # type: ignore[attr-defined]
+            return
+        time.sleep(0.01)
+    raise AssertionError(receiver.status())  # type: ignore[attr-defined]
+
+
+def test_a_file_has_the_performance_its_frames_and_the_end(opened: Opened, tmp_path: Path) -> None:
+    path = tmp_path / "a b.jsonl"
+    receiver = opened(f"jsonl:{path}")
+    for index in (0, 1, 4):
+        receiver.send(frame(index, dropped=index // 2))
+        wait_for(receiver, f"{1 + min(index, 2)} frames")
+    assert not path.exists()
+    receiver.close()
+    head, *frames, end = [json.loads(text) for text in path.read_text().splitlines()]
+    assert (head["type"], head["format"], head["subject"]) == ("performance", "facediff live 1", "Ann")
+    assert (head["frame_rate"], head["shapes"], head["unit"]) == (FRAME_RATE, list(ARKIT), "m")
+    assert [(each["index"], each["dropped"]) for each in frames] == [(0, 0), (1, 0), (4, 2)]
+    assert frames[2]["time"] == pytest.approx(4 / FRAME_RATE, abs=1e-6)
+    assert 0.1 <= frames[2]["lag"] < 5
+    np.testing.assert_allclose([frames[2]["weights"][name] for name in ARKIT], weights_of(4), atol=1e-6)
+    assert end == {"type": "end", "frames": 3, "dropped": 0}
+
+
+def test_vertices_are_offsets_from_the_neutral_face(opened: Opened, tmp_path: Path) -> None:
+    receiver = opened(f"jsonl:{tmp_path / 'a.jsonl'}?vertices=true&weights=false")
+    assert not receiver.needs_weights
+    receiver.send(frame(2))
+    receiver.close()
+    head, only, _ = [json.loads(text) for text in (tmp_path / "a.jsonl").read_text().splitlines()]
+    assert np.shape(head["neutral"]) == (VERTICES, 3)
+    assert np.shape(head["faces"])[1] == 3
+    assert "weights" not in only
+    np.testing.assert_allclose(only["vertices"], frame(2).vertices, atol=1e-6)
+
+
+def test_several_clients_each_get_whole_lines_from_when_they_came(opened: Opened) -> None:
+    port = free_port()
+    receiver = opened(f"jsonl:{port}")
+    first = connect(port)
+    wait_for(receiver, "1 clients")
+    with at_rate(200) as due:
+        for index in range(30):
+            if index == 10:
+                second = connect(port)
+                wait_for(receiver, "2 clients")
+            due(index)
+            receiver.send(frame(index))
+    receiver.close()
+    for client, begins in ((first, {0}), (second, {9, 10})):
+        head, *frames, end = lines(client)
+        assert head["type"] == "performance"
+        begin = int(str(frames[0]["index"]))
+        assert begin in begins
+        assert [each["index"] for each in frames] == list(range(begin, 30))
+        assert end == {"type": "end", "frames": 30 - begin, "dropped": 0}
+
+
+def test_a_slow_client_misses_frames_and_the_others_do_not(opened: Opened) -> None:
+    port = free_port()
+    receiver = opened(f"jsonl://127.0.0.1:{port}?vertices=true")
+    slow, quick = connect(port), connect(port)
+    wait_for(receiver, "2 clients")
+    took = []
+    with quick.makefile("rb") as stream:
+        stream.readline()
+        for index in range(300):
+            began = time.monotonic()
+            receiver.send(frame(index))
+            took.append(time.monotonic() - began)
+            assert json.loads(stream.readline())["index"] == index
+    assert "missed by slow ones" in receiver.status()
+    assert np.median(took) < 0.002
+    quick.close()
+    slow.close()
+
+
+def test_a_client_that_left_is_forgotten(opened: Opened) -> None:
+    port = free_port()
+    receiver = opened(f"jsonl:{port}")
+    client = connect(port)
+    wait_for(receiver, "1 clients")
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\0\0\0\0\0\0\0")
+    client.close()
+    for index in range(50):
+        receiver.send(frame(index))
+        time.sleep(0.002)
+    wait_for(receiver, "0 clients")
+
+
+def test_more_clients_than_are_served_are_refused(opened: Opened) -> None:
+    port = free_port()
+    receiver = opened(f"jsonl:{port}")
+    clients = [connect(port) for _ in range(MOST_CLIENTS)]
+    wait_for(receiver, f"{MOST_CLIENTS} clients")
+    with connect(port) as late:
+        assert late.recv(1) == b""
+    for client in clients:
+        client.close()
+
+
+def test_a_taken_port_is_named(opened: Opened) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(FaceDiffError, match=str(port)):
+            opened(f"jsonl:{port}")
+
+
+@pytest.mark.parametrize("name", ["a.csv", "file/a.jsonl"])
+def test_a_file_that_cannot_be_is_refused(opened: Opened, tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(FaceDiffError, match=name):
+        opened(f"jsonl:{tmp_path / name}")
+
+
+PROGRAM = """
+import sys, time
+from tests.live.conftest import *
+made = Performance(30.0, np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32), shapes=ARKIT)
+receiver = open_receiver("jsonl:-")
+receiver.open(made)
+for index in range(int(sys.argv[1])):
+    receiver.send(frame(index))
+    time.sleep(0.002)
+print(receiver.status(), file=sys.stderr)
+receiver.close()
+"""
+
+
+def run(frames: int, stdout: int) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", PROGRAM, str(frames)], stdout=stdout, stderr=subprocess.PIPE)
+
+
+def test_lines_on_standard_output_are_read_as_they_come() -> None:
+    with run(20, subprocess.PIPE) as program:
+        out, error = program.communicate(timeout=60)
+    found = [json.loads(text) for text in out.splitlines()]
+    assert [each["type"] for each in found] == ["performance", *["frame"] * 20, "end"]
+    assert (program.returncode, b"20 frames" in error) == (0, True)
+
+
+def test_a_pipe_whose_reader_stops_or_leaves_does_not_stop_the_program() -> None:
+    reading, writing = os.pipe()
+    with run(200, writing) as program:
+        os.close(writing)
+        os.read(reading, 100)
+        # Two hundred frames are more than a pipe holds; nobody reads them.
+        assert program.stderr is not None
+        assert b"dropped" in program.stderr.readline()
+        os.close(reading)
+        rest = program.stderr.read()
+        assert program.wait(30) == 0
+    assert b"Traceback" not in rest

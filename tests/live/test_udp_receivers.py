@@ -1,0 +1,298 @@
+"""Live Link Face and OSC, as independent decoders read them: values, names, order, rate and time."""
+
+from __future__ import annotations
+
+import logging
+import math
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pylivelinkface import FaceBlendShape, PyLiveLinkFace
+from pythonosc.osc_bundle import OscBundle
+from pythonosc.osc_message import OscMessage
+from pythonosc.osc_packet import OscPacket
+
+from facediff.editing.shapes import ARKIT
+from facediff.errors import FaceDiffError
+from facediff.live.frames import Performance, open_receiver
+from facediff.live.receivers.sending import Outbox
+from tests.live.conftest import FRAME_RATE, Opened, at_rate, frame, weights_of
+
+SIXTY_ONE = 61
+
+
+class Listener:
+    """A UDP socket of this machine, and what arrived at it."""
+
+    def __init__(self, port: int = 0) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", port))
+        self.socket.settimeout(5)
+        self.port = self.socket.getsockname()[1]
+
+    def take(self, count: int = 1) -> list[bytes]:
+        return [self.socket.recv(65536) for _ in range(count)]
+
+
+@pytest.fixture
+def listener() -> Iterator[Listener]:
+    made = Listener()
+    yield made
+    made.socket.close()
+
+
+def decode(data: bytes) -> dict[str, object]:
+    """A Live Link Face datagram, from the description of its fields alone."""
+    found: dict[str, object] = {"version": data[0]}
+    at = 1
+    for name in ("device", "subject"):
+        (length,) = struct.unpack_from(">i", data, at)
+        found[name] = data[at + 4 : at + 4 + length].decode("ascii")
+        at += 4 + length
+    fields = struct.unpack_from(">ifiiB", data, at)
+    found |= dict(zip(("number", "part", "rate", "per", "count"), fields, strict=True))
+    at += struct.calcsize(">ifiiB")
+    found["values"] = struct.unpack_from(">61f", data, at)
+    assert len(data) == at + SIXTY_ONE * 4
+    return found
+
+
+def test_a_public_decoder_reads_each_weight_under_its_name(opened: Opened, listener: Listener) -> None:
+    receiver = opened(f"livelink://127.0.0.1:{listener.port}?subject=Bob")
+    receiver.send(frame(3))
+    (data,) = listener.take()
+    seen, face = PyLiveLinkFace.decode(data)
+    assert seen
+    assert (face.name, face.fps) == ("Bob", 30)
+    for name, weight in zip(ARKIT, weights_of(3), strict=True):
+        shape = FaceBlendShape[name[0].upper() + name[1:]]
+        assert face.get_blendshape(shape) == pytest.approx(weight, abs=1e-7), name
+    assert [face.get_blendshape(shape) for shape in FaceBlendShape if shape.value >= len(ARKIT)] == [0.0] * 9
+
+
+def test_the_fields_of_a_live_link_datagram(opened: Opened, listener: Listener, performance: Performance) -> None:
+    opened(f"livelink://127.0.0.1:{listener.port}").send(frame(0))
+    found = decode(listener.take()[0])
+    assert found["version"] == 6
+    assert found["subject"] == performance.subject
+    assert len(str(found["device"])) == 36
+    assert (found["rate"], found["per"], found["count"]) == (30, 1, SIXTY_ONE)
+    assert found["part"] == 0.0
+
+
+def test_timecodes_are_the_time_of_day_and_miss_dropped_frames(opened: Opened, listener: Listener) -> None:
+    receiver = opened(f"livelink://127.0.0.1:{listener.port}")
+    local = time.localtime()
+    began = local.tm_hour * 3600 + local.tm_min * 60 + local.tm_sec
+    for index in (10, 11, 15, 16):
+        receiver.send(frame(index))
+    numbers = [int(str(decode(data)["number"])) for data in listener.take(4)]
+    assert np.diff(numbers).tolist() == [1, 4, 1]
+    assert 0 <= numbers[0] / FRAME_RATE - began < 3 or began > 24 * 3600 - 5
+
+
+def test_a_timecode_starts_again_at_midnight(
+    opened: Opened, listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facediff.live.receivers.live_link.seconds_of_day", lambda: 24 * 3600 - 0.05)
+    receiver = opened(f"livelink://127.0.0.1:{listener.port}")
+    for index in range(3):
+        receiver.send(frame(index))
+    last = 24 * 3600 * 30
+    assert [decode(data)["number"] for data in listener.take(3)] == [last - 2, last - 1, 0]
+
+
+def test_a_broadcast_frame_rate_is_a_fraction(listener: Listener, performance: Performance) -> None:
+    receiver = open_receiver(f"livelink://127.0.0.1:{listener.port}")
+    receiver.open(replace(performance, frame_rate=30000 / 1001))
+    receiver.send(frame(0))
+    found = decode(listener.take()[0])
+    receiver.close()
+    assert (found["rate"], found["per"]) == (30000, 1001)
+
+
+def messages(packets: list[bytes]) -> list[OscMessage]:
+    """All messages, in their order."""
+    found: list[OscMessage] = []
+    for packet in packets:
+        assert len(packet) <= 1400
+        assert OscBundle.dgram_is_bundle(packet)
+        found += [timed.message for timed in OscPacket(packet).messages]
+    return found
+
+
+def test_a_vmc_frame_is_ready_time_weights_and_apply(opened: Opened, listener: Listener) -> None:
+    receiver = opened(f"vmc://127.0.0.1:{listener.port}")
+    receiver.send(frame(7))
+    found = messages(listener.take(2))
+    assert [(each.address, each.params) for each in found[:1]] == [("/VMC/Ext/OK", [1])]
+    assert found[1].address == "/VMC/Ext/T"
+    assert found[1].params == [pytest.approx(7 / FRAME_RATE)]
+    assert (found[-1].address, found[-1].params) == ("/VMC/Ext/Blend/Apply", [])
+    values = found[2:-1]
+    assert {each.address for each in values} == {"/VMC/Ext/Blend/Val"}
+    assert [each.params[0] for each in values] == [name[0].upper() + name[1:] for name in ARKIT]
+    np.testing.assert_allclose([each.params[1] for each in values], weights_of(7), atol=1e-7)
+
+
+def test_vmc_names_may_be_arkits_own(opened: Opened, listener: Listener) -> None:
+    opened(f"vmc://127.0.0.1:{listener.port}?names=arkit").send(frame(0))
+    assert [each.params[0] for each in messages(listener.take(2))[2:-1]] == list(ARKIT)
+
+
+def test_plain_osc_has_an_address_for_each_weight(opened: Opened, listener: Listener) -> None:
+    opened(f"osc://127.0.0.1:{listener.port}?prefix=/me/face").send(frame(5, dropped=2))
+    found = {each.address: each.params for each in messages(listener.take(2))}
+    index, seconds, lag, dropped = found.pop("/me/face/frame")
+    assert (index, dropped) == (5, 2)
+    assert seconds == pytest.approx(5 / FRAME_RATE)
+    assert 0.1 <= lag < 5
+    assert found == {
+        f"/me/face/weight/{name}": [pytest.approx(weight)] for name, weight in zip(ARKIT, weights_of(5), strict=True)
+    }
+
+
+@pytest.mark.parametrize("scheme", ["livelink", "vmc", "osc"])
+def test_frames_arrive_in_order_at_their_rate(opened: Opened, listener: Listener, scheme: str) -> None:
+    steady(opened(f"{scheme}://127.0.0.1:{listener.port}"), listener, seconds=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["livelink", "vmc"])
+def test_frames_arrive_in_order_at_their_rate_for_a_minute(opened: Opened, listener: Listener, scheme: str) -> None:
+    steady(opened(f"{scheme}://127.0.0.1:{listener.port}"), listener, seconds=60)
+
+
+NUMBER: dict[str, Callable[[bytes], int | None]] = {
+    "livelink": lambda data: int(str(decode(data)["number"])),
+    "vmc": lambda data: next((round(m.params[0] * FRAME_RATE) for m in messages([data]) if "Ext/T" in m.address), None),
+    "osc": lambda data: next((m.params[0] for m in messages([data]) if m.address.endswith("/frame")), None),
+}
+
+
+def steady(receiver: object, listener: Listener, seconds: float) -> None:
+    """Frames sent at 60 a second arrive all, in order, each when it was sent."""
+    rate, count = 60.0, round(seconds * 60)
+    number = NUMBER[receiver.address.scheme]  # type: ignore[attr-defined]
+    arrived: list[tuple[float, int]] = []
+
+    def collect() -> None:
+        while len(arrived) < count:
+            data = listener.take()[0]
+            found = number(data)
+            if found is not None:
+                arrived.append((time.monotonic(), found))
+
+    thread = threading.Thread(target=collect, daemon=True)
+    thread.start()
+    sent = []
+    with at_rate(rate) as due:
+        for index in range(count):
+            due(index)
+            sent.append(time.monotonic())
+            receiver.send(frame(index))  # type: ignore[attr-defined]
+    thread.join(10)
+    times, numbers = np.array(arrived).T
+    assert (np.diff(numbers) == 1).all()
+    assert len(numbers) == count
+    assert np.median(times - np.array(sent)) < 0.02
+    assert np.polyfit(np.arange(count), times, 1)[0] == pytest.approx(1 / rate, rel=0.2 if seconds < 10 else 0.001)
+
+
+def test_a_receiver_that_is_gone_is_counted_and_found_again(opened: Opened, caplog: pytest.LogCaptureFixture) -> None:
+    listener = Listener()
+    receiver = opened(f"livelink://127.0.0.1:{listener.port}")
+    receiver.send(frame(0))
+    listener.take()
+    listener.socket.close()
+    for index in range(1, 20):
+        receiver.send(frame(index))
+    assert "refused" in receiver.status()
+    assert len([record for record in caplog.records if "nobody listens" in record.message]) == 1
+    back = Listener(listener.port)
+    for index in range(20, 24):
+        receiver.send(frame(index))
+    assert decode(back.take()[0])["subject"] == "Ann"
+    back.socket.close()
+    receiver.close()
+    receiver.send(frame(24))  # after the end: nothing
+    receiver.close()
+
+
+def test_another_machine_is_warned_of_and_this_one_is_not(caplog: pytest.LogCaptureFixture) -> None:
+    for text in ("livelink", "vmc", "osc", "livelink://localhost", "vmc://[::1]:39539"):
+        open_receiver(text)
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        open_receiver("vmc://192.0.2.1")
+    assert ["leave this machine" in record.message for record in caplog.records] == [True]
+
+
+@pytest.mark.parametrize(
+    ("text", "port"), [("livelink", 11111), ("vmc", 39539), ("osc", 9000), ("osc://127.0.0.1:7", 7)]
+)
+def test_the_usual_ports_of_this_machine(text: str, port: int) -> None:
+    receiver = open_receiver(text)
+    assert (receiver.host, receiver.port) == ("127.0.0.1", port)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("livelink://127.0.0.1:1/path", "path"),
+        ("livelink://127.0.0.1?subject=%C3%BC", "subject"),
+        ("livelink://no.such.host.invalid:1", "no.such.host.invalid"),
+        ("vmc?names=vrm", "names"),
+        ("osc?prefix=face", "prefix"),
+        ("osc?prefix=/a%00b", "prefix"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused(text: str, named: str, performance: Performance) -> None:
+    with pytest.raises(FaceDiffError, match=named):
+        open_receiver(text).open(performance)
+
+
+@pytest.mark.parametrize("scheme", ["livelink", "vmc", "osc"])
+def test_a_face_without_arkits_shapes_is_refused(scheme: str, performance: Performance) -> None:
+    with pytest.raises(FaceDiffError, match=scheme):
+        open_receiver(scheme).open(replace(performance, shapes=("A", "B")))
+
+
+def test_shapes_that_a_face_lacks_stay_at_zero_and_others_are_left_out(
+    listener: Listener, performance: Performance
+) -> None:
+    receiver = open_receiver(f"osc://127.0.0.1:{listener.port}")
+    receiver.open(replace(performance, shapes=("wink", "jawOpen")))
+    receiver.send(replace(frame(0), weights=np.array([0.9, 0.25], np.float32)))
+    found = {each.address: each.params[0] for each in messages(listener.take(2))}
+    receiver.close()
+    assert found.pop("/facediff/weight/jawOpen") == 0.25
+    found.pop("/facediff/frame")
+    assert len(found) == 51
+    assert set(found.values()) == {0.0}
+
+
+def test_a_slow_writer_loses_the_oldest_and_never_blocks() -> None:
+    taken: list[int] = []
+    go = threading.Event()
+
+    def slowly(item: int) -> None:
+        go.wait(5)
+        taken.append(item)
+
+    outbox = Outbox(slowly, 3, "test", first=-1)
+    began = time.monotonic()
+    for item in range(100):
+        outbox.put(item)
+    assert time.monotonic() - began < 1
+    go.set()
+    outbox.close(5)
+    assert taken == [-1, 97, 98, 99]
+    assert outbox.dropped == 97
+    assert not math.isnan(outbox.given)
