@@ -38,13 +38,17 @@ class WindowPlan:
     length. One that was trained on longer clips may do better with longer windows, and must cope with speech up to
     ``above``.
 
+    With a ``past``, a window sees motion before it that is given out already and does not change any more, so that
+    windows may be as short as a frame or two: :data:`LOW_LATENCY`.
+
     Attributes:
-        seconds: length of a window.
-        overlap: how much of it the next one shares; at most half of it.
+        seconds: length of what a window animates.
+        overlap: how much of it the next one shares; at most half of it, or less than all of it with a ``past``.
         before: speech before the window that the model hears too.
         after: speech after the window that the model hears too.
         above: speech that lasts longer than this is animated by windows; shorter speech in one pass. Infinite: always
             in one pass.
+        past: motion before the window that it sees and continues.
 
     Raises:
         FaceDiffError: if a length is impossible.
@@ -52,7 +56,7 @@ class WindowPlan:
     Example:
         >>> plan = WindowPlan(seconds=2.0, overlap=0.5)
         >>> plan.in_frames(25.0)
-        FramePlan(frames=50, overlap=12, before=50, after=12)
+        FramePlan(frames=50, overlap=12, before=50, after=12, past=0)
         >>> plan.look_ahead
         2.5
     """
@@ -62,14 +66,18 @@ class WindowPlan:
     before: float = 2.0
     after: float = 0.5
     above: float = 10.0
+    past: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 < self.seconds <= 600:
             raise FaceDiffError(f"window: {self.seconds:g} s is impossible; choose e.g. 4")
-        if not 0 < self.overlap <= self.seconds / 2:
+        if not 0 <= self.past < math.inf:
+            raise FaceDiffError(f"past: {self.past:g} s is impossible; choose 0 s or more")
+        most, words = (self.seconds, "less than a window") if self.past else (self.seconds / 2, "at most half of a window")
+        if not 0 < self.overlap <= most:
             raise FaceDiffError(
-                f"overlap: {self.overlap:g} s is impossible with windows of {self.seconds:g} s; choose more than 0, at "
-                f"most half of a window"
+                f"overlap: {self.overlap:g} s is impossible with windows of {self.seconds:g} s; choose more than 0, "
+                f"{words}"
             )
         if not (0 <= self.before < math.inf and 0 <= self.after < math.inf and self.above >= 0):
             raise FaceDiffError("window: the speech before and after a window must last 0 s or more, and end")
@@ -80,15 +88,15 @@ class WindowPlan:
         Raises:
             FaceDiffError: if windows are too short for frames.
         """
-        frames = round(self.seconds * frame_rate)
+        frames, past = round(self.seconds * frame_rate), round(self.past * frame_rate)
         # Half of a window may be rounded up where the window is rounded down.
-        overlap = max(1, min(round(self.overlap * frame_rate), frames // 2))
-        if frames < 4:
+        overlap = max(1, min(round(self.overlap * frame_rate), frames - 1 if past else frames // 2))
+        if frames < (2 if past else 4):
             raise FaceDiffError(
                 f"window: {self.seconds:g} s with an overlap of {self.overlap:g} s are too few frames at "
                 f"{frame_rate:g} a second; choose longer windows"
             )
-        return FramePlan(frames, overlap, round(self.before * frame_rate), round(self.after * frame_rate))
+        return FramePlan(frames, overlap, round(self.before * frame_rate), round(self.after * frame_rate), past)
 
     def chosen(self, seconds: float | None, overlap: float | None) -> WindowPlan:
         """The same with the lengths that somebody asked for; None keeps what is usual.
@@ -120,21 +128,27 @@ class FramePlan:
     """A :class:`WindowPlan` in frames.
 
     Attributes:
-        frames: of a window.
+        frames: that a window animates.
         overlap: shared by neighbours.
         before: heard before a window.
         after: heard after it.
+        past: of the motion before a window, which it sees.
     """
 
     frames: int
     overlap: int
     before: int
     after: int
+    past: int = 0
 
     @property
     def hop(self) -> int:
-        """Frames from the start of a window to that of the next."""
+        """Frames from the start of a window to that of the next, and how many are given out at a time."""
         return self.frames - self.overlap
+
+    def window(self, index: int) -> Window:
+        """A full window."""
+        return Window(self, index, min(self.past, index * self.hop) + self.frames)
 
 
 @dataclass(frozen=True)
@@ -144,7 +158,7 @@ class Window:
     Attributes:
         plan: the lengths of full windows.
         index: how many windows come before it.
-        frames: frames of this window, fewer than usual for the last one.
+        frames: frames of this window with its past, fewer than usual for the last one.
     """
 
     plan: FramePlan
@@ -152,9 +166,14 @@ class Window:
     frames: int
 
     @property
+    def fixed(self) -> int:
+        """Its first frames, which are given out already."""
+        return min(self.plan.past, self.index * self.plan.hop)
+
+    @property
     def start(self) -> int:
         """Its first frame, counted from the start of the speech."""
-        return self.index * self.plan.hop
+        return self.index * self.plan.hop - self.fixed
 
     @property
     def end(self) -> int:
@@ -169,12 +188,24 @@ class Window:
     @property
     def shared(self) -> int:
         """Its first frames, which belong to the window before it as well; 0 for the first window."""
-        return self.plan.overlap if self.index else 0
+        return self.fixed + self.plan.overlap if self.index else 0
 
     @property
     def kept(self) -> int:
         """Its last frames, which belong to the next window as well."""
-        return self.plan.overlap
+        return self.plan.window(self.index + 1).shared
+
+    @property
+    def origins(self) -> list[tuple[int, slice]]:
+        """The windows in which its frames first appeared: the index of each, and which of the frames that are new in it
+        lie in this window. All frames of the first window are new in it, and the last ones of every other."""
+        found, overlap, hop = [], self.plan.overlap, self.plan.hop
+        for index in range(max(0, (self.start - overlap) // hop), self.index + 1):
+            first = index * hop + overlap if index else 0
+            begin, end = max(self.start, first), min(self.end, (index + 1) * hop + overlap)
+            if begin < end:
+                found.append((index, slice(begin - first, end - first)))
+        return found
 
 
 class Hearing(Protocol[M_co]):
@@ -237,7 +268,7 @@ class SpeechWindows(ABC, Generic[M]):
         self._speech: Speech = np.zeros(0, np.float32)
         self._dropped = 0  # samples before these, which no window will hear again
         self._level = Level()
-        self._window = Window(plan, 0, plan.frames)  # the next one to generate, if the speech lasts
+        self._window = plan.window(0)  # the next one to generate, if the speech lasts
         self._held: Any = None  # the latest window's frames that the next one shares
         self._finished = False
 
@@ -295,11 +326,12 @@ class SpeechWindows(ABC, Generic[M]):
             parts.append(self._next_window(min(total, self._window.end + self.plan.after)))
         # The rest lies within the last window. If it is no longer than what the window before has animated already, its
         # frames are certain now, since no later window will blend into them.
-        left = total - self._window.start
+        left = total - self._window.start - self._window.fixed
         if self._held is not None and left <= self.plan.overlap:
             parts.append(self._held[:, :left])
         else:
-            parts.append(self._generate(replace(self._window, frames=left), total))
+            fixed = self._window.fixed
+            parts.append(self._generate(replace(self._window, frames=fixed + left), total)[:, fixed:])
         return self._counted(parts)
 
     def parts(
@@ -327,14 +359,15 @@ class SpeechWindows(ABC, Generic[M]):
 
     def _next_window(self, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
         """The window's frames before its overlap with the next, given speech up to frame ``heard``; then advance."""
+        fixed = self._window.fixed
         motion = self._generate(self._window, heard)
-        self._window = Window(self.plan, self._window.index + 1, self.plan.frames)
+        self._window = self.plan.window(self._window.index + 1)
         # Speech before the next window's context will not be heard again, unless the level has not counted it yet.
         needed = self._sample(self._window.start - self._window.context)
         drop = max(0, min(needed, self._level.count) - self._dropped)
         self._speech = self._speech[drop:]
         self._dropped += drop
-        return motion[:, : self.plan.hop]
+        return motion[:, fixed : fixed + self.plan.hop]
 
     def _generate(self, window: Window, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
         """Motion of a window, with speech up to frame ``heard``."""

@@ -476,7 +476,7 @@ class Inference(ABC):
         """
         motion = self.generate_samples(clip, seeds)[:, window.context : window.context + window.frames]
         if before is not None:
-            motion = crossfaded(before[0], motion)
+            motion = crossfaded(before[0], motion, window.fixed)
         return motion, [motion[:, -window.kept :]]
 
     # What inference needs of the model.
@@ -634,20 +634,16 @@ class WindowNoise:
 
     def __init__(self, name: str, window: Window, seeds: Sequence[int], device: torch.device) -> None:
         self.window = window
-        # Each window has a stream of its own for the frames that are new in it, so that its neighbour can draw the same
+        # Each window has a stream of its own for the frames that are new in it, so that later windows can draw the same
         # numbers again without keeping them.
-        self.new, self.old = (
-            [noise_stream(f"{name}/{index}", seed, device) for seed in seeds]
-            for index in (window.index, window.index - 1)
-        )
+        self.streams = [
+            ([noise_stream(f"{name}/{index}", seed, device) for seed in seeds], index, new)
+            for index, new in window.origins
+        ]
 
     def __call__(self, like: Float[Tensor, "seeds frames width"]) -> Float[Tensor, "seeds frames width"]:
         """The next noise of the shape of ``like``."""
-        window = self.window
-        new = self._draw(self.new, window.index, like)[:, : window.frames - window.shared]
-        if not window.shared:
-            return new
-        return torch.cat([self._draw(self.old, window.index - 1, like)[:, -window.shared :], new], 1)
+        return torch.cat([self._draw(streams, index, like)[:, part] for streams, index, part in self.streams], 1)
 
     def _draw(self, streams: Sequence[torch.Generator], index: int, like: Tensor) -> Tensor:
         """Noise of the frames that are new in a window of an index."""
@@ -665,14 +661,16 @@ class WindowOverlap:
     Args:
         before: features of the window before in the shared frames, one tensor for each step; None for the first window.
         kept: frames at the end that the next window will share.
+        fixed: shared frames at the start that are given out already.
 
     Attributes:
         features: those of the kept frames, one tensor for each step; the next window's ``before``.
     """
 
-    def __init__(self, before: Sequence[Tensor] | None, kept: int) -> None:
+    def __init__(self, before: Sequence[Tensor] | None, kept: int, fixed: int = 0) -> None:
         self.before = before
         self.kept = kept
+        self.fixed = fixed
         self.features: list[Tensor] = []
 
     def __call__(self, features: Float[Tensor, "seeds frames dim"]) -> Float[Tensor, "seeds frames dim"]:
@@ -682,20 +680,20 @@ class WindowOverlap:
         # predictions and its noise in every step, and so its motion; the network sees the shared frames as they are
         # and continues them. No jump is left at the boundary that would have to be smoothed afterwards.
         if self.before is not None:
-            features = crossfaded(self.before[len(self.features)], features)
+            features = crossfaded(self.before[len(self.features)], features, self.fixed)
         self.features.append(features[:, -self.kept :].clone())
         return features
 
 
 def crossfaded(
-    before: Float[Tensor, "seeds shared *rest"], now: Float[Tensor, "seeds frames *rest"]
+    before: Float[Tensor, "seeds shared *rest"], now: Float[Tensor, "seeds frames *rest"], fixed: int = 0
 ) -> Float[Tensor, "seeds frames *rest"]:
     """Go over from what a window had in the shared frames to what the next one has there.
 
-    The new window's share is 0 at the first shared frame, which is the old window's alone, and would be 1 behind the
-    last; it is smooth at both.
+    The new window's share is 0 in the ``fixed`` first frames and in the shared one behind them, which is the old
+    window's alone, and would be 1 behind the last; it is smooth at both.
     """
     shared = before.shape[1]
-    share = torch.arange(shared, device=now.device, dtype=now.dtype) / shared
+    share = (torch.arange(shared, device=now.device, dtype=now.dtype) - fixed).clamp_min(0) / (shared - fixed)
     smooth = (share * share * (3 - 2 * share)).view(-1, *[1] * (now.dim() - 2))
     return torch.cat([torch.lerp(before, now[:, :shared], smooth), now[:, shared:]], 1)

@@ -502,7 +502,7 @@ class DualPathDiffusion(AnimationModel):
         """The same for a window of long speech, blended in every denoising step with the window before it."""
         # The speech before the window is encoded with it but not animated: features at its start depend on it.
         conditions = self.conditions(clip, guided=True).frames(window.context, window.context + window.frames)
-        overlap_blend = WindowOverlap(before, window.kept)
+        overlap_blend = WindowOverlap(before, window.kept, window.fixed)
         noise = WindowNoise(clip.names[0], window, seeds, self.device)
         of_mean = WindowNoise(mean_names(clip)[0], window, [0], self.device)
         motion = self.sample(conditions, noise, of_mean, samples=len(seeds), blend=overlap_blend)
