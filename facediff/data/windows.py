@@ -43,7 +43,8 @@ class WindowPlan:
 
     Attributes:
         seconds: length of what a window animates.
-        overlap: how much of it the next one shares; at most half of it, or less than all of it with a ``past``.
+        overlap: how much of it the next one shares; at most half of it. With a ``past``: 0, or less than
+            all of it.
         before: speech before the window that the model hears too.
         after: speech after the window that the model hears too.
         above: speech that lasts longer than this is animated by windows; shorter speech in one pass. Infinite: always
@@ -73,11 +74,12 @@ class WindowPlan:
             raise FaceDiffError(f"window: {self.seconds:g} s is impossible; choose e.g. 4")
         if not 0 <= self.past < math.inf:
             raise FaceDiffError(f"past: {self.past:g} s is impossible; choose 0 s or more")
-        most, words = (self.seconds, "less than a window") if self.past else (self.seconds / 2, "at most half of a window")
-        if not 0 < self.overlap <= most:
+        # A window that sees motion which does not change any more need not share frames that do.
+        fits = 0 <= self.overlap < self.seconds if self.past else 0 < self.overlap <= self.seconds / 2
+        if not fits:
+            choose = "0 s or more, less than a window" if self.past else "more than 0 s, at most half of a window"
             raise FaceDiffError(
-                f"overlap: {self.overlap:g} s is impossible with windows of {self.seconds:g} s; choose more than 0, "
-                f"{words}"
+                f"overlap: {self.overlap:g} s is impossible with windows of {self.seconds:g} s; choose {choose}"
             )
         if not (0 <= self.before < math.inf and 0 <= self.after < math.inf and self.above >= 0):
             raise FaceDiffError("window: the speech before and after a window must last 0 s or more, and end")
@@ -90,8 +92,9 @@ class WindowPlan:
         """
         frames, past = round(self.seconds * frame_rate), round(self.past * frame_rate)
         # Half of a window may be rounded up where the window is rounded down.
-        overlap = max(1, min(round(self.overlap * frame_rate), frames - 1 if past else frames // 2))
-        if frames < (2 if past else 4):
+        overlap = round(self.overlap * frame_rate)
+        overlap = min(overlap, frames - 1) if past else max(1, min(overlap, frames // 2))
+        if frames < (1 if past else 4):
             raise FaceDiffError(
                 f"window: {self.seconds:g} s with an overlap of {self.overlap:g} s are too few frames at "
                 f"{frame_rate:g} a second; choose longer windows"
@@ -380,7 +383,7 @@ class SpeechWindows(ABC, Generic[M]):
         # A window that is mostly a pause, standardised by itself, would turn its noise into loud speech.
         deviation = max(self._level.deviation, QUIETEST)
         motion: Any = self.generate(window, speech, heard - start, self._level.mean, deviation)
-        self._held = motion[:, -self.plan.overlap :]
+        self._held = motion[:, motion.shape[1] - self.plan.overlap :]
         return motion
 
     def _counted(self, parts: Sequence[Any]) -> M:

@@ -694,6 +694,6 @@ def crossfaded(
     window's alone, and would be 1 behind the last; it is smooth at both.
     """
     shared = before.shape[1]
-    share = (torch.arange(shared, device=now.device, dtype=now.dtype) - fixed).clamp_min(0) / (shared - fixed)
+    share = (torch.arange(shared, device=now.device, dtype=now.dtype) - fixed).clamp_min(0) / max(1, shared - fixed)
     smooth = (share * share * (3 - 2 * share)).view(-1, *[1] * (now.dim() - 2))
     return torch.cat([torch.lerp(before, now[:, :shared], smooth), now[:, shared:]], 1)

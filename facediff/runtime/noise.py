@@ -111,17 +111,13 @@ class WindowNoise:
 
     def __init__(self, name: str, window: Window, seeds: Sequence[int]) -> None:
         self.window = window
-        self.new, self.old = (
-            [stream_of(f"{name}/{index}", seed) for seed in seeds] for index in (window.index, window.index - 1)
-        )
+        self.streams = [
+            ([stream_of(f"{name}/{index}", seed) for seed in seeds], index, new) for index, new in window.origins
+        ]
 
     def __call__(self, frames: int, width: int) -> Noise:
         """The next noise (seeds, frames, width); ``frames`` are those of the window."""
-        window = self.window
-        new = self._draw(self.new, window.index, width)[:, : window.frames - window.shared]
-        if not window.shared:
-            return new
-        return np.concatenate([self._draw(self.old, window.index - 1, width)[:, -window.shared :], new], 1)
+        return np.concatenate([self._draw(streams, index, width)[:, new] for streams, index, new in self.streams], 1)
 
     def _draw(self, streams: Sequence[NormalStream], index: int, width: int) -> Noise:
         frames = self.window.plan.hop if index else self.window.plan.frames

@@ -90,12 +90,12 @@ def window_motion(
     if model.description.blending == "motion":
         motion = clip_motion(model, heard, conditions)[:, wanted]
         if before is not None:
-            share = crossfade(window.shared)[:, None, None]
+            share = crossfade(window.shared, window.fixed)[:, None, None]
             blended = before[0] + share * (motion[:, : window.shared] - before[0])
             motion = np.concatenate([blended, motion[:, window.shared :]], 1)
         return motion, [motion[:, -window.kept :]]
     features = np.ascontiguousarray(model.features(heard, heard.frames)[:, wanted])
-    sampling = Sampling(model, conditions, before, window.shared)
+    sampling = Sampling(model, conditions, before, window.shared, window.fixed)
     noise = WindowNoise(NAME, window, [conditions.seed])
     motion = sampling.run(features, noise, WindowNoise(f"{NAME}/mean", window, [0]))
     return motion, [kept[:, -window.kept :] for kept in sampling.kept]
@@ -111,10 +111,10 @@ def conditioned(features: Array, conditions: Conditions) -> dict[str, npt.NDArra
     }
 
 
-def crossfade(shared: int) -> Array:
+def crossfade(shared: int, fixed: int) -> Array:
     """The new window's share in each shared frame: the rule of :func:`facediff.models.inference.crossfaded`."""
-    # 0 at the first shared frame, smooth at both ends.
-    place = np.arange(shared, dtype=np.float32) / np.float32(shared)
+    # 0 up to the first frame that may change, smooth at both ends.
+    place = np.maximum(np.arange(shared, dtype=np.float32) - fixed, 0) / np.float32(max(1, shared - fixed))
     return np.asarray(place * place * (3 - 2 * place), np.float32)
 
 
@@ -126,18 +126,25 @@ class Sampling:
         conditions: what motion is conditioned on.
         before: what the window before kept, one array for each evaluation of the network; None for nothing.
         shared: frames that this window shares with it.
+        fixed: how many of these are given out already.
 
     Attributes:
         kept: what the next window is blended with, one array for each evaluation.
     """
 
     def __init__(
-        self, model: RuntimeModel, conditions: Conditions, before: Sequence[Array] | None, shared: int
+        self,
+        model: RuntimeModel,
+        conditions: Conditions,
+        before: Sequence[Array] | None,
+        shared: int,
+        fixed: int = 0,
     ) -> None:
         self.model = model
         self.conditions = conditions
         self.before = before
         self.shared = shared
+        self.fixed = fixed
         self.kept: list[Array] = []
 
     def run(self, features: Array, noise: Draw, of_mean: Draw) -> Array:
@@ -182,7 +189,7 @@ class Sampling:
         before, share = np.zeros((1, frames, about.kept), np.float32), np.ones((1, frames), np.float32)
         if self.before is not None:
             before[:, : self.shared] = self.before[len(self.kept)]
-            share[:, : self.shared] = crossfade(self.shared)
+            share[:, : self.shared] = crossfade(self.shared, self.fixed)
         prediction, kept = self.model.run(
             "step",
             {
