@@ -23,7 +23,7 @@ from torch import Tensor
 from facediff.data import Assets, Batch, Reference, Sample, collate
 from facediff.data.audio import samples_for
 from facediff.data.frame_clock import FrameClock
-from facediff.data.windows import SpeechWindows, Window, WindowPlan
+from facediff.data.windows import LOW_LATENCY, SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoder
 
@@ -368,6 +368,10 @@ class Inference(ABC):
     def has_sampler(self, name: str | None) -> bool:
         """Whether :meth:`choose_sampler` takes this name; a model that samples is asked for registered ones."""
         return self.samples
+
+    def choose_low_latency(self) -> None:
+        """Answer speech at once from now on: frame by frame, and in few denoising steps where the model samples."""
+        self.windows = LOW_LATENCY
 
     def choose_expressivity(self, expressivity: Expressivity) -> None:
         """Go from the mean prediction (0) to a full sample (1) or beyond, for all that follows.

@@ -273,6 +273,11 @@ class DualPathDiffusion(AnimationModel):
         self._sampler_options = options
         self.sampler = chosen(process=self.process, **options)
 
+    def choose_low_latency(self) -> None:
+        """Frame by frame, and in two denoising steps of the present sampler."""
+        super().choose_low_latency()
+        self.choose_sampler(steps=LOW_LATENCY_STEPS)
+
     def choose_expressivity(self, expressivity: Expressivity) -> None:
         """Go from the mean prediction (0) to a sample (1) or beyond; checkpoints keep what the model was made with.
 
