@@ -33,6 +33,7 @@ class WindowOptions:
     Attributes:
         window: seconds of a window (default: 4)
         overlap: seconds that neighbouring windows share (default: 1)
+        low_latency: answer at once: windows of one frame, 0.12 s of look-ahead, two denoising steps
         max_seconds: refuse speech that lasts longer
         stream: read PCM (16 bit, mono, little endian) from standard input as it comes
         rate: sample rate of that PCM
@@ -40,6 +41,7 @@ class WindowOptions:
 
     window: Annotated[ranges.Window | None, Option(metavar="S")] = None
     overlap: Annotated[ranges.Window | None, Option(metavar="S")] = None
+    low_latency: bool = False
     max_seconds: Annotated[ranges.Duration | None, Option(metavar="S")] = None
     stream: bool = False
     rate: Annotated[ranges.SampleRate, Option(metavar="HZ")] = 16_000
@@ -198,6 +200,7 @@ def animate(
         precision=precision,
         window=windows.window,
         overlap=windows.overlap,
+        low_latency=windows.low_latency,
         voice_gate=sound.voice_gate,
         denoise=sound.denoise,
         alignment=sound.alignment,

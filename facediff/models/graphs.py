@@ -12,7 +12,7 @@ Here is what all models share; each method has its own graphs next to its networ
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -78,6 +78,8 @@ class SamplingLoop:
         decoded: what the last graph decodes: the ``sample``, or the ``kept`` numbers of the last step.
         noise: what unit noise is multiplied by before use, (state, state); None for nothing.
         noise_of: what noise depends on.
+        quick_steps: the steps that are visited at low latency (:meth:`Inference.choose_low_latency`).
+        quick_table: for each of them, as in ``table``.
     """
 
     state: int
@@ -90,6 +92,8 @@ class SamplingLoop:
     decoded: Literal["sample", "kept"]
     noise: Float[Tensor, "state state"] | None
     noise_of: NoiseOf
+    quick_steps: list[int] = field(default_factory=list)
+    quick_table: list[list[float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

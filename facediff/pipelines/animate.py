@@ -61,6 +61,7 @@ class AnimationOptions:
     precision: Literal["32", "bf16"] = "32"
     window: ranges.Window | None = None
     overlap: ranges.Window | None = None
+    low_latency: bool = False
     controls: AnimationControls = field(default_factory=AnimationControls)
     voice_gate: str = "energy"
     denoise: bool = False
@@ -74,6 +75,8 @@ class AnimationOptions:
 
     def __post_init__(self) -> None:
         ranges.check_fields(self)
+        if self.low_latency and (self.window is not None or self.overlap is not None):
+            raise FaceDiffError("--low-latency: chooses the windows; omit --window and --overlap")
         _ = self.expressivity_factors, self.guidance_scales, self.gate
         if self.controls.acting is not None:
             from facediff.pipelines.acting import read_acting
@@ -98,7 +101,15 @@ class AnimationOptions:
         """What finds the pauses in which the mouth comes to rest; None if nothing does."""
         from facediff.data.voice_activity import read_gate
 
-        return read_gate(self.voice_gate)
+        return read_gate(self.gate_text)
+
+    @property
+    def gate_text(self) -> str:
+        """The gate's name with its options."""
+        from facediff.data.voice_activity import QUICK_GATE, USUAL_GATE
+
+        # The usual gate looks further ahead than windows of low latency do.
+        return QUICK_GATE if self.low_latency and self.voice_gate == USUAL_GATE else self.voice_gate
 
     @property
     def guidance_scales(self) -> dict[str, float]:
@@ -174,6 +185,8 @@ class AnimationPipeline:
             raise FaceDiffError(
                 f"--seed {seed}: {type(self.model).__name__} makes one animation, whatever the seed; omit the option"
             )
+        if options.low_latency:
+            self.model.choose_low_latency()
         if options.sampler is not None or options.steps is not None:
             self.model.choose_sampler(options.sampler, options.steps)
         if options.guidance is not None:
@@ -477,7 +490,7 @@ class AnimationPipeline:
         if sampler is not None:
             metadata["sampler"] = f"{type(sampler).__name__}, {sampler.steps} steps"
         if self.rest is not None:
-            metadata["voice gate"] = self.options.voice_gate
+            metadata["voice gate"] = self.options.gate_text
         if self.options.denoise:
             metadata["denoised"] = "yes"
         if self.direction is not None:

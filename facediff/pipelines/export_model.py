@@ -334,6 +334,8 @@ def describe(
         longest=graphs.longest,
         drawn=loop.drawn if loop else 0,
         noise_of=loop.noise_of if loop else "clip",
+        quick_steps=loop.quick_steps if loop else [],
+        quick_table=loop.quick_table if loop else [],
     )
 
 

@@ -11,7 +11,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from facediff.data.pcm import pcm
-from facediff.data.voice_activity import EnergyGate
+from facediff.data.voice_activity import QUICK_GATE, USUAL_GATE, read_gate
 from facediff.errors import FaceDiffError
 from facediff.runtime.gated import GatedStream
 from facediff.runtime.model import RuntimeModel, real_time_factor
@@ -52,6 +52,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--shapes", type=Path, metavar="SHAPES", help="blendshapes of .csv, and of .glb if given")
     made.add_argument("--window", type=float, metavar="S", help="seconds of a window of long speech")
     made.add_argument("--overlap", type=float, metavar="S", help="seconds that windows share")
+    made.add_argument("--low-latency", action="store_true", help="windows of one frame, 0.2 s behind the speech")
     made.add_argument("--no-voice-gate", action="store_true", help="do not bring the mouth to rest in pauses")
     made.add_argument("--threads", type=int, default=0, metavar="N", help="of the processor (default: its cores)")
     made.add_argument("--version", action="version", version=f"facediff-run {__version__}")
@@ -94,7 +95,11 @@ def run(options: argparse.Namespace) -> None:
     if options.window is not None or options.overlap is not None:
         model.windows = model.windows.chosen(options.window, options.overlap)
         model.windows.in_frames(model.frame_rate)
-    gate = None if options.no_voice_gate else EnergyGate()
+        if options.low_latency:
+            raise FaceDiffError("--low-latency: chooses the windows; omit --window and --overlap")
+    if options.low_latency:
+        model.choose_low_latency()
+    gate = None if options.no_voice_gate else read_gate(QUICK_GATE if options.low_latency else USUAL_GATE)
     choices = {name: getattr(options, name) for name in ("identity", "condition", "style", "seed", "expressivity")}
     if streamed:
         stream = GatedStream(model.stream(**choices, gate=gate))

@@ -74,6 +74,8 @@ class Description:
         longest: frames at most of what is animated in one pass; 0 for any number.
         drawn: numbers in a frame of the noise that the loop starts from; ``state`` if 0.
         noise_of: what noise depends on: the ``clip`` and the seed, or the ``seed``.
+        quick_steps: the diffusion steps visited at low latency; none where the model does not change its steps.
+        quick_table: for each of them, as in ``table``.
         check: the comparison with PyTorch when the folder was written.
     """
 
@@ -109,6 +111,8 @@ class Description:
     longest: int = 0
     drawn: int = 0
     noise_of: str = "clip"
+    quick_steps: list[int] = field(default_factory=list)
+    quick_table: list[list[float]] = field(default_factory=list)
     check: dict[str, Any] = field(default_factory=dict)
 
     def content(self) -> dict[str, Any]:
@@ -208,15 +212,15 @@ def _check(path: Path, found: Description) -> None:
     for name, least in (("state", 1), ("kept", 1), ("drawn", 0), ("longest", 0)):
         if not (least if sampled else 0) <= getattr(found, name) <= 10_000_000:
             refuse(name, f"{least} to 10000000")
-    least = 1 if sampled else 0
-    if not least <= len(found.steps) <= 100_000 or not all(isinstance(each, int) and each >= 0 for each in found.steps):
-        refuse("steps", "steps of the noise process")
-    rows = found.table
-    if len(rows) != len(found.steps) or not all(
-        isinstance(row, list) and len(row) == 5 and all(isinstance(number, int | float) for number in row)
-        for row in rows
-    ):
-        refuse("table", "five numbers for each step")
+    for steps, table, least in (("steps", "table", int(sampled)), ("quick_steps", "quick_table", 0)):
+        visited, rows = getattr(found, steps), getattr(found, table)
+        if not least <= len(visited) <= 100_000 or not all(isinstance(each, int) and each >= 0 for each in visited):
+            refuse(steps, "steps of the noise process")
+        if len(rows) != len(visited) or not all(
+            isinstance(row, list) and len(row) == 5 and all(isinstance(number, int | float) for number in row)
+            for row in rows
+        ):
+            refuse(table, "five numbers for each step")
     if found.decoded not in ("sample", "kept"):
         refuse("decoded", "sample or kept")
     for name in ("identities", "faces", "styles"):

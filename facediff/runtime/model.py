@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.data.audio import samples_for
-from facediff.data.voice_activity import EnergyGate, Openness, openness, toward_rest
-from facediff.data.windows import SpeechWindows, Window, WindowPlan
+from facediff.data.voice_activity import EnergyGate, Openness, VoiceGate, openness, toward_rest
+from facediff.data.windows import LOW_LATENCY, SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.runtime.folder import Arrays, Description, read_folder
 from facediff.runtime.sampling import NAME, Conditions, Heard, clip_motion, window_motion
@@ -42,6 +42,7 @@ class RuntimeModel:
         description: what ``model.json`` says.
         clock: how the model counts its frames.
         windows: how long speech is cut; may be changed at any time.
+        loop: each step with its row of the sampler's table.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class RuntimeModel:
         self.clock = description.frame_clock
         self.arrays = arrays
         self.windows = description.plan
+        self.loop = list(zip(description.steps, description.table, strict=True))
         self._load = load
         # What encodes styles is opened where it is needed: most animations take a style by its name.
         self._sessions = {name: load(name) for name in description.graphs if name != "style"}
@@ -91,6 +93,12 @@ class RuntimeModel:
 
         return cls(description, arrays, load)
 
+    def choose_low_latency(self) -> None:
+        """Answer speech at once from now on: frame by frame, and in few denoising steps where the model samples."""
+        self.windows = LOW_LATENCY
+        if quick := self.description.quick_steps:
+            self.loop = list(zip(quick, self.description.quick_table, strict=True))
+
     @property
     def frame_rate(self) -> float:
         """Motion frames a second."""
@@ -105,7 +113,7 @@ class RuntimeModel:
         style: str | None = None,
         seed: int = 0,
         expressivity: float = 1.0,
-        gate: EnergyGate | None = EnergyGate(),  # noqa: B008 - it cannot be changed
+        gate: VoiceGate | None = EnergyGate(),  # noqa: B008 - it cannot be changed
         name: str = NAME,
     ) -> Animation:
         """Animate a face with speech, as ``facediff animate`` does.
@@ -155,7 +163,7 @@ class RuntimeModel:
         seed: int = 0,
         expressivity: float = 1.0,
         plan: WindowPlan | None = None,
-        gate: EnergyGate | None = EnergyGate(),  # noqa: B008 - it cannot be changed
+        gate: VoiceGate | None = EnergyGate(),  # noqa: B008 - it cannot be changed
     ) -> RuntimeStream:
         """Animate speech of any length while it arrives; the arguments are those of :meth:`animate`.
 
@@ -181,7 +189,7 @@ class RuntimeModel:
         audio: Array | None,
         name: str,
         conditions: Conditions,
-        gate: EnergyGate | None,
+        gate: VoiceGate | None,
     ) -> Animation:
         """Vertices (T, V, 3) of a face with everything that exporters need."""
         about, arrays = self.description, self.arrays
@@ -200,7 +208,7 @@ class RuntimeModel:
             **({"seed": str(conditions.seed)} if about.generation == "sampled" else {}),
         }
         if about.generation == "sampled":
-            metadata["sampler"] = f"{about.sampler}, {len(about.steps)} steps"
+            metadata["sampler"] = f"{about.sampler}, {len(self.loop)} steps"
         if gate is not None:
             metadata["voice gate"] = "energy"
         if conditions.expressivity != 1:
@@ -318,7 +326,7 @@ class RuntimeStream(SpeechWindows[Array]):
         face: int,
         conditions: Conditions,
         plan: WindowPlan,
-        gate: EnergyGate | None = None,
+        gate: VoiceGate | None = None,
     ) -> None:
         super().__init__(plan.in_frames(model.frame_rate), model.frame_rate)
         self.model = model

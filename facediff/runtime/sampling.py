@@ -171,7 +171,7 @@ class Sampling:
         about = self.model.description
         predictions: list[Array] = []
         kept = noisy
-        for step, (of_noisy, first, second, third, of_noise) in zip(about.steps, about.table, strict=True):
+        for step, (of_noisy, first, second, third, of_noise) in self.model.loop:
             prediction, kept = self._evaluate(features, noisy, step)
             predictions = [prediction, *predictions][:3]
             made = np.float32(of_noisy) * noisy

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from facediff import registry
-from facediff.data.voice_activity import EnergyGate
+from facediff.data.voice_activity import QUICK_GATE, EnergyGate, read_gate
 from facediff.data.windows import Window, WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion
@@ -161,6 +161,23 @@ def test_stream_gives_what_the_file_gives(folder: Path) -> None:
     pieces = [stream.feed(piece) for piece in np.split(speech, [1, 1000, 30_000, 30_001])]
     made = np.concatenate([*pieces, stream.finish()], 1)[0] + runtime.arrays["templates"][stream.face]
     assert np.array_equal(made, runtime.animate(speech, identity="A", seed=2, gate=None).vertices)
+
+
+def test_low_latency_gives_what_the_model_gives(model: AnimationModel, folder: Path) -> None:
+    runtime, speech = RuntimeModel.open(folder), sound(1.2)
+    usual = runtime.animate(speech, identity="B", seed=1, gate=None).vertices
+    runtime.choose_low_latency()
+    with model.choosing():
+        model.choose_low_latency()
+        wanted = model.animate(torch.from_numpy(speech), identity="B", seed=1).vertices.numpy()
+    found = runtime.animate(speech, identity="B", seed=1, gate=None)
+    assert largest(found.vertices, wanted) < 1e-4
+    assert largest(usual, wanted) > 1e-3
+    assert found.metadata["sampler"].endswith("2 steps")
+    stream = GatedStream(runtime.stream(identity="B", seed=1, gate=read_gate(QUICK_GATE)))
+    made = np.concatenate([*map(stream.feed, np.split(speech, [1, 9000])), stream.finish()])
+    gated = runtime.animate(speech, identity="B", seed=1, gate=read_gate(QUICK_GATE)).vertices
+    assert np.abs(made - gated).max() < 1e-6 * np.ptp(gated)
 
 
 def test_gated_stream_gives_what_the_file_gives(folder: Path) -> None:

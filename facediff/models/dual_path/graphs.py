@@ -82,7 +82,9 @@ def graphs_of(model: DualPathDiffusion) -> Graphs:
     if [*model.views()] != [()]:
         raise FaceDiffError("guidance: a guided model cannot be exported; set all scales to 1")
     network, sampler = model.network, model.sampler
-    table = update_table(sampler)
+    with model.choosing():
+        model.choose_low_latency()
+        quick = model.sampler
     preconditioned = model.motion_space.preconditioning is not None
     folded = model.sampling_space == "folded" and not preconditioned
     batch, frames, width = 2, 50, network.embed.in_features
@@ -138,11 +140,13 @@ def graphs_of(model: DualPathDiffusion) -> Graphs:
             kept=kept,
             sampler=type(sampler).__name__,
             steps=list(sampler.timesteps),
-            table=table,
+            table=update_table(sampler),
             last_step=model.process.steps - 1,
             decoded=decoded,
             noise=root,
             noise_of="clip",
+            quick_steps=list(quick.timesteps),
+            quick_table=update_table(quick),
         ),
     )
 

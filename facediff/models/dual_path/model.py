@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.data.windows import Window
+from facediff.data.windows import LOW_LATENCY_STEPS, Window
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel

@@ -1,0 +1,161 @@
+"""Windows that continue motion which is given out already, against a loop in NumPy and by what a stream promises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facediff.data.voice_activity import QUICK_GATE, Openness, read_gate
+from facediff.data.windows import LOW_LATENCY, LOW_LATENCY_STEPS, FramePlan, WindowPlan
+from facediff.errors import FaceDiffError
+from facediff.models.dual_path.model import DualPathDiffusion
+from facediff.models.inference import SpeechStream, WindowNoise
+from tests.fakes.tiny import Tiny
+from tests.models.test_windows import CPU, Array, Echo, clip
+
+PLANS = [
+    WindowPlan(0.04, 0.0, before=0.2, after=0.12, above=0, past=0.4),  # a frame each, after ten frames of the past
+    WindowPlan(0.16, 0.08, before=0.2, after=0.04, above=0, past=0.4),
+    WindowPlan(0.2, 0.16, before=0.0, after=0.0, above=0, past=0.12),  # shares more than it hops
+    WindowPlan(0.12, 0.0, before=0.6, after=0.08, above=0, past=0.04),
+]
+
+
+def expected(speech: Array, total: int, plan: FramePlan) -> Array:
+    """The motion of :class:`Echo` by hand: what each window hears, and the blend of the frames that may change."""
+    out: list[float] = []
+    held: Array | None = None
+    while True:
+        new = len(out)  # given out so far, where the window's own frames begin
+        left = total - new
+        if held is not None and left <= plan.overlap:
+            return np.concatenate([out, held[:left]])
+        count = min(left, plan.frames)
+        start = max(0, new - plan.past)
+        context = min(plan.before, start)
+        known = (
+            speech[: min(total, new + plan.frames + plan.after) * 640] if left > plan.frames else speech[: total * 640]
+        )
+        scaled = (known - known.mean()) / max(known.std(), 0.003)
+        values = scaled[(start - context) * 640 :].reshape(-1, 640).mean(1)
+        values = (values + 0.1 * np.arange(len(values)) + 0.003 * len(values))[context + new - start :][:count]
+        if held is not None:
+            share = np.arange(plan.overlap) / max(1, plan.overlap)
+            share = 3 * share**2 - 2 * share**3
+            values[: plan.overlap] = (1 - share) * held + share * values[: plan.overlap]
+        if left <= plan.frames:
+            return np.concatenate([out, values])
+        out += values[: plan.hop].tolist()
+        held = values[plan.hop :]
+
+
+@pytest.mark.parametrize("plan", PLANS)
+@pytest.mark.parametrize("frames", [1, 2, 5, 11, 37])
+def test_windows_with_a_past_are_the_loop_over_windows(plan: WindowPlan, frames: int) -> None:
+    speech = 0.2 * np.random.default_rng(frames).standard_normal(frames * 640)
+    stream, place, parts = SpeechStream(Echo(), clip(), plan=plan), 0, []
+    for size in (100, 3_000, 641, 10**6):
+        parts.append(stream.feed(torch.from_numpy(speech[place : place + size]).float()))
+        place += size
+    made = torch.cat([*parts, stream.finish()], 1)[0, :, 0, 0].numpy()
+    np.testing.assert_allclose(made, expected(speech, frames, plan.in_frames(25.0)), rtol=1e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("plan", [*PLANS, LOW_LATENCY])
+def test_windows_with_a_past_share_its_noise(plan: WindowPlan) -> None:
+    whole: dict[int, torch.Tensor] = {}
+    for index in range(40):
+        window = plan.in_frames(25.0).window(index)
+        noise = WindowNoise("a", window, [5], CPU)(torch.empty(1, window.frames, 32))[0]
+        for place, row in enumerate(noise, window.start):
+            assert torch.equal(whole.setdefault(place, row), row)
+    every = torch.stack([whole[place] for place in sorted(whole)]).double()
+    assert float((every @ every.T / 32 - torch.eye(len(every))).abs().max()) < 6.5 * (2 / 32) ** 0.5
+
+
+@pytest.fixture
+def model(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> DualPathDiffusion:
+    made = make_model()
+    made.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    return made.eval()
+
+
+def test_frames_that_are_given_out_do_not_change(model: DualPathDiffusion) -> None:
+    """Each window sees the motion that was given out, and goes on from it."""
+    model.choose_low_latency()
+    generate, given, looked = model.generate_window, [], 0
+
+    def spied(heard, window, seeds, before):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+        nonlocal looked
+        motion, after = generate(heard, window, seeds, before)
+        for place in range(window.fixed):
+            torch.testing.assert_close(motion[0, place], given[window.start + place], rtol=1e-4, atol=1e-5)
+            looked += 1
+        given.append(motion[0, window.fixed])
+        return motion, after
+
+    model.generate_window = spied  # type: ignore[method-assign]
+    speech = torch.randn(2 * 16_000, generator=torch.Generator().manual_seed(0)) * 0.2
+    made = model.animate(speech, identity=model.identities[0]).vertices
+    assert len(given) == len(made) == 50
+    assert looked == sum(min(25, index) for index in range(50))
+
+
+def test_a_low_latency_stream_is_the_file_and_keeps_its_promise(model: DualPathDiffusion) -> None:
+    model.choose_low_latency()
+    speech = torch.randn(24_000, generator=torch.Generator().manual_seed(1)) * 0.2
+    with torch.inference_mode():
+        stream = model.stream(identity=model.identities[0])
+        parts, heard = [], 0
+        for piece in speech.split(160):
+            parts.append(stream.feed(piece))
+            heard += len(piece)
+            # At most 0.16 s of speech lie between the start of a frame and the sample that makes it certain.
+            assert stream.frames >= (heard / 16_000 - 0.16) * 25 - 1e-9
+        parts.append(stream.finish())
+    template = model.assets.template(model.identities[0])
+    wanted = model.animate(speech, identity=model.identities[0]).vertices - template
+    torch.testing.assert_close(torch.cat(parts, 1)[0], wanted, rtol=1e-4, atol=1e-6)
+
+
+def test_low_latency_takes_few_steps_and_is_forgotten(model: DualPathDiffusion) -> None:
+    before = model.windows, model.sampler.steps
+    with model.choosing():
+        model.choose_low_latency()
+        assert (model.windows, model.sampler.steps) == (LOW_LATENCY, LOW_LATENCY_STEPS)
+    assert (model.windows, model.sampler.steps) == before
+
+
+@pytest.mark.parametrize("rate", [24.0, 25.0, 29.97, 30.0, 48.0, 60.0, 120.0])
+def test_low_latency_waits_less_than_the_goal_at_every_rate(rate: float) -> None:
+    plan = LOW_LATENCY.in_frames(rate)
+    waited = (plan.frames + plan.after) / rate
+    assert plan.overlap == 0
+    assert 0.1 < waited < 0.18
+    gate = read_gate(QUICK_GATE)
+    assert gate is not None
+    # A frame's middle lies half a frame after its start: the gate must be certain of it by then.
+    assert Openness(gate, rate).look_ahead <= waited - 0.5 / rate
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [({"past": -0.1}, "past"), ({"past": float("inf")}, "past"), ({"overlap": LOW_LATENCY.seconds}, "overlap")],
+)
+def test_impossible_pasts_are_refused(change: dict[str, float], field: str) -> None:
+    with pytest.raises(FaceDiffError, match=field):
+        replace(LOW_LATENCY, **change)
+
+
+def test_low_latency_excludes_lengths_of_windows() -> None:
+    from facediff.pipelines.animate import AnimationOptions
+
+    with pytest.raises(FaceDiffError, match="--low-latency"):
+        AnimationOptions(Path("a.ckpt"), window=1.0, low_latency=True)
+    assert AnimationOptions(Path("a.ckpt"), low_latency=True).gate_text == QUICK_GATE
+    assert AnimationOptions(Path("a.ckpt"), low_latency=True, voice_gate="off").gate is None
