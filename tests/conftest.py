@@ -15,7 +15,7 @@ os.environ["WANDB_SILENT"] = "true"
 os.environ["FACEDIFF_TRACEBACK"] = "1"  # unexpected errors fail a test as what they are
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,9 @@ import torch
 
 from facediff import registry
 from facediff.models import DualPathDiffusion
+from facediff.runtime.onnxruntime_web import VERSION
 from tests.fakes.tiny import SEEN, VERTICES, Tiny, write_tiny
+from tools.browser.chromium import Chromium, find_chromium
 
 # A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C, which some test.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -149,3 +151,36 @@ def ctc_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
         num_conv_pos_embedding_groups=4,
     )
     return saved(Wav2Vec2ForCTC, config, tmp_path_factory.mktemp("ctc"))
+
+
+@pytest.fixture(scope="session")
+def program() -> Path:
+    """A Chromium; without one the test is skipped, or fails where FACEDIFF_REQUIRE_BROWSER is set."""
+    found = find_chromium()
+    if found is None:
+        words = (
+            "no Chromium found: put one on the PATH, or run  export FACEDIFF_CHROMIUM=$(tools/browser/install.sh DIR)"
+        )
+        if os.environ.get("FACEDIFF_REQUIRE_BROWSER"):
+            pytest.fail(words)
+        pytest.skip(words)
+    return found
+
+
+@pytest.fixture(scope="session")
+def browser(program: Path) -> Iterator[Chromium]:
+    with Chromium(program) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def web_runtime_package(program: Path) -> Path:
+    """ONNX Runtime for browsers, which the browser's installation brings along; skipped or failed as the browser."""
+    name = f"onnxruntime-web-{VERSION}.tgz"
+    found = next((path for path in (program.parent / name, program.parent.parent / name) if path.is_file()), None)
+    if found is None:
+        words = f"no {name} next to the browser: run  export FACEDIFF_CHROMIUM=$(tools/browser/install.sh DIR)"
+        if os.environ.get("FACEDIFF_REQUIRE_BROWSER"):
+            pytest.fail(words)
+        pytest.skip(words)
+    return found

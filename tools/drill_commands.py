@@ -217,8 +217,9 @@ DRILLS = [
 """One or several for each command that writes, except ``fit``, which has a drill of its own."""
 
 WRITES_NOTHING = ("components", "data check")
-SERVES = ("study serve",)
-"""Runs until it is stopped, and writes in transactions of SQLite; tests/study/test_store.py kills it."""
+SERVES = ("study serve", "serve")
+"""Run until they are stopped. The first writes in transactions of SQLite, and tests/study/test_store.py kills it; what
+the second writes with --output, tests/runtime/test_site.py interrupts."""
 FIT = "fit"
 
 

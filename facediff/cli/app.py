@@ -34,6 +34,7 @@ COMMANDS = {
     "export-model": Command(
         "facediff.cli.export_model:export_model", "a trained model as a folder that animates without PyTorch"
     ),
+    "serve": Command("facediff.cli.serve:serve", "a page on which an exported model animates, in the browser"),
     "import-checkpoint": Command(
         "facediff.cli.import_checkpoint:import_checkpoint", "make a model of a published method's own checkpoint"
     ),

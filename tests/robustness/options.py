@@ -62,6 +62,7 @@ BASES: dict[str, str] = {
     "import-checkpoint": "WORLD/author.pth --dataset vocaset --identities A,B,C --templates WORLD/faces.pkl "
     "--audio-config WORLD/audio.json -o out.ckpt",
     "export-model": "WORLD/model.ckpt -o exported",
+    "serve": "WORLD/exported -o site",
     "publish": "WORLD/model.ckpt published --license mit --languages en",
     "style extract": "B_e02 --checkpoint WORLD/model.ckpt -o style.npy",
     "view": "WORLD/clicks.npz -o page.html",
@@ -107,6 +108,7 @@ def build_world(folder: Path) -> Path:
     from facediff.study import simulate
     from tests.fakes.benchmark import write_benchmark
     from tests.fakes.clicks import clicks
+    from tests.fakes.exported import write_exported
     from tests.fakes.person import person, write_auxiliary, write_speech
     from tests.fakes.published import write_author_files
     from tests.fakes.study import SCORES, as_file, small_study, write_study
@@ -142,6 +144,7 @@ def build_world(folder: Path) -> Path:
         (folder / name).touch()
     (folder / "text.txt").write_text("no file of any format\n")
     write_checkpoint(folder / "model.ckpt", corpus)
+    write_exported(folder / "exported")
     write_author_files(folder)
     write_benchmark(folder)
     return folder
@@ -255,10 +258,11 @@ def snapshot(folder: Path) -> dict[str, tuple[int, int]]:
 
 @contextmanager
 def nothing_leaves() -> Iterator[None]:
-    """No browser, no server, no training."""
+    """No browser, no server, no download, no training."""
     with ExitStack() as stack:
         stack.enter_context(mock.patch("webbrowser.open"))
         stack.enter_context(mock.patch("uvicorn.Server.run"))
+        stack.enter_context(mock.patch("facediff.runtime.onnxruntime_web.FILES", {}))  # nothing to be fetched
         yield
 
 

@@ -15,10 +15,7 @@ from facediff.study.definition import DATABASE
 from facediff.study.server import make_app
 from facediff.study.store import Store
 from facediff.utils.server import make_server
-from tests.export.viewer.conftest import browser, program
 from tests.fakes.study import write_methods
-
-__all__ = ["browser", "program"]
 
 Serve = Callable[[Path], str]
 

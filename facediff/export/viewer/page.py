@@ -39,7 +39,7 @@ MOST_ANIMATIONS = 4
 SCRIPTS = (
     *("motion", "surface", "clock", "camera", "scene"),
     *("plot", "curve", "waveform", "dialogs", "panels", "compare"),
-    *("direction", "lanes", "preview", "glb", "takes", "editor", "report", "player"),
+    *("archive", "direction", "lanes", "preview", "glb", "takes", "editor", "report", "player"),
 )
 """Parts of the script; each uses only the parts before it."""
 
@@ -285,7 +285,7 @@ def assemble(
         loads: what the page may load, as its content security policy says it; nothing else is let in.
     """
     style = "\n".join(_without_comments(_asset(name)) for name in styles)
-    script = "(() => {\n" + "\n".join(_without_comments(_asset(f"{name}.js")) for name in scripts) + "\n})();\n"
+    script = script_of(scripts)
     filled = {
         **values,
         # Lets this script and this style run, and nothing else be loaded.
@@ -298,6 +298,11 @@ def assemble(
     before, after = (fill(part, filled) for part in _asset(page).split("{{blobs}}"))
     texts = enumerate(blobs.texts)
     return [before, *(f'<script type="text/plain" id="blob-{n}">{text}</script>\n' for n, text in texts), after]
+
+
+def script_of(parts: Sequence[str]) -> str:
+    """Parts of a script, without the suffix, as one; each uses only the parts before it."""
+    return "(() => {\n" + "\n".join(_without_comments(_asset(f"{name}.js")) for name in parts) + "\n})();\n"
 
 
 def _without_comments(source: str) -> str:

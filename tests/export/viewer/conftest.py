@@ -1,8 +1,7 @@
-"""The browser of this folder's tests, which are skipped without one, and pages in it."""
+"""Pages of animations in the browser of the tests."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.export.viewer import write_page
-from tools.browser.chromium import Chromium, Page, find_chromium
+from tools.browser.chromium import Chromium, Page
 
 # Colour in the middle of the first face's place, read in the moment in which it was drawn.
 PIXEL = """
@@ -23,26 +22,6 @@ window.pixel = () => {
   return [...colour];
 };
 """
-
-
-@pytest.fixture(scope="session")
-def program() -> Path:
-    """A Chromium; without one the test is skipped, or fails where FACEDIFF_REQUIRE_BROWSER is set."""
-    found = find_chromium()
-    if found is None:
-        words = (
-            "no Chromium found: put one on the PATH, or run  export FACEDIFF_CHROMIUM=$(tools/browser/install.sh DIR)"
-        )
-        if os.environ.get("FACEDIFF_REQUIRE_BROWSER"):
-            pytest.fail(words)
-        pytest.skip(words)
-    return found
-
-
-@pytest.fixture(scope="session")
-def browser(program: Path) -> Iterator[Chromium]:
-    with Chromium(program) as running:
-        yield running
 
 
 @pytest.fixture

@@ -3,6 +3,9 @@
 /** Rounding of media times must not show the frame before; a hundredth of a frame is too little to be seen. */
 const FRAME_LEEWAY = 0.01;
 
+/** A time in minutes and seconds, as pages write it. */
+const seconds = (value) => `${Math.floor(value / 60)}:${(value % 60).toFixed(2).padStart(5, "0")}`;
+
 /** The frame that is shown at a time: frame t from t / rate on. */
 function frameAt(time, rate, frames) {
   return Math.max(0, Math.min(frames - 1, Math.floor(time * rate + FRAME_LEEWAY)));

@@ -3,9 +3,6 @@
 /** A word as a shell takes it. */
 const quoted = (word) => (/^[\w./:=,+@-]+$/.test(word) ? word : `'${word.replaceAll("'", `'\\''`)}'`);
 
-/** A name as a file may have it. */
-const fileName = (name) => name.replace(/[^\p{L}\p{N}._ -]+/gu, "_").trim() || "take";
-
 class Editor {
   constructor(player) {
     this.player = player;

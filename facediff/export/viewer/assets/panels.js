@@ -1,7 +1,5 @@
 // The controls, and the labels over the faces.
 
-const seconds = (value) => `${Math.floor(value / 60)}:${(value % 60).toFixed(2).padStart(5, "0")}`;
-
 /** Pixels that a panel's words need: across beside the face, or above and below it together. */
 const WORDS = { across: 150, upright: 90 };
 

@@ -17,6 +17,13 @@ function readWav(buffer) {
 class Waveform extends Plot {
   constructor(canvas, cursor, facts, wav, onSeek) {
     super(canvas, cursor, facts, onSeek);
+    this.hear(facts, wav);
+  }
+
+  /** Show a recording { samples, rate } from now on. */
+  hear(facts, wav) {
+    this.facts = facts;
+    this.seconds = facts.frames / facts.frameRate;
     this.wav = wav;
     this.loudest = wav.samples.reduce((most, value) => Math.max(most, Math.abs(value)), 1e-3);
   }

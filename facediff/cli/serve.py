@@ -1,0 +1,66 @@
+"""``facediff serve``: an exported model on a page that animates in the browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from facediff.cli.parsing import Option
+from facediff.cli.process import tell
+from facediff.errors import FaceDiffError
+from facediff.utils import ranges
+from facediff.utils.server import LOOPBACK, require_server
+
+
+def serve(
+    model: Annotated[Path, Option(metavar="FOLDER", reads=True)],
+    *,
+    output: Annotated[Path | None, Option(also="-o", metavar="OUT", writes="folder")] = None,
+    host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1",
+    port: Annotated[ranges.Port, Option(metavar="N")] = 8010,
+    open: bool = False,  # noqa: A002 - the option's name
+    runtime: Annotated[Path | None, Option(metavar="PACKAGE", reads=True)] = None,
+) -> None:
+    """Serve a page that animates recordings and the microphone in the browser, until Ctrl-C.
+
+    Everything is computed in the page, by WebAssembly; no sound leaves the machine. ONNX Runtime for browsers (20 MB)
+    is fetched from the npm registry once, and kept in facediff's cache.
+
+    For example:
+      facediff export-model demo/puppet.ckpt -o puppet-onnx
+      facediff serve puppet-onnx --open
+      facediff serve puppet-onnx -o site      # a folder for any web server
+
+    Args:
+        model: folder of `facediff export-model`
+        output: folder to write in place of serving: page, model and ONNX Runtime, for any web server
+        host: address to listen at
+        port: to listen at; 0 for any free one
+        open: open the page in the browser
+        runtime: npm's package onnxruntime-web (.tgz) or a folder with its files, for machines without network
+    """
+    if output is not None and output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
+    if output is None:
+        require_server("serving a page")
+    from facediff.runtime.folder import read_folder
+    from facediff.runtime.onnxruntime_web import web_runtime
+    from facediff.runtime.site import make_site, serve_site, write_site
+
+    read_folder(model)  # before anything is fetched
+    site = make_site(model, web_runtime(runtime, say=tell))
+    if output is not None:
+        size = write_site(site, output)
+        tell(f"wrote {output}: {size / 1e6:.1f} MB; offer it by any web server, e.g. python -m http.server -d {output}")
+        return
+
+    def ready(address: str) -> None:
+        tell(f"{address} animates with {model}; Ctrl-C ends it")
+        if host not in LOOPBACK:
+            tell(f"note: everybody who reaches {host} may open the page; browsers give it no microphone without https")
+        if open:
+            import webbrowser
+
+            webbrowser.open(address)
+
+    serve_site(site, host=host, port=port, ready=ready)

@@ -1,0 +1,155 @@
+// How far the mouth may be open in each frame: the energy gate of facediff.data.voice_activity, with its results.
+
+const GATE = { margin: 8, attack: 0.1, lead: 0.12, hold: 0.1, release: 0.15, lookAhead: 70 };
+const GATE_HOP = 160; // samples of a step of 10 ms
+const QUIETEST_LEVEL = -65, SILENT_LEVEL = -120, LOUDEST_ABOVE = 40, FADING = 3;
+const SMOOTH_STEPS = 5, FLAT = 7, SHORT_STEPS = 25, LONG_STEPS = 60, CLEARLY = 10, NOISE_MEMORY = 500, HYSTERESIS = 3;
+/** 150 Hz to 5 kHz at 16 kHz, in second-order sections: b0, b1, b2, a1, a2. */
+const SPEECH_BAND = [
+  [0.3979518861810659, 0.7959037723621318, 0.3979518861810659, 0.44530146335179394, 0.21624043303098522],
+  [1.0, -2.0, 1.0, -1.9167376370775666, 0.9201986372050089],
+];
+
+/** Second-order sections one after the other. */
+class RecursiveFilter {
+  constructor(sections) {
+    this.sections = sections.map((row) => ({ row, first: 0, second: 0 }));
+  }
+
+  feed(sample) {
+    let value = sample;
+    for (const section of this.sections) {
+      const [b0, b1, b2, a1, a2] = section.row;
+      const made = b0 * value + section.first;
+      section.first = b1 * value - a1 * made + section.second;
+      section.second = b2 * value - a2 * made;
+      value = made;
+    }
+    return value;
+  }
+}
+
+const decibels = (power) => (power > 1e-12 ? 10 * Math.log10(power) : SILENT_LEVEL);
+
+/** Says for every 10 ms whether there is speech: what rises above the noise, whose level is followed. */
+class EnergyListener {
+  constructor() {
+    this.band = new RecursiveFilter(SPEECH_BAND);
+    this.recent = []; // powers of the latest steps
+    this.levels = []; // smoothed levels of the latest steps
+    this.waiting = []; // levels that are not decided yet
+    this.stretches = [[], []]; // steady stretches [last step, level], softer ones later; short ones, and long ones
+    this.loudest = QUIETEST_LEVEL;
+    this.step = -1;
+    this.speaking = false;
+  }
+
+  /** What is certain after one more step of samples: a list of at most one decision. */
+  hear(samples) {
+    let power = 0;
+    for (const sample of samples) power += this.band.feed(sample) ** 2;
+    this.follow(power / samples.length);
+    return this.waiting.length > GATE.lookAhead ? [this.decide()] : [];
+  }
+
+  finish() {
+    return this.waiting.slice().map(() => this.decide());
+  }
+
+  follow(power) {
+    this.step += 1;
+    this.recent = [...this.recent.slice(1 - SMOOTH_STEPS), power];
+    const level = decibels(this.recent.reduce((sum, each) => sum + each, 0) / this.recent.length);
+    this.waiting.push(Math.max(level, decibels(power))); // a step that is loud by itself is loud
+    this.levels = [...this.levels.slice(1 - LONG_STEPS), level];
+    this.loudest = Math.max(level, this.loudest - FADING / 100, QUIETEST_LEVEL);
+    [SHORT_STEPS, LONG_STEPS].forEach((length, which) => {
+      const stretches = this.stretches[which];
+      const some = this.levels.slice(-length).map((each) => Math.max(each, QUIETEST_LEVEL - 20));
+      if (some.length === length && Math.max(...some) - Math.min(...some) < FLAT) {
+        const steady = some.reduce((sum, each) => sum + each, 0) / length;
+        while (stretches.length && stretches.at(-1)[1] >= steady) stretches.pop();
+        stretches.push([this.step, steady]);
+      }
+      while (stretches.length && stretches[0][0] < this.step - NOISE_MEMORY) stretches.shift();
+    });
+  }
+
+  decide() {
+    const level = this.waiting.shift(), [short, long] = this.stretches;
+    let limit = Math.max(QUIETEST_LEVEL, this.loudest - LOUDEST_ABOVE);
+    const noise = long.length ? [long[0][1]] : [];
+    if (short.length && short[0][1] < this.loudest - CLEARLY) noise.push(short[0][1]);
+    if (noise.length) limit = Math.max(limit, Math.min(...noise) + GATE.margin);
+    this.speaking = level > (this.speaking ? limit - HYSTERESIS : limit);
+    return this.speaking;
+  }
+}
+
+/** From 0 (at rest) to 1 (as the model moves it) for every frame; speech may arrive in pieces. */
+class Openness {
+  constructor(frameRate) {
+    this.frameRate = frameRate;
+    this.listener = new EnergyListener();
+    this.rest = new Float32Array(0); // samples that fill no step yet
+    this.active = [];
+    this.first = 0; // the step of the first of these
+    this.frames = 0; // that were given
+    this.ahead = Math.ceil((GATE.attack + GATE.lead) * 100);
+    this.behind = Math.ceil((GATE.hold + GATE.release) * 100);
+  }
+
+  /** The openness of the frames that are certain after more speech. */
+  feed(samples) {
+    const speech = joined(this.rest, samples);
+    const whole = Math.floor(speech.length / GATE_HOP);
+    this.rest = speech.slice(whole * GATE_HOP);
+    for (let step = 0; step < whole; step++) {
+      this.active.push(...this.listener.hear(speech.subarray(step * GATE_HOP, (step + 1) * GATE_HOP)));
+    }
+    const last = this.first + this.active.length - this.ahead - 1;
+    return this.upTo(Math.max(this.frames, Math.floor((last / 100) * this.frameRate)));
+  }
+
+  /** The openness of the frames that are left. Args: frames in all. */
+  finish(frames) {
+    this.active.push(...this.listener.finish());
+    return this.upTo(Math.max(frames, this.frames));
+  }
+
+  upTo(frames) {
+    const found = [];
+    for (let frame = this.frames; frame < frames; frame++) found.push(this.of(frame));
+    this.frames = frames;
+    const needed = Math.floor(((frames + 0.5) / this.frameRate) * 100) - this.behind - 2;
+    const drop = Math.min(Math.max(0, needed - this.first), this.active.length);
+    this.active = this.active.slice(drop);
+    this.first += drop;
+    return found;
+  }
+
+  of(frame) {
+    const middle = ((frame + 0.5) / this.frameRate) * 100; // in steps
+    const low = Math.max(0, Math.floor(middle) - this.behind - 1 - this.first);
+    const high = Math.max(0, Math.ceil(middle) + this.ahead + 1 - this.first);
+    let found = 0;
+    for (let place = low; place < Math.min(high, this.active.length); place++) {
+      if (!this.active[place]) continue;
+      const away = (place + this.first + 0.5 - middle) / 100; // seconds until that step; negative after it
+      const [free, ramp] = away > 0 ? [GATE.lead, GATE.attack] : [GATE.hold, GATE.release];
+      const beyond = Math.abs(away) - free;
+      const share = beyond <= 0 ? 0 : ramp > 0 ? Math.min(1, beyond / ramp) : 1;
+      found = Math.max(found, 1 - share * share * (3 - 2 * share));
+    }
+    return found;
+  }
+}
+
+/** Bring offsets (frames · 3 V) as far to rest as the openness of their frames says. Args: also the weights (V). */
+function towardRest(offsets, openness, weights) {
+  const size = 3 * weights.length;
+  openness.forEach((open, frame) => {
+    if (open >= 1) return;
+    for (let i = 0, at = frame * size; i < size; i++, at++) offsets[at] *= 1 - (1 - open) * weights[Math.floor(i / 3)];
+  });
+}

@@ -1,0 +1,136 @@
+// Long speech and streams by windows that blend into each other: the rules of facediff.data.windows, with its results.
+
+const SAMPLE_RATE = 16_000;
+/** Deviation below which speech is not amplified further: noise of a microphone, not speech. */
+const QUIETEST_DEVIATION = 0.003;
+
+/** The nearest whole number, of two equally near ones the even one, as Python rounds. */
+function nearest(value) {
+  const low = Math.floor(value), rest = value - low;
+  return rest < 0.5 || (rest === 0.5 && low % 2 === 0) ? low : low + 1;
+}
+
+const samplesFor = (frames, frameRate) => nearest((frames * SAMPLE_RATE) / frameRate);
+
+/** A plan { seconds, overlap, before, after } in frames. */
+function inFrames(plan, frameRate) {
+  const frames = nearest(plan.seconds * frameRate);
+  if (frames < 4) throw new Error(`windows of ${plan.seconds} s are too few frames at ${frameRate} a second; choose longer ones`);
+  const overlap = Math.max(1, Math.min(nearest(plan.overlap * frameRate), Math.floor(frames / 2)));
+  const before = nearest(plan.before * frameRate), after = nearest(plan.after * frameRate);
+  return { frames, overlap, before, after, hop: frames - overlap };
+}
+
+/** A window of long speech: its place, and how many of its frames the window before it has as well. */
+function windowAt(plan, index, frames = plan.frames) {
+  const start = index * plan.hop;
+  return { plan, index, frames, start, end: start + frames, context: Math.min(plan.before, start), shared: index ? plan.overlap : 0, kept: plan.overlap };
+}
+
+/** Mean and deviation of all samples so far. */
+class Level {
+  constructor() {
+    this.count = this.sum = this.squares = 0;
+  }
+
+  hear(samples) {
+    this.count += samples.length;
+    for (const value of samples) {
+      this.sum += value;
+      this.squares += value * value;
+    }
+  }
+
+  get mean() {
+    return this.sum / Math.max(this.count, 1);
+  }
+
+  get deviation() {
+    return Math.sqrt(Math.max(0, this.squares / Math.max(this.count, 1) - this.mean ** 2));
+  }
+}
+
+/** Samples one after the other. */
+function joined(first, second) {
+  const made = new Float32Array(first.length + second.length);
+  made.set(first);
+  made.set(second, first.length);
+  return made;
+}
+
+/**
+ * Animates speech that arrives in pieces, window by window; memory does not grow with its length.
+ *
+ * Args: the plan in frames; frames a second; `generate(window, speech, frames, mean, deviation)`, which gives a window's
+ * motion as an array (frames · size); the size of a frame.
+ */
+class SpeechWindows {
+  constructor(plan, frameRate, generate, size) {
+    Object.assign(this, { plan, frameRate, generate, size });
+    this.frames = 0; // that were given out
+    this.speech = new Float32Array(0);
+    this.dropped = 0; // samples before these, which no window will hear again
+    this.level = new Level();
+    this.window = windowAt(plan, 0);
+    this.held = null; // the latest window's frames that the next one shares
+  }
+
+  get heard() {
+    return this.dropped + this.speech.length;
+  }
+
+  sample(frame) {
+    return samplesFor(frame, this.frameRate);
+  }
+
+  /** Hear more speech; the parts of motion that have become certain. */
+  async feed(samples) {
+    this.speech = joined(this.speech, samples);
+    const parts = [];
+    while (this.heard >= this.sample(this.window.end + this.plan.after)) {
+      parts.push(await this.nextWindow(this.window.end + this.plan.after));
+    }
+    return this.counted(parts);
+  }
+
+  /** The motion that is left. Args: frames in all; as many as fit the speech if absent. */
+  async finish(frames) {
+    const total = frames ?? nearest((this.heard * this.frameRate) / SAMPLE_RATE);
+    if (total < 1) throw new Error("the speech is shorter than one frame");
+    const missing = this.sample(total) - this.heard;
+    if (missing > 0) this.speech = joined(this.speech, new Float32Array(missing));
+    const parts = [];
+    while (this.window.end < total) parts.push(await this.nextWindow(Math.min(total, this.window.end + this.plan.after)));
+    // What is left lies within the last window; if the window before has animated it already, it is certain now.
+    const left = total - this.window.start;
+    if (this.held && left <= this.plan.overlap) parts.push(this.held.subarray(0, left * this.size));
+    else parts.push(await this.make(windowAt(this.plan, this.window.index, left), total));
+    return this.counted(parts);
+  }
+
+  /** The window's frames before its overlap with the next, given speech up to frame `heard`; then advance. */
+  async nextWindow(heard) {
+    const motion = await this.make(this.window, heard);
+    this.window = windowAt(this.plan, this.window.index + 1);
+    const needed = this.sample(this.window.start - this.window.context);
+    const drop = Math.max(0, Math.min(needed, this.level.count) - this.dropped);
+    this.speech = this.speech.slice(drop);
+    this.dropped += drop;
+    return motion.subarray(0, this.plan.hop * this.size);
+  }
+
+  async make(window, heard) {
+    const start = window.start - window.context;
+    const first = this.sample(start) - this.dropped, last = this.sample(heard) - this.dropped;
+    this.level.hear(this.speech.subarray(Math.max(0, this.level.count - this.dropped), last));
+    const deviation = Math.max(this.level.deviation, QUIETEST_DEVIATION);
+    const motion = await this.generate(window, this.speech.slice(first, last), heard - start, this.level.mean, deviation);
+    this.held = motion.slice(-this.plan.overlap * this.size);
+    return motion;
+  }
+
+  counted(parts) {
+    this.frames += parts.reduce((sum, part) => sum + part.length / this.size, 0);
+    return parts;
+  }
+}

@@ -1,0 +1,193 @@
+"""An exported model as a web site: a page in which it animates recordings and the microphone, by WebAssembly.
+
+The site is a folder of plain files: the page, the worker that computes, ONNX Runtime for browsers, and the model. Any
+web server can offer it. The one here listens at this machine only, and sends the headers that let WebAssembly use
+threads.
+"""
+
+from __future__ import annotations
+
+import html
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from facediff.animation import Animation
+from facediff.animation.files import FORMAT as ARCHIVE
+from facediff.errors import FaceDiffError
+from facediff.export.format import outward
+from facediff.export.viewer.packing import Blobs, millimetres
+from facediff.export.viewer.page import assemble, script_of
+from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, read_folder
+from facediff.runtime.onnxruntime_web import LICENCE
+from facediff.utils.files import atomic_folder
+from facediff.utils.server import HEADERS as SERVED
+from facediff.utils.server import OwnPagesOnly, WithHeaders, names_of, require_server, run_server
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import Response
+
+FORMAT = "facediff site 1"
+PAGE = "index.html"
+SCRIPTS = (
+    *("motion", "surface", "clock", "camera", "scene", "stage", "plot", "waveform"),
+    *("dialogs", "report", "archive", "glb", "windows", "frame_clock", "resample", "talk"),
+)
+"""Parts of the page's script; each uses only the parts before it."""
+WORKER = ("archive", "npz", "noise", "windows", "voice_gate", "frame_clock", "exported", "generating", "talk_worker")
+"""Parts of the worker's script."""
+DELAYS = ({"seconds": 1.0, "overlap": 0.4},)
+"""Windows for a microphone that answer sooner than the model's own."""
+
+LOADS = "connect-src 'self'; worker-src 'self'; img-src data:; media-src blob:"
+"""What the page may load: its own worker and microphone script; sound that the reader has opened."""
+WORKER_POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; connect-src 'self'"
+"""What scripts of the site may load: themselves, compiled WebAssembly, and files of the site."""
+HEADERS = {
+    # With the opener policy of every page, these give a page shared memory, without which WebAssembly has one thread.
+    "Cross-Origin-Embedder-Policy": "require-corp",
+    "Permissions-Policy": "microphone=(self)",
+    "Cache-Control": "no-cache",
+}
+TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".mjs": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".wasm": "application/wasm",
+    ".txt": "text/plain; charset=utf-8",
+}
+
+Site = Mapping[str, bytes | Path]
+"""The files of a site by their paths in it: what is made, and where the others lie."""
+
+
+def make_site(folder: Path, runtime: Mapping[str, Path]) -> Site:
+    """The site of an exported model.
+
+    Args:
+        folder: of ``facediff export-model``.
+        runtime: ONNX Runtime's files, as :func:`facediff.runtime.onnxruntime_web.web_runtime` gives them.
+
+    Raises:
+        FaceDiffError: if the folder holds no model, or one without triangles.
+    """
+    description, arrays = read_folder(folder)
+    files: dict[str, bytes | Path] = {
+        PAGE: page(folder.resolve().name, description, arrays).encode(),
+        "worker.js": script_of(WORKER).encode(),
+        "capture.js": script_of(("capture",)).encode(),
+        "_headers": headers_file().encode(),
+        "onnxruntime/LICENCE.txt": LICENCE.encode(),
+    }
+    files |= {f"onnxruntime/{name}": path for name, path in runtime.items()}
+    # A page takes styles by their names: what encodes them from motion is left out.
+    graphs = [each for each in description.graphs if each != "style"]
+    files |= {f"model/{name}": folder / name for name in (DESCRIPTION, ARRAYS, *(f"{each}.onnx" for each in graphs))}
+    return files
+
+
+def page(title: str, description: Description, arrays: Arrays) -> str:
+    """The page of a model.
+
+    Raises:
+        FaceDiffError: if the model has no triangles.
+    """
+    if "faces" not in arrays:
+        raise FaceDiffError(
+            f"{title}: holds no triangles, which a picture needs; export a model whose corpus has a mesh"
+        )
+    face = Animation(
+        title,
+        arrays["templates"][:1].astype(np.float32),
+        arrays["templates"][0].astype(np.float32),
+        description.frame_rate,
+        faces=arrays["faces"].astype(np.int32),
+        unit=description.unit,
+    )
+    facts: dict[str, Any] = {
+        "format": FORMAT,
+        "archive": ARCHIVE,
+        "millimetres": millimetres(face),
+        "inward": not np.array_equal(outward(face), face.triangles),
+        "delays": DELAYS,
+    }
+    values = {"title": html.escape(title)}
+    return "".join(assemble("talk.html", ("style.css", "talk.css"), SCRIPTS, values, facts, Blobs(), loads=LOADS))
+
+
+def headers_file() -> str:
+    """The headers in the form in which several hosts of static files take them from the site itself."""
+    lines = ["/*", *(f"  {name}: {value}" for name, value in {**SERVED, **HEADERS}.items())]
+    return "\n".join(lines) + "\n"
+
+
+def write_site(site: Site, folder: Path) -> int:
+    """Write a site as a folder for any web server; how many bytes it has.
+
+    Raises:
+        FaceDiffError: if the folder has content already or cannot be written; nothing half-written stays.
+    """
+    with atomic_folder(folder) as staged:
+        for name, content in site.items():
+            path = staged / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if isinstance(content, bytes):
+                path.write_bytes(content)
+            else:
+                shutil.copyfile(content, path)
+        return sum(path.stat().st_size for path in staged.rglob("*") if path.is_file())
+
+
+def make_app(site: Site, hosts: tuple[str, ...] | None) -> Starlette:
+    """The ASGI application that offers a site, and nothing else.
+
+    Args:
+        site: its files.
+        hosts: names under which it is served; None for any.
+    """
+    from starlette.applications import Starlette
+    from starlette.middleware import Middleware
+    from starlette.responses import FileResponse, PlainTextResponse, Response
+    from starlette.routing import Route
+
+    async def show(request: Request) -> Response:
+        name = request.path_params["name"] or PAGE
+        content = site.get(name)
+        if content is None:
+            return PlainTextResponse("no such file", 404)
+        kind = TYPES.get(Path(name).suffix, "application/octet-stream")
+        # The page states its policy itself; scripts that run in workers have only this one.
+        headers = HEADERS if name == PAGE else {**HEADERS, "Content-Security-Policy": WORKER_POLICY}
+        if isinstance(content, bytes):
+            return Response(content, media_type=kind, headers=headers)
+        return FileResponse(content, media_type=kind, headers=headers)
+
+    return Starlette(
+        routes=[Route("/{name:path}", show)],
+        middleware=[Middleware(WithHeaders), Middleware(OwnPagesOnly, hosts=hosts)],
+    )
+
+
+def serve_site(
+    site: Site, *, host: str = "127.0.0.1", port: int = 0, ready: Callable[[str], object] | None = None
+) -> None:
+    """Serve a site until Ctrl-C.
+
+    Args:
+        site: its files.
+        host: address to listen at; by default nobody but this machine reaches it.
+        port: to listen at; 0 for any free one.
+        ready: called with the page's address as soon as it can be opened.
+
+    Raises:
+        FaceDiffError: if the address cannot be used.
+        MissingExtraError: if the server's packages are not installed.
+    """
+    require_server("serving a page")
+    run_server(lambda _: make_app(site, names_of(host)), host=host, port=port, ready=ready)

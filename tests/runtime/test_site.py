@@ -1,0 +1,163 @@
+"""The site of an exported model: what the server offers, to whom, and the folder that any server can offer."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+import uvicorn
+
+from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from facediff.runtime import onnxruntime_web
+from facediff.runtime.site import Site, make_app, make_site, write_site
+from facediff.utils.server import LOOPBACK, make_server
+from tests.fakes.exported import write_exported
+
+Serve = Callable[[Site], str]
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """Serves a site on a free port, and gives the address without a slash at its end."""
+    running: list[tuple[uvicorn.Server, threading.Thread, socket.socket]] = []
+
+    def start(site: Site) -> str:
+        listening = socket.create_server(("127.0.0.1", 0))
+        ready = threading.Event()
+        config = uvicorn.Config(
+            make_app(site, LOOPBACK), log_level="error", lifespan="off", ws="none", server_header=False
+        )
+        server = make_server(config, ready.set)
+        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
+        thread.start()
+        assert ready.wait(20)
+        running.append((server, thread, listening))
+        return f"http://127.0.0.1:{listening.getsockname()[1]}"
+
+    yield start
+    for server, thread, listening in running:
+        server.should_exit = True
+        thread.join(10)
+        listening.close()
+
+
+@pytest.fixture
+def runtime(tmp_path: Path) -> dict[str, Path]:
+    """Files in the place of ONNX Runtime's."""
+    for name in ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.wasm"):
+        (tmp_path / name).write_bytes(name.encode())
+    return {name: tmp_path / name for name in ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.wasm")}
+
+
+@pytest.fixture
+def site(runtime: dict[str, Path], tmp_path: Path) -> Site:
+    return make_site(write_exported(tmp_path / "<b>face"), runtime)
+
+
+def ask(url: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    request = urllib.request.Request(url, headers=headers)  # noqa: S310 - our own server
+    try:
+        with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310 - our own server
+            return response.status, {key.lower(): value for key, value in response.headers.items()}, response.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, {}, error.read()
+
+
+def test_every_file_is_offered_as_what_it_is_under_strict_headers(site: Site, serve: Serve) -> None:
+    address = serve(site)
+    kinds = {"": "text/html", "worker.js": "text/javascript", "onnxruntime/ort.wasm.min.mjs": "text/javascript"}
+    kinds |= {"onnxruntime/ort-wasm-simd-threaded.wasm": "application/wasm", "model/model.json": "application/json"}
+    for name, kind in kinds.items():
+        status, headers, content = ask(f"{address}/{name}")
+        assert (status, headers["content-type"].split(";")[0]) == (200, kind)
+        # Both are needed for shared memory, without which WebAssembly has one thread.
+        assert headers["cross-origin-opener-policy"] == "same-origin"
+        assert headers["cross-origin-embedder-policy"] == "require-corp"
+        wanted = site[name or "index.html"]
+        assert content == (wanted if isinstance(wanted, bytes) else wanted.read_bytes())
+        if name:
+            assert "default-src 'none'" in headers["content-security-policy"]
+    assert b"<b>face" not in ask(address)[2]
+
+
+def test_nothing_else_is_offered_and_no_other_page_may_ask(site: Site, serve: Serve) -> None:
+    address = serve(site)
+    for name in ("model/../../secret", "..%2f..%2fetc/passwd", "model/", "/etc/passwd", "model/notes.txt"):
+        assert ask(f"{address}/{name}")[0] == 404
+    assert ask(address, Host="evil.example")[0] == 403
+    assert ask(address, Origin="http://evil.example")[0] == 403
+
+
+def test_folder_holds_the_site(site: Site, tmp_path: Path) -> None:
+    size = write_site(site, tmp_path / "out")
+    found = {path.relative_to(tmp_path / "out").as_posix(): path for path in (tmp_path / "out").rglob("*.*")}
+    assert set(found) | {"_headers"} == set(site)
+    for name, path in found.items():
+        content = site[name]
+        assert path.read_bytes() == (content if isinstance(content, bytes) else content.read_bytes())
+    assert size == sum(path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file())
+    with pytest.raises(FaceDiffError, match="out"):
+        write_site(site, tmp_path / "out")
+
+
+def test_folder_that_is_interrupted_leaves_nothing(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.copyfile", mock.Mock(side_effect=KeyboardInterrupt))
+    before = set(tmp_path.iterdir())
+    with pytest.raises(KeyboardInterrupt):
+        write_site(site, tmp_path / "out")
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_model_without_triangles_is_refused(runtime: dict[str, Path], tmp_path: Path) -> None:
+    folder = write_exported(tmp_path / "model")
+    with np.load(folder / "arrays.npz") as archive:
+        arrays = {name: archive[name] for name in archive if name != "faces"}
+    np.savez_compressed(folder / "arrays.npz", **arrays)
+    text = (folder / "model.json").read_text()
+    size = (folder / "arrays.npz").stat().st_size
+    content = json.loads(text)
+    content["sizes"]["arrays.npz"] = size
+    (folder / "model.json").write_text(json.dumps(content))
+    with pytest.raises(FaceDiffError, match="triangles"):
+        make_site(folder, runtime)
+
+
+def test_command_writes_a_folder_and_says_errors_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(onnxruntime_web, "FILES", {})
+    monkeypatch.chdir(tmp_path)
+    write_exported(tmp_path / "face")
+    assert main(["serve", "face", "-o", "site"]) == 0
+    assert (tmp_path / "site" / "index.html").is_file()
+    capsys.readouterr()
+    for words, named in (
+        (["face", "-o", "site"], "--output site"),
+        (["missing"], "missing"),
+        (["face", "--runtime", "nowhere.tgz"], "--runtime nowhere.tgz"),
+        (["site"], "site/model.json"),
+    ):
+        assert main(["serve", *words]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert named in said
+
+
+def test_port_that_is_taken_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(onnxruntime_web, "FILES", {})
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert main(["serve", str(write_exported(tmp_path / "face")), "--port", port]) == 2
+    assert f"--port {port}" in capsys.readouterr().err
