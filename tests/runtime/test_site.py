@@ -25,7 +25,7 @@ from tests.fakes.exported import write_exported
 Serve = Callable[[Site], str]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def serve() -> Iterator[Serve]:
     """Serves a site on a free port, and gives the address without a slash at its end."""
     running: list[tuple[uvicorn.Server, threading.Thread, socket.socket]] = []

@@ -14,7 +14,9 @@ async function inflate(bytes, size, name) {
   const reader = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate-raw")).getReader();
   let at = 0;
   for (;;) {
-    const { done, value } = await reader.read();
+    const { done, value } = await reader.read().catch(() => {
+      throw new Error(`${name}: is damaged; copy or export the model again`);
+    });
     if (done) break;
     if (at + value.length > size) {
       await reader.cancel();

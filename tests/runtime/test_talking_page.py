@@ -1,0 +1,193 @@
+"""The page of an exported model in a real browser: the motion of the Python runtime, and errors in words."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from facediff.animation import Animation, read_archive
+from facediff.data.audio import read_speech
+from facediff.runtime import RuntimeModel
+from facediff.runtime.onnxruntime_web import web_runtime
+from facediff.runtime.site import make_site
+from tests.fakes.contrasts import CONTRASTS
+from tests.runtime.test_runtime import folder, largest, model, sound
+from tests.runtime.test_site import Serve, serve
+from tools.browser.chromium import Chromium, Page
+
+__all__ = ["folder", "model", "serve"]
+
+pytest.importorskip("onnxscript")
+
+HOSTILE = "</script><img src=x onerror=alert(1)>"
+BYTES = """((bytes) => {
+  let text = "";
+  for (let at = 0; at < bytes.length; at += 32768) text += String.fromCharCode(...bytes.subarray(at, at + 32768));
+  return btoa(text);
+})"""
+
+
+@pytest.fixture(scope="module")
+def web_files(web_runtime_package: Path) -> dict[str, Path]:
+    return web_runtime(web_runtime_package)
+
+
+@pytest.fixture(scope="module")
+def site(folder: Path, web_files: dict[str, Path]) -> dict[str, bytes | Path]:
+    """The site of the tiny model; what a test changes in it is seen by the pages that are open."""
+    return dict(make_site(folder, web_files))
+
+
+@pytest.fixture(scope="module")
+def page(site: dict[str, bytes | Path], browser: Chromium, serve: Serve) -> Iterator[Page]:
+    """The page of the model. At the end nothing may have gone wrong in it, and nothing may have left it."""
+    address = serve(site)
+    shown = browser.open(address)
+    shown.wait_for("window.facediff && (facediff.ready || facediff.errors.length)")
+    yield shown
+    assert shown.problems == []
+    assert shown.evaluate("facediff.errors") == []
+    assert [url for url in shown.requests if not url.startswith((address, "blob:", "data:"))] == []
+    shown.close()
+
+
+def choose(page: Page, file: Path) -> None:
+    """Choose a recording as a person does, and wait for its motion."""
+    root = page.send("DOM.getDocument")["root"]["nodeId"]
+    field = page.send("DOM.querySelector", nodeId=root, selector="#file")["nodeId"]
+    page.send("DOM.setFileInputFiles", files=[str(file)], nodeId=field)
+    page.wait_for("facediff.finished || facediff.errors.length")
+
+
+def archive_of(page: Page, path: Path) -> Animation:
+    """The animation that the page gives as a file."""
+    packed = "facediff.page.archive().then((parts) => new Blob(parts).arrayBuffer())"
+    text = page.evaluate(f"{packed}.then((all) => {BYTES}(new Uint8Array(all)))")
+    path.write_bytes(base64.b64decode(text))
+    return read_archive(path)
+
+
+def record(path: Path, seconds: float) -> Path:
+    """A recording with a pause at its end, in 16 bits."""
+    samples = np.concatenate([sound(seconds - 0.5), np.zeros(8000, np.float32)])
+    soundfile.write(path, samples, 16_000, subtype="PCM_16")
+    return path
+
+
+def test_page_gives_the_motion_of_the_python_runtime(folder: Path, page: Page, tmp_path: Path) -> None:
+    runtime = RuntimeModel.open(folder)
+    assert page.evaluate("crossOriginIsolated")
+    choices = {"identity": "B", "style": "A", "seed": 5, "expressivity": 1.5}
+    for seconds in (1.6, 4.3):  # in one pass, and by windows of which the last is short
+        file = record(tmp_path / "hello.wav", seconds)
+        for name, value in choices.items():
+            page.evaluate(f"document.getElementById('{name}').value = '{value}'")
+        choose(page, file)
+        found = archive_of(page, tmp_path / "found.npz")
+        speech = read_speech(file)
+        wanted = runtime.animate(speech, **choices, name="hello")  # type: ignore[arg-type]
+        assert largest(found.vertices, wanted.vertices) < 1e-4
+        np.testing.assert_allclose(found.speech, speech, atol=1 / 32_768)  # Chromium divides by 32767
+        np.testing.assert_array_equal(found.triangles, wanted.triangles)
+        assert (found.name, found.frame_rate, found.unit) == (wanted.name, wanted.frame_rate, wanted.unit)
+        assert {**found.metadata, "generator": ""} == {**wanted.metadata, "generator": ""}
+        assert found.regions.keys() == wanted.regions.keys()
+
+
+def test_page_plays_and_obeys_keys_and_buttons(page: Page, tmp_path: Path) -> None:
+    page.evaluate("document.getElementById('identity').value = 'A'")
+    choose(page, record(tmp_path / "hello.wav", 1.6))
+    page.wait_for("facediff.frame > 5")  # it plays by itself
+    page.press("ArrowLeft")
+    page.wait_for("!facediff.playing")
+    page.press("End")
+    page.wait_for("facediff.frame === 39")
+    page.press("Home")
+    page.wait_for("facediff.frame === 0")
+    shown = "[...facediff.page.stage.face.positions]"
+    first = page.evaluate(shown)
+    page.press("ArrowRight")
+    page.wait_for("facediff.frame === 1")
+    page.wait_for(f"String({shown}) !== '{','.join(map(str, first[:3]))}' && facediff.page.stage.shown > 2")
+    offsets = np.array(page.evaluate("[...facediff.page.animated.at(1)]")) * 1000
+    template = np.array(page.evaluate("[...facediff.page.stage.face.template]"))
+    np.testing.assert_allclose(page.evaluate(shown), template + offsets, atol=1e-3)
+    # Another face of the model has no animation yet.
+    page.evaluate(
+        "(find => (find.value = 'B', find.dispatchEvent(new Event('change'))))(document.getElementById('identity'))"
+    )
+    assert page.evaluate("document.getElementById('play').disabled && !document.getElementById('again').disabled")
+    page.evaluate("document.getElementById('again').click()")
+    page.wait_for("facediff.finished")
+    assert page.evaluate("facediff.page.animated.names.identity") == "B"
+    page.evaluate("(document.getElementById('again').click(), document.getElementById('cancel').click())")
+    page.wait_for("!facediff.page.job && !facediff.page.animated")
+
+
+@pytest.mark.parametrize(("width", "height", "dark"), [(1280, 800, True), (375, 740, False)])
+def test_wide_and_narrow_windows_have_room_and_contrast(width: int, height: int, dark: bool, page: Page) -> None:
+    page.resize(width, height)
+    scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+    page.send("Emulation.setEmulatedMedia", features=[scheme])
+    facts = page.evaluate(
+        """({
+          over: document.documentElement.scrollWidth - innerWidth,
+          below: document.documentElement.scrollHeight - innerHeight,
+          stage: document.getElementById("stage").getBoundingClientRect().height,
+          controls: [...document.querySelectorAll("button, select, input")].filter((each) => each.offsetParent)
+            .map((each) => [each.getBoundingClientRect().left, each.getBoundingClientRect().right]),
+          named: [...document.querySelectorAll("button, select, input")]
+            .every((each) => (each.ariaLabel || each.textContent || each.labels?.[0]?.textContent || "").trim()),
+        })"""
+    )
+    assert facts["over"] <= 0
+    assert facts["below"] <= 0
+    assert facts["stage"] > 150
+    assert facts["named"]
+    assert all(left >= 0 and right <= width for left, right in facts["controls"])
+    contrasts = page.evaluate(CONTRASTS)
+    assert len(contrasts) > 10
+    assert min(contrasts)[0] >= 4.5, min(contrasts)
+
+
+def test_damaged_model_is_refused_in_words_and_names_are_text(
+    folder: Path, site: dict[str, bytes | Path], page: Page
+) -> None:
+    """Models that are changed after the page was made, as on anybody's server."""
+    whole, about = dict(site), json.loads((folder / "model.json").read_text())
+    arrays = (folder / "arrays.npz").read_bytes()
+    flipped = arrays[:120] + bytes([arrays[120] ^ 1]) + arrays[121:]  # in the numbers of the first array
+    speech = b"!" * about["sizes"]["speech.onnx"]
+    reload = "facediff.page.load('wasm').then(() => '', (error) => error.message)"
+
+    def described(**fields: object) -> bytes:
+        return json.dumps({**about, **fields}).encode()
+
+    cases: list[tuple[str, bytes, str]] = [
+        ("model.json", b"{", "model.json"),
+        ("model.json", b"[]", "model.json"),
+        ("model.json", described(frame_rate=1e9), "frame_rate"),
+        ("model.json", described(windows={"seconds": 1e9}), "windows"),
+        ("model.json", described(sizes={}), "sizes"),
+        ("model.json", described(faces=["A", HOSTILE]), "templates"),
+        ("arrays.npz", arrays + b"!", "arrays.npz"),
+        ("arrays.npz", flipped, "arrays.npz"),
+        ("speech.onnx", speech, "speech.onnx"),
+    ]
+    for name, content, named in cases:
+        site[f"model/{name}"] = content
+        assert named in page.evaluate(reload)
+        site.update(whole)
+    hostile = [HOSTILE, *about["faces"][1:]]
+    site["model/model.json"] = described(model=HOSTILE, faces=hostile, identities=hostile[:2], styles=about["styles"])
+    page.evaluate("(facediff.page.about = null, document.getElementById('identity').replaceChildren())")
+    assert page.evaluate(reload) == ""
+    assert page.evaluate("document.getElementById('identity').value") == HOSTILE
+    assert HOSTILE in page.evaluate("document.getElementById('about').textContent")
+    assert page.evaluate("document.images.length") == 0
