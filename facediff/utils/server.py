@@ -50,6 +50,30 @@ def names_of(host: str) -> tuple[str, ...] | None:
     return tuple(dict.fromkeys((*LOOPBACK, host)))
 
 
+def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None) -> bool:
+    """Whether a request is for a server under one of its own names, and no page from elsewhere sends it.
+
+    A page from elsewhere can let its own name point to this machine; its requests then carry that name as their host.
+
+    Args:
+        host: of the request, with its port.
+        origin: of the page whose script sends it; None if none does.
+        hosts: names under which the page is served; None if any may be right, as where all addresses are listened at.
+
+    Example:
+        >>> is_own_page("localhost:80", "http://localhost:80", LOOPBACK), is_own_page("evil.example", None, LOOPBACK)
+        (True, False)
+    """
+    if origin is not None and origin.lower() != f"http://{host.lower()}":
+        return False
+    if hosts is None:
+        return True
+    try:
+        return (urlsplit(f"//{host}").hostname or "") in {name.lower() for name in hosts}
+    except ValueError:
+        return False
+
+
 class WithHeaders:
     """Adds :data:`HEADERS` to every response."""
 
@@ -71,22 +95,20 @@ class WithHeaders:
 class OwnPagesOnly:
     """Refuses requests under another host's name, and those that another page's script sends.
 
-    A page from elsewhere can let its own name point to this machine; its requests then carry that name as their host.
-
     Args:
         app: the ASGI application.
-        hosts: names under which the page is served; None if any may be right, as where all addresses are listened at.
+        hosts: as :func:`is_own_page` takes them.
     """
 
     def __init__(self, app: Any, hosts: Collection[str] | None) -> None:  # noqa: ANN401 - any ASGI application
         self.app = app
-        self.hosts = None if hosts is None else {host.lower() for host in hosts}
+        self.hosts = hosts
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401 - of ASGI
         """Answer a request."""
         headers = {name.lower(): value.decode("latin-1") for name, value in scope.get("headers", [])}
         host, origin = headers.get(b"host", ""), headers.get(b"origin")
-        if self._knows(host) and (origin is None or origin.lower() == f"http://{host.lower()}"):
+        if is_own_page(host, origin, self.hosts):
             await self.app(scope, receive, send)
             return
         body = b'{"error": "only the page that this server shows may ask it"}'
@@ -94,14 +116,6 @@ class OwnPagesOnly:
         start = [(b"content-type", b"application/json"), (b"content-length", length)]
         await send({"type": "http.response.start", "status": 403, "headers": start})
         await send({"type": "http.response.body", "body": body})
-
-    def _knows(self, host: str) -> bool:
-        if self.hosts is None:
-            return True
-        try:
-            return (urlsplit(f"//{host}").hostname or "") in self.hosts
-        except ValueError:
-            return False
 
 
 async def read_body(request: Request, most_bytes: int) -> dict[str, Any]:
@@ -127,20 +141,22 @@ async def read_body(request: Request, most_bytes: int) -> dict[str, Any]:
     return content
 
 
-def require_server(purpose: str) -> None:
+def require_server(purpose: str, names: Collection[str] = ("starlette", "uvicorn"), extra: str = "study") -> None:
     """Refuse to begin where the server's packages are not installed.
 
     Args:
         purpose: what they are needed for.
+        names: of the packages.
+        extra: of facediff that brings them.
 
     Raises:
         MissingExtraError: naming the extra.
     """
-    for name in ("starlette", "uvicorn"):
+    for name in names:
         try:
             importlib.import_module(name)
         except ImportError as error:
-            raise MissingExtraError(name, "study", purpose) from error
+            raise MissingExtraError(name, extra, purpose) from error
 
 
 def run_server(

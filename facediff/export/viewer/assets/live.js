@@ -1,0 +1,241 @@
+// A performance while it happens: frames and speech come over a WebSocket, and are shown and heard together.
+
+const HEADER = 24, MESH = 0, FRAME = 1, SPEECH = 2; // as the receiver's description has them
+/** Waits between attempts to connect, in ms; the last one is repeated. */
+const RETRIES = [250, 500, 1000, 2000, 4000];
+const SILENCE_MS = 1500; // without a frame: nobody performs
+const LATE_S = 0.5; // a lag that anybody notices
+/** Seconds: of sound that is planned ahead of the picture at least; that both may be apart; that speech is kept for. */
+const CUSHION = 0.03, APART = 0.04, KEPT = 10;
+
+/** Plays speech with the frames of the same time, however much later than the speech they come. */
+class DelayedSpeech {
+  constructor(rate) {
+    this.rate = rate;
+    this.on = false;
+    this.context = null; // browsers give none before a person has clicked
+    this.delay = null; // seconds by the page's clock at which frames of time 0 were shown
+    this.waiting = [];
+    this.planned = null; // times of speech and of the sound device at which what is planned ends
+    this.played = 0;
+    this.anchors = 0; // times that the sound had to be moved to the picture
+  }
+
+  async toggle() {
+    this.on = !this.on;
+    this.planned = null;
+    this.waiting = [];
+    this.context ??= new AudioContext();
+    await (this.on ? this.context.resume() : this.context.suspend());
+  }
+
+  /** A frame of a time came onto the page. */
+  frame(time, now) {
+    const delay = now - time;
+    // Frames come a little early or late; their mean does not.
+    this.delay = this.delay === null || Math.abs(delay - this.delay) > 1 ? delay : this.delay + (delay - this.delay) / 20;
+    this.plan(now);
+  }
+
+  /** Speech that begins at a time. */
+  speech(time, samples, now) {
+    if (!this.on) return;
+    this.waiting.push({ time, samples });
+    const oldest = this.waiting.at(-1).time - KEPT;
+    while (this.waiting[0].time < oldest) this.waiting.shift();
+    this.plan(now);
+  }
+
+  plan(now) {
+    if (!this.on || this.delay === null) return;
+    for (const { time, samples } of this.waiting.splice(0)) {
+      const wanted = this.context.currentTime + (time + this.delay - now) + CUSHION;
+      const follows = this.planned && Math.abs(this.planned.time - time) < 1e-3 && Math.abs(this.planned.at - wanted) < APART;
+      const at = follows ? this.planned.at : wanted;
+      if (at < this.context.currentTime) continue; // too late to be heard with its face
+      if (!follows) this.anchors += 1;
+      const buffer = this.context.createBuffer(1, samples.length, this.rate);
+      buffer.copyToChannel(Float32Array.from(samples, (each) => each / 32767), 0);
+      const source = this.context.createBufferSource();
+      source.buffer = buffer;
+      source.connect(this.context.destination);
+      source.start(at);
+      this.planned = { time: time + samples.length / this.rate, at: at + samples.length / this.rate };
+      this.played += samples.length;
+    }
+  }
+}
+
+class LivePage {
+  constructor() {
+    this.attempts = 0;
+    this.connections = 0;
+    this.stage = null;
+    this.speech = null;
+    this.arrivals = []; // of the last second, in ms
+    this.stats = { received: 0, missed: 0, dropped: 0, lag: 0, index: -1, time: 0 };
+    this.last = -Infinity;
+    this.connect();
+    setInterval(() => this.showNumbers(), 250);
+  }
+
+  connect() {
+    const socket = new WebSocket(`ws://${location.host}/live`);
+    this.socket = socket;
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = ({ data }) => {
+      try {
+        typeof data === "string" ? this.begin(JSON.parse(data)) : this.take(data);
+      } catch (error) {
+        report(error);
+        socket.close();
+      }
+    };
+    socket.onclose = () => this.again();
+  }
+
+  /** Try to connect again, less and less often. */
+  again() {
+    const wait = RETRIES[Math.min(this.attempts, RETRIES.length - 1)];
+    this.attempts += 1;
+    this.stage?.perform(false);
+    document.body.classList.add("lost");
+    this.say("Nobody performs here; trying to connect again …");
+    setTimeout(() => this.connect(), wait);
+  }
+
+  say(words) {
+    if (find("state").textContent !== words) find("state").textContent = words;
+  }
+
+  begin(about) {
+    if (about.format !== this.format()) throw new Error("the performance has another format: load this page again");
+    // What is on the graphics card belongs to one mesh.
+    if (this.about && this.about.mesh !== about.mesh) return location.reload();
+    this.about = about;
+    this.attempts = 0;
+    this.connections += 1;
+    this.stats.index = -1;
+    document.body.classList.remove("lost");
+    this.say("Connected: waiting for frames");
+    document.querySelector("h1").textContent = about.subject;
+    find("about").replaceChildren(
+      describe([["frames a second", String(about.frameRate)], ...Object.entries(about.metadata)]),
+      make("p", "fine", `Positions are rounded to ${about.step} mm on each axis.`)
+    );
+    find("sound").hidden = !about.speech;
+    if (about.speech) this.speech ??= new DelayedSpeech(about.sampleRate);
+  }
+
+  format() {
+    return JSON.parse(find("facts").textContent).format;
+  }
+
+  take(data) {
+    const view = new DataView(data);
+    const kind = view.getUint8(0);
+    if (kind === MESH) this.wear(view, data);
+    else if (kind === FRAME) this.show(view, data);
+    else if (kind === SPEECH) this.speech?.speech(view.getFloat64(16, true), new Int16Array(data, HEADER), performance.now() / 1000);
+  }
+
+  wear(view, data) {
+    const [vertices, triangles, coloured] = [4, 8, 12].map((at) => view.getUint32(at, true));
+    if (this.stage) return;
+    const template = new Float32Array(data, HEADER, 3 * vertices);
+    const faces = new Uint32Array(data, HEADER + 12 * vertices, 3 * triangles);
+    const colours = coloured ? new Uint8Array(data, HEADER + 12 * vertices + 12 * triangles, 3 * vertices) : null;
+    this.offsets = new Float32Array(3 * vertices);
+    this.stage = new Stage(find("view"), find("stage"), { template, faces, colours }, this.about.frameRate);
+    document.body.classList.add("ready");
+  }
+
+  show(view, data) {
+    const now = performance.now();
+    const index = view.getUint32(4, true), time = view.getFloat64(16, true);
+    this.socket.send(String(index));
+    const { offsets, stats } = this;
+    const steps = new Int16Array(data, HEADER);
+    if (steps.length !== offsets.length) throw new Error("a frame has another number of vertices than the face");
+    for (let i = 0; i < offsets.length; i++) offsets[i] = this.about.step * steps[i];
+    this.stage.push(offsets);
+    if (!this.stage.performing) this.stage.perform(true);
+    if (stats.index >= 0) stats.missed += Math.max(0, index - stats.index - 1);
+    Object.assign(stats, { index, time, dropped: view.getUint32(8, true), lag: view.getFloat32(12, true) });
+    stats.received += 1;
+    this.last = now;
+    this.arrivals.push(now);
+    this.speech?.frame(time, now / 1000);
+    this.say("Live");
+  }
+
+  showNumbers() {
+    const now = performance.now(), { stats } = this;
+    while (this.arrivals.length && this.arrivals[0] < now - 1000) this.arrivals.shift();
+    const performing = now - this.last < SILENCE_MS;
+    if (!performing && this.stage?.performing) {
+      this.stage.perform(false);
+      if (this.socket.readyState === WebSocket.OPEN) this.say("Connected: waiting for frames");
+    }
+    document.body.classList.toggle("late", performing && stats.lag > LATE_S);
+    find("lag").textContent = performing ? `${Math.round(1000 * stats.lag)} ms` : "–";
+    find("rate").textContent = performing ? `${this.arrivals.length} frames/s` : "–";
+    find("dropped").textContent = stats.received ? String(stats.missed) : "–";
+    find("time").textContent = stats.received ? `${stats.time.toFixed(1)} s` : "–";
+  }
+
+  press(id, on) {
+    find(id).setAttribute("aria-pressed", String(on));
+  }
+
+  controls() {
+    const sound = async () => {
+      if (!this.speech) return;
+      await this.speech.toggle();
+      this.press("sound", this.speech.on);
+    };
+    const edges = () => {
+      this.stage?.setEdges(!this.stage.edges);
+      this.press("wireframe", Boolean(this.stage?.edges));
+    };
+    find("sound").addEventListener("click", () => sound().catch(report));
+    find("wireframe").addEventListener("click", edges);
+    find("reset").addEventListener("click", () => this.stage?.camera.reset());
+    const actions = {
+      "+": (camera) => camera.magnify(1.15),
+      "-": (camera) => camera.magnify(1 / 1.15),
+      a: (camera) => camera.turn(-0.1, 0),
+      d: (camera) => camera.turn(0.1, 0),
+      w: (camera) => camera.turn(0, 0.1),
+      s: (camera) => camera.turn(0, -0.1),
+      r: (camera) => camera.reset(),
+      e: edges,
+      m: () => find("sound").hidden || find("sound").click(),
+      "?": () => find("keys").showModal(),
+    };
+    addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || !this.stage) return;
+      const action = actions[event.key.toLowerCase()];
+      if (!action) return;
+      event.preventDefault();
+      action(this.stage.camera);
+    });
+  }
+}
+
+connectDialogs();
+const livePage = new LivePage();
+livePage.controls();
+// What scripts and tests may use.
+window.facediff = {
+  errors,
+  get ready() { return Boolean(livePage.stage); },
+  get connections() { return livePage.connections; },
+  get stats() { return { ...livePage.stats, shown: livePage.stage?.shown ?? 0 }; },
+  get speech() {
+    const { speech } = livePage;
+    return speech && { on: speech.on, played: speech.played, anchors: speech.anchors, delay: speech.delay, planned: speech.planned };
+  },
+  get positions() { return livePage.stage?.face.positions; },
+  get state() { return find("state").textContent; },
+};
