@@ -8,10 +8,10 @@ the address gives as ``?option=value``.
 from __future__ import annotations
 
 import re
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from time import monotonic
 from typing import Any, cast
 from urllib.parse import parse_qsl, urlsplit
 
@@ -51,7 +51,7 @@ class LiveFrame:
     @property
     def lag(self) -> float:
         """Seconds since its speech was heard."""
-        return time.monotonic() - self.heard
+        return monotonic() - self.heard
 
 
 @dataclass(frozen=True)
