@@ -24,6 +24,7 @@ from facediff.models.layers import (
     Rotation,
     Share,
     Width,
+    all_states,
     exporting,
     needed_mask,
 )
@@ -283,7 +284,7 @@ class GruDecoder(Decoder):
         lengths, scale, shift = self.prepare(style, mask) if prepared is None else prepared
         if exporting():
             # Graphs know no packed sequences: they take clips of one length, see ``graph_takes_padding``.
-            return torch.addcmul(shift, self.norm(self.gru(fused)[0] + fused), scale)
+            return torch.addcmul(shift, self.norm(all_states(self.gru, fused) + fused), scale)
         # Packed, so that the backward direction starts at a clip's own last frame and not in its padding.
         packed = pack_padded_sequence(fused, lengths, batch_first=True, enforce_sorted=False)
         hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])

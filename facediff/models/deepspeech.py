@@ -19,8 +19,17 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from facediff.errors import ArgumentError, FaceDiffError
-from facediff.models.audio_encoders import AudioEncoder, Features, Lengths, Waves, by_length, fingerprint
-from facediff.models.layers import Frames, Width, frame_mask, interpolate_frames
+from facediff.models.audio_encoders import AudioEncoder, Features, Lengths, Waves, by_length, fingerprint, fourier
+from facediff.models.layers import (
+    Frames,
+    Width,
+    all_states,
+    exporting,
+    frame_mask,
+    interpolate_frames,
+    longest,
+    sliding,
+)
 from facediff.registry import audio_encoder
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.limits import quoted
@@ -79,9 +88,15 @@ def cepstra(samples: Float64[Tensor, "batch samples"]) -> Float64[Tensor, "batch
         samples: whole numbers of 16 bits, at 16 kHz.
     """
     emphasised = torch.cat([samples[:, :1], samples[:, 1:] - 0.97 * samples[:, :-1]], 1)
-    steps = 1 + max(0, math.ceil((samples.shape[1] - FRAME) / HOP))
+    steps = 1 + max(0, (samples.shape[1] - FRAME + HOP - 1) // HOP)
     padded = nn.functional.pad(emphasised, (0, (steps - 1) * HOP + FRAME - samples.shape[1]))
-    power = torch.fft.rfft(padded.unfold(1, FRAME, HOP), SPECTRUM).abs().square() / SPECTRUM
+    frames = sliding(padded[..., None], FRAME, HOP, steps)[:, :, 0]
+    if exporting():  # browsers' runtimes have no complex numbers
+        kernel = fourier(FRAME, SPECTRUM).to(frames)
+        real, imaginary = (frames @ kernel).chunk(2, -1)
+        power = (real.square() + imaginary.square()) / SPECTRUM
+    else:
+        power = torch.fft.rfft(frames, SPECTRUM).abs().square() / SPECTRUM
     filters, transform = tables()
     tiny = torch.finfo(torch.float64).eps
 
@@ -89,8 +104,7 @@ def cepstra(samples: Float64[Tensor, "batch samples"]) -> Float64[Tensor, "batch
         return torch.where(x == 0, tiny, x).log()
 
     made = logarithm(power @ filters.T) @ transform.T
-    made[..., 0] = logarithm(power.sum(-1))
-    return made
+    return torch.cat([logarithm(power.sum(-1, keepdim=True)), made[..., 1:]], -1)
 
 
 def network_input(audio: Waves, context: int) -> Float[Tensor, "batch steps inputs"]:
@@ -104,7 +118,7 @@ def network_input(audio: Waves, context: int) -> Float[Tensor, "batch steps inpu
     samples = (audio.cpu().double() * 32768.0).trunc().clamp(-32768, 32767)
     found = nn.functional.pad(cepstra(samples)[:, ::2], (0, 0, context, context))
     # (batch, steps, cepstra, steps around): a step's row holds one step after the other.
-    rows = found.unfold(1, 2 * context + 1, 1).transpose(2, 3).flatten(2)
+    rows = sliding(found, 2 * context + 1, 1, found.shape[1] - 2 * context).transpose(2, 3).flatten(2)
     mean = rows.mean((1, 2), keepdim=True)
     deviation = rows.std((1, 2), correction=0, keepdim=True)
     return ((rows - mean) / deviation).to(audio)
@@ -134,7 +148,7 @@ class DeepSpeech(nn.Module):
         """Logits over letters, space, apostrophe and blank, of clips of one length."""
         for layer in (self.first, self.second, self.third):
             x = layer(x).clamp(0.0, LOUDEST)
-        x = self.fifth(self.recurrent(x)[0]).clamp(0.0, LOUDEST)
+        x = self.fifth(all_states(self.recurrent, x)).clamp(0.0, LOUDEST)
         logits: Tensor = self.logits(x)
         return logits
 
@@ -317,12 +331,12 @@ class DeepSpeechEncoder(AudioEncoder):
     ) -> Float[Tensor, "batch most_steps width"]:
         """Encode at the times of another rate; the last logits are held. See :meth:`AudioEncoder.at_rate`."""
         features, lengths = cached or self.frozen_features(audio, audio_lengths)
-        times = torch.arange(int(steps.max()), dtype=torch.float64) * (RATE / rate)
+        times = torch.arange(longest(steps), dtype=torch.float64) * (RATE / rate)
         places = torch.minimum(times[None], lengths.cpu().double()[:, None] - 1)
         low = places.floor().long()
         high = torch.minimum(low + 1, lengths.cpu()[:, None] - 1).to(features.device)
         share = (places - low)[..., None].to(features)
-        rows = torch.arange(len(features), device=features.device)[:, None]
+        rows = torch.arange(features.shape[0], device=features.device)[:, None]
         made = torch.lerp(features[rows, low.to(features.device)], features[rows, high], share)
         made = made if self.out is None else self.out(made)
         return made * frame_mask(steps, made.shape[1])[..., None]

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from facediff.data import Batch
 from facediff.data.frame_clock import FrameClock
 from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import Lengths, Waves
@@ -167,6 +168,9 @@ class Speech:
     audio_lengths: Lengths
     cached_features: None = None
 
+
+Spoken = Batch | Speech
+"""Where speech is found."""
 
 Hear = Callable[[Speech, Int[Tensor, " batch"], int], Tensor]
 """Features of speech for a number of frames of each clip, and the largest of these numbers."""

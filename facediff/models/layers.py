@@ -129,6 +129,43 @@ def interpolate_ends(features: Float[Tensor, "batch steps dim"], frames: int) ->
     return F.interpolate(features.transpose(1, 2), size=frames, mode="linear", align_corners=True).transpose(1, 2)
 
 
+def all_states(network: nn.GRU | nn.LSTM, x: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames states"]:
+    """The states of a recurrent network after each frame, of clips of one length; its input has the batch first."""
+    return recurrent_nodes(network, x) if exporting() else network(x)[0]
+
+
+def recurrent_nodes(
+    network: nn.GRU | nn.LSTM, x: Float[Tensor, "batch frames dim"]
+) -> Float[Tensor, "batch frames states"]:
+    """The same as nodes of the ONNX format, since PyTorch would record every frame by itself, or a loop over them."""
+    lstm, ends = isinstance(network, nn.LSTM), ("", "_reverse")[: 1 + network.bidirectional]
+    # PyTorch's gates are i, f, g, o and r, z, n; ONNX has i, o, f, c and z, r, h.
+    order = [0, 3, 1, 2] if lstm else [1, 0, 2]
+    attributes: dict[str, int | str] = {
+        "hidden_size": network.hidden_size,
+        "direction": "bidirectional" if network.bidirectional else "forward",
+        **({} if lstm else {"linear_before_reset": 1}),
+    }
+
+    def stacked(name: str) -> Tensor:
+        parts = [getattr(network, f"{name}{end}").unflatten(0, (len(order), -1))[order].flatten(0, 1) for end in ends]
+        return torch.stack(parts)
+
+    x = x.transpose(0, 1)
+    for layer in range(network.num_layers):
+        bias = torch.cat([stacked(f"bias_ih_l{layer}"), stacked(f"bias_hh_l{layer}")], 1)
+        weights = stacked(f"weight_ih_l{layer}"), stacked(f"weight_hh_l{layer}"), bias
+        made = torch.onnx.ops.symbolic(
+            "LSTM" if lstm else "GRU",
+            (x, *weights),
+            attributes,  # type: ignore[arg-type]
+            dtype=x.dtype,
+            shape=(x.shape[0], len(ends), x.shape[1], network.hidden_size),
+        )
+        x = made.transpose(1, 2).flatten(2)  # directions side by side
+    return x.transpose(0, 1)
+
+
 class RotaryEmbedding(nn.Module):
     """Rotary position embedding: rotates channel pairs by an angle proportional to the frame number.
 

@@ -25,6 +25,8 @@ from facediff.models.layers import (
     Layers,
     Share,
     Width,
+    all_states,
+    exporting,
     interpolate_frames,
 )
 from facediff.registry import identity_encoder, style_encoder
@@ -212,8 +214,11 @@ class TcnGruTransformer(StyleEncoder):
         lengths = mask.sum(1)
         x = torch.stack([branch(reference, column) for branch in self.branches]).mean(0)  # F_TCN, eq. 2
         # Packed, so that the backward direction starts at a clip's own last frame and not in its padding (eq. 3 to 5).
-        packed = pack_padded_sequence(x, lengths.cpu(), batch_first=True, enforce_sorted=False)
-        x, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=mask.shape[1])
+        if exporting():
+            x = all_states(self.gru, x)  # graphs take clips of one length
+        else:
+            packed = pack_padded_sequence(x, lengths.cpu(), batch_first=True, enforce_sorted=False)
+            x, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=mask.shape[1])
         # The position embedding P, stretched to each clip's length, and the Transformer (eq. 6).
         rows = torch.full_like(lengths, self.positions.shape[0])
         positions = interpolate_frames(self.positions.expand(len(lengths), -1, -1), rows, lengths)
@@ -315,13 +320,12 @@ class LstmStyle(StyleEncoder):
         if self.pooling == "mean":
             return (states * mask[..., None]).sum(1) / mask.sum(1)[:, None].clamp_min(1)
         last = mask.sum(1) - 1
-        return states[torch.arange(len(states), device=states.device), last]
+        return states[torch.arange(states.shape[0], device=states.device), last]
 
     def states(self, reference: Frames, mask: FrameMask) -> Float[Tensor, "batch frames style_dim"]:
         """The state after each frame: it depends on that frame and those before it alone."""
         # Padding comes after all valid frames; zeros keep what is not finite there out of the gradient.
-        states: Tensor = self.lstm(reference.masked_fill(~mask[..., None], 0.0))[0]
-        return states
+        return all_states(self.lstm, reference.masked_fill(~mask[..., None], 0.0))
 
 
 @style_encoder.register("none")

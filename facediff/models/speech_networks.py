@@ -26,7 +26,7 @@ from facediff.models.audio_encoders import (
     load_typed,
     with_edges,
 )
-from facediff.models.layers import Frames, Share, Width, interpolate_ends, interpolate_frames
+from facediff.models.layers import Frames, Share, Width, exporting, interpolate_ends, interpolate_frames, longest
 from facediff.registry import audio_encoder
 from facediff.utils.ranges import Range
 
@@ -188,6 +188,8 @@ class Wav2Vec2Encoder(AudioEncoder):
 
 def by_lengths(padded: Tensor, lengths: Tensor, steps: Tensor, encode: Callable[[Tensor, int], Tensor]) -> Tensor:
     """Encode clips that agree in length and wanted steps together, without their padding; the padded results."""
+    if exporting():
+        return encode(padded, longest(steps))  # graphs take clips of one length
     # The networks attend to all of a clip without a mask, so padding would change every step.
     parts: dict[int, Tensor] = {}
     pairs = list(zip(lengths.tolist(), steps.tolist(), strict=True))

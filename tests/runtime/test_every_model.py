@@ -6,8 +6,7 @@ slow ones export them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import torch
 from facediff import registry
 from facediff.data.windows import WindowPlan
 from facediff.errors import FaceDiffError
-from facediff.models import AnimationModel, StyleContentDisentanglement
+from facediff.models import AnimationModel
 from facediff.models.graphs import Graph
 from facediff.pipelines.export_model import arrays_of, describe, export_model
 from facediff.runtime import RuntimeModel
@@ -30,11 +29,32 @@ PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
 MEL = partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0)
 SIZES: dict[str, Any] = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": float(RATE), "audio_encoder": MEL}
 
-CASES: dict[str, Callable[[], AnimationModel]] = {
-    "style content": partial(StyleContentDisentanglement, **SIZES, dim=16, content_dim=16),
-    "style content at 50": partial(StyleContentDisentanglement, **SIZES, dim=16, content_dim=16, speech_rate=50),
-    "style content at 12.5": partial(StyleContentDisentanglement, **SIZES, dim=16, content_dim=16, speech_rate=12.5),
+STYLE_CONTENT = {"dim": 16, "content_dim": 16}
+PUBLISHED = {"audio_dim": 16, "dim": 16}
+SELFTALK = {**PUBLISHED, "lip_reader": "none"}
+VOCA = {**PUBLISHED, "components": 8, "channels": (8, 8)}
+OWN = {"audio_dim": None}  # the encoder's own channels
+
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "style content": ("StyleContentDisentanglement", STYLE_CONTENT),
+    "style content at 50": ("StyleContentDisentanglement", {**STYLE_CONTENT, "speech_rate": 50}),
+    "style content at 12.5": ("StyleContentDisentanglement", {**STYLE_CONTENT, "speech_rate": 12.5}),
+    "SelfTalk": ("SelfTalk", SELFTALK),
+    "SelfTalk at 25, wav2vec": ("SelfTalk", {**SELFTALK, **OWN, "audio_encoder": "wav2vec2"}),
+    "SelfTalk at 30, wav2vec": ("SelfTalk", {**SELFTALK, **OWN, "audio_encoder": "wav2vec2", "frame_rate": 30.0}),
+    "Voca": ("Voca", VOCA),
+    "Voca at 25, DeepSpeech": ("Voca", {**VOCA, **OWN, "audio_encoder": "deepspeech"}),
+    "Voca at 60, DeepSpeech": ("Voca", {**VOCA, **OWN, "audio_encoder": "deepspeech", "frame_rate": 60.0}),
 }
+"""Models by what is special about them, and their options."""
+
+Sources = dict[str, Path]
+
+
+@pytest.fixture
+def sources(hubert_source: Path, deepspeech_source: Path) -> Sources:
+    """Pretrained networks in miniature by the audio encoder that reads them."""
+    return {"wav2vec2": hubert_source, "deepspeech": deepspeech_source}
 
 
 @dataclass
@@ -53,15 +73,20 @@ class Session:
         return [each.numpy() for each in (made if isinstance(made, tuple) else (made,))]
 
 
-def ready(case: str, root: Path) -> AnimationModel:
+def ready(case: str, root: Path, sources: Sources) -> AnimationModel:
     torch.manual_seed(0)
-    made, data = CASES[case](), Tiny(root=str(root))
+    name, options = CASES[case]
+    options = {**SIZES, **options}
+    if isinstance(encoder := options["audio_encoder"], str):
+        options["audio_encoder"] = partial(registry.audio_encoder.get(encoder), source=str(sources[encoder]))
+    made, data = registry.model.get(name)(**options), Tiny(root=str(root))
     for parameter in made.parameters():
         if parameter.requires_grad and not parameter.any():
             torch.nn.init.normal_(parameter, std=0.1)
-    made.adopt(data.assets().with_motion_scale(data.motion_scale()))
+    assets = data.assets().with_motion_scale(data.motion_scale())
+    made.adopt(replace(assets, frame_rate=made.frame_rate))
     made.attach_mesh()
-    return made.eval()
+    return made.eval()  # type: ignore[no-any-return]
 
 
 def in_eager(model: AnimationModel) -> RuntimeModel:
@@ -84,8 +109,8 @@ def assert_alike(runtime: RuntimeModel, model: AnimationModel, seconds: float, i
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_runtime_gives_what_the_model_gives(case: str, tiny_root: Path) -> None:
-    model = ready(case, tiny_root)
+def test_runtime_gives_what_the_model_gives(case: str, tiny_root: Path, sources: Sources) -> None:
+    model = ready(case, tiny_root, sources)
     runtime = in_eager(model)
     for seconds, identity in ((0.3, "B"), (1.013, UNSEEN), (4.317, "A")):  # the last one by windows
         assert_alike(runtime, model, seconds, identity, seed=5)
@@ -93,8 +118,10 @@ def test_runtime_gives_what_the_model_gives(case: str, tiny_root: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_exported_folder_gives_what_the_model_gives(case: str, tiny_root: Path, tmp_path: Path) -> None:
-    model = ready(case, tiny_root)
+def test_exported_folder_gives_what_the_model_gives(
+    case: str, tiny_root: Path, tmp_path: Path, sources: Sources
+) -> None:
+    model = ready(case, tiny_root, sources)
     assert export_model(model, tmp_path / "out").check["share_of_range"] < 1e-4
     runtime = RuntimeModel.open(tmp_path / "out")
     for seconds, identity in ((0.3, "B"), (4.317, UNSEEN)):
@@ -102,6 +129,6 @@ def test_exported_folder_gives_what_the_model_gives(case: str, tiny_root: Path, 
 
 
 def test_direct_model_has_no_samples_around_a_mean(tiny_root: Path) -> None:
-    runtime = in_eager(ready("style content", tiny_root))
+    runtime = in_eager(ready("style content", tiny_root, {}))
     with pytest.raises(FaceDiffError, match="expressivity"):
         runtime.animate(sound(1.0), expressivity=0.5)

@@ -22,6 +22,7 @@ from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay, MotionScale
 from facediff.models.evaluation import IdentityPolicy
+from facediff.models.graphs import Graphs, Spoken
 from facediff.models.inference import BatchMotion, Progress, Style
 from facediff.models.layers import Width, frame_mask
 from facediff.registry import component_class
@@ -164,8 +165,13 @@ class PublishedModel(AnimationModel):
         count = len(self.identities)
         if batch.style is not None and batch.style.shape[1] == count:
             return batch.style.to(batch.template)
-        known = nn.functional.one_hot(batch.identity.clamp_min(0), count).to(batch.template)
-        return torch.where(batch.identity[:, None] >= 0, known, self.unknown_weights().to(known))
+        return self.weights_of(batch.identity).to(batch.template)
+
+    def weights_of(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identities"]:
+        """One-hot rows of identities; of an unknown speaker (−1) :meth:`unknown_weights`."""
+        places = torch.arange(len(self.identities), device=identity.device)
+        known = (identity[:, None] == places).float()
+        return torch.where(identity[:, None] >= 0, known, self.unknown_weights().to(known))
 
     def unknown_weights(self) -> Float[Tensor, " identities"]:
         """The weights of an unknown speaker."""
@@ -207,6 +213,47 @@ class PublishedModel(AnimationModel):
         made = self.generate_frames(clips, frames, seeds=list(seeds)[:count], progress=progress)
         motion = held(made, frames, clip.frame_lengths.expand(count))
         return motion if self.samples else motion.expand(len(seeds), -1, -1, -1)
+
+
+class DirectModel(PublishedModel):
+    """Base of the published methods that make all frames at once, and nothing at random."""
+
+    @abstractmethod
+    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames *width"]:
+        """Speech features of each frame."""
+
+    @abstractmethod
+    def decode(
+        self,
+        features: Float[Tensor, "batch frames *width"],
+        weights: Float[Tensor, "batch identities"],
+        frames: Int[Tensor, " batch"] | None,
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Scaled motion.
+
+        Args:
+            features: as :meth:`hear` gives them.
+            weights: as :meth:`identity_weights` gives them.
+            frames: valid ones of each clip; None if all are.
+        """
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """All frames in one pass; nothing is random."""
+        made = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
+        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+
+    @property
+    def heard_steps(self) -> int:
+        """Steps that the audio encoder is asked for, for each frame."""
+        return 1
+
+    def graphs(self) -> Graphs:
+        """Speech to features, features to motion."""
+        from facediff.models.published.graphs import direct_graphs
+
+        return direct_graphs(self)
 
 
 class SpeakerTable(nn.Module):

@@ -23,7 +23,7 @@ from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.folding import WeightCache
 from facediff.models.inference import BatchMotion, Progress
-from facediff.models.layers import Layers, Share, Width
+from facediff.models.layers import Layers, Share, Width, all_states
 from facediff.models.published.base import SpeakerTable, masked_mean
 from facediff.models.published.diffusion import DiffusionModel, FoldedSpace, NoiseSource, SamplingSpace, VertexSpace
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
@@ -278,7 +278,7 @@ class FaceDiffuserNetwork(nn.Module):
         # A one-hot step times a matrix is one of its columns.
         embedded = F.mish(self.step.weight.T[step] + self.step.bias)[:, None].expand(-1, frames, -1)
         joined = self.norm(torch.cat([audio, motion, embedded.to(motion.dtype)], -1))
-        return self.gru(joined)[0] * style[:, None]
+        return all_states(self.gru, joined) * style[:, None]
 
 
 # The authors' checkpoints.

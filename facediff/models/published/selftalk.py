@@ -30,9 +30,10 @@ from facediff.models.audio_encoders import (
     standardise,
 )
 from facediff.models.evaluation import IdentityPolicy
-from facediff.models.inference import BatchMotion, Progress
+from facediff.models.graphs import Spoken
+from facediff.models.inference import BatchMotion
 from facediff.models.layers import Heads, Layers, Share, Weight, Width, frame_mask, interpolate_ends, needed_mask
-from facediff.models.published.base import PublishedModel, masked_mean
+from facediff.models.published.base import DirectModel, masked_mean
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, backbone_config, recogniser
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.ranges import Range
@@ -45,7 +46,7 @@ LipReading = Literal["text", "none"]
 
 
 @registry.model.register("SelfTalk")
-class SelfTalk(PublishedModel):
+class SelfTalk(DirectModel):
     """SelfTalk: all frames in one pass, trained with a lip reader.
 
     Args:
@@ -157,13 +158,18 @@ class SelfTalk(PublishedModel):
             raise ArgumentError({"lip_vertices": max(vertices)}, f"the faces have {self.n_vertices} vertices")
         return LipReader(vertices, dim=text.width, letters=text.letters, **self._reader_options)
 
-    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+    @property
+    def heard_steps(self) -> int:
+        """Two where speech comes in pairs."""
+        return 2 if self.pairs else 1
+
+    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Speech features of each frame; where speech comes in pairs, two hidden states side by side."""
         rule: StepRule = "hidden_cut" if self.pairs else "features"
-        steps = 2 * frames if self.pairs else frames
-        cached = batch.cached_features or ()
-        hidden = self.audio_encoder.at_steps(batch.audio, batch.audio_lengths, steps, rule, *cached)
-        return hidden.reshape(len(hidden), int(frames.max()), -1)
+        cached = heard.cached_features or ()
+        each = self.heard_steps
+        hidden = self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, each * frames, rule, *cached)
+        return hidden.reshape(hidden.shape[0], hidden.shape[1] // each, each * hidden.shape[2])
 
     # Training.
 
@@ -189,12 +195,10 @@ class SelfTalk(PublishedModel):
 
     # Inference.
 
-    def generate_frames(
-        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
-    ) -> BatchMotion:
-        """All frames in one pass; nothing is random."""
-        made = self.network(self.hear(batch, frames), frames)
-        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+    def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
+        """By the decoder, which knows no speakers."""
+        made: Tensor = self.network(features, frames)
+        return made
 
     def lip_steps_of(self, frames: int) -> int:
         """Steps at 50 a second for which the lip reader reads so many frames."""
@@ -259,11 +263,11 @@ class SelfTalkNetwork(nn.Module):
         nn.init.zeros_(self.motion_out.bias)
 
     def forward(
-        self, speech: Float[Tensor, "batch frames width"], frames: Int[Tensor, " batch"]
+        self, speech: Float[Tensor, "batch frames width"], frames: Int[Tensor, " batch"] | None
     ) -> Float[Tensor, "batch frames coordinates"]:
         """Speech is what is decoded, and what is attended to; every frame sees all of it, and no frame its number."""
         tokens = self.audio_map(speech)
-        padding = padding_of(frames, tokens.shape[1])
+        padding = None if frames is None else padding_of(frames, tokens.shape[1])
         made = self.decoder(tokens, tokens, tgt_key_padding_mask=padding, memory_key_padding_mask=padding)
         moved: Tensor = self.motion_out(made)
         return moved

@@ -23,10 +23,11 @@ from facediff.data.frame_clock import FrameClock
 from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.deepspeech import DeepSpeechEncoder, network_of
-from facediff.models.inference import BatchMotion, Progress
-from facediff.models.layers import Width, frame_mask
-from facediff.models.published.base import PublishedModel, SpeakerTable, masked_mean
+from facediff.models.graphs import Spoken
+from facediff.models.layers import Width, exporting, frame_mask, sliding
+from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, dataset_facts, recogniser
+from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 from facediff.utils.tensorflow_files import read_graph
 
@@ -38,7 +39,7 @@ CHANNELS = (32, 32, 64, 64)
 
 
 @registry.model.register("Voca")
-class Voca(PublishedModel):
+class Voca(DirectModel):
     """VOCA: a window of speech around each frame, convolved to the coefficients of linear shapes.
 
     Args:
@@ -109,22 +110,37 @@ class Voca(PublishedModel):
         heard = torch.tensor([self.frames_of(int(n)) for n in batch.audio_lengths], device=batch.frame_lengths.device)
         return torch.minimum(batch.frame_lengths, heard.clamp_min(1))
 
-    def hear(self, batch: Batch, most: int) -> Float[Tensor, "batch frames channels rows"]:
-        """The window of speech around each of so many frames; what lies before or after the speech is zero."""
-        rows = torch.tensor(
-            [max(1, self.clock.row_count(int(n))) for n in batch.audio_lengths], device=batch.audio.device
-        )
-        cached = batch.cached_features or ()
-        rate = self.frame_rate * self.rows_per_frame
-        heard = self.audio_encoder.at_rate(batch.audio, batch.audio_lengths, rows, rate, *cached)
-        before, last = self.speech_window // 2, (most - 1) * self.rows_per_frame
-        after = max(0, last + self.speech_window - before - heard.shape[1])
-        windows = F.pad(heard, (0, 0, before, after)).unfold(1, self.speech_window, 1)
-        return windows[:, : last + 1 : self.rows_per_frame]
+    @property
+    def heard_steps(self) -> int:
+        """Rows of speech from one frame to the next."""
+        return self.rows_per_frame
 
-    def coefficients(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames components"]:
+    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames channels rows"]:
+        """The window of speech around each frame; what lies before or after the speech is zero."""
+        each, rows = self.rows_per_frame, self.row_counts(heard.audio_lengths)
+        cached = heard.cached_features or ()
+        made = self.audio_encoder.at_rate(heard.audio, heard.audio_lengths, rows, self.frame_rate * each, *cached)
+        before, most = self.speech_window // 2, int(frames.max()) if not exporting() else made.shape[1] // each
+        # A graph has as many rows for each frame, of which the last ones may not be valid; they are zero.
+        missing = (most - 1) * each - made.shape[1] if not exporting() else -each
+        after = max(0, missing + self.speech_window - before)
+        return sliding(F.pad(made, (0, 0, before, after)), self.speech_window, each, most)
+
+    def row_counts(self, samples: Int[Tensor, " batch"]) -> Int[Tensor, " batch"]:
+        """Rows of speech of clips, at least one."""
+        if exporting():  # the clock's rule in the same floating point, without leaving the graph
+            rate = self.frame_rate * self.rows_per_frame
+            return (samples.double() / SAMPLE_RATE * rate).round().long().clamp_min(1)
+        counts = [max(1, self.clock.row_count(count)) for count in samples.tolist()]
+        return torch.tensor(counts, device=samples.device)
+
+    def coefficients(
+        self,
+        windows: Float[Tensor, "batch frames channels rows"],
+        weights: Float[Tensor, "batch identities"],
+        frames: Int[Tensor, " batch"],
+    ) -> Float[Tensor, "batch frames components"]:
         """Coefficients of the linear shapes for each frame; zero on padding."""
-        windows, weights = self.hear(batch, int(frames.max())), self.identity_weights(batch)
         # The batch norm must not see padding, so frames stand in one row without it.
         mask = frame_mask(frames, windows.shape[1])
         clips = mask.nonzero()[:, 0]
@@ -154,7 +170,7 @@ class Voca(PublishedModel):
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Squared distances of vertices, and of their differences between frames."""
         frames = self.trained_frames(batch)
-        coefficients = self.coefficients(batch, frames)
+        coefficients = self.coefficients(self.hear(batch, frames), self.identity_weights(batch), frames)
         truth = (batch.motion * self.scale).flatten(2)[:, : coefficients.shape[1]]
         error = self.network.expression(coefficients) - truth
         # Distances are sums over the three coordinates; the first frame is its own frame before.
@@ -164,12 +180,20 @@ class Voca(PublishedModel):
         loss = reconstruction + self.velocity_weight * velocity
         return {"reconstruction": reconstruction, "velocity": velocity, "loss": loss}
 
-    def generate_frames(
-        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
-    ) -> BatchMotion:
-        """Each frame from its own window; nothing is random."""
-        made = self.network.expression(self.coefficients(batch, frames))
-        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+    def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
+        """Each frame from its own window."""
+        made = self.of_all(features, weights) if frames is None else self.coefficients(features, weights, frames)
+        offsets: Tensor = self.network.expression(made)
+        return offsets
+
+    def of_all(
+        self, windows: Float[Tensor, "batch frames channels rows"], weights: Float[Tensor, "batch identities"]
+    ) -> Float[Tensor, "batch frames components"]:
+        """Coefficients without padding, of every speaker, then mixed: nothing depends on the values of the weights."""
+        count, each = weights.shape[1], windows.flatten(0, 1)
+        speakers = torch.eye(count, device=weights.device)[:, None].expand(-1, each.shape[0], -1)
+        made = self.network(each.repeat(count, 1, 1), speakers.flatten(0, 1)).view(count, *windows.shape[:2], -1)
+        return torch.einsum("bk,kbtc->btc", weights, made)
 
 
 class VocaNetwork(nn.Module):
@@ -224,7 +248,8 @@ class VocaNetwork(nn.Module):
         count, channels, rows = windows.shape
         x = self.norm(windows.reshape(count, 1, channels * rows)).view(count, channels, rows)
         for number, convolution in enumerate(self.convolutions):
-            inside = padded_same(x.new_ones(x.shape[2]), self.TAPS).unfold(0, self.TAPS, 2)
+            ones = padded_same(x.new_ones(x.shape[2]), self.TAPS)
+            inside = sliding(ones[None, :, None], self.TAPS, 2, (len(ones) - self.TAPS) // 2 + 1)[0, :, 0]
             x = convolution(padded_same(x, self.TAPS))
             if number == 0:
                 # The speaker's channels are padded with zeros as well: at the ends not all taps meet them.

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoder
-from facediff.models.graphs import Speech
+from facediff.models.graphs import Spoken
 from facediff.models.layers import Attention, FeedForward, sliding
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.speaker_encoders import StyleEncoder
@@ -97,7 +97,7 @@ class DisentanglementNetwork(nn.Module):
         return self.content_of(batch, batch.frame_lengths, batch.motion.shape[1])
 
     def content_of(
-        self, heard: Batch | Speech, lengths: Int[Tensor, " batch"], frames: int
+        self, heard: Spoken, lengths: Int[Tensor, " batch"], frames: int
     ) -> Float[Tensor, "batch frames content_dim"]:
         """Content of speech, of so many frames each."""
         cached = heard.cached_features or ()
