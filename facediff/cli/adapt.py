@@ -1,9 +1,10 @@
-"""``facediff adapt``: a trained model is fine-tuned on a new speaker, or learns to hear other voices."""
+"""``facediff adapt``: a trained model is fine-tuned on a new speaker, or learns to hear other voices, or at once."""
 
 from __future__ import annotations
 
 import shlex
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
     from facediff.models.hearing import HearingOptions
 
 CLIP_SECONDS = 0.05  # What training on a clip takes with the built-in corpus's small model, on two processor cores
+OF_TRAINING = (
+    *("optimizer_states", "lr_schedulers", "loops", "callbacks"),
+    *("facediff_training_state", "current_model_state", "averaging_state"),
+)
+"""What a checkpoint holds for a training that goes on."""
+
 Mode = Literal["finetune", "joint"]
 
 
@@ -28,6 +35,8 @@ def adapt(
     checkpoint: Checkpoint,
     person: Annotated[str | None, Option(metavar="DIR", reads=True)] = None,
     voices: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_VOICE_STEPS)] = None,
+    at_once: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_AT_ONCE_STEPS)] = None,
+    audio_encoder: Annotated[str | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     output: Output,
     mode: Mode = "finetune",
@@ -42,11 +51,12 @@ def adapt(
     quiet: bool = False,
     yes: bool = False,
 ) -> None:
-    """Fine-tune a checkpoint on a new speaker, or let it learn to hear other voices, and write a checkpoint.
+    """Fine-tune a checkpoint on a new speaker, or let it learn to hear other voices or at once; write a checkpoint.
 
     With --person, it learns from a minute of the new speaker's motion, and knows them by name. With --voices, it learns
-    to hear other voices, rooms and noise, and moves as before. The corpus that the checkpoint was trained on must be on
-    this machine.
+    to hear other voices, rooms and noise, and moves as before. With --at-once, its audio encoder learns to hear
+    0.12 s ahead and no further; a small one may take its place. The corpus that the checkpoint was trained on must be
+    on this machine.
 
     Args:
         checkpoint: trained model (.ckpt)
@@ -54,6 +64,9 @@ def adapt(
             trained on and has clips that belong to no split
         voices: let the audio encoder learn other voices, rooms and noise, in so many steps (600 if no number); modes,
             epochs and rates are those of --person
+        at_once: let the audio encoder learn to hear at once, in so many steps (1500 if no number)
+        audio_encoder: with --at-once: what takes its place, such as mel or mel:num_layers=6, and learns to give
+            what it gave
         augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
             docs/voices.md)
         output: checkpoint to write (.ckpt)
@@ -72,17 +85,29 @@ def adapt(
     """
     if output.suffix != ".ckpt":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
-    if (person is None) == (voices is None):
-        raise FaceDiffError("--person, --voices: expected one of them: a new speaker to move like, or voices to hear")
+    if sum(each is not None for each in (person, voices, at_once)) != 1:
+        raise FaceDiffError(
+            "--person, --voices, --at-once: expected one of them: a new speaker to move like, voices to hear, or "
+            "hearing at once"
+        )
     if augmentation and voices is None:
         raise FaceDiffError("--augmentation: says how --voices changes speech; give --voices as well")
+    if audio_encoder is not None and at_once is None:
+        raise FaceDiffError("--audio-encoder: takes the place of one that hears too slowly; give --at-once as well")
     check_model_source(checkpoint, "--checkpoint")
-    if voices is not None:
+    if person is None:
+        from facediff.models.hearing import AT_ONCE, HearingOptions
+
+        if at_once is not None:
+            chosen = replace(AT_ONCE, steps=at_once, seed=seed)
+        else:
+            chosen = HearingOptions(steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed)
+            chosen = replace(chosen, augmentations=augmentation or chosen.augmentations)
         device = {"gpu": "cuda"}.get(accelerator, accelerator)
-        chosen = {"steps": voices, "seed": seed, **({"augmentations": augmentation} if augmentation else {})}
-        adapt_to_voices(checkpoint, output, data_root, corpus, device, commercial_only, chosen, quiet=quiet)
+        adapt_hearing(
+            *(checkpoint, output, data_root, corpus, device, commercial_only, chosen, audio_encoder), quiet=quiet
+        )
         return
-    assert person is not None  # noqa: S101 - for the type checker
     from lightning.pytorch import Trainer, seed_everything
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
@@ -142,21 +167,21 @@ def adapt(
     )
 
 
-def adapt_to_voices(
+def adapt_hearing(
     checkpoint: Path,
     output: Path,
     data_root: Path | None,
     corpus: str | None,
     device: str,
     commercial_only: bool,
-    chosen: dict[str, Any],
+    chosen: HearingOptions,
+    encoder: str | None,
     *,
     quiet: bool,
 ) -> None:
-    """Write a checkpoint whose audio encoder has learnt other voices; see :func:`adapt`."""
+    """Write a checkpoint whose audio encoder has learnt other voices, or to hear at once; see :func:`adapt`."""
     from facediff.models.base import PROVENANCE_KEY
     from facediff.models.checkpoint import build_model, read_checkpoint
-    from facediff.models.hearing import HearingOptions
     from facediff.pipelines.animate import usable_device
     from facediff.utils.licences import require_cleared
 
@@ -171,36 +196,65 @@ def adapt_to_voices(
     if not data.root.is_dir():
         raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
     content[PROVENANCE_KEY] = {**content.get(PROVENANCE_KEY, {}), "parent": model_name(checkpoint)}
-    left = hear_voices(checkpoint, content, data, output, HearingOptions(**chosen), device=device, quiet=quiet)
-    tell(
-        f"{output}: has learnt other voices in {time.monotonic() - started:.0f} s; they change what it hears by "
-        f"{left:.2f} of its variance"
+    left = hear(checkpoint, content, data, output, chosen, encoder, device=device, quiet=quiet)
+    what, words = (
+        ("other voices", "they change what it hears by")
+        if chosen.ahead is None
+        else ("to hear at once", "what it hears differs by")
     )
+    tell(f"{output}: has learnt {what} in {time.monotonic() - started:.0f} s; {words} {left:.2f} of its variance")
 
 
-def hear_voices(
+def hear(
     checkpoint: Path,
     content: dict[str, Any],
     data: SpeechMotionDataModule,
     output: Path,
     options: HearingOptions,
+    encoder: str | None = None,
     *,
     device: str = "cpu",
     quiet: bool = False,
 ) -> float:
-    """Write a checkpoint's content with an audio encoder that has learnt other voices, and everything else as it is.
+    """Write a checkpoint's content with an audio encoder that has learnt more, and everything else as it is.
+
+    Args:
+        checkpoint: the file.
+        content: of it; it is changed.
+        data: the corpus.
+        output: checkpoint to write.
+        options: what is learnt.
+        encoder: what takes the audio encoder's place, by name with its options; None for itself.
+        device: where.
+        quiet: no progress bar.
 
     Returns:
         as :func:`facediff.models.hearing.learn_voices`.
+
+    Raises:
+        FaceDiffError: if there is no such encoder, or it cannot be replaced.
     """
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
+    from facediff.models.adaptation import with_audio_encoder
     from facediff.models.checkpoint import build_model
     from facediff.models.hearing import encoder_weights, learn_voices
     from facediff.utils.progress import progress_bar
 
-    model = build_model(checkpoint, content).to(device)
-    with progress_bar("other voices", options.steps, shown=not quiet) as step:
-        left = learn_voices(model, data, options, step)
+    model, teacher = build_model(checkpoint, content).to(device), None
+    if encoder is not None:
+        from facediff.registry import audio_encoder as registered
+
+        name, given = registered.read(encoder)
+        chosen = {"class_path": f"facediff.registry.audio_encoder.{name}", "init_args": given}
+        teacher, replaced = model.speech_encoder, set(encoder_weights(model))
+        model = with_audio_encoder(model, chosen).to(device)
+        content["hyper_parameters"] = {**content["hyper_parameters"], "audio_encoder": chosen}
+        content["state_dict"] = {key: each for key, each in content["state_dict"].items() if key not in replaced}
+        for key in OF_TRAINING:  # it is of the encoder that was replaced; `fit` begins anew
+            content.pop(key, None)
+    what = "other voices" if options.ahead is None else "hearing at once"
+    with progress_bar(what, options.steps, shown=not quiet) as step:
+        left = learn_voices(model, data, options, step, teacher=teacher)
     weights = encoder_weights(model)
     # With averaged weights, those of the last step are kept for a training that goes on.
     for key in ("state_dict", "current_model_state"):

@@ -43,7 +43,7 @@ def demo(
         epochs: training epochs (default: the config's)
         data_root: where the corpus is kept (default: the user's cache folder)
     """
-    from facediff.cli.adapt import hear_voices
+    from facediff.cli.adapt import hear
     from facediff.cli.lightning import run_cli
     from facediff.export import ExportOptions, check_export
 
@@ -65,7 +65,7 @@ def demo(
     fitted.trainer.save_checkpoint(checkpoint)
     if not fast:
         tell(f"facediff demo: trained in {time.monotonic() - started:.0f} s; now it learns to hear other voices")
-        hear_voices(checkpoint, read_checkpoint(checkpoint), fitted.datamodule, checkpoint, HearingOptions())
+        hear(checkpoint, read_checkpoint(checkpoint), fitted.datamodule, checkpoint, HearingOptions())
     tell(f"facediff demo: ready after {time.monotonic() - started:.0f} s; now the test")
     where = ["--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={output}"]
     tested = run_cli("test", ["--ckpt_path", str(checkpoint), *where])

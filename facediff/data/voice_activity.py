@@ -140,7 +140,8 @@ class EnergyGate(VoiceGate):
     """Speech is what rises above the noise, whose level is followed.
 
     The level between 150 Hz and 5 kHz is compared with that of the noise: the softest stretch of the last 5 s, and of
-    what is heard ahead, in which it was steady. Where nothing was steady yet, only what is far below the loudest is a pause.
+    what is heard ahead, in which it was steady. Where nothing was steady yet, only what is far below the loudest is a
+    pause.
 
     Args:
         margin: decibels above the noise at which speech begins.

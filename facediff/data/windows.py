@@ -207,8 +207,10 @@ class Window:
 
     @property
     def origins(self) -> list[tuple[int, slice]]:
-        """The windows in which its frames first appeared: the index of each, and which of the frames that are new in it
-        lie in this window. All frames of the first window are new in it, and the last ones of every other.
+        """The windows in which its frames first appeared.
+
+        For each its index, and which of the frames that are new in it lie in this window. All frames of the first
+        window are new in it, and the last ones of every other.
         """
         found, overlap, hop = [], self.plan.overlap, self.plan.hop
         for index in range(max(0, (self.start - overlap) // hop), self.index + 1):

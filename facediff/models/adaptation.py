@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from lightning.pytorch.cli import instantiate_module
@@ -42,6 +42,28 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
     grown.adopt(replace(model.assets, identities=identities))
     grown.licences, grown.provenance = model.licences, model.provenance
     return grown
+
+
+def with_audio_encoder(model: AnimationModel, encoder: dict[str, Any]) -> AnimationModel:
+    """The same model with another audio encoder, which has learnt nothing yet.
+
+    Args:
+        model: a trained model.
+        encoder: the encoder as a checkpoint's hyperparameters name it: ``class_path`` and ``init_args``.
+
+    Raises:
+        FaceDiffError: if the model's audio encoder is not chosen by name, or such a one cannot be made.
+    """
+    if model.hears_all or "audio_encoder" not in model.hparams:  # the published methods have rules for their own one
+        raise FaceDiffError(f"{type(model).__name__}: its audio encoder cannot be replaced")
+    options = {key: value for key, value in model.hparams.items() if not key.startswith("_")}
+    changed: AnimationModel = instantiate_module(type(model), {**options, "audio_encoder": encoder})
+    old = {id(weight) for weight in model.speech_encoder.state_dict(keep_vars=True).values()}
+    rest = {name: weight for name, weight in model.state_dict(keep_vars=True).items() if id(weight) not in old}
+    changed.adopt(model.assets)
+    changed.load_state_dict({**changed.state_dict(), **rest})
+    changed.licences, changed.provenance = model.licences, model.provenance
+    return changed.eval()
 
 
 def grow(before: Tensor, after: Tensor) -> Tensor:

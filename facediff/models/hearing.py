@@ -1,4 +1,4 @@
-"""A trained model learns to hear other voices, rooms and microphones, while it moves as before.
+"""A trained model learns to hear other voices, rooms and microphones, or at once, while it moves as before.
 
 Training with changed speech asks of the whole model that it learns the same motion again from every voice, which is
 long, and clean speech pays for it. Here only the audio encoder learns: of changed speech it is to make what it made of
@@ -7,6 +7,11 @@ Wang, Zhao and Gong 2017, "Large-scale domain adaptation via teacher-student lea
 part, so that a step costs a small part of a training step, and no motion is needed. In the end the weights go most of
 the way from the old ones to the new ones, which gives back most of what clean speech has lost and keeps most of what
 other voices have gained (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models").
+
+In the same way an encoder learns to hear at once: of speech that ends a moment after a frame it is to make what the
+teacher makes of the whole recording. A student of another kind may take the teacher's place, such as a small one that
+of HuBERT, which takes a fifth of a second for each frame of a stream (Hinton, Vinyals and Dean 2015, "Distilling the
+knowledge in a neural network").
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +30,9 @@ from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.augmentation import Augmenter, Example, OfSpeech, read_augmentations
+from facediff.data.windows import LOW_LATENCY, QUIETEST
 from facediff.errors import FaceDiffError
+from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.layers import frame_mask
 from facediff.utils import SAMPLE_RATE
@@ -47,6 +54,9 @@ OTHER_VOICES = (
 WINDOW = 4.0
 """Seconds of a clip that are heard at a time, at most."""
 
+HEARD_AT_ONCE = (0.6, 1.7)
+"""Seconds that a student hears at a time, at least and at most, which learns to hear at once."""
+
 STEP_RATE = 50
 """Features a second that are compared."""
 
@@ -66,6 +76,8 @@ class HearingOptions:
         learning_rate: the highest; it rises over the first twentieth of the steps and falls as a cosine.
         seed: of all that is drawn.
         workers: processes that change speech; 0 for this one.
+        ahead: seconds of speech that are heard after a feature, while the teacher hears the whole recording; None for
+            the whole recording here too.
     """
 
     augmentations: Sequence[str] = OTHER_VOICES
@@ -77,6 +89,37 @@ class HearingOptions:
     learning_rate: float = 1e-3
     seed: int = 0
     workers: int = 1
+    ahead: float | None = None
+
+
+AT_ONCE = HearingOptions(augmentations=(), share=0.0, moved=1.0, ahead=LOW_LATENCY.after)
+"""How an audio encoder learns to hear at once."""
+
+
+class Heard(NamedTuple):
+    """A batch of speech as the teacher and as the student hears it.
+
+    Attributes:
+        recorded: (batch, samples).
+        lengths: valid samples of each.
+        changed: what the student hears of it, (batch, fewer samples), from ``start`` to ``end``.
+        start: of what the student hears, in steps.
+        end: likewise.
+        mean: of each clip's speech up to ``end``; None where the student hears all of it.
+        deviation: likewise.
+    """
+
+    recorded: Tensor
+    lengths: Tensor
+    changed: Tensor
+    start: Tensor
+    end: Tensor
+    mean: Tensor | None = None
+    deviation: Tensor | None = None
+
+    def to(self, device: torch.device) -> Heard:
+        """On a device."""
+        return Heard(*(None if each is None else each.to(device) for each in self))  # type: ignore[arg-type]
 
 
 def learn_voices(
@@ -84,17 +127,20 @@ def learn_voices(
     data: SpeechMotionDataModule,
     options: HearingOptions = HearingOptions(),  # noqa: B008 - it cannot be changed
     step_done: Callable[[], object] = lambda: None,
+    *,
+    teacher: AudioEncoder | None = None,
 ) -> float:
-    """Let a trained model's audio encoder learn other voices, in place.
+    """Let a trained model's audio encoder learn other voices, or to hear at once, in place.
 
     Args:
         model: a trained model.
         data: the corpus; its training clips are heard, and their motion is not looked at.
         options: how.
         step_done: called after each step.
+        teacher: what the encoder is to become like; as it is now if None.
 
     Returns:
-        what is left of the difference that the changes of speech made to the features, as a share of the features'
+        what is left of the difference between the student's features and the teacher's, as a share of the features'
         variance; the mean of the last tenth of the steps.
 
     Raises:
@@ -110,7 +156,7 @@ def learn_voices(
     weights = [weight for weight in student.parameters() if weight.requires_grad]
     if not weights:
         raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
-    teacher = copy.deepcopy(student).eval().requires_grad_(False)
+    teacher = (copy.deepcopy(student) if teacher is None else teacher).to(model.device).eval().requires_grad_(False)
     before = [weight.detach().clone() for weight in weights]
     pairs = _Pairs(data, Augmenter(augmentations), options)
     workers = min(options.workers, processors() - 1)
@@ -122,13 +168,11 @@ def learn_voices(
     with torch.random.fork_rng(devices):
         torch.manual_seed(options.seed)
         student.train()
-        for clean, changed, lengths in loader:
-            clean, changed, lengths = (each.to(model.device) for each in (clean, changed, lengths))
-            steps = (lengths * STEP_RATE // SAMPLE_RATE).clamp_min(1)
+        for batch in loader:
+            heard: Heard = batch.to(model.device)
             with torch.no_grad():
-                wanted = teacher(clean, lengths, steps)
-            mask = frame_mask(steps, wanted.shape[1])[..., None]
-            error = _difference(student(changed, lengths, steps), wanted, mask)
+                wanted = teacher(heard.recorded, heard.lengths, _steps(heard.lengths))
+            error = _difference(_features(student, heard), *_compared(wanted, heard, options.ahead))
             optimiser.zero_grad()
             error.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(weights, 1.0)
@@ -149,6 +193,35 @@ def encoder_weights(model: AnimationModel) -> dict[str, Tensor]:
     return {f"{name}.{key}": value.detach().cpu() for key, value in model.speech_encoder.state_dict().items()}
 
 
+def _steps(samples: Tensor) -> Tensor:
+    """Features that are compared of so many samples."""
+    return (samples * STEP_RATE // SAMPLE_RATE).clamp_min(1)
+
+
+def _features(student: AudioEncoder, heard: Heard) -> Tensor:
+    """What the student makes of what it hears, at the level of all speech so far as in a stream."""
+    steps = heard.end - heard.start
+    if heard.mean is None or heard.deviation is None:
+        made: Tensor = student(heard.changed, heard.lengths, steps)
+        return made
+    with student.at_level(heard.mean[:, None], heard.deviation[:, None]):
+        made = student(heard.changed, steps * SAMPLE_RATE // STEP_RATE, steps)
+    return made
+
+
+def _compared(wanted: Tensor, heard: Heard, ahead: float | None) -> tuple[Tensor, Tensor]:
+    """The teacher's features of what the student hears, and True on the steps that are compared."""
+    count = heard.end - heard.start
+    if ahead is None:
+        return wanted, frame_mask(count, wanted.shape[1])[..., None]
+    place = torch.arange(int(count.max()), device=wanted.device)[None]
+    taken = (heard.start[:, None] + place).clamp_max(wanted.shape[1] - 1)
+    # What lies ahead is heard, but no feature is wanted of it; those before the last half second are easy.
+    last = (count - round(ahead * STEP_RATE))[:, None]
+    mask = (place < last) & (place >= last - STEP_RATE // 2)
+    return wanted.gather(1, taken[..., None].expand(-1, -1, wanted.shape[2])), mask[..., None]
+
+
 def _difference(made: Tensor, wanted: Tensor, mask: Tensor) -> Tensor:
     """Squared difference of features (batch, steps, channels) as a share of their variance, over valid steps."""
     # Channels that hardly vary hold nothing worth hearing: their variance counts as a twentieth of the mean one.
@@ -165,8 +238,8 @@ def _rate(step: int, steps: int) -> float:
     return (step + 1) / rise if step < rise else 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
 
 
-class _Pairs(Dataset[tuple[Tensor, Tensor, Tensor]]):
-    """Batches of speech as it was recorded and as it was changed, (batch, samples) each, and the valid samples.
+class _Pairs(Dataset[Heard]):
+    """Batches of speech as it was recorded and as it was changed.
 
     A batch follows from its number and the seed, whatever process makes it.
     """
@@ -181,7 +254,7 @@ class _Pairs(Dataset[tuple[Tensor, Tensor, Tensor]]):
         """Number of batches."""
         return self.options.steps
 
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+    def __getitem__(self, index: int) -> Heard:
         """A batch by number."""
         if index >= len(self):
             raise IndexError(index)
@@ -192,7 +265,23 @@ class _Pairs(Dataset[tuple[Tensor, Tensor, Tensor]]):
             recorded.append(speech)
             changed.append(self._changed(speech, random) if random.random() < self.options.share else speech)
         lengths = torch.tensor([len(speech) for speech in recorded])
-        return _padded(recorded), _padded(changed), lengths
+        end = _steps(lengths)
+        if self.options.ahead is None:
+            return Heard(_padded(recorded), lengths, _padded(changed), torch.zeros_like(end), end)
+        spans = [self._span(steps, random) for steps in end.tolist()]
+        size = SAMPLE_RATE // STEP_RATE
+        known = [each[: stop * size].astype(np.float64) for each, (_, stop) in zip(changed, spans, strict=True)]
+        heard = [each[start * size : stop * size] for each, (start, stop) in zip(changed, spans, strict=True)]
+        mean, deviation = (torch.tensor(each, dtype=torch.float32) for each in zip(*map(_level, known), strict=True))
+        start, stop = torch.tensor(spans).unbind(1)
+        return Heard(_padded(recorded), lengths, _padded(heard), start, stop, mean, deviation)
+
+    def _span(self, steps: int, random: np.random.Generator) -> tuple[int, int]:
+        """Where a window of low latency begins and ends in a clip, in steps."""
+        least = min(steps, round((self.options.ahead or 0) * STEP_RATE) + 2)
+        end = int(random.integers(least, steps + 1))
+        shortest, longest = (round(seconds * STEP_RATE) for seconds in HEARD_AT_ONCE)
+        return max(0, end - int(random.integers(shortest, longest + 1))), end
 
     def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:
         """A clip or a piece of further speech, or a random window of it."""
@@ -216,6 +305,11 @@ class _Pairs(Dataset[tuple[Tensor, Tensor, Tensor]]):
             speech, nothing, len(nothing) * SAMPLE_RATE / max(1, len(speech)), nothing[0], nothing[0, :, 0]
         )
         return self.augmenter(example, int(random.integers(2**31))).speech
+
+
+def _level(speech: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Mean and deviation as a stream takes them."""
+    return float(speech.mean()), max(float(speech.std()), QUIETEST)
 
 
 def _padded(speech: list[Any]) -> Tensor:

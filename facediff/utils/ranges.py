@@ -269,6 +269,9 @@ SwayAngle = Annotated[float, Range(0, 15, above=True)]
 USUAL_SWAY = 2.0
 """Degrees where no number is given."""
 Tolerance = Annotated[float, Range(1e-15, 1)]
+USUAL_AT_ONCE_STEPS = 1500
+"""Steps in which an audio encoder learns to hear at once."""
+
 USUAL_VOICE_STEPS = 600
 """Training steps in which an audio encoder learns other voices where no number is given."""
 Vertices = Annotated[int, Range(1, 2_000_000)]

@@ -238,3 +238,25 @@ def test_voices(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     for wrong in ([], ["--voices", "2", "--person", "C"], ["--person", "C", "--augmentation", "noise"]):
         assert main([*words, *wrong]) == 2
         assert "--voices" in capsys.readouterr().err
+
+
+def test_hearing_at_once_with_another_audio_encoder(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The new encoder stands where the old one stood, and nothing else has changed."""
+    out = tmp_path / "quick.ckpt"
+    words = ["adapt", "--checkpoint", str(checkpoint), "-o", str(out), "--accelerator", "cpu", "--quiet"]
+    assert main([*words, "--at-once", "2", "--audio-encoder", "mel:hidden_dim=8,num_layers=2"]) == 0
+    before, after = load_model(checkpoint), load_model(out)
+    assert after.speech_encoder.stem.out_channels == 8
+    assert before.speech_encoder.stem.out_channels != 8
+    encoder = set(encoder_weights(after))
+    assert set(after.state_dict()) - encoder == set(before.state_dict()) - set(encoder_weights(before))
+    for name, value in after.state_dict().items():
+        assert name in encoder or torch.equal(value, before.state_dict()[name])
+    assert "optimizer_states" not in read_checkpoint(out)
+    for wrong in (["--audio-encoder", "mel", "--voices"], ["--at-once", "--voices"]):
+        assert main([*words, *wrong]) == 2
+        assert "--at-once" in capsys.readouterr().err
+    assert main([*words, "--at-once", "2", "--audio-encoder", "mle"]) == 2
+    assert "mle" in capsys.readouterr().err

@@ -27,6 +27,7 @@ NO_PATHS = {
         "accelerator",
         "acting",
         "augmentation",
+        "audio_encoder",
         "baseline",
         "by",
         "clip",

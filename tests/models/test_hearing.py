@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,9 @@ import torch
 
 from facediff.data.augmentation import filtered
 from facediff.errors import FaceDiffError
+from facediff.models.adaptation import with_audio_encoder
 from facediff.models.base import AnimationModel
-from facediff.models.hearing import HearingOptions, encoder_weights, learn_voices
+from facediff.models.hearing import AT_ONCE, HearingOptions, encoder_weights, learn_voices
 from tests.fakes.tiny import Tiny
 
 FEW = HearingOptions(steps=3, batch_size=2, workers=0)
@@ -123,3 +125,37 @@ def test_further_speech_is_heard_as_often_as_clips(make_model: Callable[..., Ani
     data.asked.clear()
     learn_voices(make_model(), data, replace(FEW, further=0))
     assert not data.asked
+
+
+def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tiny: Tiny) -> None:
+    """On test clips: features 0.12 s before the end of what has been heard are those of the whole recording."""
+    speech = [tiny.dataset("test_a")[index].audio.numpy() for index in range(4)]
+    wanted = [features(model, each) for each in speech]
+
+    def error() -> float:
+        found = []
+        for each, whole in zip(speech, wanted, strict=True):
+            for frames in (6, 9, 12, 15):
+                count = torch.tensor([640 * frames])
+                level = model.speech_encoder.at_level(
+                    float(each[: 640 * frames].mean()), float(each[: 640 * frames].std())
+                )
+                with torch.inference_mode(), level:
+                    made = model.speech_encoder(torch.from_numpy(each[None, : 640 * frames]), count, count // 640)[0]
+                found.append((made[frames - 4] - whole[frames - 4]).square())
+        return float(torch.cat(found).mean())
+
+    before = error()
+    learn_voices(model, tiny, replace(AT_ONCE, steps=60, batch_size=6, workers=0, learning_rate=3e-3))
+    assert error() < 0.85 * before
+
+
+def test_a_student_of_another_size_learns_from_its_teacher(model: AnimationModel, tiny: Tiny) -> None:
+    small = {"class_path": "facediff.registry.audio_encoder.mel", "init_args": {"hidden_dim": 8, "num_layers": 2}}
+    model.adopt(tiny.assets())
+    torch.manual_seed(1)
+    student = with_audio_encoder(model, small)
+    options = replace(AT_ONCE, steps=40, batch_size=6, workers=0, learning_rate=3e-3)
+    first = learn_voices(copy.deepcopy(student), tiny, replace(options, steps=2), teacher=model.speech_encoder)
+    last = learn_voices(student, tiny, options, teacher=model.speech_encoder)
+    assert last < 0.5 * first
