@@ -29,6 +29,7 @@ class Command:
 COMMANDS = {
     "demo": Command("facediff.cli.demo:demo", "make a corpus, train, test and render a talking face, in ten minutes"),
     "animate": Command("facediff.cli.animate:animate", "animate a face with a recording of speech"),
+    "live": Command("facediff.cli.live:live", "animate a face while somebody speaks, in engines and browsers"),
     "adapt": Command("facediff.cli.adapt:adapt", "fine-tune a trained model on a new speaker, or on other voices"),
     "publish": Command("facediff.cli.publish:publish", "a trained model as a folder for others, and on the hub"),
     "export-model": Command(

@@ -164,6 +164,7 @@ class EnergyGate(VoiceGate):
     ) -> None:
         super().__init__(attack=attack, lead=lead, hold=hold, release=release)
         self.margin = margin
+        self.ahead = ahead
         self.look_ahead = round(ahead * 100)
 
     def listener(self) -> Listener:

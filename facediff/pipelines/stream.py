@@ -108,6 +108,11 @@ class LiveAnimation:
         self._acted = np.zeros((0, 5))
         self._given = 0
 
+    @property
+    def made(self) -> int:
+        """Frames that the model has generated so far; some of them may wait for the gate or for acting."""
+        return self._stream.frames
+
     def feed(self, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Hear samples (n,), and give the frames (m, V, 3) that are certain now; m may be 0."""
         speech = samples if self._convert is None else self._convert(samples, False)

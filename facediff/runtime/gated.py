@@ -27,6 +27,11 @@ class GatedStream:
         self._waiting = np.zeros((0, *self._template.shape), np.float32)
         self._opened = np.zeros(0, np.float32)
 
+    @property
+    def made(self) -> int:
+        """Frames that the model has generated so far; some of them may wait for the gate."""
+        return self.stream.frames
+
     def feed(self, samples: Array) -> Array:
         """Hear samples (n,) at 16 kHz, and give the frames (m, V, 3) that are certain now; m may be 0."""
         made = self.stream.feed(samples)

@@ -210,7 +210,7 @@ class RuntimeModel:
         if about.generation == "sampled":
             metadata["sampler"] = f"{about.sampler}, {len(self.loop)} steps"
         if gate is not None:
-            metadata["voice gate"] = "energy"
+            metadata["voice gate"] = "energy" if isinstance(gate, EnergyGate) else type(gate).__name__
         if conditions.expressivity != 1:
             metadata["expressivity"] = f"{conditions.expressivity:g}"
         optional = {key: arrays[key] for key in ("faces", "colours", "inner_lip_pairs") if key in arrays}

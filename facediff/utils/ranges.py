@@ -268,6 +268,7 @@ Stride = Annotated[int, Range(1, 1000)]
 SwayAngle = Annotated[float, Range(0, 15, above=True)]
 USUAL_SWAY = 2.0
 """Degrees where no number is given."""
+Threads = Annotated[int, Range(0, 1024)]
 Tolerance = Annotated[float, Range(1e-15, 1)]
 USUAL_AT_ONCE_STEPS = 1500
 """Steps in which an audio encoder learns to hear at once."""

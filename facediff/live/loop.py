@@ -1,0 +1,411 @@
+"""The loop of a live performance: what is heard goes to the model, and its frames leave at their time.
+
+Three threads: the source's, which only hands samples over; the model's; and the caller's, which waits for the time of
+each frame and gives it to the receivers. Between them are a :class:`Backlog` of speech and a queue of frames, both of
+bounded length: what cannot be animated or sent in time is dropped and counted, and a performance never falls behind.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.audio import samples_for
+from facediff.live.frames import LiveFrame, Receiver
+from facediff.live.model import LiveModel
+from facediff.live.sources import Source, Speech
+from facediff.live.timing import Lags, Pacer, SpokenClock
+from facediff.utils import SAMPLE_RATE
+
+Array = npt.NDArray[np.float32]
+Solver = Callable[[Array], Array]
+"""Offsets (V, 3) of a frame to weights of blendshapes (K,)."""
+
+PATIENCE = 3.0
+"""Seconds of speech that may wait for a model which usually is fast enough."""
+
+RECENT = 3.0
+"""Seconds of speech over which a model's speed is measured."""
+
+
+@dataclass
+class Summary:
+    """What a performance was like.
+
+    Attributes:
+        frames: that were sent.
+        dropped: frames that came too late to be sent.
+        speech: seconds that were heard.
+        lost: seconds of speech that were dropped because the model was too slow.
+        busy: seconds that the model has computed.
+        lag: from the moment that a frame's last sample was spoken until the frame was sent.
+        waiting: of that, from the moment the frame was ready until it was sent.
+        computing: of a window.
+        sending: seconds in which a frame was solved for and given to the receivers.
+        receivers: what each of them reports, by name.
+    """
+
+    frames: int = 0
+    dropped: int = 0
+    speech: float = 0.0
+    lost: float = 0.0
+    busy: float = 0.0
+    lag: Lags = field(default_factory=Lags)
+    waiting: Lags = field(default_factory=Lags)
+    computing: Lags = field(default_factory=Lags)
+    sending: Lags = field(default_factory=Lags)
+    receivers: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def factor(self) -> float:
+        """Seconds of computing for each second of speech."""
+        return self.busy / self.speech if self.speech else 0.0
+
+    def sentences(self) -> list[str]:
+        """The report at the end."""
+        lines = [
+            f"{self.frames} frames of {self.speech:.1f} s; lag {self.lag}; {self.dropped} frames dropped"
+            + (f", {self.lost:.1f} s of speech" if self.lost else ""),
+            f"computing {self.computing} a window (real-time factor {self.factor:.2f}); sending {self.sending} a frame",
+        ]
+        return lines + [f"{name}: {status}" for name, status in self.receivers.items() if status]
+
+
+class Backlog:
+    """Speech that waits for the model; what is too much is dropped at its oldest end, in whole frames.
+
+    Args:
+        frame_rate: of the motion.
+    """
+
+    def __init__(self, frame_rate: float) -> None:
+        self.frame_rate = frame_rate
+        self.limit = PATIENCE
+        self.dropped = 0  # frames
+        self._pieces: deque[Speech] = deque()
+        self._waiting = 0  # samples
+        self._ended = False
+        self._changed = threading.Condition()
+
+    def put(self, samples: Speech) -> None:
+        """Add speech; never waits."""
+        with self._changed:
+            self._pieces.append(samples)
+            self._waiting += len(samples)
+            # Half of what is allowed is left, so that there are few gaps rather than many.
+            if self._waiting > self.limit * SAMPLE_RATE:
+                self._drop(self._waiting - round(self.limit / 2 * SAMPLE_RATE))
+            self._changed.notify()
+
+    def _drop(self, least: int) -> None:
+        """Drop the oldest samples: frames that they last as a whole."""
+        frames = math.floor(least * self.frame_rate / SAMPLE_RATE)
+        # Counted from the start, so that frames which are no whole number of samples do not add up to an error.
+        samples = samples_for(self.dropped + frames, self.frame_rate) - samples_for(self.dropped, self.frame_rate)
+        kept = np.concatenate(self._pieces)[samples:]
+        self._pieces = deque([kept])
+        self._waiting = len(kept)
+        self.dropped += frames
+
+    def end(self) -> None:
+        """No more speech comes."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+
+    def take(self, most: float) -> tuple[Speech, int] | None:
+        """Wait for speech, and take it: samples, and how many frames were dropped before them; None at the end.
+
+        Args:
+            most: seconds that are taken at most.
+        """
+        with self._changed:
+            while not self._waiting and not self._ended:
+                self._changed.wait()
+            if not self._waiting:
+                return None
+            whole = np.concatenate(self._pieces)
+            count = min(len(whole), max(1, round(most * SAMPLE_RATE)))
+            self._pieces = deque([whole[count:]]) if count < len(whole) else deque()
+            self._waiting -= count
+            return whole[:count], self.dropped
+
+
+@dataclass(frozen=True)
+class _Ready:
+    """A frame that waits for its time."""
+
+    index: int
+    spoken: float
+    ready: float
+    vertices: Array
+
+
+class Loop:
+    """One performance, from the first sample to the last frame.
+
+    Args:
+        model: animates.
+        source: of the speech.
+        receivers: of the frames; they are open, and closed by whoever has opened them.
+        hearing: those of them that play the speech.
+        solve: finds weights of blendshapes for receivers that need them.
+        seconds: of speech, after which it ends; None for the source's own end.
+        report: prints a sentence.
+        every: seconds between reports; None for none but that of a slow model.
+    """
+
+    def __init__(
+        self,
+        model: LiveModel,
+        source: Source,
+        receivers: Sequence[Receiver],
+        *,
+        hearing: Sequence[Receiver] = (),
+        solve: Solver | None = None,
+        seconds: float | None = None,
+        report: Callable[[str], None] = print,
+        every: float | None = 5.0,
+    ) -> None:
+        self.model, self.source, self.receivers, self.hearing = model, source, receivers, hearing
+        self.summary = Summary()
+        self.clock = SpokenClock()
+        self.pacer = Pacer(model.hop)
+        self._solve, self._seconds, self._report, self._every = solve, seconds, report, every
+        self._backlog = Backlog(model.frame_rate)
+        self._stopped = threading.Event()
+        self._changed = threading.Condition()
+        self._frames: deque[_Ready] = deque()
+        self._spoken: deque[tuple[Speech, float]] = deque()  # speech for receivers that play it
+        self._ended = False
+        self._error: BaseException | None = None
+        self._interval = Lags()
+        self._abandoned = False  # nobody waits for the frames that are left
+        self._slow_told = False
+        self._failing: set[str] = set()  # names of receivers that have raised
+
+    def run(self) -> Summary:
+        """Perform until the speech ends, ``seconds`` have been heard, or Ctrl-C.
+
+        Raises:
+            FaceDiffError: if the source or the model fails.
+        """
+        listening = threading.Thread(target=self._guard(self._listen), name="speech", daemon=True)
+        animating = threading.Thread(target=self._guard(self._animate), name="model", daemon=True)
+        listening.start()
+        animating.start()
+        try:
+            self._send_all()
+        except KeyboardInterrupt:  # how most performances end
+            self._abandoned = True
+        finally:
+            self._stopped.set()
+            self._backlog.end()
+            animating.join(timeout=5.0)  # a source may wait for its next sample for ever
+            self.summary.receivers = {each.name: each.status() for each in self.receivers}
+        if self._error is not None:
+            raise self._error
+        return self.summary
+
+    def _guard(self, work: Callable[[], None]) -> Callable[[], None]:
+        """A thread's work, whose error ends the performance and is raised where it was started."""
+
+        def guarded() -> None:
+            try:
+                work()
+            except BaseException as error:  # noqa: BLE001 - raised by run
+                self._error = self._error or error
+            finally:
+                self._backlog.end()
+                if work == self._animate:  # no more frames come; an error of the source leaves some to be finished
+                    with self._changed:
+                        self._ended = True
+                        self._changed.notify()
+
+        return guarded
+
+    # The source's thread.
+
+    def _listen(self) -> None:
+        """Take speech from the source."""
+        heard, most = 0, math.inf if self._seconds is None else round(self._seconds * SAMPLE_RATE)
+
+        def deliver(samples: Speech, at: float) -> None:
+            nonlocal heard
+            samples = samples[: int(min(len(samples), most - heard))]
+            if not len(samples) or self._stopped.is_set():
+                return
+            start, heard = heard / SAMPLE_RATE, heard + len(samples)
+            with self._changed:
+                self.clock.arrived(heard / SAMPLE_RATE, at)
+                self.summary.speech = heard / SAMPLE_RATE
+                if self.hearing:
+                    self._spoken.append((samples, start))
+                    self._changed.notify()
+            self._backlog.put(samples)
+            if heard >= most:
+                self._stopped.set()
+                self._backlog.end()  # the source may wait long before it notices
+
+        self.source.run(deliver, self._stopped)
+
+    # The model's thread.
+
+    def _animate(self) -> None:
+        """Turn speech into frames."""
+        stream = self.model.start()
+        fed, made = 0, 0  # samples, and frames of the stream, which does not know of what was dropped
+        gaps: deque[tuple[int, int]] = deque([(0, 0)])  # from which frame of the stream on how many were dropped before
+        recent: deque[tuple[float, float]] = deque()  # seconds of computing, seconds of speech
+        while (taken := self._backlog.take(max(self.model.hop, 0.02))) is not None:
+            samples, dropped = taken
+            if dropped != gaps[-1][1]:
+                gaps.append((math.ceil(fed * self.model.frame_rate / SAMPLE_RATE), dropped))
+                self.summary.lost = dropped / self.model.frame_rate
+            before, began = stream.made, time.monotonic()
+            vertices = stream.feed(samples)
+            now = time.monotonic()
+            fed += len(samples)
+            if stream.made > before:
+                self.summary.computing.add(now - began)
+            recent.append((now - began, len(samples) / SAMPLE_RATE))
+            self._measure(recent)
+            made = self._ready(vertices, made, gaps, now)
+        if fed and not self._abandoned:
+            began = time.monotonic()
+            vertices = stream.finish()
+            now = time.monotonic()
+            self.summary.busy += now - began
+            self._ready(vertices, made, gaps, now)
+
+    def _measure(self, recent: deque[tuple[float, float]]) -> None:
+        """Find out whether the model is fast enough, and how much speech may therefore wait for it."""
+        computed, heard = recent[-1][0], sum(speech for _, speech in recent)
+        self.summary.busy += computed
+        hop = self.model.hop
+        enough = max(RECENT, 2 * hop)
+        while heard - recent[0][1] > enough:
+            heard -= recent.popleft()[1]
+        factor = sum(each for each, _ in recent) / max(heard, 1e-9)
+        slow = heard > enough / 2 and factor > 1
+        # Speech that waits for a model that cannot catch up would only make all frames late.
+        self._backlog.limit = hop + 0.25 if slow else hop + PATIENCE
+        if slow and not self._slow_told:
+            self._slow_told = True
+            self._report(
+                f"the model takes {factor:.1f} s for a second of speech on this machine, so that speech is dropped: "
+                f"export it with fewer --steps, choose a longer --window or a shorter --overlap, or end other programs"
+            )
+
+    def _ready(self, vertices: Array, made: int, gaps: deque[tuple[int, int]], now: float) -> int:
+        """Queue frames (m, V, 3) of the stream, the first of which has the number ``made``; the number of the next."""
+        if not len(vertices):
+            return made
+        offsets = vertices - self.model.neutral
+        with self._changed:
+            for place, each in enumerate(offsets):
+                while len(gaps) > 1 and gaps[1][0] <= made + place:
+                    gaps.popleft()
+                index = made + place + gaps[0][1]
+                spoken = self.clock.spoken((index + 1) / self.model.frame_rate)
+                if place == 0:
+                    self.pacer.ready(spoken, now)
+                self._frames.append(_Ready(index, spoken, now, each))
+            self._changed.notify()
+        return made + len(vertices)
+
+    # The caller's thread.
+
+    def _send_all(self) -> None:
+        """Give every frame to the receivers when it is due, until there are no more."""
+        told = time.monotonic()
+        weights: tuple[int, Array | None] = (-1, None)  # of which frame
+        while True:
+            with self._changed:
+                while not (self._frames or self._spoken or self._ended):
+                    self._changed.wait()
+                speech, frame = list(self._spoken), self._frames[0] if self._frames else None
+                self._spoken.clear()
+                if frame is None and self._ended and not speech:
+                    return
+            for samples, start in speech:
+                self._each(self.hearing, self._speaking(samples, start))
+            if frame is None:
+                continue
+            if weights[0] != frame.index and self._solve is not None and not self._late(frame):
+                began = time.monotonic()
+                weights = frame.index, self._solve(frame.vertices)
+                solving = time.monotonic() - began
+            else:
+                solving = 0.0
+            if not self._wait_for(frame):
+                continue
+            with self._changed:
+                self._frames.popleft()
+            if self._late(frame):
+                self.summary.dropped += 1
+            else:
+                self._send(frame, weights[1] if weights[0] == frame.index else None, solving)
+            if self._every is not None and time.monotonic() - told > self._every:
+                told = time.monotonic()
+                self._tell()
+
+    def _wait_for(self, frame: _Ready) -> bool:
+        """Wait until a frame is due; False if there is speech to be handed over before."""
+        with self._changed:
+            while (early := self.pacer.due(frame.spoken) - time.monotonic()) > 0:
+                if self._spoken:
+                    return False
+                self._changed.wait(early)
+        return True
+
+    def _late(self, frame: _Ready) -> bool:
+        """Whether a frame's time has passed by more than a hop: later ones are more urgent."""
+        return time.monotonic() > self.pacer.due(frame.spoken) + self.model.hop
+
+    def _send(self, frame: _Ready, weights: Array | None, solving: float) -> None:
+        began = time.monotonic()
+        out = LiveFrame(
+            index=frame.index,
+            time=frame.index / self.model.frame_rate,
+            heard=frame.spoken,
+            vertices=frame.vertices,
+            weights=weights,
+            dropped=self.summary.dropped + self._backlog.dropped,
+        )
+        self._each(self.receivers, lambda receiver: receiver.send(out))
+        now = time.monotonic()
+        self.summary.frames += 1
+        self.summary.lag.add(now - frame.spoken)
+        self._interval.add(now - frame.spoken)
+        self.summary.waiting.add(began - frame.ready)
+        self.summary.sending.add(now - began + solving)
+
+    def _each(self, receivers: Sequence[Receiver], do: Callable[[Receiver], None]) -> None:
+        """Do something with every receiver; one that fails, which none should, does not end the others."""
+        for receiver in receivers:
+            try:
+                do(receiver)
+            except Exception as error:  # noqa: BLE001 - a third party's receiver may raise whatever it likes
+                if receiver.name not in self._failing:
+                    self._failing.add(receiver.name)
+                    self._report(f"{receiver.name}: {type(error).__name__}: {error}")
+
+    @staticmethod
+    def _speaking(samples: Speech, start: float) -> Callable[[Receiver], None]:
+        return lambda receiver: receiver.hear(samples, start)
+
+    def _tell(self) -> None:
+        """Report on the last seconds."""
+        parts = [f"{self.summary.speech:.0f} s: lag {self._interval}"]
+        parts.append(f"{self.summary.dropped + self._backlog.dropped} frames dropped")
+        parts += [f"{each.name}: {status}" for each in self.receivers if (status := each.status())]
+        self._interval = Lags()
+        self._report("; ".join(parts))

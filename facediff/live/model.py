@@ -1,0 +1,131 @@
+"""What animates a live performance: a model with its choices made, from which streams are started."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.voice_activity import EnergyGate, Openness, VoiceGate
+from facediff.utils import SAMPLE_RATE
+
+if TYPE_CHECKING:
+    from facediff.runtime import RuntimeModel
+
+Array = npt.NDArray[np.float32]
+
+
+class Hearing(Protocol):
+    """A stream: speech in pieces, to vertices."""
+
+    @property
+    def made(self) -> int:
+        """Frames that the model has generated so far; some of them may wait to be certain."""
+
+    def feed(self, samples: Array, /) -> Array:
+        """Hear samples (n,) at 16 kHz, and give the frames (m, V, 3) that are certain now."""
+
+    def finish(self) -> Array:
+        """The frames (m, V, 3) that are left."""
+
+
+@dataclass(frozen=True, eq=False)
+class LiveModel:
+    """A model that is ready to perform.
+
+    Attributes:
+        start: starts a stream at the beginning of speech.
+        frame_rate: frames a second.
+        neutral: the face at rest (V, 3).
+        faces: triangles (F, 3); empty if there are none.
+        unit: of length.
+        look_ahead: seconds of speech that must be heard after a frame begins before it is certain, at most.
+        hop: seconds of frames that become certain together.
+        colours: of the vertices (V, 3); None if there are none.
+        metadata: model, corpus, licences, identity, style, seed.
+    """
+
+    start: Callable[[], Hearing]
+    frame_rate: float
+    neutral: Array
+    faces: npt.NDArray[np.int32]
+    unit: str
+    look_ahead: float
+    hop: float
+    colours: npt.NDArray[np.uint8] | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def lag(self) -> float:
+        """Seconds from the end of a frame's speech until the frame is certain, but for computing."""
+        return max(0.0, self.look_ahead - 1 / self.frame_rate)
+
+    def warm_up(self) -> None:
+        """Compute once what a window costs, so that the first one of the performance is not the slow one."""
+        stream = self.start()
+        stream.feed(np.zeros(round((self.look_ahead + self.hop + 0.1) * SAMPLE_RATE), np.float32))
+
+
+def runtime_model(model: RuntimeModel, *, gate: VoiceGate | None, **chosen: Any) -> LiveModel:  # noqa: ANN401
+    """An exported model.
+
+    Args:
+        model: the model, whose ``windows`` are those of the performance.
+        gate: brings the mouth to rest in pauses; None for no gate.
+        chosen: ``identity``, ``condition``, ``style``, ``seed`` and ``expressivity`` of
+            :meth:`~facediff.runtime.RuntimeModel.stream`.
+
+    Raises:
+        FaceDiffError: if a name is unknown or a number out of range.
+    """
+    from facediff.runtime.gated import GatedStream
+
+    def start() -> GatedStream:
+        return GatedStream(model.stream(**chosen, gate=gate))
+
+    stream = start().stream
+    template = model.arrays["templates"][stream.face].astype(np.float32)
+    still = model.animation(template[None], stream.face, None, "live", stream.conditions, gate)
+    plan = model.windows
+    gate_ahead = 0.0 if gate is None else Openness(gate, model.frame_rate).look_ahead
+    return LiveModel(
+        start=start,
+        frame_rate=model.frame_rate,
+        neutral=template,
+        faces=np.zeros((0, 3), np.int32) if still.faces is None else still.faces.astype(np.int32),
+        unit=still.unit,
+        look_ahead=max(plan.look_ahead, gate_ahead),
+        hop=plan.in_frames(model.frame_rate).hop / model.frame_rate,
+        colours=still.colours,
+        metadata=dict(still.metadata),
+    )
+
+
+USUAL_GATE = "energy"
+"""The gate of live performances, which hears no further ahead than the windows do."""
+
+
+def usual_gate(look_ahead: float) -> str:
+    """The voice gate that waits no longer than the windows, for :func:`~facediff.data.voice_activity.read_gate`.
+
+    Args:
+        look_ahead: seconds of speech that the windows wait for.
+
+    Example:
+        >>> usual_gate(4.5)
+        'energy'
+        >>> usual_gate(0.2)
+        'energy:attack=0.085,lead=0.085,ahead=0'
+    """
+    usual = EnergyGate()
+    free = look_ahead - 0.03  # the gate decides in steps of 10 ms
+    if free >= usual.ahead + usual.attack + usual.lead:
+        return USUAL_GATE
+    # A mouth that opens late is worse than a gate that does not know the noise yet: the opening goes first.
+    attack = min(usual.attack, max(0.0, free / 2))
+    lead = min(usual.lead, max(0.0, free - attack))
+    ahead = min(usual.ahead, max(0.0, free - attack - lead))
+    return f"{USUAL_GATE}:attack={attack:.4g},lead={lead:.4g},ahead={ahead:.4g}"

@@ -1,0 +1,241 @@
+"""Where speech comes from: a microphone, a recording that is played in real time, or samples on standard input.
+
+A source runs in a thread of its own, hands over pieces of 16 kHz as they come, and ends by itself or when stopped.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.pcm import pcm
+from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.live.resampling import Resampler
+from facediff.utils import SAMPLE_RATE
+
+Speech = npt.NDArray[np.float32]
+"""Samples (n,), full scale 1."""
+
+Deliver = Callable[[Speech, float], None]
+"""Takes samples at 16 kHz, and :func:`time.monotonic` when the last of them arrived."""
+
+PIECE = 0.01
+"""Seconds of a recording that are played at a time."""
+
+AHEAD = 0.25
+"""Seconds by which samples of a pipe may be ahead of the clock: what a recorder has kept while this program started."""
+
+FASTER = 1.005
+"""Samples of a pipe are taken at most so much faster than they are played: more than the clocks of sound cards differ,
+so that a recorder is never held up, while a file that is sent through a pipe is played in real time."""
+
+USUAL = "default"
+"""In place of a device: the one that the system chooses."""
+
+SILENT = 5.0
+"""Seconds without a sample after which a microphone is gone."""
+
+
+class Source(ABC):
+    """Speech that arrives.
+
+    Attributes:
+        name: what reports call it.
+    """
+
+    name: str
+
+    @abstractmethod
+    def run(self, deliver: Deliver, stopped: threading.Event) -> None:
+        """Hand over all speech, as it comes, until it ends or is stopped.
+
+        Raises:
+            FaceDiffError: if it cannot be heard, or not any more.
+        """
+
+
+class Played(Source):
+    """A recording in real time, as if it were spoken now.
+
+    Args:
+        path: of any format, rate and number of channels that :func:`~facediff.data.audio.read_speech` takes.
+
+    Raises:
+        FaceDiffError: naming the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        from facediff.data.audio import read_speech
+
+        self.name = str(path)
+        self.samples = read_speech(path)
+
+    def run(self, deliver: Deliver, stopped: threading.Event) -> None:
+        """Hand over a piece whenever its last sample would have been spoken."""
+        start = time.monotonic()
+        size = round(PIECE * SAMPLE_RATE)
+        for first in range(0, len(self.samples), size):
+            piece = self.samples[first : first + size]
+            if stopped.wait(max(0.0, start + (first + len(piece)) / SAMPLE_RATE - time.monotonic())):
+                return
+            deliver(piece, time.monotonic())
+
+
+class Pcm(Source):
+    """Samples of 16 bits, mono, little endian, on standard input.
+
+    Args:
+        rate: samples a second.
+
+    Raises:
+        FaceDiffError: if standard input is closed or a terminal.
+    """
+
+    name = "standard input"
+
+    def __init__(self, rate: int = SAMPLE_RATE) -> None:
+        if sys.stdin is None or sys.stdin.closed:
+            raise FaceDiffError("standard input: is closed; send 16-bit mono samples to it")
+        self._stream = sys.stdin.buffer
+        if sys.stdin.isatty():
+            raise FaceDiffError("standard input: is a terminal; send 16-bit mono samples to it, as from arecord")
+        self.rate = rate
+        self._convert = Resampler(rate, SAMPLE_RATE)
+
+    def run(self, deliver: Deliver, stopped: threading.Event) -> None:
+        """Hand over what is there, no faster than it is spoken."""
+        read, start = 0, 0.0
+        for samples in pcm(self._stream, self.rate):
+            now = time.monotonic()
+            start = start or now
+            read += len(samples)
+            early = start + read / self.rate / FASTER - AHEAD - now
+            if stopped.wait(max(0.0, early)):
+                return
+            deliver(self._convert(samples), time.monotonic() - self._convert.delay)
+        if not read:
+            raise FaceDiffError("standard input: ended before any sample came; send 16-bit mono samples to it")
+        deliver(self._convert(np.zeros(0, np.float32), True), time.monotonic())
+
+
+class Microphone(Source):
+    """A sound device of this machine, through PortAudio.
+
+    Args:
+        device: number or part of the name; ``default`` for the system's choice.
+
+    Raises:
+        MissingExtraError: if sounddevice is not installed.
+        FaceDiffError: if PortAudio is missing, there is no such device, or it cannot be opened.
+    """
+
+    def __init__(self, device: str = USUAL) -> None:
+        self._sound = sound_library("a microphone")
+        self._device, about = find_device(self._sound, device, "input")
+        self.rate = round(float(about["default_samplerate"]))
+        self.name = f"microphone {about['name']}"
+        self.lost = 0
+        """Blocks that came too fast for PortAudio."""
+        try:
+            self._sound.check_input_settings(device=self._device, channels=1, dtype="float32", samplerate=self.rate)
+        except (self._sound.PortAudioError, ValueError) as error:
+            raise _refused(self.name, error) from error
+
+    def run(self, deliver: Deliver, stopped: threading.Event) -> None:
+        """Hand over blocks as PortAudio gives them, in its thread."""
+        convert, latest, broken = Resampler(self.rate, SAMPLE_RATE), [time.monotonic()], list[Exception]()
+
+        def heard(block: npt.NDArray[np.float32], count: int, clock: Any, status: Any) -> None:  # noqa: ANN401
+            now = time.monotonic()
+            latest[0] = now
+            self.lost += bool(status)
+            # The block was recorded before it is handed over; a driver that does not know when says 0.
+            waited = clock.currentTime - clock.inputBufferAdcTime - count / self.rate
+            arrived = now - waited if clock.inputBufferAdcTime and 0 < waited < 1 else now
+            try:
+                deliver(convert(block[:, 0].copy()), arrived - convert.delay)
+            except Exception as error:  # noqa: BLE001 - raised in the thread that waits; PortAudio would only print it
+                broken.append(error)
+
+        try:
+            with self._sound.InputStream(
+                device=self._device,
+                channels=1,
+                samplerate=self.rate,
+                dtype="float32",
+                latency="low",
+                callback=heard,
+            ) as stream:
+                while not stopped.wait(0.1):
+                    if broken:
+                        raise broken[0]
+                    if not stream.active or time.monotonic() - latest[0] > SILENT:
+                        raise FaceDiffError(f"{self.name}: gives no sound any more; connect it again")
+        except (self._sound.PortAudioError, OSError) as error:
+            raise _refused(self.name, error) from error
+
+
+def sound_library(feature: str) -> Any:  # noqa: ANN401 - a module without types
+    """The library that speaks to sound devices.
+
+    Raises:
+        MissingExtraError: if it is not installed.
+        FaceDiffError: if PortAudio, which it needs, is not.
+    """
+    try:
+        import sounddevice
+    except ImportError as error:
+        raise MissingExtraError("sounddevice", "live", feature) from error
+    except OSError as error:  # its package for Linux comes without PortAudio
+        raise FaceDiffError(
+            f"{feature} needs PortAudio, which is not installed; install it (apt-get install libportaudio2), or give a "
+            f"recording, or samples on standard input"
+        ) from error
+    return sounddevice
+
+
+def find_device(library: Any, wanted: str, kind: str) -> tuple[int, dict[str, Any]]:  # noqa: ANN401
+    """The number and the facts of a sound device.
+
+    Args:
+        library: of :func:`sound_library`.
+        wanted: its number or a part of its name; ``default`` for the system's choice.
+        kind: ``input`` or ``output``.
+
+    Raises:
+        FaceDiffError: naming the devices that there are.
+    """
+    word = "--microphone" if kind == "input" else "--sound"
+    try:
+        devices = list(library.query_devices())
+    except (library.PortAudioError, OSError) as error:
+        raise FaceDiffError(f"{word}: no sound device can be asked for ({error}); give a recording") from error
+    fit = {place: each for place, each in enumerate(devices) if each[f"max_{kind}_channels"] > 0}
+    if not fit:
+        raise FaceDiffError(
+            f"{word}: there is no {kind} device; connect one"
+            + (", or give a recording, or samples on standard input" if kind == "input" else ", or leave it out")
+        )
+    if wanted == USUAL:
+        usual = library.default.device[0 if kind == "input" else 1]
+        place = usual if usual in fit else next(iter(fit))
+        return place, fit[place]
+    named = [place for place, each in fit.items() if wanted == str(place) or wanted.lower() in each["name"].lower()]
+    exact = [place for place in named if wanted in (str(place), fit[place]["name"])]
+    if len(named) == 1 or exact:
+        return (exact or named)[0], fit[(exact or named)[0]]
+    known = [f"{place}: {each['name']}" for place, each in fit.items()]
+    problem = "several devices are called so" if named else f"there is no {kind} device of this name or number"
+    raise FaceDiffError(f"{word} {wanted}: {problem}; {choices(wanted, known)}")
+
+
+def _refused(name: str, error: Exception) -> FaceDiffError:
+    return FaceDiffError(f"{name}: cannot be opened ({error}); close what uses it, or choose another device")

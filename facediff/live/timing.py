@@ -1,0 +1,146 @@
+"""Clocks of a live performance: when speech was spoken, when its frames are due, and how late they were.
+
+All times are seconds of :func:`time.monotonic`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+MEMORY = 5.0
+"""Seconds of arrivals and bursts that are remembered."""
+
+GAP = 0.5
+"""Seconds by which speech must come late for the source to have paused."""
+
+MARGIN = 0.01
+"""Seconds by which a frame is ready before it is due, at least."""
+
+SHRINKING = 0.01
+"""Seconds by which the delay may shrink in a second: frames then follow each other 1 % faster, which nobody sees."""
+
+
+class SpokenClock:
+    """When a moment of speech was spoken, from when its samples arrived.
+
+    Samples arrive in blocks, and some of them late. A moment counts as spoken when its sample would have arrived
+    without any such delay: by the earliest arrival of the last seconds, so that clocks of sound cards may drift.
+    """
+
+    def __init__(self) -> None:
+        self._earliest: deque[tuple[float, float]] = deque()  # (when, arrival − moment), later ones larger
+        self._before: deque[tuple[float, float]] = deque()  # (moment, offset) of speech before a pause of the source
+
+    def arrived(self, moment: float, at: float) -> None:
+        """All speech up to a moment, in seconds from the start, had arrived at a time."""
+        offset = at - moment
+        if self._earliest and offset > self._earliest[0][1] + GAP:
+            self._before.append((moment, self._earliest[0][1]))
+            self._earliest.clear()
+        while self._earliest and self._earliest[-1][1] >= offset:
+            self._earliest.pop()
+        self._earliest.append((at, offset))
+        while self._earliest[0][0] < at - MEMORY:
+            self._earliest.popleft()
+        while self._before and self._before[0][0] < moment - 60:
+            self._before.popleft()
+
+    def spoken(self, moment: float) -> float:
+        """When a moment of speech was spoken.
+
+        Example:
+            >>> clock = SpokenClock()
+            >>> clock.arrived(0.02, 100.02)
+            >>> clock.arrived(0.04, 100.05)  # 10 ms late
+            >>> round(clock.spoken(0.04), 3)
+            100.04
+        """
+        for until, offset in self._before:
+            if moment < until:
+                return moment + offset
+        return moment + self.offset
+
+    @property
+    def offset(self) -> float:
+        """What is added to the latest moments."""
+        return self._earliest[0][1] if self._earliest else 0.0
+
+
+class Pacer:
+    """The delay between speech and its frames: constant, so that frames follow each other at their rate.
+
+    Frames come in bursts, a hop of the windows at a time; the first of a burst has waited longest for the others. The
+    delay is what those frames need, and a margin. It grows when a burst comes late, by one hop at most, and shrinks
+    slowly when it has been longer than necessary.
+
+    Args:
+        hop: seconds of a burst.
+    """
+
+    def __init__(self, hop: float) -> None:
+        self.hop = hop
+        self.delay: float | None = None
+        self._needed: deque[tuple[float, float]] = deque()  # (when, what a burst needed)
+        self._changed = 0.0
+
+    def ready(self, spoken: float, now: float) -> None:
+        """The first frame of a burst has become ready, whose speech was spoken at a time."""
+        needed = now - spoken
+        self._needed.append((now, needed))
+        while self._needed[0][0] < now - MEMORY:
+            self._needed.popleft()
+        all_needed = [each for _, each in self._needed]
+        if self.delay is None:
+            self.delay = needed + 2 * MARGIN
+        elif needed + MARGIN > self.delay:
+            self.delay = min(needed + MARGIN, max(self.delay, min(all_needed) + self.hop))
+        else:
+            enough = min(self.delay, max(all_needed) + MARGIN)
+            self.delay = max(enough, self.delay - SHRINKING * min(MEMORY, now - self._changed))
+        self._changed = now
+
+    def due(self, spoken: float) -> float:
+        """When a frame is due whose speech was spoken at a time."""
+        return spoken + (self.delay or 0.0)
+
+
+class Lags:
+    """A distribution of seconds, in bins of 1 ms up to a minute: its size does not grow.
+
+    Example:
+        >>> lags = Lags()
+        >>> for lag in (0.1, 0.2, 0.9):
+        ...     lags.add(lag)
+        >>> round(lags.share(0.5), 3), round(lags.worst, 3)
+        (0.2, 0.9)
+    """
+
+    BIN = 0.001
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(60_001, np.int64)
+        self.count = 0
+        self.worst = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count one more."""
+        self._counts[min(len(self._counts) - 1, max(0, round(seconds / self.BIN)))] += 1
+        self.count += 1
+        self.worst = max(self.worst, seconds)
+
+    def share(self, share: float) -> float:
+        """The seconds that a share of all do not exceed; 0.5 for the median. NaN if there are none."""
+        if not self.count:
+            return math.nan
+        return float(np.searchsorted(np.cumsum(self._counts), math.ceil(share * self.count)) * self.BIN)
+
+    def __str__(self) -> str:
+        """Median, 95 % and worst in milliseconds."""
+        if not self.count:
+            return "none"
+        return f"{1000 * self.share(0.5):.0f} ms median, {1000 * self.share(0.95):.0f} ms 95 %, " + (
+            f"{1000 * self.worst:.0f} ms worst"
+        )

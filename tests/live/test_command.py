@@ -1,0 +1,216 @@
+"""The commands ``facediff live`` and ``facediff-live``: options, checks before anything is opened, the whole path."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+
+from facediff.cli.app import main as facediff
+from facediff.cli.live import live
+from facediff.cli.parsing import flat, parameters_of
+from facediff.data.voice_activity import EnergyGate, Openness, read_gate
+from facediff.errors import FaceDiffError
+from facediff.live.app import main, parser
+from facediff.live.command import LiveOptions, perform
+from facediff.live.model import LiveModel, usual_gate
+from facediff.registry import Kind
+from tests.fakes.live import Kept, fake_model
+
+MADE: list[Kept] = []
+
+
+class Keeping(Kept):
+    """A receiver that tests find again."""
+
+    def __init__(self, address: object, *, weights: bool = False, refuse: bool = False) -> None:
+        super().__init__(weights=weights)
+        self.name, self.refuse = str(getattr(address, "text", address)), refuse
+        MADE.append(self)
+
+    def open(self, performance: Any) -> None:  # noqa: ANN401
+        super().open(performance)
+        if self.refuse:
+            raise FaceDiffError(f"{self.name}: port taken")
+
+
+@pytest.fixture(autouse=True)
+def receivers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No receivers but the one of this file."""
+    kind = Kind("receiver", "", "tests", aliases=False)
+    kind.register("keep")(Keeping)
+    for place in ("facediff.registry", "facediff.live.frames", "facediff.live.command"):
+        monkeypatch.setattr(f"{place}.receiver", kind)
+    MADE.clear()
+
+
+@pytest.fixture
+def speech(tmp_path: Path) -> Path:
+    soundfile.write(tmp_path / "speech.wav", 0.1 * np.sin(np.arange(4800) / 9), 16_000)
+    return tmp_path / "speech.wav"
+
+
+def opened(options: LiveOptions) -> LiveModel:
+    """A model that needs no folder."""
+    return fake_model()
+
+
+def test_performance_from_a_recording_to_receivers(speech: Path) -> None:
+    said: list[str] = []
+    options = LiveOptions(Path("folder"), str(speech), to=["keep:1", "keep:2"])
+    summary = perform(options, opened, said.append)
+    assert summary.frames == 15
+    assert [len(made.frames) for made in MADE] == [15, 15]
+    assert [made.closed for made in MADE] == [1, 1]
+    performance = MADE[0].performance
+    assert performance is not None
+    assert (performance.frame_rate, performance.speech, performance.metadata["licence"]) == (50.0, True, "none")
+    assert sum(len(samples) for samples, _ in MADE[0].speech) == 4800  # a recording is heard, too
+    assert any("lag" in sentence for sentence in said)
+
+
+def test_receiver_that_cannot_open_closes_those_before_it(speech: Path) -> None:
+    options = LiveOptions(Path("folder"), str(speech), to=["keep:1", "keep:2?refuse=true"])
+    with pytest.raises(FaceDiffError, match="keep:2"):
+        perform(options, opened, str)
+    assert [made.closed for made in MADE] == [1, 1]
+    assert not MADE[0].frames
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ({"speech": None}, "speech"),
+        ({"microphone": "default"}, "speech"),
+        ({"rate": 8000}, "--rate"),
+        ({"to": []}, "--to.*keep"),
+        ({"to": ["kep:1"]}, "--to kep:1.*keep"),
+        ({"to": ["keep:1", "keep:1"]}, "--to keep:1"),
+        ({"to": ["keep:1?weights=true"]}, "--shapes"),
+        ({"to": ["keep:1?weights=true"], "shapes": Path("nowhere")}, "--shapes nowhere"),
+        ({"sound": "loud"}, "--sound loud"),
+        ({"voice_gate": "energetic"}, "--voice-gate"),
+        ({"speech": "nowhere.wav"}, "nowhere.wav"),
+        ({"seconds": 0.0}, "seconds"),
+        ({"window": float("nan")}, "window"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_a_model_is_opened(words: dict[str, Any], named: str, speech: Path) -> None:
+    def never(options: LiveOptions) -> LiveModel:
+        raise AssertionError("opened")
+
+    with pytest.raises(FaceDiffError, match=named):
+        perform(LiveOptions(**{"model": Path("m"), "speech": str(speech), "to": ["keep:1"], **words}), never, str)
+
+
+def test_weights_of_blendshapes_are_solved_for(speech: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Of a set whose one shape moves the first vertex as the made-up stream does."""
+    neutral = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
+    monkeypatch.setattr("tests.fakes.live.fake_model", None)
+    for name, moved in (("neutral", 0.0), ("jawOpen", 20.0)):
+        vertices = neutral.copy()
+        vertices[0, 0] += moved
+        lines = [*(f"v {x} {y} {z}" for x, y, z in vertices), "f 1 2 3", "f 2 4 3"]
+        (tmp_path / f"{name}.obj").write_text("\n".join(lines))
+    model = fake_model()
+    still = LiveModel(**{**vars(model), "neutral": neutral, "start": lambda: Moved(model.start(), neutral)})
+    options = LiveOptions(Path("m"), str(speech), to=["keep:1?weights=true"], shapes=tmp_path)
+    perform(options, lambda _: still, str)
+    performance = MADE[0].performance
+    assert performance is not None
+    assert performance.shapes == ("jawOpen",)
+    weights = [float(frame.weights[0]) for frame in MADE[0].frames if frame.weights is not None]
+    assert len(weights) == 15
+    # Smoothness makes the weight lag behind a ramp by a little.
+    assert np.allclose(weights[5:], np.arange(5, 15) / 20, atol=0.03)
+
+
+class Moved:
+    """A stream whose frames begin at a neutral face."""
+
+    def __init__(self, stream: Any, neutral: np.ndarray) -> None:  # noqa: ANN401
+        self.stream, self.neutral = stream, neutral
+
+    @property
+    def made(self) -> int:
+        return int(self.stream.made)
+
+    def feed(self, samples: np.ndarray) -> np.ndarray:
+        return np.asarray(self.stream.feed(samples) + self.neutral, np.float32)
+
+    def finish(self) -> np.ndarray:
+        return np.asarray(self.stream.finish() + self.neutral, np.float32)
+
+
+def test_both_commands_have_the_same_options() -> None:
+    """But for those that need PyTorch."""
+    full = {parameter.name: parameter for parameter in flat(parameters_of(live))}
+    small = {action.dest: action for action in parser()._actions if not isinstance(action, argparse._HelpAction)}
+    small.pop("version")
+    assert set(full) - set(small) == {"steps", "device"}
+    for name, action in small.items():
+        if not full[name].positional:
+            assert (action.default or None) == (full[name].default or None), name
+            assert bool(action.const) == (full[name].option.bare is not None or full[name].is_switch), name
+
+
+def test_usual_gate_waits_no_longer_than_the_windows() -> None:
+    for look_ahead in (0.05, 0.1, 0.2, 0.3, 0.5, 0.9, 1.5, 4.5):
+        gate = read_gate(usual_gate(look_ahead))
+        assert gate is not None
+        assert Openness(gate, 25.0).look_ahead <= max(look_ahead, 0.03) + 1e-9
+    whole = read_gate(usual_gate(1.5))
+    assert whole is not None
+    assert vars(whole) == vars(EnergyGate())
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["nowhere", "-", "--to", "keep:1"], "nowhere"),
+        (["FOLDER", "nowhere.wav", "--to", "keep:1"], "nowhere.wav"),
+        (["FOLDER", "-", "--to", "keep:1", "--steps", "3"], "--steps"),
+        (["FOLDER", "-", "--to", "keep:1", "--seconds", "0"], "--seconds"),
+        (["FOLDER", "-", "--to", "keep:1", "--threads", "-1"], "--threads"),
+    ],
+)
+def test_wrong_words_end_with_one_sentence(
+    words: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "model.json").touch()
+    assert facediff(["live", *(str(tmp_path) if word == "FOLDER" else word for word in words)]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert named in line
+
+
+def test_small_command_says_errors_in_one_line(
+    speech: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["nowhere", str(speech), "--to", "keep:1"]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "nowhere" in line
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("facediff.live.app.perform", stopped)
+    assert main(["nowhere", str(speech), "--to", "keep:1"]) == 130
+
+
+def test_live_needs_neither_pytorch_nor_scipy() -> None:
+    program = (
+        "import sys\n"
+        "for name in ('torch', 'scipy', 'lightning', 'jsonargparse', 'sounddevice'): sys.modules[name] = None\n"
+        "import facediff.live.command, facediff.live.sound, facediff.editing.live_weights, facediff.editing.shapes\n"
+        "from facediff.live.app import main\n"
+        "sys.exit(main(['nowhere', '--microphone', '--to', 'nothing:1']))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2, done.stderr
+    assert "nothing" in done.stderr

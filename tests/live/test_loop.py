@@ -1,0 +1,140 @@
+"""The loop in real time, with a model and receivers that cost what a test says."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+
+from facediff.data.audio import samples_for
+from facediff.errors import FaceDiffError
+from facediff.live.loop import Backlog, Loop
+from tests.fakes.live import AHEAD, FRAME_RATE, HOP, FakeStream, Kept, Spoken, fake_model
+
+FRAME = 1 / FRAME_RATE
+
+
+def test_every_frame_leaves_at_its_time() -> None:
+    kept, reports = Kept(), list[str]()
+    loop = Loop(fake_model(), Spoken(0.8), [kept], report=reports.append, every=0.3)
+    began = time.monotonic()
+    summary = loop.run()
+    assert [frame.index for frame in kept.frames] == list(range(40))
+    assert [frame.vertices[0, 0] for frame in kept.frames] == list(range(40))
+    assert np.allclose([frame.time for frame in kept.frames], np.arange(40) * FRAME)
+    # Bursts of four frames come every 80 ms, but leave one by one; a busy machine may hold one up.
+    apart = np.diff(kept.times)
+    assert np.median(apart) == pytest.approx(FRAME, abs=0.004)
+    assert np.mean(apart > FRAME / 4) > 0.9
+    # The first frame of a burst waits for the others and the look-ahead.
+    least = (HOP + AHEAD - 1) * FRAME
+    assert least - 0.005 < summary.lag.share(0.5) < least + 0.15
+    assert np.allclose([frame.heard for frame in kept.frames], began + (1 + np.arange(40)) * FRAME, atol=0.1)
+    assert (summary.frames, summary.dropped, summary.lost) == (40, 0, 0)
+    assert summary.receivers == {"kept:": "40 frames"}
+    assert reports
+    assert all("lag" in sentence for sentence in [*reports, *summary.sentences()[:1]])
+
+
+def test_slow_receiver_gets_fewer_frames_and_never_older_ones() -> None:
+    kept = Kept(seconds=2.5 * FRAME)
+    summary = Loop(fake_model(), Spoken(0.8), [kept], report=str).run()
+    numbers = [frame.index for frame in kept.frames]
+    assert numbers == sorted({*numbers})
+    assert summary.dropped == 40 - len(numbers) > 10
+    assert kept.frames[-1].dropped > 5
+    assert summary.lag.worst < (HOP + AHEAD) * FRAME + 2 * HOP * FRAME + 0.15
+
+
+def test_slow_model_drops_speech_says_so_once_and_keeps_its_lag(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("facediff.live.loop.RECENT", 0.5)
+    kept, reports = Kept(), list[str]()
+    loop = Loop(fake_model(partial(FakeStream, 2.5)), Spoken(1.6), [kept], report=reports.append)
+    summary = loop.run()
+    assert len([sentence for sentence in reports if "--steps" in sentence]) == 1
+    assert 0.2 < summary.lost < 1.4
+    numbers = np.array([frame.index for frame in kept.frames])
+    assert (np.diff(numbers) > 0).all()
+    assert summary.frames + summary.dropped == pytest.approx(80 - summary.lost * FRAME_RATE, abs=1)
+    # Numbers count speech that was dropped, so that a frame's time is that of the speech.
+    assert numbers[-1] == 79
+    assert summary.lag.worst < 2.0
+
+
+def test_speech_weights_and_the_end_reach_the_receivers() -> None:
+    kept, deaf, solved = Kept(weights=True), Kept(), list[float]()
+
+    def solve(offsets: np.ndarray) -> np.ndarray:
+        solved.append(float(offsets[0, 0]))
+        return offsets[:1, 0] / 100
+
+    loop = Loop(fake_model(), Spoken(30.0), [kept, deaf], hearing=[kept], solve=solve, seconds=0.3, report=str)
+    assert loop.run().speech == pytest.approx(0.3)
+    assert sum(len(samples) for samples, _ in kept.speech) == 4800
+    assert np.allclose([start for _, start in kept.speech], np.arange(30) * 0.01)
+    assert not deaf.speech
+    assert solved == list(range(15))  # once a frame, in order
+    weights = [float(frame.weights[0]) for frame in kept.frames if frame.weights is not None]
+    assert weights == pytest.approx(np.arange(15) / 100)
+
+
+def test_receiver_that_fails_does_not_stop_the_others() -> None:
+    failing, kept, reports = Kept(error=RuntimeError("gone")), Kept(), list[str]()
+    Loop(fake_model(), Spoken(0.3), [failing, kept], report=reports.append).run()
+    assert len(kept.frames) == len(failing.frames) == 15
+    assert len([sentence for sentence in reports if "gone" in sentence]) == 1
+
+
+def test_interrupt_ends_with_a_summary() -> None:
+    kept = Kept(error=KeyboardInterrupt())
+    began = time.monotonic()
+    summary = Loop(fake_model(), Spoken(30.0), [kept], report=str).run()
+    assert time.monotonic() - began < 5
+    assert summary.receivers == {"kept:": "3 frames"}
+
+
+def test_error_of_the_source_or_the_model_is_raised() -> None:
+    class Broken(FakeStream):
+        def feed(self, samples: np.ndarray) -> np.ndarray:
+            raise FaceDiffError("model: broken")
+
+    kept = Kept()
+    with pytest.raises(FaceDiffError, match="unplugged"):
+        Loop(fake_model(), Spoken(0.4, error=FaceDiffError("unplugged")), [kept], report=str).run()
+    assert len(kept.frames) == 20  # what was heard is finished
+    with pytest.raises(FaceDiffError, match="broken"):
+        Loop(fake_model(Broken), Spoken(30.0), [kept], report=str).run()
+
+
+@pytest.mark.parametrize("frame_rate", [25.0, 29.97, 60.0])
+def test_backlog_drops_whole_frames_without_an_error_that_adds_up(frame_rate: float) -> None:
+    backlog, put, taken = Backlog(frame_rate), 0, 0
+    backlog.limit = 0.5
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        count = int(rng.integers(1, 2000))
+        backlog.put(np.arange(put, put + count, dtype=np.float32))
+        put += count
+        if rng.random() < 0.3:
+            found = backlog.take(0.05)
+            assert found is not None
+            samples, dropped = found
+            # Samples are numbered: what is missing before these is exactly what the dropped frames last.
+            assert samples[0] == taken + samples_for(dropped, frame_rate)
+            assert (np.diff(samples) == 1).all()
+            taken += len(samples)
+    assert backlog.dropped > 100
+    backlog.end()
+    while backlog.take(0.05) is not None:
+        pass
+
+
+@pytest.mark.slow
+def test_lag_stays_for_a_minute() -> None:
+    kept = Kept()
+    loop = Loop(fake_model(), Spoken(60.0, pauses={3000: 1.0}), [kept], report=str)
+    loop.run()
+    lags = np.array(kept.times) - [frame.heard for frame in kept.frames]
+    assert abs(np.median(lags[-500:]) - np.median(lags[500:1000])) < 0.01

@@ -1,0 +1,207 @@
+"""Sources of speech: a recording and a pipe in real time, and a microphone through a made-up sound library.
+
+No sound device is used: what stands for ``sounddevice`` here has the part of its interface that is used.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+
+from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.live.frames import Performance
+from facediff.live.sound import SoundOut
+from facediff.live.sources import Microphone, Pcm, Played, Source
+from facediff.live.timing import Pacer, SpokenClock
+from tests.fakes.live import FakeSound, PortAudioError, device
+
+
+def heard(source: Source, stopped: threading.Event | None = None) -> tuple[np.ndarray, np.ndarray, list[float]]:
+    """All samples of a source, how many each piece has, and when each piece came, from the start."""
+    pieces: list[np.ndarray] = []
+    times: list[float] = []
+    began = time.monotonic()
+
+    def deliver(samples: np.ndarray, at: float) -> None:
+        pieces.append(samples)
+        times.append(at - began)
+
+    source.run(deliver, stopped or threading.Event())
+    return np.concatenate(pieces), np.array([len(piece) for piece in pieces]), times
+
+
+def test_recording_is_played_in_real_time(tmp_path: Path) -> None:
+    wave = np.sin(np.arange(22_050 // 2) / 9)
+    soundfile.write(tmp_path / "a.wav", np.stack([wave, wave], 1), 22_050)  # another rate, and two channels
+    source = Played(tmp_path / "a.wav")
+    samples, counts, times = heard(source)
+    assert np.array_equal(samples, source.samples)
+    assert len(samples) == 8000
+    late = np.array(times) - np.cumsum(counts) / 16_000
+    assert late.min() >= -0.001
+    assert np.median(late) < 0.01
+
+
+@pytest.fixture
+def standard_input(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], None]]:
+    """Makes a pipe with bytes in it, that is closed at its other end, standard input."""
+    with ExitStack() as stack:
+
+        def put(data: bytes) -> None:
+            out, into = os.pipe()
+            threading.Thread(target=lambda: (os.write(into, data), os.close(into)), daemon=True).start()
+            monkeypatch.setattr(sys, "stdin", stack.enter_context(os.fdopen(out)))
+
+        yield put
+
+
+def test_file_through_a_pipe_is_played_in_real_time(standard_input: Callable[[bytes], None]) -> None:
+    wave = (3000 * np.sin(np.arange(32_000) / 9)).astype("<i2")
+    standard_input(wave.tobytes() + b"\0")  # with half a sample at its end
+    samples, counts, times = heard(Pcm(48_000))
+    assert abs(len(samples) - 32_000 / 3) < 200
+    ahead = np.cumsum(counts) / 16_000 - times
+    assert 0.1 < ahead.max() < 0.3  # what a recorder may have kept
+    assert times[-1] > 0.4
+
+
+@pytest.mark.parametrize(("data", "named"), [(b"", "ended before"), (b"RIFF1234", "sound file")])
+def test_standard_input_that_cannot_be(data: bytes, named: str, standard_input: Callable[[bytes], None]) -> None:
+    standard_input(data)
+    with pytest.raises(FaceDiffError, match=f"standard input.*{named}"):
+        heard(Pcm())
+
+
+@pytest.mark.parametrize(
+    "stdin",
+    [None, SimpleNamespace(closed=True), SimpleNamespace(closed=False, buffer=io.BytesIO(), isatty=lambda: True)],
+)
+def test_closed_standard_input_and_terminals_are_refused(stdin: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", stdin)
+    with pytest.raises(FaceDiffError, match="standard input"):
+        Pcm()
+
+
+CARDS = (device("Line out", 0, 2), device("Webcam", 1, 0, 32_000.0), device("USB Mic", 2, 2), device("USB Mic 2", 1, 0))
+
+
+def library(monkeypatch: pytest.MonkeyPatch, *cards: dict[str, Any], **words: Any) -> FakeSound:  # noqa: ANN401
+    made = FakeSound(*cards, **words)
+    monkeypatch.setitem(sys.modules, "sounddevice", made)  # type: ignore[arg-type]
+    return made
+
+
+@pytest.mark.parametrize(
+    ("wanted", "name"),
+    [("default", "USB Mic"), ("1", "Webcam"), ("webc", "Webcam"), ("USB Mic", "USB Mic"), ("mic 2", "USB Mic 2")],
+)
+def test_microphone_is_found_by_number_or_name(wanted: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    library(monkeypatch, *CARDS, usual=2)
+    assert Microphone(wanted).name == f"microphone {name}"
+
+
+@pytest.mark.parametrize(("wanted", "named"), [("7", "Webcam"), ("Line out", "USB Mic"), ("usb", "several")])
+def test_unknown_microphone_names_the_devices(wanted: str, named: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    library(monkeypatch, *CARDS)
+    with pytest.raises(FaceDiffError, match=rf"--microphone {wanted}.*{named}"):
+        Microphone(wanted)
+
+
+def test_machine_without_a_microphone_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    library(monkeypatch, device("Line out", 0, 2), usual=-1)
+    with pytest.raises(FaceDiffError, match="--microphone"):
+        Microphone()
+    library(monkeypatch)
+    with pytest.raises(FaceDiffError, match="--microphone"):
+        Microphone()
+
+
+def test_missing_library_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sounddevice", None)
+    with pytest.raises(MissingExtraError, match=r"sounddevice.*facediff\[live\]"):
+        Microphone()
+
+    class Finder:
+        @staticmethod
+        def find_spec(name: str, *_: object) -> None:
+            if name == "sounddevice":
+                raise OSError("PortAudio library not found")
+
+    monkeypatch.delitem(sys.modules, "sounddevice")
+    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
+    with pytest.raises(FaceDiffError, match="PortAudio"):
+        Microphone()
+
+
+def test_busy_microphone_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    library(monkeypatch, *CARDS, refuse=PortAudioError("Device unavailable"))
+    with pytest.raises(FaceDiffError, match="Webcam.*Device unavailable"):
+        heard(Microphone("Webcam"))
+
+
+def test_microphone_hands_over_blocks_with_the_time_at_which_they_were_spoken(monkeypatch: pytest.MonkeyPatch) -> None:
+    sound, stopped = library(monkeypatch, *CARDS), threading.Event()
+    pieces: list[tuple[np.ndarray, float]] = []
+    source = Microphone("Webcam")
+    thread = threading.Thread(target=source.run, args=(lambda *piece: pieces.append(piece), stopped))
+    thread.start()
+    while not sound.opened:
+        time.sleep(0.005)
+    [stream] = sound.opened
+    assert (stream.samplerate, stream.channels) == (32_000, 1)
+    block = np.sin(np.arange(3200) / 20)[:, None].astype(np.float32)
+    for _ in range(3):
+        now = time.monotonic()
+        # PortAudio says that the first sample was recorded 0.15 s ago, so the last one 0.05 s ago.
+        stream.callback(block, 3200, SimpleNamespace(currentTime=7.15, inputBufferAdcTime=7.0), None)
+        assert pieces[-1][1] == pytest.approx(now - 0.052, abs=0.03)  # 2 ms are held back
+    stream.callback(block, 3200, SimpleNamespace(currentTime=0.0, inputBufferAdcTime=0.0), "input overflow")
+    assert pieces[-1][1] == pytest.approx(time.monotonic(), abs=0.03)
+    assert source.lost == 1
+    stopped.set()
+    thread.join(timeout=5)
+    assert stream.closed
+    assert sum(len(samples) for samples, _ in pieces) == 4 * 1600 - 32
+
+
+def test_microphone_that_is_unplugged_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = library(monkeypatch, *CARDS)
+    threading.Timer(0.05, lambda: sound.opened[0].stop()).start()
+    with pytest.raises(FaceDiffError, match="Webcam"):
+        Microphone("Webcam").run(lambda *_: None, threading.Event())
+
+
+def test_speech_is_heard_when_its_frames_are_due(monkeypatch: pytest.MonkeyPatch) -> None:
+    library(monkeypatch, device("Phones", 0, 2, 16_000.0))
+    out, clock, pacer = SoundOut(), SpokenClock(), Pacer(0.1)
+    still = np.zeros((1, 3), np.float32)
+    out.open(Performance(25.0, still, np.zeros((0, 3), np.int32)))
+    start = time.monotonic()
+    played = np.ones((160, 1), np.float32)
+    out._play(played, 160, SimpleNamespace(currentTime=1.0, outputBufferDacTime=1.0), None)
+    assert not played.any()  # nothing is known of the delay yet
+    clock.arrived(0.5, start - 0.5)  # speech began a second ago
+    pacer.ready(start - 0.7, start)  # frames need 0.7 s, and a margin
+    out.follow(clock, pacer)
+    ramp = np.arange(16_000, dtype=np.float32) / 16_000
+    out.hear(ramp, 0.0)
+    out._play(played, 160, SimpleNamespace(currentTime=1.0, outputBufferDacTime=1.1), None)
+    # The block is heard in 0.1 s, 1.1 s after its speech began; less the delay, that is 0.38 s of it.
+    assert played[0, 0] == pytest.approx(1.1 - (pacer.delay or 0.0), abs=0.03)
+    again = np.zeros((160, 1), np.float32)
+    out._play(again, 160, SimpleNamespace(currentTime=1.01, outputBufferDacTime=1.11), None)
+    assert again[0, 0] == pytest.approx(played[-1, 0] + 1 / 16_000, abs=1e-3)  # without a gap
+    out.close()
+    out.close()
