@@ -217,9 +217,10 @@ DRILLS = [
 """One or several for each command that writes, except ``fit``, which has a drill of its own."""
 
 WRITES_NOTHING = ("components", "data check")
-SERVES = ("study serve", "serve")
+SERVES = ("study serve", "serve", "live")
 """Run until they are stopped. The first writes in transactions of SQLite, and tests/study/test_store.py kills it; what
-the second writes with --output, tests/runtime/test_site.py interrupts."""
+the second writes with --output, tests/runtime/test_site.py interrupts; what the third writes are files of receivers,
+which differ from run to run by the lag that they state."""
 FIT = "fit"
 
 

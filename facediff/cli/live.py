@@ -31,6 +31,7 @@ def live(
     voice_gate: Annotated[str, Option(metavar="GATE")] = "energy",
     window: Annotated[ranges.Window | None, Option(metavar="S")] = None,
     overlap: Annotated[ranges.Window | None, Option(metavar="S")] = None,
+    low_latency: bool = False,
     shapes: Annotated[Path | None, Option(metavar="SHAPES", reads=True)] = None,
     sound: Annotated[str | None, Option(metavar="WHERE")] = None,
     seconds: Annotated[ranges.Duration | None, Option(metavar="S")] = None,
@@ -65,6 +66,7 @@ def live(
             windows) or webrtc, with options (energy:ahead=0.3); off for the model's own motion there
         window: seconds of a window; shorter ones answer sooner (default: the model's)
         overlap: seconds that neighbouring windows share
+        low_latency: answer at once: windows of one frame, 0.12 s of look-ahead, two denoising steps
         shapes: blendshapes for receivers that take weights: folder of meshes, .glb with targets, or "puppet" (built in)
         sound: where the speech is played, delayed to match: off, out (a sound device; out:NAME for one by its name), or
             receivers (the page in the browser) (default: receivers for a recording, else off)
@@ -99,6 +101,7 @@ def live(
         voice_gate=voice_gate,
         window=window,
         overlap=overlap,
+        low_latency=low_latency,
         shapes=shapes,
         sound=sound,
         seconds=seconds,
@@ -120,6 +123,7 @@ def trained_model(options: LiveOptions, steps: int | None, device: str) -> LiveM
     """
     import numpy as np
 
+    from facediff.data.windows import LOW_LATENCY
     from facediff.live.model import LiveModel
     from facediff.models import load_model
     from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, facts_of, usable_device
@@ -127,7 +131,7 @@ def trained_model(options: LiveOptions, steps: int | None, device: str) -> LiveM
     from facediff.utils.licences import licence_metadata
 
     model = load_model(options.model, usable_device(device))
-    plan = model.windows.chosen(options.window, options.overlap)
+    plan = LOW_LATENCY if options.low_latency else model.windows.chosen(options.window, options.overlap)
     chosen = AnimationOptions(
         checkpoint=options.model,
         identity=options.identity,
@@ -138,6 +142,7 @@ def trained_model(options: LiveOptions, steps: int | None, device: str) -> LiveM
         voice_gate=options.gate(plan.look_ahead),
         window=options.window,
         overlap=options.overlap,
+        low_latency=options.low_latency,
         device=device,
     )
     pipeline = AnimationPipeline(chosen, seed=options.seed, model=model)

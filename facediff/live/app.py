@@ -41,6 +41,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--voice-gate", default="energy", metavar="GATE", help="what finds the pauses; off for none")
     made.add_argument("--window", type=float, metavar="S", help="seconds of a window")
     made.add_argument("--overlap", type=float, metavar="S", help="seconds that windows share")
+    made.add_argument("--low-latency", action="store_true", help="windows of one frame, 0.2 s behind the speech")
     made.add_argument("--shapes", type=Path, metavar="SHAPES", help="blendshapes whose weights are sent")
     made.add_argument("--sound", metavar="WHERE", help="where the speech is played: off, out, out:DEVICE or receivers")
     made.add_argument("--seconds", type=float, metavar="S", help="end after so much speech")

@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from facediff.data.voice_activity import read_gate
+from facediff.data.voice_activity import QUICK_GATE, USUAL_GATE, read_gate
 from facediff.errors import FaceDiffError, printable
 from facediff.live.frames import OPTION, Performance, Receiver, open_receivers
 from facediff.live.loop import Loop, Solver, Summary
-from facediff.live.model import USUAL_GATE, LiveModel, runtime_model, usual_gate
+from facediff.live.model import LiveModel, runtime_model, usual_gate
 from facediff.live.sound import SoundOut
 from facediff.live.sources import USUAL, Microphone, Pcm, Played, Source
 from facediff.registry import receiver
@@ -45,6 +45,7 @@ class LiveOptions:
     voice_gate: str = USUAL_GATE
     window: ranges.Window | None = None
     overlap: ranges.Window | None = None
+    low_latency: bool = False
     shapes: Path | None = None
     sound: str | None = None
     seconds: ranges.Duration | None = None
@@ -63,6 +64,8 @@ class LiveOptions:
             raise FaceDiffError(f"{OPTION}: missing; give a receiver, one of {', '.join(receiver.names())}")
         if self.sound is not None and self.sound.partition(":")[0] not in (OFF, OUT, RECEIVERS):
             raise FaceDiffError(f"--sound {self.sound}: expected {OFF}, {OUT}, {OUT}:DEVICE or {RECEIVERS}")
+        if self.low_latency and (self.window is not None or self.overlap is not None):
+            raise FaceDiffError("--low-latency: chooses the windows; omit --window and --overlap")
         if self.voice_gate != USUAL_GATE:
             read_gate(self.voice_gate)
 
@@ -80,7 +83,9 @@ class LiveOptions:
 
     def gate(self, look_ahead: float) -> str:
         """The voice gate for windows that wait for so many seconds of speech."""
-        return usual_gate(look_ahead) if self.voice_gate == USUAL_GATE else self.voice_gate
+        if self.voice_gate != USUAL_GATE:
+            return self.voice_gate
+        return QUICK_GATE if self.low_latency else usual_gate(look_ahead)
 
     def expressivity_of_all(self) -> float:
         """Expressivity as one number, which is what an exported model takes."""
@@ -99,7 +104,10 @@ def exported_model(options: LiveOptions) -> LiveModel:
 
     expressivity = options.expressivity_of_all()
     model = RuntimeModel.open(options.model, threads=options.threads)
-    model.windows = model.windows.chosen(options.window, options.overlap)
+    if options.low_latency:
+        model.choose_low_latency()
+    else:
+        model.windows = model.windows.chosen(options.window, options.overlap)
     return runtime_model(
         model,
         gate=read_gate(options.gate(model.windows.look_ahead)),
@@ -153,7 +161,8 @@ def perform(options: LiveOptions, open_model: Callable[[LiveOptions], LiveModel]
     )
     model.warm_up()
     with opened(everyone, performance):
-        report(
+        tell = (lambda _: None) if options.quiet else report
+        tell(
             f"ready; {source.name}; {model.frame_rate:g} frames a second, each {model.lag:.2f} s after its speech and "
             f"the time that computing takes; Ctrl-C ends it"
         )

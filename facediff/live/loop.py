@@ -294,14 +294,15 @@ class Loop:
         while heard - recent[0][1] > enough:
             heard -= recent.popleft()[1]
         factor = sum(each for each, _ in recent) / max(heard, 1e-9)
-        slow = heard > enough / 2 and factor > 1
+        slow = heard > 0.9 * enough and factor > 1
         # Speech that waits for a model that cannot catch up would only make all frames late.
         self._backlog.limit = hop + 0.25 if slow else hop + PATIENCE
         if slow and not self._slow_told:
             self._slow_told = True
             self._report(
-                f"the model takes {factor:.1f} s for a second of speech on this machine, so that speech is dropped: "
-                f"export it with fewer --steps, choose a longer --window or a shorter --overlap, or end other programs"
+                f"the model takes {factor:.2f} s for a second of speech on this machine, so that speech is dropped: "
+                f"export it with fewer --steps, choose a longer --window or a shorter --overlap (or omit "
+                f"--low-latency), or end other programs"
             )
 
     def _ready(self, vertices: Array, made: int, gaps: deque[tuple[int, int]], now: float) -> int:
@@ -367,8 +368,9 @@ class Loop:
         return True
 
     def _late(self, frame: _Ready) -> bool:
-        """Whether a frame's time has passed by more than a hop: later ones are more urgent."""
-        return time.monotonic() > self.pacer.due(frame.spoken) + self.model.hop
+        """Whether a frame's time has passed by more than a hop, and a later one is there, which is more urgent."""
+        newer = self._frames and self._frames[-1].index > frame.index
+        return bool(newer) and time.monotonic() > self.pacer.due(frame.spoken) + self.model.hop
 
     def _send(self, frame: _Ready, weights: Array | None, solving: float) -> None:
         began = time.monotonic()

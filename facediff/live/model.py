@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.voice_activity import EnergyGate, Openness, VoiceGate
+from facediff.data.voice_activity import USUAL_GATE, EnergyGate, Openness, VoiceGate
 from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:
@@ -104,12 +104,8 @@ def runtime_model(model: RuntimeModel, *, gate: VoiceGate | None, **chosen: Any)
     )
 
 
-USUAL_GATE = "energy"
-"""The gate of live performances, which hears no further ahead than the windows do."""
-
-
 def usual_gate(look_ahead: float) -> str:
-    """The voice gate that waits no longer than the windows, for :func:`~facediff.data.voice_activity.read_gate`.
+    """The usual voice gate, but that it waits no longer than the windows, as ``read_gate`` takes it.
 
     Args:
         look_ahead: seconds of speech that the windows wait for.

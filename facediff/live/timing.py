@@ -19,6 +19,10 @@ GAP = 0.5
 MARGIN = 0.01
 """Seconds by which a frame is ready before it is due, at least."""
 
+GROWTH = 0.1
+"""Seconds, or a hop if that is longer, by which the delay grows beyond the least that bursts have needed: a machine
+that is slower than that drops frames."""
+
 SHRINKING = 0.01
 """Seconds by which the delay may shrink in a second: frames then follow each other 1 % faster, which nobody sees."""
 
@@ -73,8 +77,8 @@ class Pacer:
     """The delay between speech and its frames: constant, so that frames follow each other at their rate.
 
     Frames come in bursts, a hop of the windows at a time; the first of a burst has waited longest for the others. The
-    delay is what those frames need, and a margin. It grows when a burst comes late, by one hop at most, and shrinks
-    slowly when it has been longer than necessary.
+    delay is what those frames need, and a margin. It grows when a burst comes late, within limits, and shrinks slowly
+    when it has been longer than necessary.
 
     Args:
         hop: seconds of a burst.
@@ -96,7 +100,7 @@ class Pacer:
         if self.delay is None:
             self.delay = needed + 2 * MARGIN
         elif needed + MARGIN > self.delay:
-            self.delay = min(needed + MARGIN, max(self.delay, min(all_needed) + self.hop))
+            self.delay = min(needed + MARGIN, max(self.delay, min(all_needed) + max(self.hop, GROWTH)))
         else:
             enough = min(self.delay, max(all_needed) + MARGIN)
             self.delay = max(enough, self.delay - SHRINKING * min(MEMORY, now - self._changed))

@@ -58,6 +58,7 @@ FILES = (
 DRAWN = "WORLD/ours WORLD/corpus --topology tests.fakes.tiny.Tiny -o out.png --dpi 80 --width 85"
 BASES: dict[str, str] = {
     "animate": "WORLD/speech.wav --checkpoint WORLD/model.ckpt -o out.npy --quiet",
+    "live": "WORLD/model.ckpt WORLD/speech.wav --to jsonl:out.jsonl?weights=false --seconds 0.3 --quiet",
     "adapt": "--checkpoint WORLD/model.ckpt --person C -o out.ckpt --epochs 1 --accelerator cpu --quiet",
     "import-checkpoint": "WORLD/author.pth --dataset vocaset --identities A,B,C --templates WORLD/faces.pkl "
     "--audio-config WORLD/audio.json -o out.ckpt",
