@@ -113,15 +113,15 @@ class JsonLines(Receiver):
         """Write what waits and the last line, and let go."""
         if self._outbox is not None and self._sink is not None:
             self._outbox.close()
-            self._sink.close(self._outbox.dropped)
             self._words = self.status()
+            self._sink.close(self._outbox.dropped)
             self._outbox = self._sink = None
 
     def status(self) -> str:
         """Lines or clients, and what slow ones missed."""
         if self._outbox is None or self._sink is None:
             return self._words
-        return self._sink.status(self._outbox.dropped)
+        return self._sink.status(self._outbox.given - self._outbox.dropped, self._outbox.dropped)
 
 
 def line(content: dict[str, object]) -> bytes:
@@ -181,8 +181,10 @@ class _Stream:
                 raise _Unfinished
         self.wanted = False
 
-    def status(self, dropped: int) -> str:
-        return f"{self._frames} frames written" + (f", {dropped} dropped" if dropped else "")
+    def status(self, given: int, dropped: int) -> str:
+        # What waits is written before the end, unless nothing can be written any more.
+        frames = given if self.wanted else self._frames
+        return f"{frames} frames" + (f", {dropped} dropped" if dropped else "")
 
 
 class _Unfinished(Exception):  # noqa: N818 - no error: it takes a half-written file away
@@ -271,8 +273,8 @@ class _Clients:
                 client.close()
             self._clients.clear()
 
-    def status(self, dropped: int) -> str:
+    def status(self, given: int, dropped: int) -> str:
         with self._lock:
             missed = dropped + self._missed + sum(outbox.dropped for outbox in self._clients.values())
-            words = [f"{len(self._clients)} clients", f"{self.connected} so far"]
+            words = [f"{given} frames", f"{len(self._clients)} clients", f"{self.connected} so far"]
         return ", ".join(words + ([f"{missed} frames missed by slow ones"] if missed else []))
