@@ -45,7 +45,7 @@ DELAYS = ({"seconds": 1.0, "overlap": 0.4},)
 """Windows for a microphone that answer sooner than the model's own."""
 
 LOADS = "connect-src 'self'; worker-src 'self'; img-src data:; media-src blob:"
-"""What the page may load: its own worker and microphone script; sound that the reader has opened."""
+"""What the page may load besides its own scripts: its worker, and sound that the reader has opened."""
 WORKER_POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; connect-src 'self'"
 """What scripts of the site may load: themselves, compiled WebAssembly, and files of the site."""
 HEADERS = {
@@ -118,7 +118,8 @@ def page(title: str, description: Description, arrays: Arrays) -> str:
         "delays": DELAYS,
     }
     values = {"title": html.escape(title)}
-    return "".join(assemble("talk.html", ("style.css", "talk.css"), SCRIPTS, values, facts, Blobs(), loads=LOADS))
+    styles = "style.css", "talk.css"
+    return "".join(assemble("talk.html", styles, SCRIPTS, values, facts, Blobs(), loads=LOADS, own_scripts=True))
 
 
 def headers_file() -> str:

@@ -272,6 +272,7 @@ def assemble(
     blobs: Blobs,
     *,
     loads: str,
+    own_scripts: bool = False,
 ) -> list[str]:
     """A page of this package's assets in pieces, in order.
 
@@ -283,13 +284,15 @@ def assemble(
         facts: JSON that the script reads.
         blobs: the binary parts.
         loads: what the page may load, as its content security policy says it; nothing else is let in.
+        own_scripts: whether scripts that the page's own server offers may be loaded too, as audio worklets must be.
     """
     style = "\n".join(_without_comments(_asset(name)) for name in styles)
     script = script_of(scripts)
+    own = " 'self'" if own_scripts else ""
     filled = {
         **values,
         # Lets this script and this style run, and nothing else be loaded.
-        "policy": f"default-src 'none'; script-src {hash_source(script)}; style-src {hash_source(style)}; "
+        "policy": f"default-src 'none'; script-src {hash_source(script)}{own}; style-src {hash_source(style)}; "
         f"{loads}; base-uri 'none'; form-action 'none'",
         "style": style,
         "facts": script_data(facts),
