@@ -11,12 +11,14 @@ import html
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from facediff.animation import Animation
 from facediff.animation.files import FORMAT as ARCHIVE
+from facediff.data.voice_activity import QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
+from facediff.data.windows import LOW_LATENCY
 from facediff.errors import FaceDiffError
 from facediff.export.format import outward
 from facediff.export.viewer.packing import Blobs, millimetres
@@ -41,8 +43,15 @@ SCRIPTS = (
 """Parts of the page's script; each uses only the parts before it."""
 WORKER = ("archive", "npz", "noise", "windows", "voice_gate", "frame_clock", "exported", "generating", "talk_worker")
 """Parts of the worker's script."""
-DELAYS = ({"seconds": 1.0, "overlap": 0.4},)
-"""Windows for a microphone that answer sooner than the model's own."""
+DELAYS: tuple[dict[str, float | bool], ...] = (
+    {**vars(LOW_LATENCY), "quick": True},
+    {**vars(LOW_LATENCY), "quick": True, "seconds": 4 / 30},  # a third of the work
+    {"seconds": 1.0, "overlap": 0.4},
+)
+"""Windows for a microphone that answer sooner than the model's own; quick ones take few denoising steps. A page begins
+with the first, and goes on with the next where the machine is too slow."""
+
+GATE_OPTIONS = "margin", "attack", "lead", "hold", "release"
 
 LOADS = "connect-src 'self'; worker-src 'self'; img-src data:; media-src blob:"
 """What the page may load besides its own scripts: its worker, and sound that the reader has opened."""
@@ -116,10 +125,17 @@ def page(title: str, description: Description, arrays: Arrays) -> str:
         "millimetres": millimetres(face),
         "inward": not np.array_equal(outward(face), face.triangles),
         "delays": DELAYS,
+        "gates": {"usual": gate_facts(USUAL_GATE), "quick": gate_facts(QUICK_GATE)},
     }
     values = {"title": html.escape(title)}
     styles = "style.css", "talk.css"
     return "".join(assemble("talk.html", styles, SCRIPTS, values, facts, Blobs(), loads=LOADS, own_scripts=True))
+
+
+def gate_facts(text: str) -> dict[str, float]:
+    """What the page's voice gate is given, of a gate's name and options."""
+    gate = cast(EnergyGate, read_gate(text))
+    return {**{name: getattr(gate, name) for name in GATE_OPTIONS}, "ahead": gate.look_ahead}
 
 
 def headers_file() -> str:

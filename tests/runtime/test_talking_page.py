@@ -13,6 +13,7 @@ import soundfile
 
 from facediff.animation import Animation, read_archive
 from facediff.data.audio import read_speech
+from facediff.data.voice_activity import QUICK_GATE, read_gate
 from facediff.runtime import RuntimeModel
 from facediff.runtime.onnxruntime_web import web_runtime
 from facediff.runtime.site import make_site
@@ -98,6 +99,12 @@ def test_page_gives_the_motion_of_the_python_runtime(folder: Path, page: Page, t
         assert (found.name, found.frame_rate, found.unit) == (wanted.name, wanted.frame_rate, wanted.unit)
         assert {**found.metadata, "generator": ""} == {**wanted.metadata, "generator": ""}
         assert found.regions.keys() == wanted.regions.keys()
+    page.evaluate("facediff.page.animate(facediff.page.choices, facediff.page.delays[0])")
+    runtime.choose_low_latency()
+    wanted = runtime.animate(speech, **choices, gate=read_gate(QUICK_GATE), name="hello")  # type: ignore[arg-type]
+    found = archive_of(page, tmp_path / "found.npz")
+    assert largest(found.vertices, wanted.vertices) < 1e-4
+    assert found.metadata["sampler"] == wanted.metadata["sampler"]
 
 
 def test_page_plays_and_obeys_keys_and_buttons(page: Page, tmp_path: Path) -> None:
@@ -128,6 +135,68 @@ def test_page_plays_and_obeys_keys_and_buttons(page: Page, tmp_path: Path) -> No
     assert page.evaluate("facediff.page.animated.names.identity") == "B"
     page.evaluate("(document.getElementById('again').click(), document.getElementById('cancel').click())")
     page.wait_for("!facediff.page.job && !facediff.page.animated")
+
+
+@pytest.mark.parametrize("rate", [44_100, 48_000, 8000])
+def test_resampling_keeps_what_speech_has_and_brings_no_aliases(rate: int, page: Page) -> None:
+    """A tone of 1 kHz stays as it is, in whatever pieces it comes; one of 11 kHz, which 16 kHz cannot hold, is gone."""
+    script = f"""(() => {{
+      const wave = (hertz) => (_, i) => Math.sin((2 * Math.PI * hertz * i) / {rate});
+      const tone = (hertz) => Float32Array.from({{ length: {rate} / 4 }}, wave(hertz));
+      const heard = (samples, piece) => {{
+        const resampler = facediff.resampler({rate}, 16000), made = [];
+        for (let at = 0; at < samples.length; at += piece) {{
+          made.push(...resampler.feed(samples.subarray(at, at + piece)));
+        }}
+        return made;
+      }};
+      return [heard(tone(1000), 882), heard(tone(1000), 77), heard(tone(11000), 882)];
+    }})()"""
+    kept, again, gone = (np.array(each) for each in page.evaluate(script))
+    np.testing.assert_array_equal(kept, again)
+    assert len(kept) > 3900
+    middle = slice(200, len(kept))  # at its beginning a tone is no pure one
+    np.testing.assert_allclose(kept[middle], np.sin(2 * np.pi * np.arange(len(kept)) / 16)[middle], atol=1e-3)
+    if rate > 22_000:
+        assert np.abs(gone[middle]).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_microphone_is_animated_frame_by_frame(
+    folder: Path, web_files: dict[str, Path], program: Path, serve: Serve, tmp_path: Path
+) -> None:
+    """Chromium's microphone plays a recording over and over; the tiny model is quick enough for any machine."""
+    file = record(tmp_path / "speech.wav", 4.0)
+    flags = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
+    with Chromium(program, [*flags, f"--use-file-for-fake-audio-capture={file}"]) as running:
+        page = running.open(serve(make_site(folder, web_files)), width=400, height=500)
+        page.wait_for("window.facediff && (facediff.ready || facediff.errors.length)")
+        page.evaluate("document.getElementById('microphone').click()")
+        page.wait_for("facediff.listening?.shown > 150", 60)
+        found = page.evaluate("({...facediff.listening, waiting: facediff.page.listening.queue.length})")
+        assert page.evaluate("document.getElementById('open').disabled")
+        assert found["lag"] < 1.0
+        assert found["lost"] == 0
+        assert found["waiting"] < 50  # memory does not grow
+        seconds = page.evaluate("(performance.now() - facediff.page.listening.origin) / 1000")
+        assert found["shown"] == pytest.approx((seconds - found["lag"]) * 25, abs=15)
+        page.evaluate("document.getElementById('microphone').click()")
+        page.wait_for("!facediff.listening && !document.getElementById('open').disabled")
+        assert page.problems == []
+        assert page.evaluate("facediff.errors") == []
+
+
+@pytest.mark.slow
+def test_without_a_microphone_or_leave_it_says_so(
+    folder: Path, web_files: dict[str, Path], program: Path, serve: Serve
+) -> None:
+    with Chromium(program) as running:
+        page = running.open(serve(make_site(folder, web_files)))
+        page.wait_for("window.facediff && (facediff.ready || facediff.errors.length)")
+        page.evaluate("document.getElementById('microphone').click()")
+        page.wait_for("facediff.errors.length")
+        assert "microphone" in page.evaluate("facediff.errors[0]")
+        assert page.evaluate("!facediff.listening && !document.getElementById('open').disabled")
 
 
 @pytest.mark.parametrize(("width", "height", "dark"), [(1280, 800, True), (375, 740, False)])

@@ -5,7 +5,7 @@ const MODEL_FORMAT = "facediff model", MODEL_VERSION = 1;
 const NEEDED = { sampled: ["speech", "step", "motion"], direct: ["speech", "motion"] };
 const OPTIONAL = { sampled: ["start", "style"], direct: ["style"] };
 /** What a description says where a folder was written before there was a choice. */
-const EARLIER = { generation: "sampled", blending: "steps", clock: { rule: "rounded" }, style_source: "reference", longest: 0, drawn: 0, noise_of: "clip" };
+const EARLIER = { generation: "sampled", blending: "steps", clock: { rule: "rounded" }, style_source: "reference", longest: 0, drawn: 0, noise_of: "clip", quick_steps: [], quick_table: [] };
 const MOST_DESCRIPTION = 20e6, MOST_GRAPH = 2e9; // bytes
 
 /** Let messages in: what computes for long can be cancelled then. */
@@ -63,11 +63,12 @@ function checkDescription(about) {
   const names = (value) => Array.isArray(value) && value.every((each) => typeof each === "string");
   for (const name of ["identities", "faces", "styles"]) if (!names(about[name])) refuse(name, "names");
   for (const name of about.style_source === "reference" ? ["faces", "styles"] : ["faces"]) if (!about[name].length) refuse(name, "one name at least");
-  const { steps, table } = about;
-  const steady = Array.isArray(steps) && within(steps.length, sampled ? 1 : 0, 100_000) && steps.every((each) => whole(each, 0, 2 ** 31));
-  if (!steady) refuse("steps", "steps of the noise process");
   const row = (each) => Array.isArray(each) && each.length === 5 && each.every(Number.isFinite);
-  if (!Array.isArray(table) || table.length !== steps.length || !table.every(row)) refuse("table", "five numbers for each step");
+  for (const [named, tabled, least] of [["steps", "table", sampled ? 1 : 0], ["quick_steps", "quick_table", 0]]) {
+    const steps = about[named], table = about[tabled];
+    if (!Array.isArray(steps) || !within(steps.length, least, 100_000) || !steps.every((each) => whole(each, 0, 2 ** 31))) refuse(named, "steps of the noise process");
+    if (!Array.isArray(table) || table.length !== steps.length || !table.every(row)) refuse(tabled, "five numbers for each step");
+  }
   if (!whole(about.last_step, -1, 2 ** 31)) refuse("last_step", "a step of the noise process");
   if (!["sample", "kept"].includes(about.decoded)) refuse("decoded", "sample or kept");
   for (const name of ["windows", "sizes", "licences"]) if (typeof about[name] !== "object" || !about[name]) refuse(name, "an object");
@@ -76,9 +77,9 @@ function checkDescription(about) {
   if (!CLOCK_RULES.includes(rule) || !whole(rows, 1, 1000) || !Array.isArray(convolutions) || convolutions.length > 64 || !convolutions.every(layer)) {
     refuse("clock", "a known rule with rows and convolutions");
   }
-  const { seconds, overlap, before, after, above } = about.windows;
+  const { seconds, overlap, before, after, above, past = 0 } = about.windows;
   const long = (value) => within(value, 0, 600);
-  if (!long(seconds) || !long(overlap) || !long(before) || !long(after) || !within(above, 0, Infinity) || !(overlap > 0 && overlap <= seconds / 2)) {
+  if (!long(seconds) || !long(overlap) || !long(before) || !long(after) || !long(past) || !within(above, 0, Infinity) || !(past ? overlap < seconds : overlap > 0 && overlap <= seconds / 2)) {
     refuse("windows", "possible lengths");
   }
   inFrames(about.windows, about.frame_rate);
@@ -122,6 +123,7 @@ class ExportedModel {
     this.vertices = arrays.templates.shape[1];
     this.size = 3 * this.vertices;
     this.clock = new FrameClock(about.frame_rate, about.clock);
+    this.hurry(false);
   }
 
   /** Args: ONNX Runtime; the folder's address; what computes, by its names; what hears a share of all bytes. */
@@ -151,6 +153,13 @@ class ExportedModel {
       }
     }
     return new ExportedModel(ort, about, arrays, sessions);
+  }
+
+  /** Visit few denoising steps from now on, for low latency, or as many as usual. */
+  hurry(on) {
+    const { steps, table, quick_steps: few, quick_table: ofFew } = this.about;
+    const [visited, rows] = on && few.length ? [few, ofFew] : [steps, table];
+    this.loop = visited.map((step, at) => [step, rows[at]]);
   }
 
   /** What motion is conditioned on besides speech. Args: names and numbers, which may be absent. */

@@ -13,7 +13,7 @@ async function clipMotion(model, heard, conditions, check) {
     made = (await model.run("motion", { features: ["float32", features.data, features.shape], ...conditioned(features, conditions) }))[0].data;
   } else {
     const noise = about.noise_of === "seed" ? new SeedNoise(conditions.seed) : new ClipNoise(CLIP_NAME, conditions.seed);
-    made = await new Sampling(model, conditions, features, null, 0, check).run(noise, new ClipNoise(`${CLIP_NAME}/mean`, 0));
+    made = await new Sampling(model, conditions, features, null, null, check).run(noise, new ClipNoise(`${CLIP_NAME}/mean`, 0));
   }
   const given = made.length / size;
   if (given === heard.frames) return made;
@@ -33,19 +33,19 @@ async function windowMotion(model, heard, window, conditions, before, check) {
     const motion = (await clipMotion(model, heard, conditions, check)).slice(context * size, (context + frames) * size);
     if (before) {
       for (let frame = 0; frame < shared; frame++) {
-        const share = crossfade(frame, shared);
+        const share = crossfade(frame, shared, window.fixed);
         for (let i = frame * size; i < (frame + 1) * size; i++) motion[i] = before[0][i] + share * (motion[i] - before[0][i]);
       }
     }
-    return { motion, kept: [motion.slice(-window.kept * size)] };
+    return { motion, kept: [lastOf(motion, window.kept * size)] };
   }
   const { data, shape } = await model.features(heard, heard.frames);
   const width = data.length / heard.frames;
   const features = { data: data.slice(context * width, (context + frames) * width), shape: [1, frames, ...shape.slice(2)] };
-  const sampling = new Sampling(model, conditions, features, before, shared, check);
+  const sampling = new Sampling(model, conditions, features, before, window, check);
   const noise = new WindowNoise(CLIP_NAME, window, conditions.seed);
   const motion = await sampling.run(noise, new WindowNoise(`${CLIP_NAME}/mean`, window, 0));
-  return { motion, kept: sampling.kept.map((each) => each.slice(-window.kept * about.kept)) };
+  return { motion, kept: sampling.kept.map((each) => lastOf(each, window.kept * about.kept)) };
 }
 
 /** What every graph after the first is given; each takes what it has a use for. */
@@ -58,16 +58,19 @@ function conditioned(features, { identity, style, template }) {
   };
 }
 
-/** The new window's share in a shared frame: 0 at the first one, smooth at both ends. */
-function crossfade(frame, shared) {
-  const place = frame / shared;
+/** The last numbers of an array; there may be fewer. */
+const lastOf = (array, count) => array.slice(Math.max(0, array.length - count));
+
+/** The new window's share in a shared frame: 0 up to the first one that may change, smooth at both ends. */
+function crossfade(frame, shared, fixed) {
+  const place = Math.max(frame - fixed, 0) / Math.max(1, shared - fixed);
   return place * place * (3 - 2 * place);
 }
 
 /** One run of the sampler, of a clip or of a window that continues another. */
 class Sampling {
-  constructor(model, conditions, features, before, shared, check) {
-    Object.assign(this, { model, conditions, features, before, shared, check });
+  constructor(model, conditions, features, before, window, check) {
+    Object.assign(this, { model, conditions, features, before, window, check });
     this.frames = features.shape[1];
     this.kept = []; // what the next window is blended with, one array for each evaluation
   }
@@ -93,11 +96,10 @@ class Sampling {
 
   /** The sampler's result, and what was kept of the last step. */
   async loop(noisy, noise) {
-    const { steps, table, state } = this.model.about;
+    const { loop, about: { state } } = this.model;
     let sample = noisy, predictions = [], kept = noisy;
-    for (let at = 0; at < steps.length; at++) {
-      const [ofSample, first, second, third, ofNoise] = table[at];
-      const found = await this.evaluate(sample, steps[at]);
+    for (const [step, [ofSample, first, second, third, ofNoise]] of loop) {
+      const found = await this.evaluate(sample, step);
       predictions = [found.prediction, ...predictions].slice(0, 3);
       kept = found.kept;
       const made = sample.map((value) => ofSample * value);
@@ -113,11 +115,12 @@ class Sampling {
   /** The network's prediction at a step, blended with that of the window before. */
   async evaluate(sample, step) {
     await this.check();
-    const { model, frames, shared, features } = this, { about } = model;
+    const { model, frames, features } = this, { about } = model;
     const before = new Float32Array(frames * about.kept), share = new Float32Array(frames).fill(1);
     if (this.before) {
+      const { shared, fixed } = this.window;
       before.set(this.before[this.kept.length]);
-      for (let frame = 0; frame < shared; frame++) share[frame] = crossfade(frame, shared);
+      for (let frame = 0; frame < shared; frame++) share[frame] = crossfade(frame, shared, fixed);
     }
     const [prediction, kept] = await model.run("step", {
       features: ["float32", features.data, features.shape],

@@ -97,27 +97,22 @@ class SeedNoise {
   }
 }
 
-/** Noise of a window of long speech; frames that two windows share have the same noise in both. */
+/** Noise of a window of long speech; frames that several windows have are given the same noise in all of them. */
 class WindowNoise {
   constructor(name, window, seed) {
     this.window = window;
-    this.fresh = streamOf(`${name}/${window.index}`, seed);
-    this.old = streamOf(`${name}/${window.index - 1}`, seed);
+    this.streams = window.origins.map((origin) => [streamOf(`${name}/${origin[0]}`, seed), ...origin]);
   }
 
   /** The next noise (frames · width) of the window's frames. */
-  draw(_, width) {
-    const { window } = this;
-    const own = this.part(this.fresh, window.index, width).subarray(0, (window.frames - window.shared) * width);
-    if (!window.shared) return own;
-    const before = this.part(this.old, window.index - 1, width);
-    const made = new Float32Array(window.frames * width);
-    made.set(before.subarray(before.length - window.shared * width));
-    made.set(own, window.shared * width);
+  draw(frames, width) {
+    const { plan } = this.window, made = new Float32Array(frames * width);
+    let at = 0;
+    for (const [stream, index, from, to] of this.streams) {
+      const drawn = stream.draw((index ? plan.hop : plan.frames) * width);
+      made.set(drawn.subarray(from * width, to * width), at);
+      at += (to - from) * width;
+    }
     return made;
-  }
-
-  part(stream, index, width) {
-    return stream.draw((index ? this.window.plan.hop : this.window.plan.frames) * width);
   }
 }

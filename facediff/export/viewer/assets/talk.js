@@ -7,6 +7,8 @@ const MOST_FILE = 1e9;
 const MOST_WAITING = 3;
 /** Bursts of frames whose lateness decides how far the picture stays behind the microphone. */
 const BURSTS = 30;
+/** Seconds by which even the quickest of these bursts may be later than its windows say; else longer windows are tried. */
+const MOST_LATE = 0.4;
 
 /** What a recording became: offsets from the face at rest, frame by frame, in the model's unit. */
 class Animated {
@@ -24,8 +26,8 @@ class Animated {
 
 /** A microphone that is animated: it hears, sends what it hears to the worker, and shows what comes back, in time. */
 class Listening {
-  constructor(page, id) {
-    Object.assign(this, { page, id });
+  constructor(page, id, windows) {
+    Object.assign(this, { page, id, windows });
     this.sent = this.done = this.lost = 0; // samples at 16 kHz
     this.origin = null; // when the first sample was heard, in ms
     this.queue = []; // frames { number, offsets } that wait for their moment
@@ -55,7 +57,7 @@ class Listening {
     const samples = this.context.sampleRate === SAMPLE_RATE ? block : this.resampler.feed(block);
     if (this.sent - this.done > MOST_WAITING * SAMPLE_RATE) { // a slow machine would fall behind for ever
       this.lost += samples.length;
-      this.page.say("this machine is too slow for these windows: some speech is left out; choose longer ones");
+      this.page.say("this machine is too slow for the model: some speech is left out");
       return;
     }
     this.sent += samples.length;
@@ -71,6 +73,8 @@ class Listening {
     const size = offsets.length / count, elapsed = (performance.now() - this.origin) / 1000;
     for (let i = 0; i < count; i++) this.queue.push({ number: start + i, offsets: offsets.subarray(i * size, (i + 1) * size) });
     this.late = [...this.late.slice(1 - BURSTS), elapsed - this.heardAt(start)];
+    const { seconds: hop, after } = this.windows;
+    if (this.late.length === BURSTS && Math.min(...this.late) > hop + after + MOST_LATE) this.page.wait();
   }
 
   /** How many seconds the picture stays behind the sound: as long as the slowest of the latest bursts took. */
@@ -90,7 +94,7 @@ class Listening {
     if (!due) return;
     this.shown = due.number;
     this.page.show(due.offsets);
-    this.page.say(`listening: the face is ${this.lag.toFixed(1)} s behind` + (this.dropped ? `, ${this.dropped} frames dropped` : ""));
+    this.page.say(`listening: the face is ${this.lag.toFixed(1)} s behind` + (this.dropped ? `, ${this.dropped} frames left out` : ""));
   }
 
   close() {
@@ -125,7 +129,9 @@ class TalkingPage {
       this.opening = { resolve, reject };
       this.worker.onerror = (event) => reject(new Error(`the worker does not start: ${event.message ?? "worker.js is missing"}`));
     });
-    const threads = crossOriginIsolated ? this.facts.threads ?? Math.min(navigator.hardwareConcurrency || 1, 4) : 1;
+    // Half of the cores: threads that wait for one another lose more than they gain where others need the cores too.
+    const usual = Math.max(1, Math.min(4, Math.floor((navigator.hardwareConcurrency || 1) / 2)));
+    const threads = crossOriginIsolated ? this.facts.threads ?? usual : 1;
     this.device = device;
     this.threads = threads;
     this.say("loading the model …", 0);
@@ -176,7 +182,7 @@ class TalkingPage {
     find("identity").value = about.identities.length && about.faces.includes(about.identities[0]) ? about.identities[0] : about.faces[0];
     this.wear();
     const usual = about.windows;
-    this.delays = this.facts.delays.map((each) => ({ ...usual, ...each })).filter((each) => each.seconds < usual.seconds);
+    this.delays = this.facts.delays.map((each) => ({ ...usual, past: 0, ...each })).filter((each) => each.seconds < usual.seconds);
     this.delays.push(usual);
     find("delay").append(...this.delays.map((plan, number) => new Option(`${(plan.seconds + plan.after).toFixed(1)} s`, number)));
     const rows = [
@@ -206,7 +212,12 @@ class TalkingPage {
   get choices() {
     const seed = Number(find("seed").value), expressivity = Number(find("expressivity").value);
     const style = this.offers("style") ? find("style").value : undefined;
-    return { identity: find("identity").value, style, seed, expressivity: this.offers("expressivity") ? expressivity : 1, gate: find("gate").checked };
+    return { identity: find("identity").value, style, seed, expressivity: this.offers("expressivity") ? expressivity : 1 };
+  }
+
+  /** What brings the mouth to rest in pauses, and looks as far ahead as the windows do; null for nothing. */
+  gateOf(windows) {
+    return find("gate").checked ? this.facts.gates[windows?.quick ? "quick" : "usual"] : null;
   }
 
   /** Buttons as what happens now allows. */
@@ -267,9 +278,10 @@ class TalkingPage {
     else this.waveform = new Waveform(find("waveform"), find("voice-cursor"), facts, wav, (frame) => this.seek(frame));
     this.waveform.draw();
     this.say(`animating ${name} …`, 0);
-    const finished = new Promise((resolve, reject) => (this.job = { id, kind: "animate", choices, resolve, reject, began: performance.now() }));
+    const gate = this.gateOf(windows);
+    const finished = new Promise((resolve, reject) => (this.job = { id, choices, gate, windows, resolve, reject }));
     this.settle();
-    this.send({ kind: "animate", id, samples, choices, windows });
+    this.send({ kind: "animate", id, samples, choices, gate, windows });
     return finished;
   }
 
@@ -331,7 +343,7 @@ class TalkingPage {
       animated.done = true;
       animated.seconds = data.seconds;
       animated.names = data.names;
-      animated.choices = job.choices;
+      animated.job = job;
       this.job = null;
       const spoken = animated.samples.length / SAMPLE_RATE;
       this.say(`${spoken.toFixed(1)} s of speech animated in ${data.seconds.toFixed(1)} s`);
@@ -345,12 +357,21 @@ class TalkingPage {
     else if (data.kind === "heard") this.listening.done = data.samples;
   }
 
+  /** This machine is too slow for the windows: go on with the next longer ones. */
+  wait() {
+    const next = Number(find("delay").value) + 1;
+    if (next >= this.delays.length) return;
+    find("delay").value = next;
+    this.listen().catch(report);
+  }
+
   async listen() {
     this.clear();
-    const id = (this.jobs += 1), listening = new Listening(this, id);
+    const windows = this.delays[Number(find("delay").value)];
+    const id = (this.jobs += 1), listening = new Listening(this, id, windows);
     this.listening = listening;
     this.settle();
-    this.send({ kind: "listen", id, choices: this.choices, windows: this.delays[Number(find("delay").value)] });
+    this.send({ kind: "listen", id, choices: this.choices, gate: this.gateOf(windows), windows });
     this.say("listening …");
     try {
       await listening.open();
@@ -456,17 +477,18 @@ class TalkingPage {
 
   /** What is written about the animation in its files. */
   get metadata() {
-    const { about, animated } = this;
+    const { about, animated } = this, { choices, gate, windows } = animated.job;
+    const steps = windows?.quick && about.quick_steps.length ? about.quick_steps : about.steps;
     const found = {
       generator: `facediff ${about.facediff}, in a browser`,
       model: `${about.model}, exported in ${about.precision}`,
       corpus: about.synthetic ? `${about.corpus} (synthetic)` : about.corpus,
       ...about.licences,
       ...animated.names,
-      ...(about.generation === "sampled" ? { seed: String(animated.choices.seed), sampler: `${about.sampler}, ${about.steps.length} steps` } : {}),
+      ...(about.generation === "sampled" ? { seed: String(choices.seed), sampler: `${about.sampler}, ${steps.length} steps` } : {}),
     };
-    if (animated.choices.gate) found["voice gate"] = "energy";
-    if (animated.choices.expressivity !== 1) found.expressivity = String(animated.choices.expressivity);
+    if (gate) found["voice gate"] = "energy";
+    if (choices.expressivity !== 1) found.expressivity = String(choices.expressivity);
     return found;
   }
 
@@ -605,7 +627,7 @@ async function start() {
       const { listening } = page;
       return listening && { lag: listening.lag, dropped: listening.dropped, shown: listening.shown, lost: listening.lost, sent: listening.sent };
     },
-    get isolated() { return crossOriginIsolated; },
+    resampler: (from, to) => new Resampler(from, to),
   };
   connectDialogs();
   page.connect();

@@ -13,10 +13,10 @@ const checking = (id) => async () => {
 
 /** Give frames to the page, with the mouth as far at rest as the gate says; what waits for the gate is kept. */
 class Outlet {
-  constructor(id, conditions, gated) {
+  constructor(id, conditions, gate) {
     this.id = id;
     this.weights = model.arrays.rest_weights.data.slice(conditions.face * model.vertices, (conditions.face + 1) * model.vertices);
-    this.gate = gated ? new Openness(model.about.frame_rate) : null;
+    this.gate = gate ? new Openness(gate, model.about.frame_rate) : null;
     this.open = []; // of frames that wait for their motion
     this.waiting = []; // motion that waits for the gate, frame by frame
     this.given = 0;
@@ -55,10 +55,11 @@ const actions = {
     postMessage({ kind: "opened", id, about, arrays });
   },
 
-  /** Animate a recording. */
-  async animate({ id, samples, choices, windows }) {
+  /** Animate a recording. Args: windows other than the model's, `quick` ones in few steps; a gate, or null. */
+  async animate({ id, samples, choices, gate, windows }) {
     const conditions = model.conditions(choices), { about } = model;
-    const outlet = new Outlet(id, conditions, choices.gate), check = checking(id);
+    const outlet = new Outlet(id, conditions, gate), check = checking(id);
+    model.hurry(windows?.quick);
     const frames = model.clock.frames(samples.length);
     if (frames < 1) throw new Error("the recording is shorter than one frame; choose a longer one");
     const plan = windows ?? about.windows;
@@ -80,10 +81,11 @@ const actions = {
   },
 
   /** Begin to listen to a microphone. */
-  async listen({ id, choices, windows }) {
+  async listen({ id, choices, gate, windows }) {
+    model.hurry(windows.quick);
     const conditions = model.conditions(choices);
     const stream = model.stream(conditions, inFrames(windows, model.about.frame_rate), checking(id));
-    listening = { id, stream, outlet: new Outlet(id, conditions, choices.gate), heard: 0 };
+    listening = { id, stream, outlet: new Outlet(id, conditions, gate), heard: 0 };
   },
 
   /** More of the microphone's samples at 16 kHz. */

@@ -1,6 +1,5 @@
 // How far the mouth may be open in each frame: the energy gate of facediff.data.voice_activity, with its results.
 
-const GATE = { margin: 8, attack: 0.1, lead: 0.12, hold: 0.1, release: 0.15, lookAhead: 70 };
 const GATE_HOP = 160; // samples of a step of 10 ms
 const QUIETEST_LEVEL = -65, SILENT_LEVEL = -120, LOUDEST_ABOVE = 40, FADING = 3;
 const SMOOTH_STEPS = 5, FLAT = 7, SHORT_STEPS = 25, LONG_STEPS = 60, CLEARLY = 10, NOISE_MEMORY = 500, HYSTERESIS = 3;
@@ -33,7 +32,8 @@ const decibels = (power) => (power > 1e-12 ? 10 * Math.log10(power) : SILENT_LEV
 
 /** Says for every 10 ms whether there is speech: what rises above the noise, whose level is followed. */
 class EnergyListener {
-  constructor() {
+  constructor(gate) {
+    this.gate = gate;
     this.band = new RecursiveFilter(SPEECH_BAND);
     this.recent = []; // powers of the latest steps
     this.levels = []; // smoothed levels of the latest steps
@@ -49,7 +49,7 @@ class EnergyListener {
     let power = 0;
     for (const sample of samples) power += this.band.feed(sample) ** 2;
     this.follow(power / samples.length);
-    return this.waiting.length > GATE.lookAhead ? [this.decide()] : [];
+    return this.waiting.length > this.gate.ahead ? [this.decide()] : [];
   }
 
   finish() {
@@ -80,23 +80,28 @@ class EnergyListener {
     let limit = Math.max(QUIETEST_LEVEL, this.loudest - LOUDEST_ABOVE);
     const noise = long.length ? [long[0][1]] : [];
     if (short.length && short[0][1] < this.loudest - CLEARLY) noise.push(short[0][1]);
-    if (noise.length) limit = Math.max(limit, Math.min(...noise) + GATE.margin);
+    if (noise.length) limit = Math.max(limit, Math.min(...noise) + this.gate.margin);
     this.speaking = level > (this.speaking ? limit - HYSTERESIS : limit);
     return this.speaking;
   }
 }
 
-/** From 0 (at rest) to 1 (as the model moves it) for every frame; speech may arrive in pieces. */
+/**
+ * From 0 (at rest) to 1 (as the model moves it) for every frame; speech may arrive in pieces.
+ *
+ * Args: a gate { margin, attack, lead, hold, release, ahead }, the last in steps of 10 ms; frames a second.
+ */
 class Openness {
-  constructor(frameRate) {
+  constructor(gate, frameRate) {
+    this.gate = gate;
     this.frameRate = frameRate;
-    this.listener = new EnergyListener();
+    this.listener = new EnergyListener(gate);
     this.rest = new Float32Array(0); // samples that fill no step yet
     this.active = [];
     this.first = 0; // the step of the first of these
     this.frames = 0; // that were given
-    this.ahead = Math.ceil((GATE.attack + GATE.lead) * 100);
-    this.behind = Math.ceil((GATE.hold + GATE.release) * 100);
+    this.ahead = Math.ceil((gate.attack + gate.lead) * 100);
+    this.behind = Math.ceil((gate.hold + gate.release) * 100);
   }
 
   /** The openness of the frames that are certain after more speech. */
@@ -132,11 +137,12 @@ class Openness {
     const middle = ((frame + 0.5) / this.frameRate) * 100; // in steps
     const low = Math.max(0, Math.floor(middle) - this.behind - 1 - this.first);
     const high = Math.max(0, Math.ceil(middle) + this.ahead + 1 - this.first);
+    const { attack, lead, hold, release } = this.gate;
     let found = 0;
     for (let place = low; place < Math.min(high, this.active.length); place++) {
       if (!this.active[place]) continue;
       const away = (place + this.first + 0.5 - middle) / 100; // seconds until that step; negative after it
-      const [free, ramp] = away > 0 ? [GATE.lead, GATE.attack] : [GATE.hold, GATE.release];
+      const [free, ramp] = away > 0 ? [lead, attack] : [hold, release];
       const beyond = Math.abs(away) - free;
       const share = beyond <= 0 ? 0 : ramp > 0 ? Math.min(1, beyond / ramp) : 1;
       found = Math.max(found, 1 - share * share * (3 - 2 * share));

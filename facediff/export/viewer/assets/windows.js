@@ -12,19 +12,41 @@ function nearest(value) {
 
 const samplesFor = (frames, frameRate) => nearest((frames * SAMPLE_RATE) / frameRate);
 
-/** A plan { seconds, overlap, before, after } in frames. */
+/** A plan { seconds, overlap, before, after, past } in frames. */
 function inFrames(plan, frameRate) {
-  const frames = nearest(plan.seconds * frameRate);
-  if (frames < 4) throw new Error(`windows of ${plan.seconds} s are too few frames at ${frameRate} a second; choose longer ones`);
-  const overlap = Math.max(1, Math.min(nearest(plan.overlap * frameRate), Math.floor(frames / 2)));
+  const frames = nearest(plan.seconds * frameRate), past = nearest((plan.past ?? 0) * frameRate);
+  if (frames < (past ? 1 : 4)) throw new Error(`windows of ${plan.seconds} s are too few frames at ${frameRate} a second; choose longer ones`);
+  const wanted = nearest(plan.overlap * frameRate);
+  const overlap = past ? Math.min(wanted, frames - 1) : Math.max(1, Math.min(wanted, Math.floor(frames / 2)));
   const before = nearest(plan.before * frameRate), after = nearest(plan.after * frameRate);
-  return { frames, overlap, before, after, hop: frames - overlap };
+  return { frames, overlap, before, after, past, hop: frames - overlap };
 }
 
-/** A window of long speech: its place, and how many of its frames the window before it has as well. */
-function windowAt(plan, index, frames = plan.frames) {
-  const start = index * plan.hop;
-  return { plan, index, frames, start, end: start + frames, context: Math.min(plan.before, start), shared: index ? plan.overlap : 0, kept: plan.overlap };
+/** One window of long speech. Args: the plan; how many windows come before it; its new frames, fewer for the last one. */
+class SpeechWindow {
+  constructor(plan, index, fresh = plan.frames) {
+    const at = index * plan.hop;
+    this.plan = plan;
+    this.index = index;
+    this.fixed = Math.min(plan.past, at); // its first frames, which are given out already
+    this.frames = this.fixed + fresh;
+    this.start = at - this.fixed;
+    this.end = this.start + this.frames;
+    this.context = Math.min(plan.before, this.start); // frames before it that the model hears too
+    this.shared = index ? this.fixed + plan.overlap : 0; // its first frames, which the window before it has as well
+    this.kept = Math.min(plan.past, at + plan.hop) + plan.overlap; // its last frames, which the next window has as well
+  }
+
+  /** The windows in which its frames first appeared: [index, from, to], of the frames that are new in that window. */
+  get origins() {
+    const { overlap, hop } = this.plan, found = [];
+    for (let index = Math.max(0, Math.floor((this.start - overlap) / hop)); index <= this.index; index++) {
+      const first = index ? index * hop + overlap : 0;
+      const begin = Math.max(this.start, first), end = Math.min(this.end, (index + 1) * hop + overlap);
+      if (begin < end) found.push([index, begin - first, end - first]);
+    }
+    return found;
+  }
 }
 
 /** Mean and deviation of all samples so far. */
@@ -71,7 +93,7 @@ class SpeechWindows {
     this.speech = new Float32Array(0);
     this.dropped = 0; // samples before these, which no window will hear again
     this.level = new Level();
-    this.window = windowAt(plan, 0);
+    this.window = new SpeechWindow(plan, 0);
     this.held = null; // the latest window's frames that the next one shares
   }
 
@@ -102,21 +124,21 @@ class SpeechWindows {
     const parts = [];
     while (this.window.end < total) parts.push(await this.nextWindow(Math.min(total, this.window.end + this.plan.after)));
     // What is left lies within the last window; if the window before has animated it already, it is certain now.
-    const left = total - this.window.start;
+    const { fixed, index } = this.window, left = total - this.window.start - fixed;
     if (this.held && left <= this.plan.overlap) parts.push(this.held.subarray(0, left * this.size));
-    else parts.push(await this.make(windowAt(this.plan, this.window.index, left), total));
+    else parts.push((await this.make(new SpeechWindow(this.plan, index, left), total)).subarray(fixed * this.size));
     return this.counted(parts);
   }
 
   /** The window's frames before its overlap with the next, given speech up to frame `heard`; then advance. */
   async nextWindow(heard) {
-    const motion = await this.make(this.window, heard);
-    this.window = windowAt(this.plan, this.window.index + 1);
+    const { fixed, index } = this.window, motion = await this.make(this.window, heard);
+    this.window = new SpeechWindow(this.plan, index + 1);
     const needed = this.sample(this.window.start - this.window.context);
     const drop = Math.max(0, Math.min(needed, this.level.count) - this.dropped);
     this.speech = this.speech.slice(drop);
     this.dropped += drop;
-    return motion.subarray(0, this.plan.hop * this.size);
+    return motion.subarray(fixed * this.size, (fixed + this.plan.hop) * this.size);
   }
 
   async make(window, heard) {
@@ -125,7 +147,7 @@ class SpeechWindows {
     this.level.hear(this.speech.subarray(Math.max(0, this.level.count - this.dropped), last));
     const deviation = Math.max(this.level.deviation, QUIETEST_DEVIATION);
     const motion = await this.generate(window, this.speech.slice(first, last), heard - start, this.level.mean, deviation);
-    this.held = motion.slice(-this.plan.overlap * this.size);
+    this.held = motion.slice(motion.length - this.plan.overlap * this.size);
     return motion;
   }
 
