@@ -28,8 +28,12 @@ Array = npt.NDArray[np.float32]
 Solver = Callable[[Array], Array]
 """Offsets (V, 3) of a frame to weights of blendshapes (K,)."""
 
-PATIENCE = 3.0
-"""Seconds of speech that may wait for a model which usually is fast enough."""
+PATIENCE = (0.5, 3.0)
+"""Least and most seconds of speech that may wait for a model which usually is fast enough: as many as its look-ahead
+has, since somebody who waits for a long window anyway prefers waiting to gaps."""
+
+HURRIED = 0.25
+"""The same for a model that is too slow: speech that waits would only make all frames late."""
 
 RECENT = 3.0
 """Seconds of speech over which a model's speed is measured."""
@@ -66,7 +70,7 @@ class Summary:
     @property
     def factor(self) -> float:
         """Seconds of computing for each second of speech."""
-        return self.busy / self.speech if self.speech else 0.0
+        return self.busy / max(self.speech - self.lost, 1e-9)
 
     def sentences(self) -> list[str]:
         """The report at the end."""
@@ -83,11 +87,12 @@ class Backlog:
 
     Args:
         frame_rate: of the motion.
+        limit: seconds of speech that may wait.
     """
 
-    def __init__(self, frame_rate: float) -> None:
+    def __init__(self, frame_rate: float, limit: float) -> None:
         self.frame_rate = frame_rate
-        self.limit = PATIENCE
+        self.limit = limit
         self.dropped = 0  # frames
         self._pieces: deque[Speech] = deque()
         self._waiting = 0  # samples
@@ -179,7 +184,8 @@ class Loop:
         self.clock = SpokenClock()
         self.pacer = Pacer(model.hop)
         self._solve, self._seconds, self._report, self._every = solve, seconds, report, every
-        self._backlog = Backlog(model.frame_rate)
+        self._patience = min(max(PATIENCE[0], model.look_ahead), PATIENCE[1])
+        self._backlog = Backlog(model.frame_rate, model.hop + self._patience)
         self._stopped = threading.Event()
         self._changed = threading.Condition()
         self._frames: deque[_Ready] = deque()
@@ -295,8 +301,7 @@ class Loop:
             heard -= recent.popleft()[1]
         factor = sum(each for each, _ in recent) / max(heard, 1e-9)
         slow = heard > 0.9 * enough and factor > 1
-        # Speech that waits for a model that cannot catch up would only make all frames late.
-        self._backlog.limit = hop + 0.25 if slow else hop + PATIENCE
+        self._backlog.limit = hop + (HURRIED if slow else self._patience)
         if slow and not self._slow_told:
             self._slow_told = True
             self._report(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from functools import partial
 
@@ -11,6 +12,7 @@ import pytest
 from facediff.data.audio import samples_for
 from facediff.errors import FaceDiffError
 from facediff.live.loop import Backlog, Loop
+from facediff.live.sources import Deliver
 from tests.fakes.live import AHEAD, FRAME_RATE, HOP, FakeStream, Kept, Spoken, fake_model
 
 FRAME = 1 / FRAME_RATE
@@ -63,6 +65,41 @@ def test_slow_model_drops_speech_says_so_once_and_keeps_its_lag(monkeypatch: pyt
     assert summary.lag.worst < 2.0
 
 
+def test_click_is_in_the_frame_in_which_it_was_spoken() -> None:
+    """Of a face that follows the level of the sound: the time at which its frame leaves is that of the click, late by
+    what a frame lasts, and the margin.
+    """
+
+    class Clicks(Spoken):
+        def run(self, deliver: Deliver, stopped: threading.Event) -> None:
+            began, places = time.monotonic(), (20, 41, 67)
+            for piece in range(100):
+                time.sleep(max(0.0, began + 0.01 * (piece + 1) - time.monotonic()))
+                if piece in places:
+                    clicked.append(time.monotonic())
+                deliver(np.full(160, float(piece in places), np.float32), time.monotonic())
+
+    class Level(FakeStream):
+        def feed(self, samples: np.ndarray) -> np.ndarray:
+            self.heard += len(samples)
+            self.levels = np.concatenate([getattr(self, "levels", np.zeros(0)), samples])
+            made = np.zeros((len(self.levels) // 320, 4, 3), np.float32)
+            made[:, 0, 0] = self.levels[: 320 * len(made)].reshape(-1, 320).max(1)
+            self.levels = self.levels[320 * len(made) :]
+            self.made += len(made)
+            return made
+
+    kept, clicked = Kept(), list[float]()
+    Loop(fake_model(Level), Clicks(1.0), [kept], report=str).run()
+    loud = [place for place, frame in enumerate(kept.frames) if frame.vertices[0, 0] > 0.5]
+    assert [kept.frames[place].index for place in loud] == [10, 20, 33]
+    lags = np.array([kept.times[place] for place in loud]) - clicked
+    assert (lags >= 0).all()
+    assert np.median(lags) < 0.1
+    heard = np.array([kept.frames[place].heard for place in loud])
+    assert np.abs(heard - clicked).max() < FRAME + 0.02
+
+
 def test_speech_weights_and_the_end_reach_the_receivers() -> None:
     kept, deaf, solved = Kept(weights=True), Kept(), list[float]()
 
@@ -110,8 +147,7 @@ def test_error_of_the_source_or_the_model_is_raised() -> None:
 
 @pytest.mark.parametrize("frame_rate", [25.0, 29.97, 60.0])
 def test_backlog_drops_whole_frames_without_an_error_that_adds_up(frame_rate: float) -> None:
-    backlog, put, taken = Backlog(frame_rate), 0, 0
-    backlog.limit = 0.5
+    backlog, put, taken = Backlog(frame_rate, 0.5), 0, 0
     rng = np.random.default_rng(0)
     for _ in range(300):
         count = int(rng.integers(1, 2000))

@@ -1,0 +1,349 @@
+"""The lag of live performances, from sample in to packet out, and whether it stays: by receiver, over minutes.
+
+    python tools/benchmarks/live.py puppet-onnx --shapes puppet --minutes 10 --low-latency
+
+First a click track through the loop with a face that only follows the level of the sound, so that nothing but the loop
+and the receivers is measured: from the moment that a click is written to standard input to the moment that the first
+packet with an open mouth arrives. Then the exported model with speech of the built-in corpus on standard input: from
+the moment that the last sample of a frame is written until the frame's packet arrives. Packets arrive at sockets of
+this program: Live Link Face and VMC by UDP, JSON lines by TCP, the page's frames by WebSocket.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from sampling_tables import processor
+
+from facediff.data.audio import read_speech
+from facediff.data.puppet import Puppet
+from facediff.live.frames import Performance, open_receivers
+from facediff.live.loop import Loop
+from facediff.live.model import LiveModel
+from facediff.live.sources import Pcm
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.tables import markdown_table
+
+RATE = 30.0
+PIECE = SAMPLE_RATE // 100
+
+
+class Heard:
+    """What arrived at a socket: number of the frame, when, and how far the mouth was open (NaN if not known)."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.rows: list[tuple[int, float, float]] = []
+
+    def add(self, index: int, opened: float = float("nan")) -> None:
+        """Note a frame that arrives now."""
+        self.rows.append((index, time.monotonic(), opened))
+
+    def table(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """The numbers, the times and the openings."""
+        index, when, opened = zip(*self.rows, strict=True)
+        return np.array(index), np.array(when), np.array(opened)
+
+
+def listen_live_link(sock: socket.socket, heard: Heard) -> None:
+    """Packets by their description: version, two texts, frame, part, rate, count, values."""
+    first = None
+    while data := sock.recv(4096):
+        place = 1
+        for _ in range(2):
+            place += 4 + struct.unpack_from(">i", data, place)[0]
+        number, _, _, _, count = struct.unpack_from(">ifiiB", data, place)
+        values = struct.unpack_from(f">{count}f", data, place + 17)
+        first = number if first is None else first
+        heard.add(number - first, values[17])  # jawOpen
+
+
+def listen_vmc(sock: socket.socket, heard: Heard, rate: float) -> None:
+    """Bundles by python-osc; a frame has arrived with its last message."""
+    from pythonosc.osc_bundle import OscBundle
+
+    index, opened = 0, float("nan")
+    while data := sock.recv(65_536):
+        for message in OscBundle(data):
+            if message.address == "/VMC/Ext/T":
+                index = round(message.params[0] * rate)
+            elif message.address == "/VMC/Ext/Blend/Val" and message.params[0] == "JawOpen":
+                opened = message.params[1]
+            elif message.address == "/VMC/Ext/Blend/Apply":
+                heard.add(index, opened)
+
+
+def listen_lines(port: int, heard: Heard) -> None:
+    """JSON lines of a TCP port."""
+    with connected(lambda: socket.create_connection(("127.0.0.1", port))) as connection:
+        for line in connection.makefile():
+            frame = json.loads(line)
+            if frame["type"] == "frame":
+                heard.add(frame["index"], frame["weights"]["jawOpen"])
+
+
+def listen_page(port: int, heard: Heard) -> None:
+    """What the page in the browser is sent."""
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    with connected(lambda: connect(f"ws://127.0.0.1:{port}/live")) as connection:
+        try:
+            while True:
+                data = connection.recv()
+                if isinstance(data, bytes) and data[0] == 1:
+                    index = struct.unpack_from("<I", data, 4)[0]
+                    heard.add(index)
+                    connection.send(str(index))
+        except ConnectionClosed:
+            pass
+
+
+def connected(connect: Callable[[], Any]) -> Any:  # noqa: ANN401
+    """A connection to a server that is about to listen."""
+    patience = time.monotonic() + 60
+    while True:
+        try:
+            return connect()
+        except OSError:
+            if time.monotonic() > patience:
+                raise
+            time.sleep(0.05)
+
+
+def free_port(kind: int = socket.SOCK_STREAM) -> int:
+    """A port that nobody uses."""
+    with socket.socket(socket.AF_INET, kind) as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+class Listeners:
+    """A listener for each protocol, in threads of their own.
+
+    Args:
+        rate: frames a second.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self.heard = [Heard(name) for name in ("Live Link Face", "VMC", "JSON lines", "page")]
+        self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
+        for sock in self._sockets:
+            sock.bind(("127.0.0.1", 0))
+        udp = [sock.getsockname()[1] for sock in self._sockets]
+        tcp = [free_port() for _ in range(2)]
+        link, vmc, lines, page = self.heard
+        work: list[tuple[Callable[..., None], tuple[Any, ...]]] = [
+            (listen_live_link, (self._sockets[0], link)),
+            (listen_vmc, (self._sockets[1], vmc, rate)),
+            (listen_lines, (tcp[0], lines)),
+            (listen_page, (tcp[1], page)),
+        ]
+        for target, arguments in work:
+            threading.Thread(target=target, args=arguments, daemon=True).start()
+        self.addresses = [
+            f"livelink://127.0.0.1:{udp[0]}",
+            f"vmc://127.0.0.1:{udp[1]}",
+            f"jsonl:{tcp[0]}",
+            f"browser:{tcp[1]}",
+        ]
+
+
+def write_in_real_time(
+    samples: npt.NDArray[np.int16], descriptor: int, times: list[float], stop: Callable[[], bool] = lambda: False
+) -> None:
+    """Write samples as a microphone gives them, 10 ms at a time; ``times`` gets when each piece was written."""
+    start = time.monotonic()
+    for first in range(0, len(samples), PIECE):
+        time.sleep(max(0.0, start + (first + PIECE) / SAMPLE_RATE - time.monotonic()))
+        if stop():
+            break
+        os.write(descriptor, samples[first : first + PIECE].tobytes())
+        times.append(time.monotonic())
+    os.close(descriptor)
+
+
+class LevelFace:
+    """A stream whose jaw opens with the largest sample of each frame, as soon as the frame has been heard."""
+
+    def __init__(self) -> None:
+        self.made = 0
+        self._speech = np.zeros(0, np.float32)
+
+    def feed(self, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Frames (m, 4, 3) of whole frames of sound."""
+        self._speech = np.concatenate([self._speech, samples])
+        frames = []
+        while len(self._speech) >= (size := round((self.made + 1) * SAMPLE_RATE / RATE) - self._until(self.made)):
+            frame = np.zeros((4, 3), np.float32)
+            frame[0, 0] = np.abs(self._speech[:size]).max()
+            frames.append(frame)
+            self._speech = self._speech[size:]
+            self.made += 1
+        return np.stack([np.zeros((4, 3), np.float32), *frames])[1:]
+
+    def finish(self) -> npt.NDArray[np.float32]:
+        """Nothing is left."""
+        return np.zeros((0, 4, 3), np.float32)
+
+    @staticmethod
+    def _until(frame: int) -> int:
+        return round(frame * SAMPLE_RATE / RATE)
+
+
+def clicks(seconds: float) -> str:
+    """The table of the click track."""
+    rng, count = np.random.default_rng(0), int(seconds / 0.7)
+    places = (0.5 + 0.7 * np.arange(count) + 0.1 * rng.random(count)) * SAMPLE_RATE
+    track = np.zeros(round((seconds + 1) * SAMPLE_RATE), np.int16)
+    for place in places.astype(int):
+        track[place : place + 80] = 30_000
+    listeners = Listeners(RATE)
+    out, into = os.pipe()
+    before, sys.stdin = sys.stdin, os.fdopen(out)
+    neutral = np.random.default_rng(1).normal(size=(4, 3)).astype(np.float32)
+    faces = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+    model = LiveModel(LevelFace, RATE, np.zeros((4, 3), np.float32), faces, "m", look_ahead=1 / RATE, hop=1 / RATE)
+    receivers = open_receivers(listeners.addresses)
+    performance = Performance(RATE, neutral, faces, shapes=("jawOpen",))
+    for receiver in receivers:
+        receiver.open(performance)
+    time.sleep(1.0)  # until all are connected
+    written: list[float] = []
+    threading.Thread(target=write_in_real_time, args=(track, into, written), daemon=True).start()
+    Loop(
+        model,
+        Pcm(),
+        receivers,
+        solve=lambda offsets: np.clip(offsets[:1, 0], 0, 1).astype(np.float32),
+        report=lambda text: print(text, file=sys.stderr),
+        every=None,
+    ).run()
+    for receiver in receivers:
+        receiver.close()
+    sys.stdin.close()
+    sys.stdin = before
+    rows = []
+    for heard in listeners.heard[:3]:
+        _, when, opened = heard.table()
+        arrived = when[1:][(opened[1:] > 0.5) & (opened[:-1] <= 0.5)]
+        spoken = np.array([written[int(place) // PIECE] for place in places])
+        # A click arrives in the first open frame after it.
+        lags = np.array([arrived[arrived > moment][0] - moment for moment in spoken if (arrived > moment).any()])
+        rows.append([heard.name, str(len(lags)), *shown(lags)])
+    head = ["receiver", f"clicks of {count}", "median", "95 %", "worst"]
+    return markdown_table(head, rows)
+
+
+def shown(lags: npt.NDArray[np.float64]) -> list[str]:
+    """Median, 95 % and worst in milliseconds."""
+    return [f"{1000 * value:.0f} ms" for value in (np.median(lags), np.quantile(lags, 0.95), lags.max())]
+
+
+def speech(seconds: float) -> npt.NDArray[np.int16]:
+    """Recordings of the built-in corpus one after the other."""
+    parts, length = [], 0
+    files = sorted((Path(Puppet().root) / "wav").glob("*.wav"))
+    while length < seconds * SAMPLE_RATE:
+        for file in files:
+            parts.append(read_speech(file))
+            length += len(parts[-1])
+    joined = np.concatenate(parts)[: round(seconds * SAMPLE_RATE)]
+    return np.asarray(np.clip(joined * 32_768, -32_768, 32_767), np.int16)
+
+
+def resident(process: int) -> float:
+    """Megabytes that a process holds."""
+    found = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{process}/status").read_text())
+    return int(found.group(1)) / 1000 if found else float("nan")
+
+
+def model(options: argparse.Namespace) -> Iterator[str]:
+    """The tables of an exported model, line by line."""
+    description = json.loads((options.model / "model.json").read_text())
+    rate, seconds = float(description["frame_rate"]), 60 * options.minutes
+    listeners = Listeners(rate)
+    words = [sys.executable, "-m", "facediff.live.app", str(options.model), "-", "--shapes", str(options.shapes)]
+    words += ["--low-latency"] if options.low_latency else []
+    words += ["--window", str(options.window)] if options.window else []
+    words += ["--threads", str(options.threads)] if options.threads else []
+    words += [word for address in listeners.addresses for word in ("--to", address)]
+    samples, written, sizes = speech(seconds), list[float](), list[tuple[float, float]]()
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        printed: list[str] = []
+        for line in process.stderr:
+            printed.append(line)
+            if "ready" in line:
+                break
+        reading = threading.Thread(target=lambda: printed.extend(process.stderr or ()))
+        reading.start()
+        time.sleep(1.0)  # until all are connected
+        writing = threading.Thread(target=write_in_real_time, args=(samples, os.dup(process.stdin.fileno()), written))
+        process.stdin.close()
+        writing.start()
+        began = time.monotonic()
+        while process.poll() is None:
+            sizes.append((time.monotonic() - began, resident(process.pid)))
+            time.sleep(2.0)
+        reading.join()
+    last = (np.arange(round(seconds * rate)) + 1) / rate * SAMPLE_RATE  # the sample with which each frame ends
+    spoken = np.array(written)[np.minimum(last.astype(int) // PIECE, len(written) - 1)]
+    rows, minutes = [], []
+    for heard in listeners.heard:
+        index, when, _ = heard.table()
+        lags = when - spoken[index]
+        order = "yes" if (np.diff(index) > 0).all() else "no"
+        rows.append([heard.name, str(len(index)), str(len(spoken) - len(index)), order, *shown(lags)])
+        first, middle, end = (lags[part] for part in parts(index / rate, seconds))
+        minutes.append([heard.name, *(f"{1000 * np.median(each):.0f} ms" for each in (first, middle, end))])
+    at, megabytes = np.array(sizes).T
+    memory = [f"{np.median(megabytes[part]):.1f} MB" for part in parts(at, seconds)]
+    yield markdown_table(["receiver", "frames", "missing", "in order", "median", "95 %", "worst"], rows)
+    yield ""
+    yield markdown_table(["", "first minute", "middle", "last minute"], [*minutes, ["memory", *memory]])
+    yield ""
+    yield from (f"    {line.rstrip()}" for line in printed[-6:])
+
+
+def parts(at: npt.NDArray[np.float64], seconds: float) -> list[npt.NDArray[np.bool_]]:
+    """The first, the middle and the last minute, or fifth, of some seconds."""
+    length = min(60.0, seconds / 5)
+    starts = (0.0, (seconds - length) / 2, seconds - length)
+    return [(at >= start) & (at <= start + length) for start in starts]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path, help="folder of facediff export-model")
+    parser.add_argument("--shapes", type=Path, default=Path("puppet"), help="blendshapes (default: puppet)")
+    parser.add_argument("--minutes", type=float, default=1.0, help="of speech (default: 1)")
+    parser.add_argument("--low-latency", action="store_true")
+    parser.add_argument("--window", type=float)
+    parser.add_argument("--threads", type=int)
+    options = parser.parse_args(arguments)
+    print(f"{processor('cpu')}, {os.cpu_count()} cores\n\nA click track, and a face that follows its level:\n")
+    print(clicks(60.0 * min(options.minutes, 1.0)))
+    print("\nThe model, with speech:\n")
+    for line in model(options):
+        print(line)
+
+
+if __name__ == "__main__":
+    main()
