@@ -90,20 +90,34 @@ def test_speech_is_sent_as_samples_with_their_time(served: Browser, visitor: Cli
     assert np.frombuffer(data, "<i2", offset=HEADER).tolist() == [0, 16384, -32767, 32767]
 
 
-def test_a_page_that_does_not_answer_gets_no_more_frames_and_blocks_nobody(
+def number(data: str | bytes) -> int:
+    assert isinstance(data, bytes)
+    return int(struct.unpack_from("<B3xI", data)[1])
+
+
+def test_a_page_that_falls_behind_gets_fewer_frames_and_blocks_nobody(
     served: Browser, visitor: ClientConnection
 ) -> None:
+    served.send(frame(0))
+    visitor.send(str(number(visitor.recv(5))))
+    time.sleep(0.1)
     began = time.monotonic()
-    for index in range(40):
+    for index in range(1, 41):
         served.send(frame(index))
-    assert time.monotonic() - began < 1
-    got = [struct.unpack_from("<B3xI", visitor.recv(5))[1] for _ in range(ON_THE_WAY)]  # type: ignore[arg-type]
-    assert got == list(range(ON_THE_WAY))
+        time.sleep(0.002)
+    assert time.monotonic() - began < 2
+    assert [number(visitor.recv(5)) for _ in range(ON_THE_WAY)] == list(range(1, ON_THE_WAY + 1))
     assert f"{40 - ON_THE_WAY} frames missed" in served.status()
-    visitor.send("0")
+    visitor.send("1")
     time.sleep(0.1)
     served.send(frame(50))
-    assert struct.unpack_from("<B3xI", visitor.recv(5))[1] == 50  # type: ignore[arg-type]
+    assert number(visitor.recv(5)) == 50
+
+
+def test_a_program_that_never_answers_gets_what_it_reads(served: Browser, visitor: ClientConnection) -> None:
+    for index in range(40):
+        served.send(frame(index))
+        assert number(visitor.recv(5)) == index
 
 
 @pytest.mark.parametrize("words", ["hello", "-1", "1", b"\0\1", "9" * 100, "١"])

@@ -16,8 +16,9 @@ The page asks for itself (``GET /``) and opens the WebSocket ``/live`` of the sa
    2     speech   samples n, 0 (uint32), 0 (float32), time in s (float64)      samples (n int16)
    ====  =======  ===========================================================  ===================================
 
-The page answers every frame with its index as a text. A page that does not keep up is sent fewer frames: no more than
-:data:`ON_THE_WAY` go unanswered. Whatever else it says ends its connection.
+The page answers every frame with its index as a text. Once it has answered, no more than :data:`ON_THE_WAY` frames go
+unanswered: a page that does not keep up is sent fewer. A program that never answers is sent what its connection takes.
+Whatever else is said ends the connection.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import html
 import http
 import json
 import logging
+import socket
 import struct
 import sys
 import threading
@@ -57,8 +59,8 @@ MOST_BYTES = 64
 """Of what a page says; the number of a frame has at most 10."""
 ON_THE_WAY = 6
 """Frames that a page has not answered yet. A page of this machine answers within one."""
-WAITING = 64
-"""Messages that wait for a page: frames, and seconds of speech."""
+MOST_SPEECH = 64
+"""Pieces of speech that wait for a page."""
 SCRIPTS = ("surface", "camera", "scene", "stage", "dialogs", "report", "live")
 
 
@@ -247,9 +249,17 @@ class _Viewer:
     def __init__(self, connection: ServerConnection) -> None:
         self._connection = connection
         self._lock = threading.Lock()
-        self._on_the_way = 0
-        self.missed = 0
-        self._outbox: Outbox[bytes] = Outbox(self._send, WAITING, "live page")
+        self._on_the_way = self._skipped = 0
+        self._answers = False
+        # Small buffers: what waits in the system's is late when it arrives.
+        connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**17)
+        self._frames: Outbox[bytes] = Outbox(self._send_frame, ON_THE_WAY, "frames of a page")
+        self._speech: Outbox[bytes] = Outbox(self._send, MOST_SPEECH, "speech of a page")
+
+    @property
+    def missed(self) -> int:
+        """Frames that were not sent, because the page did not keep up."""
+        return self._skipped + self._frames.dropped
 
     def _send(self, data: bytes) -> None:
         from websockets.exceptions import ConnectionClosed
@@ -259,25 +269,30 @@ class _Viewer:
         except ConnectionClosed as error:
             raise ConnectionError(str(error)) from error
 
+    def _send_frame(self, data: bytes) -> None:
+        with self._lock:
+            self._on_the_way += 1
+        self._send(data)
+
     def show(self, data: bytes) -> None:
         """Send a frame, unless too many are unanswered."""
         with self._lock:
-            if self._on_the_way >= ON_THE_WAY:
-                self.missed += 1
-                return
-            self._on_the_way += 1
-        self._outbox.put(data)
+            late = self._answers and self._on_the_way >= ON_THE_WAY
+        if late:
+            self._skipped += 1
+        else:
+            self._frames.put(data)
 
     def say(self, data: bytes) -> None:
-        """Send speech, unless too much waits: a frame that the outbox dropped would stay unanswered."""
-        if self._outbox.waiting < WAITING - ON_THE_WAY:
-            self._outbox.put(data)
+        """Send speech."""
+        self._speech.put(data)
 
     def hears(self, words: str | bytes) -> bool:
         """Take note of what the page says; whether it is the index of a frame."""
         if not isinstance(words, str) or not (words.isascii() and words.isdecimal()):
             return False
         with self._lock:
+            self._answers = True
             self._on_the_way -= 1
             return self._on_the_way >= 0
 
@@ -287,7 +302,9 @@ class _Viewer:
             self._connection.close(1001, "the performance is over")
 
     def close(self) -> None:
-        self._outbox.close(0.2)
+        """End the threads."""
+        for outbox in (self._frames, self._speech):
+            outbox.close(0.2)
 
 
 def _response(status: http.HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> Response:

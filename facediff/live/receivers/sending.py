@@ -228,11 +228,6 @@ class Outbox(Generic[Item]):
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    @property
-    def waiting(self) -> int:
-        """Items that are not taken yet."""
-        return len(self._waiting)
-
     def put(self, item: Item) -> None:
         """Hand an item over, without waiting."""
         with self._changed:
