@@ -33,6 +33,8 @@ STYLE_CONTENT = {"dim": 16, "content_dim": 16}
 PUBLISHED = {"audio_dim": 16, "dim": 16}
 SELFTALK = {**PUBLISHED, "lip_reader": "none"}
 VOCA = {**PUBLISHED, "components": 8, "channels": (8, 8)}
+FACEDIFFUSER = {**PUBLISHED, "diffusion_steps": 8}
+DIFFSPEAKER = {**PUBLISHED, "sampling_steps": 8, "smooth": True}
 OWN = {"audio_dim": None}  # the encoder's own channels
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -42,6 +44,19 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "SelfTalk": ("SelfTalk", SELFTALK),
     "SelfTalk at 25, wav2vec": ("SelfTalk", {**SELFTALK, **OWN, "audio_encoder": "wav2vec2"}),
     "SelfTalk at 30, wav2vec": ("SelfTalk", {**SELFTALK, **OWN, "audio_encoder": "wav2vec2", "frame_rate": 30.0}),
+    "FaceDiffuser": ("FaceDiffuser", FACEDIFFUSER),
+    "FaceDiffuser, folded, HuBERT": (
+        "FaceDiffuser",
+        {**FACEDIFFUSER, **OWN, "audio_encoder": "wav2vec2", "sampling_space": "folded"},
+    ),
+    "FaceDiffuser, offsets, skips": ("FaceDiffuser", {**FACEDIFFUSER, "noised": "offsets", "skip_steps": 3}),
+    "FaceDiffuser at 30": ("FaceDiffuser", {**FACEDIFFUSER, "frame_rate": 30.0, "sampling_space": "folded"}),
+    "DiffSpeaker": ("DiffSpeaker", DIFFSPEAKER),
+    "DiffSpeaker, ddim, HuBERT": (
+        "DiffSpeaker",
+        {**DIFFSPEAKER, **OWN, "audio_encoder": "wav2vec2", "scheduler": "ddim", "smooth": False},
+    ),
+    "DiffSpeaker, vertices": ("DiffSpeaker", {**DIFFSPEAKER, "sampling_space": "vertices"}),
     "Voca": ("Voca", VOCA),
     "Voca at 25, DeepSpeech": ("Voca", {**VOCA, **OWN, "audio_encoder": "deepspeech"}),
     "Voca at 60, DeepSpeech": ("Voca", {**VOCA, **OWN, "audio_encoder": "deepspeech", "frame_rate": 60.0}),

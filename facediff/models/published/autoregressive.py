@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from facediff.data import Batch
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import StepRule
+from facediff.models.graphs import Graphs
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.base import LongSpeech, PublishedModel
@@ -81,6 +82,17 @@ class AutoregressiveModel(PublishedModel):
         }
         self.loop: Loop = loop
         self.plan_long_speech(long_speech)
+
+    def graphs(self) -> Graphs:
+        """None: each frame needs those before it.
+
+        Raises:
+            FaceDiffError: always.
+        """
+        raise FaceDiffError(
+            f"{type(self).__name__}: decodes frame by frame, which needs a graph with a memory, and cannot be exported; "
+            f"export a model that makes all frames at once, or animate with facediff animate"
+        )
 
     def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch steps width"]:
         """Speech features: as many as frames, or two for each where speech comes in pairs."""

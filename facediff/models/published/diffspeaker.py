@@ -23,6 +23,7 @@ from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
 from facediff.models.folding import WeightCache
+from facediff.models.graphs import Graphs, Spoken
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, frame_mask
 from facediff.models.published.autoregressive import (
@@ -176,15 +177,16 @@ class DiffSpeaker(DiffusionModel):
             return super().unknown_weights()
         return torch.eye(len(self.identities))[0]
 
-    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states, interpolated to the frames."""
-        cached = batch.cached_features or ()
-        return self.audio_encoder.at_steps(batch.audio, batch.audio_lengths, frames, "hidden", *cached)
+        cached = heard.cached_features or ()
+        return self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, frames, "hidden", *cached)
 
     def conditions(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Conditions:
         """What the network is conditioned on in every step."""
         valid = frame_mask(frames, int(frames.max())) if bool((frames != frames.max()).any()) else None
-        return self.network.conditions(self.hear(batch, frames), self.identity_weights(batch), valid)
+        heard = self.network.audio_map(self.hear(batch, frames))
+        return self.network.conditions(heard, self.identity_weights(batch), valid)
 
     # Training.
 
@@ -217,6 +219,19 @@ class DiffSpeaker(DiffusionModel):
 
     # Sampling.
 
+    def space(self) -> VertexSpace | FoldedSpace:
+        """Where the reverse process runs."""
+        rest = self.network.motion_out.bias.new_zeros(1, 1, 3 * self.n_vertices)
+        if self.sampling_space == "vertices":
+            return VertexSpace(self.network, rest)
+        return FoldedSpace(self.network, rest, fresh_noise=False)
+
+    def graphs(self) -> Graphs:
+        """Speech, one step of the reverse process, the last map with the smoothing."""
+        from facediff.models.published.graphs import diffspeaker_graphs
+
+        return diffspeaker_graphs(self)
+
     def sample(
         self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
     ) -> BatchMotion:
@@ -224,12 +239,7 @@ class DiffSpeaker(DiffusionModel):
         self.check_length(frames, batch.names[0])
         network, conditions = self.network, self.conditions(batch, frames)
         start = noise(batch.template.new_empty(len(batch), int(frames.max()), 3 * self.n_vertices))
-        rest = start.new_zeros(1, 1, 3 * self.n_vertices)
-        space = (
-            VertexSpace(network, rest)
-            if self.sampling_space == "vertices"
-            else FoldedSpace(network, rest, fresh_noise=False)
-        )
+        space = self.space()
         state = space.of(start)
         # Noisy motion is always U h + weight · b + left · start, of which h, a sum of features, has the network's
         # width; so the vertices are not needed before the end.
@@ -404,15 +414,21 @@ class DiffSpeakerNetwork(nn.Module):
 
     def conditions(
         self,
-        hidden: Float[Tensor, "batch frames width"],
+        memory: Float[Tensor, "batch frames dim"],
         identities: Float[Tensor, "batch identities"],
         valid: Bool[Tensor, "batch frames"] | None,
     ) -> Conditions:
-        """What is constant over the denoising steps; without ``valid``, all frames are."""
-        memory, frames = self.audio_map(hidden), hidden.shape[1]
+        """What is constant over the denoising steps.
+
+        Args:
+            memory: the speech after ``audio_map``.
+            identities: weights of the training identities.
+            valid: True on valid frames; all are if None.
+        """
+        frames = memory.shape[1]
         speech = [layer.cross_attention.keys_values(memory) for layer in self.layers]  # type: ignore[union-attr, operator]
-        positions = periodic_positions(frames, self.dim, self.period, device=hidden.device)
-        bias = F.pad(mutual_bias(frames, self.num_heads, self.period, device=hidden.device), (2, 0))
+        positions = periodic_positions(frames, self.dim, self.period, device=memory.device)
+        bias = F.pad(mutual_bias(frames, self.num_heads, self.period, device=memory.device), (2, 0))
         if valid is not None:
             bias = bias.masked_fill(~F.pad(valid, (2, 0), value=True)[:, None, None], -torch.inf)
         return Conditions(self.style(identities), speech, positions, bias)

@@ -22,6 +22,7 @@ from facediff.data.frame_clock import FrameClock, Rule
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.folding import WeightCache
+from facediff.models.graphs import Graphs, Spoken
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width, all_states
 from facediff.models.published.base import SpeakerTable, masked_mean
@@ -126,12 +127,12 @@ class FaceDiffuser(DiffusionModel):
             found.append(min(own, self.steps_of(samples) // 2) if self.pairs else own)
         return found
 
-    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Speech features, two steps side by side for each frame."""
         rule: StepRule = "hidden_cut" if self.pairs else "hidden"
-        cached = batch.cached_features or ()
-        hidden = self.audio_encoder.at_steps(batch.audio, batch.audio_lengths, 2 * frames, rule, *cached)
-        return hidden.reshape(len(hidden), hidden.shape[1] // 2, -1)
+        cached = heard.cached_features or ()
+        hidden = self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, 2 * frames, rule, *cached)
+        return hidden.reshape(hidden.shape[0], hidden.shape[1] // 2, 2 * hidden.shape[2])
 
     # Training.
 
@@ -148,7 +149,7 @@ class FaceDiffuser(DiffusionModel):
         """The loss with given random numbers."""
         frames = self.trained_frames(batch)
         longest = int(frames.max())
-        rest = self.rest(batch)
+        rest = self.rest(batch.template)
         clean = (batch.motion * self.scale).flatten(2)[:, :longest] + rest
         noisy = self.posterior.add_noise(clean, noise[:, :longest], step)
         network = self.network
@@ -157,20 +158,29 @@ class FaceDiffuser(DiffusionModel):
         error = F.huber_loss(network.motion_out(made) + rest, clean, reduction="none")
         return masked_mean(error, frames)
 
-    def rest(self, batch: Batch) -> Float[Tensor, "batch 1 coordinates"]:
+    def rest(self, template: Float[Tensor, "batch vertices 3"]) -> Float[Tensor, "batch 1 coordinates"]:
         """What is noised where the face does not move: the template, or nothing."""
-        rest = (batch.template * self.scale).flatten(1)[:, None]
+        rest = (template * self.scale).flatten(1)[:, None]
         return rest if self.noised == "absolute" else torch.zeros_like(rest)
 
     # Sampling.
+
+    def space(self, rest: Float[Tensor, "batch 1 coordinates"]) -> VertexSpace | FoldedSpace:
+        """Where the reverse process runs."""
+        return VertexSpace(self.network, rest) if self.sampling_space == "vertices" else FoldedSpace(self.network, rest)
+
+    def graphs(self) -> Graphs:
+        """Speech, one step of the reverse process, the last map."""
+        from facediff.models.published.graphs import facediffuser_graphs
+
+        return facediffuser_graphs(self)
 
     def sample(
         self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
     ) -> BatchMotion:
         """The reverse process over all steps: the first noisy motion, then new noise in each step."""
-        network, posterior, rest = self.network, self.posterior, self.rest(batch)
-        style = network.style(self.identity_weights(batch))
-        space = VertexSpace(network, rest) if self.sampling_space == "vertices" else FoldedSpace(network, rest)
+        network, posterior, rest = self.network, self.posterior, self.rest(batch.template)
+        style, space = network.style(self.identity_weights(batch)), self.space(rest)
         speech = network.audio_map(self.hear(batch, frames))
         last = self.steps - self.skip_steps - 1
         state = space.noise(noise, speech.new_empty(len(batch), int(frames.max()), space.width))
