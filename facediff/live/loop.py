@@ -285,10 +285,12 @@ class Loop:
             self._measure(recent)
             made = self._ready(vertices, made, gaps, now)
         if fed and not self._abandoned:
-            began = time.monotonic()
+            before, began = stream.made, time.monotonic()
             vertices = stream.finish()
             now = time.monotonic()
             self.summary.busy += now - began
+            if stream.made > before:
+                self.summary.computing.add(now - began)
             self._ready(vertices, made, gaps, now)
 
     def _measure(self, recent: deque[tuple[float, float]]) -> None:
