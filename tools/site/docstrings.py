@@ -118,8 +118,11 @@ def named(obj: griffe.Object, name: str) -> str | None:
     owner: griffe.Object | None = obj
     while owner is not None:
         found: griffe.Object | griffe.Alias | None = owner
-        for part in name.removeprefix("facediff.").split(".") if owner is obj.package else name.split("."):
-            found = found.all_members.get(part) if found is not None else None
+        try:
+            for part in name.removeprefix("facediff.").split(".") if owner is obj.package else name.split("."):
+                found = found.all_members.get(part) if found is not None else None
+        except griffe.AliasResolutionError:  # a module of another package that is imported there
+            found = None
         if found is not None:
             return found.canonical_path
         owner = owner.parent
