@@ -21,7 +21,7 @@ from facediff.live.app import main, parser
 from facediff.live.command import LiveOptions, perform
 from facediff.live.model import LiveModel, usual_gate
 from facediff.registry import Kind
-from tests.fakes.live import Kept, fake_model
+from tests.fakes.live import FakeSound, Kept, device, fake_model
 
 MADE: list[Kept] = []
 
@@ -73,6 +73,17 @@ def test_performance_from_a_recording_to_receivers(speech: Path) -> None:
     assert (performance.frame_rate, performance.speech, performance.metadata["licence"]) == (50.0, True, "none")
     assert sum(len(samples) for samples, _ in MADE[0].speech) == 4800  # a recording is heard, too
     assert any("lag" in sentence for sentence in said)
+
+
+def test_speech_goes_to_a_sound_device_instead_of_the_receivers(speech: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = FakeSound(device("Phones", 0, 2))
+    monkeypatch.setitem(sys.modules, "sounddevice", sound)  # type: ignore[arg-type]
+    said: list[str] = []
+    perform(LiveOptions(Path("folder"), str(speech), to=["keep:1"], sound="out:phones"), opened, said.append)
+    assert not MADE[0].speech
+    assert len(MADE[0].frames) == 15
+    [stream] = sound.opened
+    assert stream.closed
 
 
 def test_receiver_that_cannot_open_closes_those_before_it(speech: Path) -> None:

@@ -1,0 +1,90 @@
+"""``facediff live`` with a trained model: its frames are those of a stream, and Ctrl-C ends it with its report."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+import facediff
+from facediff.cli.app import main
+from facediff.data.audio import read_speech
+
+WINDOWS = {"window": 0.6, "overlap": 0.2, "voice_gate": "off"}
+WORDS = ["--window", "0.6", "--overlap", "0.2", "--voice-gate", "off"]
+
+
+@pytest.fixture
+def speech(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    soundfile.write(tmp_path / "speech.wav", 0.1 * rng.normal(size=22_400), 16_000)
+    return tmp_path / "speech.wav"
+
+
+def test_live_frames_are_those_of_a_stream(
+    checkpoint: Path, speech: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.jsonl"
+    to = f"jsonl:{out}?weights=false&vertices=true"
+    assert main(["live", str(checkpoint), str(speech), "--to", to, "--identity", "B", "--seed", "3", *WORDS]) == 0
+    said = capsys.readouterr()
+    assert said.out == ""  # a receiver may write there
+    assert "lag" in said.err
+    head, *frames, end = [json.loads(line) for line in out.read_text().splitlines()]
+    assert end["type"] == "end"
+    wanted = np.concatenate(
+        list(facediff.load(checkpoint).stream([read_speech(speech)], identity="B", seed=3, **WINDOWS))  # type: ignore[arg-type]
+    )
+    assert len(wanted) == 35
+    index = [frame["index"] for frame in frames]
+    assert len(index) > 25  # a busy machine may drop some
+    found = np.array([frame["vertices"] for frame in frames]) + np.array(head["neutral"])
+    assert np.allclose(found, wanted[index], atol=3e-6)
+    assert [frame["time"] for frame in frames] == pytest.approx([each / head["frame_rate"] for each in index])
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--threads", "2"], "--threads"),
+        (["--identity", "Z"], "Z"),
+        (["--low-latency", "--window", "1"], "--low-latency"),
+        (["--window", "0.1"], "window"),
+    ],
+)
+def test_options_that_a_trained_model_does_not_take(
+    words: list[str], named: str, checkpoint: Path, speech: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["live", str(checkpoint), str(speech), "--to", "jsonl:-?weights=false", "--quiet", *words]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert named in line
+
+
+@pytest.mark.slow
+def test_interrupt_ends_with_the_report_and_status_0(checkpoint: Path, tmp_path: Path) -> None:
+    """In a real process that waits for samples, with a file that appears whole."""
+    out = tmp_path / "out.jsonl"
+    words = [str(checkpoint), "-", "--to", f"jsonl:{out}?weights=false", *WORDS]
+    command = [sys.executable, "-m", "facediff", "live", *words]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stderr is not None
+        assert process.stdin is not None
+        while b"ready" not in process.stderr.readline():
+            assert process.poll() is None
+        process.stdin.write(np.zeros(32_000, "<i2").tobytes())
+        process.stdin.flush()
+        while b"lag" not in process.stderr.readline():  # of the report after five seconds
+            os.write(process.stdin.fileno(), np.zeros(16_000, "<i2").tobytes())
+        process.send_signal(signal.SIGINT)
+        said = process.stderr.read()
+        assert process.wait(20) == 0
+    assert b"frames of" in said
+    lines = out.read_text().splitlines()
+    assert json.loads(lines[-1])["type"] == "end"
