@@ -287,7 +287,7 @@ class SpeechWindows(ABC, Generic[M]):
 
     @abstractmethod
     def generate(self, window: Window, speech: Speech, frames: int, mean: float, deviation: float) -> M:
-        """Motion of a window, which continues the one before it.
+        """Motion of a window but for its past, which continues the window before it.
 
         Args:
             window: which one.
@@ -343,8 +343,7 @@ class SpeechWindows(ABC, Generic[M]):
         if self._held is not None and left <= self.plan.overlap:
             parts.append(self._held[:, :left])
         else:
-            fixed = self._window.fixed
-            parts.append(self._generate(replace(self._window, frames=fixed + left), total)[:, fixed:])
+            parts.append(self._generate(replace(self._window, frames=self._window.fixed + left), total))
         return self._counted(parts)
 
     def parts(
@@ -372,7 +371,6 @@ class SpeechWindows(ABC, Generic[M]):
 
     def _next_window(self, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
         """The window's frames before its overlap with the next, given speech up to frame ``heard``; then advance."""
-        fixed = self._window.fixed
         motion = self._generate(self._window, heard)
         self._window = self.plan.window(self._window.index + 1)
         # Speech before the next window's context will not be heard again, unless the level has not counted it yet.
@@ -380,7 +378,7 @@ class SpeechWindows(ABC, Generic[M]):
         drop = max(0, min(needed, self._level.count) - self._dropped)
         self._speech = self._speech[drop:]
         self._dropped += drop
-        return motion[:, fixed : fixed + self.plan.hop]
+        return motion[:, : self.plan.hop]
 
     def _generate(self, window: Window, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
         """Motion of a window, with speech up to frame ``heard``."""

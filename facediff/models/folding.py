@@ -34,6 +34,9 @@ State = Float[Tensor, "batch frames width"]
 ScaledMotion = Float[Tensor, "batch frames coordinates"]
 """Motion on the vertices, in the scale of the network."""
 
+WantedMotion = Float[Tensor, "batch wanted coordinates"]
+"""The same of the frames from a first one on."""
+
 Step = int | Int[Tensor, " batch"]
 """A step counted from 0: one for all clips, or one for each."""
 
@@ -127,8 +130,8 @@ class Space(ABC):
         """The image of the predicted clean motion."""
 
     @abstractmethod
-    def motion(self, sample: State) -> ScaledMotion:
-        """Scaled motion of the sampler's result."""
+    def motion(self, sample: State, first: int = 0) -> WantedMotion:
+        """Scaled motion of the sampler's result, from a first frame on."""
 
 
 class VertexSpace(Space):
@@ -147,9 +150,9 @@ class VertexSpace(Space):
         """M̂⁰."""
         return self.network.clean_motion(self.blend(self.features(self.network.embed(state), step)))
 
-    def motion(self, sample: State) -> ScaledMotion:
+    def motion(self, sample: State, first: int = 0) -> WantedMotion:
         """The sample as it is."""
-        return sample
+        return sample[:, first:]
 
 
 class FoldedSpace(Space):
@@ -191,7 +194,7 @@ class FoldedSpace(Space):
         self._last = features, prediction
         return prediction
 
-    def motion(self, sample: State) -> ScaledMotion:
+    def motion(self, sample: State, first: int = 0) -> WantedMotion:
         """U h + b, the only step over the vertices.
 
         Raises:
@@ -204,7 +207,7 @@ class FoldedSpace(Space):
                 "sampler: it is declared linear, but its last step does not return the last prediction; "
                 "choose --model.sampling_space=vertices"
             )
-        return self.network.clean_motion(self._last[0])
+        return self.network.clean_motion(self._last[0][:, first:])
 
 
 class PreconditionedSpace(Space):
@@ -241,9 +244,9 @@ class PreconditionedSpace(Space):
         # The prediction is blended, not the features: the noisy motion is a part of it.
         return self.blend(self.preconditioning.clean(state, self.network.clean_motion(features), steps))
 
-    def motion(self, sample: State) -> ScaledMotion:
+    def motion(self, sample: State, first: int = 0) -> WantedMotion:
         """The sample as it is."""
-        return sample
+        return sample[:, first:]
 
 
 CHUNK = 8192

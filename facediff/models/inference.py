@@ -465,7 +465,7 @@ class Inference(ABC):
     def generate_window(
         self, clip: Batch, window: Window, seeds: Sequence[int], before: list[Tensor] | None
     ) -> tuple[Motion, list[Tensor]]:
-        """Motion of one window of long speech, which continues the window before it.
+        """Motion of one window of long speech but for its past, which continues the window before it.
 
         Here for models without noise: where two windows overlap, one motion is crossfaded into the other.
 
@@ -478,10 +478,11 @@ class Inference(ABC):
         Returns:
             the motion, and what to hand over to the next window.
         """
-        motion = self.generate_samples(clip, seeds)[:, window.context : window.context + window.frames]
+        whole = self.generate_samples(clip, seeds)
+        motion = whole[:, window.context + window.fixed : window.context + window.frames]
         if before is not None:
-            motion = crossfaded(before[0], motion, window.fixed)
-        return motion, [motion[:, -window.kept :]]
+            motion = crossfaded(before[0], motion)
+        return motion, [motion[:, max(0, motion.shape[1] - window.plan.overlap) :]]
 
     # What inference needs of the model.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -111,14 +112,33 @@ class WindowNoise:
 
     def __init__(self, name: str, window: Window, seeds: Sequence[int]) -> None:
         self.window = window
-        self.streams = [
-            ([stream_of(f"{name}/{index}", seed) for seed in seeds], index, new) for index, new in window.origins
-        ]
+        self.names = [(f"{name}/{index}", index, new) for index, new in window.origins]
+        self.seeds = list(seeds)
+        self._streams: dict[str, list[NormalStream]] = {}
+        self._drawn = 0
 
     def __call__(self, frames: int, width: int) -> Noise:
         """The next noise (seeds, frames, width); ``frames`` are those of the window."""
-        return np.concatenate([self._draw(streams, index, width)[:, new] for streams, index, new in self.streams], 1)
+        made = np.concatenate([self._draw(name, index, width)[:, new] for name, index, new in self.names], 1)
+        self._drawn += 1
+        return made
 
-    def _draw(self, streams: Sequence[NormalStream], index: int, width: int) -> Noise:
-        frames = self.window.plan.hop if index else self.window.plan.frames
-        return np.stack([stream.draw((frames, width)) for stream in streams])
+    def _draw(self, name: str, index: int, width: int) -> Noise:
+        plan = self.window.plan
+        shape = (plan.hop if index else plan.frames, width)
+        if not self._drawn:
+            return np.stack([first_draw(name, seed, shape) for seed in self.seeds])
+        if name not in self._streams:
+            self._streams[name] = [stream_of(name, seed) for seed in self.seeds]
+            for stream in self._streams[name]:
+                stream.draw(shape)  # what the first call gave
+        return np.stack([stream.draw(shape) for stream in self._streams[name]])
+
+
+@lru_cache(maxsize=128)
+def first_draw(name: str, seed: int, shape: tuple[int, int]) -> Noise:
+    """The first numbers of a stream.
+
+    Windows of low latency see the noise of some thirty windows before them again, and most samplers draw only once.
+    """
+    return stream_of(name, seed).draw(shape)

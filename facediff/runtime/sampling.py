@@ -88,12 +88,12 @@ def window_motion(
     """
     wanted = slice(window.context, window.context + window.frames)
     if model.description.blending == "motion":
-        motion = clip_motion(model, heard, conditions)[:, wanted]
+        motion = clip_motion(model, heard, conditions)[:, wanted][:, window.fixed :]
         if before is not None:
-            share = crossfade(window.shared, window.fixed)[:, None, None]
-            blended = before[0] + share * (motion[:, : window.shared] - before[0])
-            motion = np.concatenate([blended, motion[:, window.shared :]], 1)
-        return motion, [motion[:, -window.kept :]]
+            shared = before[0].shape[1]
+            blended = before[0] + crossfade(shared, 0)[:, None, None] * (motion[:, :shared] - before[0])
+            motion = np.concatenate([blended, motion[:, shared:]], 1)
+        return motion, [motion[:, max(0, motion.shape[1] - window.plan.overlap) :]]
     features = np.ascontiguousarray(model.features(heard, heard.frames)[:, wanted])
     sampling = Sampling(model, conditions, before, window.shared, window.fixed)
     noise = WindowNoise(NAME, window, [conditions.seed])
@@ -148,7 +148,7 @@ class Sampling:
         self.kept: list[Array] = []
 
     def run(self, features: Array, noise: Draw, of_mean: Draw) -> Array:
-        """Offsets from the template (1, frames, vertices, 3)."""
+        """Offsets from the template (1, frames, vertices, 3), but for those frames that are given out already."""
         about, share = self.model.description, self.conditions.expressivity
         frames, width = features.shape[1], about.drawn or about.state
         mean = None
@@ -207,7 +207,7 @@ class Sampling:
     def _decoded(self, result: tuple[Array, Array], unit: Array) -> Array:
         sample, kept = result
         last = kept if self.model.description.decoded == "kept" else sample
-        return self.model.run("motion", {"sample": last, "noise": unit})[0]
+        return self.model.run("motion", {"sample": last[:, self.fixed :], "noise": unit[:, self.fixed :]})[0]
 
     def _start(self, unit: Array) -> Array:
         """The noisy motion that the loop starts from."""

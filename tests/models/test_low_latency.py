@@ -88,18 +88,18 @@ def model(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> DualPathD
 def test_frames_that_are_given_out_do_not_change(model: DualPathDiffusion) -> None:
     """Each window sees the motion that was given out, and goes on from it."""
     model.choose_low_latency()
-    generate, given, looked = model.generate_window, [], 0
+    decode, given, looked = model._motion, [], 0
 
-    def spied(heard, window, seeds, before):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    def spied(space, sample, first):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
         nonlocal looked
-        motion, after = generate(heard, window, seeds, before)
-        for place in range(window.fixed):
-            torch.testing.assert_close(motion[0, place], given[window.start + place], rtol=1e-4, atol=1e-5)
+        whole = decode(space, sample, 0)
+        for place in range(first):
+            torch.testing.assert_close(whole[0, place], given[place - first], rtol=1e-4, atol=1e-5)
             looked += 1
-        given.append(motion[0, window.fixed])
-        return motion, after
+        given.append(whole[0, first])
+        return whole[:, first:]
 
-    model.generate_window = spied  # type: ignore[method-assign]
+    model._motion = spied  # type: ignore[method-assign]
     speech = torch.randn(2 * 16_000, generator=torch.Generator().manual_seed(0)) * 0.2
     made = model.animate(speech, identity=model.identities[0]).vertices
     assert len(given) == len(made) == 50

@@ -510,7 +510,7 @@ class DualPathDiffusion(AnimationModel):
         overlap_blend = WindowOverlap(before, window.kept, window.fixed)
         noise = WindowNoise(clip.names[0], window, seeds, self.device)
         of_mean = WindowNoise(mean_names(clip)[0], window, [0], self.device)
-        motion = self.sample(conditions, noise, of_mean, samples=len(seeds), blend=overlap_blend)
+        motion = self.sample(conditions, noise, of_mean, samples=len(seeds), blend=overlap_blend, first=window.fixed)
         return motion, overlap_blend.features
 
     def sample(
@@ -521,8 +521,9 @@ class DualPathDiffusion(AnimationModel):
         *,
         samples: int = 1,
         blend: Blend = unchanged,
+        first: int = 0,
         progress: Progress | None = None,
-    ) -> Float[Tensor, "batch frames vertices 3"]:
+    ) -> Float[Tensor, "batch wanted vertices 3"]:
         """Run the sampler from noise to motion, in offsets from the template.
 
         Args:
@@ -531,11 +532,12 @@ class DualPathDiffusion(AnimationModel):
             of_mean: gives the unit noise from which the mean is predicted, for every clip.
             samples: how many of one clip.
             blend: changes the features of every step.
+            first: the first frame whose motion is wanted.
             progress: wraps the iteration over steps.
         """
         expressivity = self.expressivity
         whole = not isinstance(expressivity, Tensor)
-        mean = None if whole and expressivity == 1 else self._mean(conditions, of_mean, blend)
+        mean = None if whole and expressivity == 1 else self._mean(conditions, of_mean, blend, first)
         if mean is not None and whole and expressivity == 0:
             return mean.expand(samples * len(mean), -1, -1, -1)
         conditions = conditions.repeated(samples)
@@ -545,13 +547,13 @@ class DualPathDiffusion(AnimationModel):
             return space.noise(unit(like))
 
         sample = self.sampler.run(space.denoise, noise(self._empty(space, conditions)), noise=noise, progress=progress)
-        motion = self._motion(space, sample)
+        motion = self._motion(space, sample, first)
         if mean is None:
             return motion
         share = expressivity.to(motion)[:, None] if isinstance(expressivity, Tensor) else expressivity
         return mean + share * (motion - mean)
 
-    def _mean(self, conditions: Conditions, of_mean: NoiseSource, blend: Blend) -> Tensor:
+    def _mean(self, conditions: Conditions, of_mean: NoiseSource, blend: Blend, first: int) -> Tensor:
         """The mean of motion under the conditions, one for each clip."""
         # At the last step nothing of the motion is left in the noise, so the prediction that errs least is the mean of
         # all motions that the conditions allow. A network lets some of the noise through all the same, nearly linearly:
@@ -559,7 +561,7 @@ class DualPathDiffusion(AnimationModel):
         # the mean's own, so that a clip has one mean whatever the seed.
         space = self._space(conditions, blend)
         noise = space.noise(of_mean(self._empty(space, conditions)))
-        ends = [self._motion(space, space.denoise(start, self.process.steps - 1)) for start in (noise, -noise)]
+        ends = [self._motion(space, space.denoise(start, self.process.steps - 1), first) for start in (noise, -noise)]
         return (ends[0] + ends[1]) / 2
 
     def _space(self, conditions: Conditions, blend: Blend) -> Space:
@@ -577,9 +579,9 @@ class DualPathDiffusion(AnimationModel):
         shape = (rows // len(space.shares), frames, space.width)
         return torch.empty(shape, device=self.device, dtype=next(self.parameters()).dtype)
 
-    def _motion(self, space: Space, sample: Tensor) -> Float[Tensor, "batch frames vertices 3"]:
-        """Offsets from the template."""
-        return self.motion_space.decode(space.motion(sample)) / self.scale
+    def _motion(self, space: Space, sample: Tensor, first: int) -> Float[Tensor, "batch wanted vertices 3"]:
+        """Offsets from the template, from a first frame on."""
+        return self.motion_space.decode(space.motion(sample, first)) / self.scale
 
 
 def mean_names(batch: Batch) -> list[str]:
