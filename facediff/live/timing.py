@@ -23,8 +23,9 @@ GROWTH = 0.1
 """Seconds, or a hop if that is longer, by which the delay grows beyond the least that bursts have needed: a machine
 that is slower than that drops frames."""
 
-SHRINKING = 0.01
-"""Seconds by which the delay may shrink in a second: frames then follow each other 1 % faster, which nobody sees."""
+SHRINKING, HURRY, FASTEST = 0.01, 0.2, 0.1
+"""Seconds by which the delay shrinks in a second: frames then follow each other 1 % faster, which nobody sees; a delay
+that is far too long, after a time in which the machine was busy, shrinks faster by its excess, up to 10 %."""
 
 
 class SpokenClock:
@@ -103,7 +104,8 @@ class Pacer:
             self.delay = min(needed + MARGIN, max(self.delay, min(all_needed) + max(self.hop, GROWTH)))
         else:
             enough = min(self.delay, max(all_needed) + MARGIN)
-            self.delay = max(enough, self.delay - SHRINKING * min(MEMORY, now - self._changed))
+            rate = min(FASTEST, SHRINKING + HURRY * max(0.0, self.delay - enough - GROWTH))
+            self.delay = max(enough, self.delay - rate * min(MEMORY, now - self._changed))
         self._changed = now
 
     def due(self, spoken: float) -> float:
