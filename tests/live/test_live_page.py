@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,6 +67,14 @@ def test_the_page_shows_frames_plays_speech_and_comes_back(browser: Chromium, pu
         page.wait_for("facediff.stats.received > 3")
         page.evaluate("document.getElementById('sound').click()")
         page.wait_for("facediff.speech.played > 4000")
+        # Switched off, nothing is planned; switched on again, it goes on at once.
+        page.evaluate("document.getElementById('sound').click()")
+        page.wait_for("!facediff.speech.on")
+        heard = page.evaluate("facediff.speech.played")
+        page.wait_for(f"facediff.stats.index > {acting.index + 3}")
+        assert page.evaluate("facediff.speech.played") == heard
+        page.evaluate("document.getElementById('sound').click()")
+        page.wait_for(f"facediff.speech.played > {heard + 1000}")
         acting.stop()
         last = acting.index - 1
         page.wait_for(f"facediff.stats.index === {last}")
@@ -76,6 +85,10 @@ def test_the_page_shows_frames_plays_speech_and_comes_back(browser: Chromium, pu
         assert page.evaluate("document.getElementById('sound').getAttribute('aria-pressed')") == "true"
         assert page.evaluate("document.documentElement.scrollWidth") <= 375
         assert 0.1 <= numbers(page)["lag"] < 5
+        # Speech of a time is planned for when its frames are shown, which here is five frames after it was heard.
+        plan = page.evaluate("facediff.speech")
+        shown = plan["planned"]["time"] + plan["delay"]
+        assert plan["planned"]["at"] - plan["sounding"] == pytest.approx(shown - plan["now"], abs=0.15)
         assert numbers(page)["shown"] > 1
         # Gaps in the numbers of frames are dropped ones.
         missed = numbers(page)["missed"]
@@ -90,6 +103,10 @@ def test_the_page_shows_frames_plays_speech_and_comes_back(browser: Chromium, pu
         receiver.send(moved(puppet, 1))
         page.wait_for("facediff.stats.index === 1 && facediff.state === 'Live'")
         assert page.evaluate("facediff.errors") == []
+    # Another face: what is drawn belongs to the old one, so the page begins again.
+    with serving(replace(puppet, neutral=2 * puppet.neutral), port):
+        page.wait_for("window.facediff?.ready && facediff.connections === 1")
+        np.testing.assert_allclose(page.evaluate("facediff.positions[1]"), 2000 * puppet.neutral[0, 1], rtol=1e-5)
         # While nobody answered, the browser itself says so; nothing else went wrong.
         assert [each for each in page.problems if "ERR_CONNECTION_REFUSED" not in each] == []
         assert {url.split("/")[2] for url in page.requests if not url.startswith("data")} == {f"127.0.0.1:{port}"}

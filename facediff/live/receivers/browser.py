@@ -107,7 +107,7 @@ class Browser(Receiver):
         from facediff.animation import metres_per_unit
 
         self._scale = 1000.0 * metres_per_unit(performance.unit)
-        self._rate, self._speaks = performance.sample_rate, performance.speech
+        self._speaks = performance.speech
         self._mesh = _mesh(performance, self._scale)
         self._about = json.dumps(
             {

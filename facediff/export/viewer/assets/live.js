@@ -5,8 +5,9 @@ const HEADER = 24, MESH = 0, FRAME = 1, SPEECH = 2; // as the receiver's descrip
 const RETRIES = [250, 500, 1000, 2000, 4000];
 const SILENCE_MS = 1500; // without a frame: nobody performs
 const LATE_S = 0.5; // a lag that anybody notices
-/** Seconds: of sound that is planned ahead of the picture at least; that both may be apart; that speech is kept for. */
-const CUSHION = 0.03, APART = 0.04, KEPT = 10;
+/** Seconds: that the sound is planned after the picture, which is drawn later than it comes; that both may be apart; of
+ * speech that waits for its frames. */
+const CUSHION = 0.03, APART = 0.04, KEPT = 60;
 
 /** Plays speech with the frames of the same time, however much later than the speech they come. */
 class DelayedSpeech {
@@ -15,18 +16,27 @@ class DelayedSpeech {
     this.on = false;
     this.context = null; // browsers give none before a person has clicked
     this.delay = null; // seconds by the page's clock at which frames of time 0 were shown
-    this.waiting = [];
+    this.pieces = []; // speech whose frames are still to come, in its order
     this.planned = null; // times of speech and of the sound device at which what is planned ends
     this.played = 0;
     this.anchors = 0; // times that the sound had to be moved to the picture
   }
 
+  /** Another performance, whose times begin again. */
+  begin() {
+    this.delay = this.planned = null;
+    this.pieces = [];
+  }
+
+  /** Switch the sound on or off. */
   async toggle() {
     this.on = !this.on;
     this.planned = null;
-    this.waiting = [];
-    this.context ??= new AudioContext();
-    await (this.on ? this.context.resume() : this.context.suspend());
+    for (const piece of this.pieces) piece.planned = false;
+    await this.context?.close(); // what is planned is not heard any more
+    this.context = this.on ? new AudioContext() : null;
+    await this.context?.resume();
+    this.plan(performance.now() / 1000);
   }
 
   /** A frame of a time came onto the page. */
@@ -34,21 +44,23 @@ class DelayedSpeech {
     const delay = now - time;
     // Frames come a little early or late; their mean does not.
     this.delay = this.delay === null || Math.abs(delay - this.delay) > 1 ? delay : this.delay + (delay - this.delay) / 20;
+    while (this.pieces.length && this.pieces[0].end < time) this.pieces.shift();
     this.plan(now);
   }
 
   /** Speech that begins at a time. */
   speech(time, samples, now) {
-    if (!this.on) return;
-    this.waiting.push({ time, samples });
-    const oldest = this.waiting.at(-1).time - KEPT;
-    while (this.waiting[0].time < oldest) this.waiting.shift();
+    this.pieces.push({ time, samples, end: time + samples.length / this.rate, planned: false });
+    while (this.pieces[0].end < time - KEPT) this.pieces.shift();
     this.plan(now);
   }
 
   plan(now) {
-    if (!this.on || this.delay === null) return;
-    for (const { time, samples } of this.waiting.splice(0)) {
+    if (!this.context || this.delay === null) return;
+    for (const piece of this.pieces) {
+      if (piece.planned) continue;
+      piece.planned = true;
+      const { time, samples, end } = piece;
       const wanted = this.context.currentTime + (time + this.delay - now) + CUSHION;
       const follows = this.planned && Math.abs(this.planned.time - time) < 1e-3 && Math.abs(this.planned.at - wanted) < APART;
       const at = follows ? this.planned.at : wanted;
@@ -60,7 +72,7 @@ class DelayedSpeech {
       source.buffer = buffer;
       source.connect(this.context.destination);
       source.start(at);
-      this.planned = { time: time + samples.length / this.rate, at: at + samples.length / this.rate };
+      this.planned = { time: end, at: at + end - time };
       this.played += samples.length;
     }
   }
@@ -125,6 +137,7 @@ class LivePage {
     );
     find("sound").hidden = !about.speech;
     if (about.speech) this.speech ??= new DelayedSpeech(about.sampleRate);
+    this.speech?.begin();
   }
 
   format() {
@@ -234,7 +247,9 @@ window.facediff = {
   get stats() { return { ...livePage.stats, shown: livePage.stage?.shown ?? 0 }; },
   get speech() {
     const { speech } = livePage;
-    return speech && { on: speech.on, played: speech.played, anchors: speech.anchors, delay: speech.delay, planned: speech.planned };
+    if (!speech) return null;
+    const { on, played, anchors, delay, planned, context } = speech;
+    return { on, played, anchors, delay, planned, now: performance.now() / 1000, sounding: context?.currentTime ?? null };
   },
   get positions() { return livePage.stage?.face.positions; },
   get state() { return find("state").textContent; },
