@@ -16,7 +16,7 @@ import pytest
 from facediff.editing.shapes import ARKIT
 from facediff.errors import FaceDiffError
 from facediff.live.receivers.json_lines import MOST_CLIENTS
-from tests.live.conftest import FRAME_RATE, VERTICES, Opened, at_rate, frame, weights_of
+from tests.live.conftest import FRAME_RATE, VERTICES, Opened, frame, weights_of
 
 
 def free_port() -> int:
@@ -28,12 +28,6 @@ def connect(port: int) -> socket.socket:
     client = socket.create_connection(("127.0.0.1", port), timeout=5)
     client.settimeout(5)
     return client
-
-
-def lines(client: socket.socket) -> list[dict[str, object]]:
-    """All lines until the other side closes."""
-    with client, client.makefile("rb") as stream:
-        return [json.loads(each) for each in stream]
 
 
 def wait_for(receiver: object, words: str) -> None:
@@ -77,23 +71,22 @@ def test_vertices_are_offsets_from_the_neutral_face(opened: Opened, tmp_path: Pa
 def test_several_clients_each_get_whole_lines_from_when_they_came(opened: Opened) -> None:
     port = free_port()
     receiver = opened(f"jsonl:{port}")
-    first = connect(port)
-    wait_for(receiver, "1 clients")
-    with at_rate(200) as due:
-        for index in range(30):
-            if index == 10:
-                second = connect(port)
-                wait_for(receiver, "2 clients")
-            due(index)
+    streams = []
+    for begin in (0, 10):
+        client = connect(port)
+        streams.append(client.makefile("rb"))
+        client.close()  # the stream goes on
+        wait_for(receiver, f"{len(streams)} clients")
+        assert json.loads(streams[-1].readline())["type"] == "performance"
+        for index in range(begin, begin + 10):
             receiver.send(frame(index))
+            # Nobody is slow: each frame is read before the next one is sent.
+            assert [json.loads(stream.readline())["index"] for stream in streams] == [index] * len(streams)
     receiver.close()
-    for client, begins in ((first, {0}), (second, {9, 10})):
-        head, *frames, end = lines(client)
-        assert head["type"] == "performance"
-        begin = int(str(frames[0]["index"]))
-        assert begin in begins
-        assert [each["index"] for each in frames] == list(range(begin, 30))
-        assert end == {"type": "end", "frames": 30 - begin, "dropped": 0}
+    for stream, frames in zip(streams, (20, 10), strict=True):
+        with stream:
+            assert json.loads(stream.readline()) == {"type": "end", "frames": frames, "dropped": 0}
+            assert stream.readline() == b""
 
 
 def test_a_slow_client_misses_frames_and_the_others_do_not(opened: Opened) -> None:
