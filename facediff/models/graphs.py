@@ -241,6 +241,30 @@ def speech_graph(model: AnimationModel, hear: Hear, steps_of: Callable[[int], in
     )
 
 
+class StyleGraph(nn.Module):
+    """Reference motion to a style vector."""
+
+    def __init__(self, model: AnimationModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Encode offsets from the template."""
+        with of_frames(mask.shape[1]):
+            return self.model.encode_style(motion, mask)
+
+
+def style_graphs(model: AnimationModel, width: int) -> list[Graph]:
+    """The graph that takes a style from motion, if styles have any width."""
+    batch, frames = 2, 50
+    motion = torch.randn(batch, frames, model.n_vertices, 3, generator=torch.Generator().manual_seed(0))
+    inputs = {"motion": motion, "mask": torch.ones(batch, frames, dtype=torch.bool)}
+    made = Graph("style", StyleGraph(model), inputs, dict.fromkeys(inputs, FRAMES), ("style",))
+    return [made] if width else []
+
+
 def features_of(speech: Graph) -> Tensor:
     """What the graph that hears makes of its example values."""
     with torch.no_grad():

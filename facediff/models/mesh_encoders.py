@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from facediff.errors import FaceDiffError
-from facediff.models.layers import Frames, Share, Width
+from facediff.models.layers import Frames, Share, Width, exporting
 from facediff.models.principal import PrincipalComponents
 from facediff.registry import mesh_encoder
 from facediff.utils.ranges import Range, Vertices
@@ -152,13 +152,13 @@ class SpiralDown(nn.Module):
     def forward(self, x: Float[Tensor, "frames vertices in_channels"]) -> Float[Tensor, "frames coarse out_channels"]:
         """Features of the next level's vertices."""
         # The features along each vertex's spiral, one after the other: one gather for all, then one linear map.
-        around = x.index_select(1, self.table.flatten()).view(len(x), len(self.table), -1)
+        around = x.index_select(1, self.table.flatten()).view(x.shape[0], len(self.table), -1)
         out = self.map(around)
         if self.rows is None or self.weights is None:
             return out
         # A sparse matrix product by scattering: each vertex adds its share to the one coarse vertex of its group.
         shares = out * self.weights[:, None]
-        return shares.new_zeros(len(x), self.sizes[1], out.shape[-1]).index_add(1, self.rows, shares)
+        return shares.new_zeros(x.shape[0], self.sizes[1], out.shape[-1]).index_add(1, self.rows, shares)
 
 
 @mesh_encoder.register("spiral")
@@ -277,7 +277,7 @@ class SpiralMeshEncoder(MeshEncoder):
         if not self.attached:
             raise FaceDiffError("mesh encoder: the mesh is not known yet; attach a hierarchy, or load trained weights")
         frames = motion.flatten(0, 1)
-        if self.max_frames is None or len(frames) <= self.max_frames:
+        if self.max_frames is None or exporting() or len(frames) <= self.max_frames:
             return self.encode(frames).view(*motion.shape[:2], -1)
         parts = [self._part(part) for part in torch.split(frames, self.max_frames)]
         return torch.cat(parts).view(*motion.shape[:2], -1)

@@ -221,7 +221,7 @@ class TcnGruTransformer(StyleEncoder):
             x, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=mask.shape[1])
         # The position embedding P, stretched to each clip's length, and the Transformer (eq. 6).
         rows = torch.full_like(lengths, self.positions.shape[0])
-        positions = interpolate_frames(self.positions.expand(len(lengths), -1, -1), rows, lengths)
+        positions = interpolate_frames(self.positions.expand(lengths.shape[0], -1, -1), rows, lengths)
         x = x + nn.functional.pad(positions, (0, 0, 0, mask.shape[1] - positions.shape[1]))
         for layer in self.layers:
             x = layer(x, mask)

@@ -1,19 +1,26 @@
 """A speaking style from what was typed after ``--style``: a clip's name, a file, or a weighted mixture of several.
 
-From top to bottom: what was typed is split into names with weights; each name becomes a reference motion or a style
-vector; a motion file is brought to offsets from its speaker's neutral face, and checked against the face that it is
-taken for. Libraries are imported inside the functions, so that splitting alone costs nothing.
+What was typed is split into names with weights (:mod:`facediff.animation.style_files`); each name becomes a reference
+motion or a style vector; a motion file is brought to offsets from its speaker's neutral face, and checked against the
+face that it is taken for. Libraries are imported inside the functions, so that splitting alone costs nothing.
 """
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from facediff.animation.style_files import (
+    FILES,
+    StyleFile,
+    frames_of,
+    normalised,
+    open_style,
+    split_styles,
+    stillness_of,
+    stride_of,
+)
 from facediff.errors import FaceDiffError, choices
 
 if TYPE_CHECKING:
@@ -28,15 +35,8 @@ if TYPE_CHECKING:
     StyleLike = str | Path | Mapping[str, float] | Animation | npt.NDArray[np.floating] | Tensor | Reference | Style
     """What a style may be given as in Python, see :func:`style_from`."""
 
-FILES = (".npy", ".npz")
-"""Suffixes of files that hold a style; anything else is the name of a clip."""
 MEDIAN = "median"
 """Instead of a template's file: the median of the motion's own frames."""
-CANCELLED = 1e-3
-"""Weights whose sum is less than this share of their sizes have nothing left to divide by."""
-OTHER_FACE = 0.25
-"""How far the stillest vertices may lie from the face, as a share of how far all vertices of a reference do."""
-NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)"
 
 
 def read_styles(
@@ -121,70 +121,6 @@ def style_from(
             f"(frames, vertices, 3) or a style vector"
         )
     return style_of(StyleFile(Path("style"), array), identity, model, template=template)
-
-
-@dataclass(frozen=True)
-class Weighted:
-    """One style of a mixture.
-
-    Attributes:
-        name: a file or the name of a clip.
-        weight: None if none was given.
-    """
-
-    name: str
-    weight: float | None
-
-
-def split_styles(words: str, clips: Sequence[str] = ()) -> list[Weighted]:
-    r"""The styles of a mixture, split at commas; a weight is what follows the last colon, if that is a number.
-
-    Words that are a file, or the name of a clip, as a whole are taken as such: alone, a name may hold commas, or end in
-    a colon and a number.
-
-    >>> split_styles(r"C:\ann\x.npy:0.3,F1_e05:-1")
-    [Weighted(name='C:\\ann\\x.npy', weight=0.3), Weighted(name='F1_e05', weight=-1.0)]
-    """
-    # Before anything is split: a file or clip may have commas and colons in its name.
-    if words in clips or Path(words).is_file():
-        return [Weighted(words, None)]
-    parts = []
-    for word in words.split(","):
-        found = re.fullmatch(rf"(.*):\s*({NUMBER})\s*", word, re.IGNORECASE)
-        name = (found[1] if found else word).strip()
-        if not name:
-            raise FaceDiffError(f"--style {words}: expected names or files with weights, such as a.npy:0.3,b.npy:0.7")
-        parts.append(Weighted(name, float(found[2]) if found else None))
-    return parts
-
-
-def style_paths(words: str | None) -> list[Path]:
-    """The files among the words of ``--style``; if one of them has changed, so has the style."""
-    return [Path(part.name) for part in split_styles(words) if Path(part.name).is_file()] if words else []
-
-
-def normalised(words: str, weights: Sequence[float | None]) -> list[float]:
-    """Weights that sum to 1; a note is printed if that changed them.
-
-    Raises:
-        FaceDiffError: if only some are given, one is not finite, or their sum is too near to 0.
-    """
-    given = [weight for weight in weights if weight is not None]
-    if not given:
-        return [1.0 / len(weights)] * len(weights)
-    if len(given) < len(weights):
-        raise FaceDiffError(f"--style {words}: give every style a weight (A:0.3,B:0.7), or none of them")
-    total = math.fsum(given)
-    # Weights may be negative (to lead away from a style), so their sum may cancel to almost nothing; the mixture, which
-    # is divided by it, would be huge.
-    if not all(map(math.isfinite, given)) or not abs(total) > CANCELLED * math.fsum(map(abs, given)):
-        raise FaceDiffError(
-            f"--style {words}: expected finite weights whose sum is not 0, since they are divided by it"
-        )
-    shares = [weight / total for weight in given]
-    if abs(total - 1.0) > 1e-6:
-        print(f"note: --style: weights are divided by their sum: {', '.join(f'{share:.3g}' for share in shares)}")
-    return shares
 
 
 def vector_of(style: Reference | Style, model: AnimationModel) -> Tensor:
@@ -298,42 +234,10 @@ def style_of(
         if opened.unit not in (None, assets.unit):
             scale = metres_per_unit(str(opened.unit)) / metres_per_unit(assets.unit)
     # Networks see offsets from the speaker's own neutral face, at the frame rate and in the unit of their corpus.
-    motion = torch.from_numpy(frames_of(opened, assets, stride_of(path, rate, assets.frame_rate)))
+    motion = torch.from_numpy(frames_of(opened, assets.n_vertices, stride_of(path, rate, assets.frame_rate)))
     offsets = scale * (motion - face)
     check_face(path, offsets, assets, whose)
     return Reference(path.stem, offsets)
-
-
-@dataclass(frozen=True)
-class StyleFile:
-    """A motion or a style vector as read from a file.
-
-    Attributes:
-        path: the file.
-        array: (T, V, 3) or (T, 3V) absolute vertices, or a style vector.
-        template: (V, 3) of an animation, in the motion's unit; None for a bare array.
-        frame_rate: likewise.
-        unit: likewise.
-    """
-
-    path: Path
-    array: npt.NDArray[np.generic]
-    template: npt.NDArray[np.float32] | None = None
-    frame_rate: float | None = None
-    unit: str | None = None
-
-
-def open_style(path: Path) -> StyleFile:
-    """A style's file, memory-mapped where it is an array."""
-    from facediff.animation import read_archive
-    from facediff.utils.arrays import open_array
-
-    if not path.is_file():
-        raise FaceDiffError(f"--style {path}: no such file")
-    if path.suffix == ".npz":
-        animation = read_archive(path)
-        return StyleFile(path, animation.vertices, animation.template, animation.frame_rate, animation.unit)
-    return StyleFile(path, open_array(path, kinds="fiu", name=f"--style {path}"))
 
 
 def corpus_clip(name: str, model: AnimationModel) -> Path:
@@ -358,40 +262,6 @@ def read_vector(opened: StyleFile, model: AnimationModel) -> Tensor:
             f"NaN); make one with `facediff style extract` from this very checkpoint"
         )
     return torch.from_numpy(vector)
-
-
-def frames_of(opened: StyleFile, assets: Assets, stride: int) -> npt.NDArray[np.float32]:
-    """Absolute vertices (T, V, 3) of every ``stride``-th frame.
-
-    Raises:
-        FaceDiffError: if the file is of another topology, or not finite.
-    """
-    import numpy as np
-
-    array, vertices = opened.array, assets.n_vertices
-    if array.ndim not in (2, 3) or not len(array) or array.shape[1:] not in ((vertices, 3), (3 * vertices,)):
-        raise FaceDiffError(
-            f"--style {opened.path}: has shape {array.shape}; the checkpoint's faces have {vertices} vertices, "
-            f"so (frames, {vertices}, 3) or (frames, {3 * vertices}) is expected"
-        )
-    motion = np.array(array[::stride], np.float32).reshape(-1, vertices, 3)
-    if not np.isfinite(motion).all():
-        raise FaceDiffError(f"--style {opened.path}: holds NaN or infinity")
-    return motion
-
-
-def stride_of(path: Path, stored: float, wanted: float) -> int:
-    """Every how many-th frame of a file is taken.
-
-    Raises:
-        FaceDiffError: if the file's frame rate is no whole multiple of the checkpoint's.
-    """
-    stride = round(stored / wanted)
-    if stride < 1 or abs(stride * wanted - stored) > 1e-6:
-        raise FaceDiffError(
-            f"--style {path}: has {stored:g} frames a second, the checkpoint {wanted:g}; give a motion at that rate"
-        )
-    return stride
 
 
 def face_of_array(
@@ -441,7 +311,7 @@ def given_face(template: str | Path, opened: StyleFile, assets: Assets) -> Tenso
 
     path = Path(template)
     if str(template) == MEDIAN and not path.is_file():
-        median = np.median(frames_of(opened, assets, 1), axis=0)
+        median = np.median(frames_of(opened, assets.n_vertices, 1), axis=0)
         print(
             f"note: --style {opened.path}: the median of its {len(opened.array)} frames stands for the neutral face; a "
             f"mouth that is open most of the time then counts as closed"
@@ -470,18 +340,8 @@ def check_face(path: Path, offsets: Tensor, assets: Assets, whose: str | None) -
     Raises:
         FaceDiffError: if the motion is another face's, or the head moves.
     """
-    import torch
-
-    stored = [reference.motion.float() for reference in assets.references.values()]
-    if not stored:
-        return
-    # The quarter of the vertices that move least in the stored references (skull, neck) decides: there the offsets from
-    # one's own template are small, and those from another speaker's are not, nor those of a head that moves.
-    reach = torch.stack([torch.linalg.vector_norm(motion, dim=-1).amax(0) for motion in stored]).amax(0)
-    still = reach.argsort()[: max(1, len(reach) // 4)]
-    size = float(offsets[:, still].square().mean().sqrt())
-    usual = max(float(motion.square().mean().sqrt()) for motion in stored)
-    if size <= OTHER_FACE * usual:
+    stillness = stillness_of([reference.motion.float().numpy() for reference in assets.references.values()])
+    if stillness is None or not stillness.another_face(offsets.numpy()):
         return
     if whose is None:
         raise FaceDiffError(

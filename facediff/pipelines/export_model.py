@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from facediff.animation.style_files import Stillness, stillness_of
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description, read_folder
 from facediff.utils import SAMPLE_RATE
@@ -26,11 +27,9 @@ from facediff.version import __version__
 if TYPE_CHECKING:
     import onnx
 
-    from facediff.data import Reference
     from facediff.data.frame_clock import FrameClock
     from facediff.models.base import AnimationModel
     from facediff.models.graphs import Graph, Graphs
-    from facediff.models.inference import Style
 
 Precision = Literal["float32", "float16", "int8"]
 
@@ -247,8 +246,7 @@ def described_ends(document: onnx.ModelProto) -> dict[str, list[dict[str, Any]]]
 
 def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDArray[Any]], list[str], list[str]]:
     """What ``arrays.npz`` holds, and the names of its styles and faces."""
-    import torch
-
+    from facediff.models.styles import vector_of
     from facediff.pipelines.animate import facts_of
     from facediff.pipelines.rest import rest_weights
 
@@ -268,26 +266,19 @@ def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDAr
         arrays["noise"] = graphs.sampling.noise.numpy()
     if graphs.style != "reference":
         return arrays, list(assets.identities) if graphs.style == "identity" else [], faces
-    styles: dict[str, npt.NDArray[np.float32]] = {}
-    with torch.inference_mode():
-        for name in model.styled_identities():
-            styles[name] = style_vector(model, model.default_style(name))
+    names = model.styled_identities()
+    styles = {name: vector_of(model.default_style(name), model).numpy() for name in names}
     if not styles:
         raise FaceDiffError("styles: the checkpoint holds no reference motion; train with a corpus that gives one")
     arrays["styles"] = np.stack(list(styles.values()))
+    if (stillness := model_stillness(model)) is not None:
+        arrays["still"] = stillness.vertices
     return arrays, list(styles), faces
 
 
-def style_vector(model: AnimationModel, style: Reference | Style) -> npt.NDArray[np.float32]:
-    """The vector of a style."""
-    import torch
-
-    vector = getattr(style, "vector", None)
-    if vector is None:
-        motion = style.motion.float()[None].to(model.device)  # type: ignore[union-attr]
-        vector = model.encode_style(motion, torch.ones(1, motion.shape[1], dtype=torch.bool, device=model.device))[0]
-    found: npt.NDArray[np.float32] = vector.float().cpu().numpy()
-    return found
+def model_stillness(model: AnimationModel) -> Stillness | None:
+    """Where the model's faces keep still, by its stored references."""
+    return stillness_of([reference.motion.float().numpy() for reference in model.assets.references.values()])
 
 
 def describe(
@@ -301,6 +292,7 @@ def describe(
 ) -> Description:
     """What ``model.json`` says."""
     assets, plan, loop = model.assets, model.windows, graphs.sampling
+    stillness = model_stillness(model) if graphs.style == "reference" else None
     return Description(
         model=type(model).__name__,
         facediff=__version__,
@@ -334,6 +326,7 @@ def describe(
         longest=graphs.longest,
         drawn=loop.drawn if loop else 0,
         noise_of=loop.noise_of if loop else "clip",
+        stillness=stillness.size if stillness else 0.0,
         quick_steps=loop.quick_steps if loop else [],
         quick_table=loop.quick_table if loop else [],
     )

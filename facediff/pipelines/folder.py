@@ -12,10 +12,10 @@ from functools import partial
 from pathlib import Path
 
 from facediff.animation import Animation
+from facediff.animation.style_files import style_paths
 from facediff.errors import FaceDiffError, choices, printable
 from facediff.export import FORMATS
 from facediff.models.checkpoint import read_assets
-from facediff.models.styles import style_paths
 from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, facts_of, on_processor, read_recording
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting

@@ -44,7 +44,12 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--identity", metavar="NAME", help="whose face; the first one trained on by default")
     made.add_argument("--condition", metavar="NAME", help="training identity that the model is conditioned on")
-    made.add_argument("--style", metavar="NAME", help="name of a style in the folder; that of the face by default")
+    made.add_argument(
+        "--style",
+        metavar="STYLE",
+        help="name of a style in the folder, a motion (.npz, .npy), or a mixture (F1:0.3,a.npz:0.7); that of the face "
+        "by default",
+    )
     made.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the noise (default: 0)")
     made.add_argument(
         "--expressivity", type=float, default=1.0, metavar="X", help="from the mean (0) to a sample (1) and beyond (2)"

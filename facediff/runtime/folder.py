@@ -74,6 +74,8 @@ class Description:
         longest: frames at most of what is animated in one pass; 0 for any number.
         drawn: numbers in a frame of the noise that the loop starts from; ``state`` if 0.
         noise_of: what noise depends on: the ``clip`` and the seed, or the ``seed``.
+        stillness: how far the stored references move; motion whose still vertices (the array ``still``) lie farther
+            from the neutral face than a part of it is of another face.
         quick_steps: the diffusion steps visited at low latency; none where the model does not change its steps.
         quick_table: for each of them, as in ``table``.
         check: the comparison with PyTorch when the folder was written.
@@ -111,6 +113,7 @@ class Description:
     longest: int = 0
     drawn: int = 0
     noise_of: str = "clip"
+    stillness: float = 0.0
     quick_steps: list[int] = field(default_factory=list)
     quick_table: list[list[float]] = field(default_factory=list)
     check: dict[str, Any] = field(default_factory=dict)
@@ -284,9 +287,9 @@ def _check_arrays(path: Path, found: Description, arrays: Arrays) -> None:
     if "inner_lip_pairs" in arrays:
         need("inner_lip_pairs", (None, 2), "iu")
     for name in arrays:
-        if name.startswith("region_"):
+        if name.startswith("region_") or name == "still":
             need(name, (None,), "iu")
-        if name.startswith("region_") or name in ("faces", "inner_lip_pairs"):
+        if name.startswith("region_") or name in ("faces", "inner_lip_pairs", "still"):
             indices = arrays[name]
             if indices.size and not 0 <= int(indices.min()) <= int(indices.max()) < vertices:
                 raise FaceDiffError(f"{path}: {name} names vertices that do not exist; export the model again")

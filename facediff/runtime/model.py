@@ -20,6 +20,7 @@ from facediff.data.windows import LOW_LATENCY, SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.runtime.folder import Arrays, Description, read_folder
 from facediff.runtime.sampling import NAME, Conditions, Heard, clip_motion, window_motion
+from facediff.runtime.styles import RuntimeStyle, read_style
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Expressivity, Seed, mismatch
 from facediff.version import __version__
@@ -110,7 +111,7 @@ class RuntimeModel:
         *,
         identity: str | None = None,
         condition: str | None = None,
-        style: str | None = None,
+        style: str | RuntimeStyle | None = None,
         seed: int = 0,
         expressivity: float = 1.0,
         gate: VoiceGate | None = EnergyGate(),  # noqa: B008 - it cannot be changed
@@ -122,7 +123,8 @@ class RuntimeModel:
             audio: speech (S,) at 16 kHz.
             identity: whose face and identity; the first one trained on if None.
             condition: the training identity that the model is conditioned on, where it is not that of the face.
-            style: name of a style in the folder; that of the face's identity if None.
+            style: name of a style in the folder, a file or a mixture as ``--style`` takes them, or what
+                :meth:`encode_style` gives; that of the face's identity if None.
             seed: seed of the noise; equal seeds give the motion of PyTorch's processor.
             expressivity: from the mean prediction (0) to a sample (1) and beyond (2).
             gate: brings the mouth to rest in pauses; None for no gate.
@@ -159,7 +161,7 @@ class RuntimeModel:
         *,
         identity: str | None = None,
         condition: str | None = None,
-        style: str | None = None,
+        style: str | RuntimeStyle | None = None,
         seed: int = 0,
         expressivity: float = 1.0,
         plan: WindowPlan | None = None,
@@ -227,7 +229,12 @@ class RuntimeModel:
         )
 
     def _face(
-        self, identity: str | None, condition: str | None, style: str | None, seed: int, expressivity: float
+        self,
+        identity: str | None,
+        condition: str | None,
+        style: str | RuntimeStyle | None,
+        seed: int,
+        expressivity: float,
     ) -> tuple[int, Conditions]:
         """The face's place among the templates, and what motion is conditioned on."""
         about = self.description
@@ -239,33 +246,54 @@ class RuntimeModel:
                 f'condition: the model was not trained on "{condition}": {choices(condition, about.identities)}'
             )
         who = chosen if condition is None else condition
-        if about.style_source == "none" and style is not None:
-            raise FaceDiffError(f"style: {about.model} knows no speaking styles; omit the option")
-        # Where the model's identities are its styles, the one that it is conditioned on is the style.
-        usual = chosen if about.style_source == "reference" else who
-        name = style if style is not None else usual
-        if style is not None or about.style_source == "reference":
-            self._require_style(name)
+        found = RuntimeStyle(who, np.zeros(0, np.float32))
+        if about.style_source == "reference":
+            given = chosen if style is None else style
+            found = read_style(given, self, chosen) if isinstance(given, str) else given
+            if found.vector.shape != self.arrays["styles"].shape[1:]:
+                raise FaceDiffError(f"style: {found.name} is of another model; encode it with this one")
+        elif style is not None:
+            # The model's identities are its styles, if it has any: the one that it is conditioned on is the style.
+            if about.style_source == "none":
+                raise FaceDiffError(f"style: {about.model} knows no speaking styles; omit the option")
+            if style not in about.styles:
+                raise FaceDiffError(f'style: there is no "{style}": {choices(str(style), about.styles)}')
+            who = str(style)
+            found = RuntimeStyle(who, found.vector)
         for option, value, kind in (("seed", seed, Seed), ("expressivity", expressivity, Expressivity)):
             if (expected := mismatch(kind, value)) is not None:
                 raise FaceDiffError(f"{option} {value}: out of range; expected {expected}")
         if expressivity != 1 and about.last_step < 0:
             raise FaceDiffError(f"expressivity: {about.model} predicts no mean of its motion; omit the option")
         face = about.faces.index(chosen)
-        vector = np.zeros(0, np.float32)
-        if about.style_source == "reference":
-            vector = self.arrays["styles"][about.styles.index(name)].astype(np.float32)
-        elif style is not None:
-            who = style
         index = about.identities.index(who) if who in about.identities else -1
         template = self.arrays["templates"][face].astype(np.float32)
-        return face, Conditions(index, vector, name, template, seed, expressivity)
+        return face, Conditions(index, found.vector, found.name, template, seed, expressivity)
 
-    def _require_style(self, name: str) -> None:
-        """Refuse a style that the folder has not."""
-        known = self.description.styles
-        if name not in known:
-            raise FaceDiffError(f'style: there is no "{name}": {choices(name, known)}')
+    def encode_style(self, motion: Array, *, name: str = "reference") -> RuntimeStyle:
+        """The style of a reference motion.
+
+        Args:
+            motion: offsets (T, V, 3) from the speaker's neutral face, in the model's unit and at its frame rate.
+            name: of the style.
+
+        Raises:
+            FaceDiffError: if the model takes no styles from motion, or the motion is of another topology.
+
+        Example:
+            >>> style = model.encode_style(animation.vertices - animation.template)  # doctest: +SKIP
+            >>> model.animate(samples, identity="F1", style=style)  # doctest: +SKIP
+        """
+        if not self.has("style"):
+            raise FaceDiffError(
+                f"style: the folder has no style encoder, so {self.description.model} takes styles by name alone; "
+                f"choose one of {', '.join(self.description.styles[:5])}, or export the model again"
+            )
+        motion, vertices = np.ascontiguousarray(motion, np.float32), self.arrays["templates"].shape[1]
+        if motion.ndim != 3 or not len(motion) or motion.shape[1:] != (vertices, 3) or not np.isfinite(motion).all():
+            raise FaceDiffError(f"style: is {motion.shape}; expected finite offsets (frames, {vertices}, 3)")
+        inputs = {"motion": motion[None], "mask": np.ones((1, len(motion)), bool)}
+        return RuntimeStyle(name, self.run("style", inputs)[0][0])
 
     def has(self, graph: str) -> bool:
         """Whether the folder has such a graph."""

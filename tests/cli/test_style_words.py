@@ -13,10 +13,11 @@ import trimesh
 
 from facediff import registry
 from facediff.animation import Animation, write_archive
+from facediff.animation.style_files import Weighted, split_styles, style_paths
 from facediff.data import Reference
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, Style
-from facediff.models.styles import Weighted, read_style, read_styles, split_styles, style_paths
+from facediff.models.styles import read_style, read_styles
 from tests.fakes.tiny import Tiny
 
 
@@ -151,7 +152,7 @@ def test_a_take_brings_its_template_unit_and_frame_rate(
     assert isinstance(style, Reference)
     np.testing.assert_allclose(style.motion, offsets, atol=2e-6)
     write_archive(tmp_path / "slow.npz", replace(animation, frame_rate=30.0))
-    with pytest.raises(FaceDiffError, match="has 30 frames a second, the checkpoint 25"):
+    with pytest.raises(FaceDiffError, match="has 30 frames a second, the model 25"):
         read_style(str(tmp_path / "slow.npz"), "A", model)
     moving = twice + 40.0 * np.sin(np.arange(len(twice)))[:, None, None]
     write_archive(tmp_path / "moving.npz", replace(animation, vertices=moving.astype(np.float32)))

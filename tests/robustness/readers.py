@@ -395,7 +395,7 @@ def read_an_animation(path: Path) -> object:
 
 
 def read_a_style(path: Path) -> object:
-    from facediff.models.styles import open_style
+    from facediff.animation.style_files import open_style
 
     opened = open_style(path)
     return np.asarray(opened.array).sum()

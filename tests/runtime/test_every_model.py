@@ -131,6 +131,16 @@ def test_runtime_gives_what_the_model_gives(case: str, tiny_root: Path, sources:
         assert_alike(runtime, model, seconds, identity, seed=5)
 
 
+def test_style_content_takes_a_style_from_motion(tiny_root: Path) -> None:
+    model = ready("style content", tiny_root, {})
+    motion = 0.01 * np.random.default_rng(2).normal(size=(30, VERTICES, 3)).astype(np.float32)
+    with torch.inference_mode():
+        wanted = model.encode_style(torch.from_numpy(motion)[None], torch.ones(1, 30, dtype=torch.bool))[0].numpy()
+    np.testing.assert_allclose(in_eager(model).encode_style(motion).vector, wanted, atol=1e-6)
+    with pytest.raises(FaceDiffError, match="style"):
+        in_eager(ready("Voca", tiny_root, {})).encode_style(motion)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_exported_folder_gives_what_the_model_gives(
@@ -141,6 +151,11 @@ def test_exported_folder_gives_what_the_model_gives(
     runtime = RuntimeModel.open(tmp_path / "out")
     for seconds, identity in ((0.3, "B"), (4.317, UNSEEN)):
         assert_alike(runtime, model, seconds, identity, seed=5)
+    if runtime.has("style"):
+        motion = 0.01 * np.random.default_rng(2).normal(size=(33, VERTICES, 3)).astype(np.float32)
+        with torch.inference_mode():
+            wanted = model.encode_style(torch.from_numpy(motion)[None], torch.ones(1, 33, dtype=torch.bool))[0].numpy()
+        np.testing.assert_allclose(runtime.encode_style(motion).vector, wanted, atol=1e-5 * np.abs(wanted).max())
 
 
 def test_direct_model_has_no_samples_around_a_mean(tiny_root: Path) -> None:

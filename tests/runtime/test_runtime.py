@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import pytest
 import torch
 
 from facediff import registry
+from facediff.animation import write_archive
 from facediff.data.voice_activity import QUICK_GATE, EnergyGate, read_gate
 from facediff.data.windows import Window, WindowPlan
 from facediff.errors import FaceDiffError
@@ -30,6 +32,7 @@ from facediff.runtime import RuntimeModel
 from facediff.runtime.app import main
 from facediff.runtime.gated import GatedStream
 from facediff.runtime.noise import ClipNoise, NormalStream, WindowNoise
+from facediff.runtime.styles import read_style
 from tests.fakes.tiny import Tiny
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
@@ -190,6 +193,47 @@ def test_gated_stream_gives_what_the_file_gives(folder: Path) -> None:
     assert np.abs(made - runtime.animate(speech, identity="A", seed=2, gate=None).vertices).max() > 1e-4 * np.ptp(
         wanted
     )
+
+
+@pytest.mark.parametrize("frames", [1, 7, 130])  # the graph was recorded with 50
+def test_style_of_motion_is_that_of_the_model(model: AnimationModel, folder: Path, frames: int) -> None:
+    motion = 0.01 * np.random.default_rng(2).normal(size=(frames, 24, 3)).astype(np.float32)
+    mask = torch.ones(1, frames, dtype=torch.bool)
+    with torch.inference_mode():
+        wanted = model.encode_style(torch.from_numpy(motion)[None], mask)[0].numpy()
+    runtime = RuntimeModel.open(folder)
+    found = runtime.encode_style(motion)
+    np.testing.assert_allclose(found.vector, wanted, atol=1e-5 * np.abs(wanted).max())
+    made = [runtime.animate(sound(0.5), style=style, gate=None).vertices for style in (found, None)]
+    assert np.abs(made[0] - made[1]).max() > 1e-5
+
+
+def test_style_comes_from_a_file_or_a_mixture(model: AnimationModel, folder: Path, tmp_path: Path) -> None:
+    runtime = RuntimeModel.open(folder)
+    vertices = (model.assets.references["B"].motion + model.assets.template("B")).numpy()
+    animation = replace(runtime.animate(sound(1.0), identity="B", gate=None), vertices=vertices, speech=None)
+    write_archive(tmp_path / "b.npz", animation)
+    np.save(tmp_path / "B_1.npy", animation.vertices)  # a bare array, whose name says whose face it is
+    own = runtime.arrays["styles"][runtime.description.styles.index("B")]
+    np.save(tmp_path / "vector.npy", own)
+    for name in ("b.npz", "B_1.npy", "vector.npy"):
+        found = read_style(str(tmp_path / name), runtime, "A")
+        np.testing.assert_allclose(found.vector, own, atol=1e-5)
+        assert found.name == Path(name).stem
+    mixed = read_style(f"A:0.25,{tmp_path / 'b.npz'}:0.75", runtime, "A")
+    wanted = 0.25 * runtime.arrays["styles"][runtime.description.styles.index("A")] + 0.75 * own
+    np.testing.assert_allclose(mixed.vector, wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize("words", ["nobody.npz", "A:0.5,nobody", "short.npy", "A_2.npy", "bent.npy"])
+def test_impossible_style_is_refused(words: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runtime = RuntimeModel.open(folder)
+    monkeypatch.chdir(tmp_path)
+    np.save("short.npy", np.zeros(3, np.float32))
+    np.save("A_2.npy", np.zeros((5, 24, 3), np.float32))  # not on the face of A
+    np.save("bent.npy", np.zeros((5, 7, 3), np.float32))
+    with pytest.raises(FaceDiffError, match="style"):
+        runtime.animate(sound(0.5), style=words)
 
 
 def test_gate_holds_the_mouth_at_rest_in_silence(folder: Path) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from facediff.errors import FaceDiffError
 from facediff.models.dual_path.network import Conditions
 from facediff.models.folding import unchanged
-from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, speech_graph, update_table
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, speech_graph, style_graphs, update_table
 
 if TYPE_CHECKING:
     from facediff.models.dual_path.model import DualPathDiffusion
@@ -129,7 +129,7 @@ def graphs_of(model: DualPathDiffusion) -> Graphs:
         ("offsets",),
     )
     return Graphs(
-        parts=[speech, step, last],
+        parts=[speech, step, last, *style_graphs(model, style)],
         equal_lengths=not (encoder.takes_padding and network.decoder.graph_takes_padding),
         blending="steps",
         clock=model.clock,

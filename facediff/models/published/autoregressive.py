@@ -90,8 +90,8 @@ class AutoregressiveModel(PublishedModel):
             FaceDiffError: always.
         """
         raise FaceDiffError(
-            f"{type(self).__name__}: decodes frame by frame, which needs a graph with a memory, and cannot be exported; "
-            f"export a model that makes all frames at once, or animate with facediff animate"
+            f"{type(self).__name__}: decodes frame by frame, which needs a graph with a memory, and cannot be "
+            f"exported; export a model that makes all frames at once, or animate with facediff animate"
         )
 
     def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch steps width"]:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, features_of, speech_graph
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, features_of, speech_graph, style_graphs
 
 if TYPE_CHECKING:
     from facediff.models.style_content.model import StyleContentDisentanglement
@@ -44,19 +44,20 @@ def graphs_of(model: StyleContentDisentanglement) -> Graphs:
     speech = speech_graph(model, network.content_of, steps_of)
     features = features_of(speech)
     batch, frames = features.shape[:2]
+    width = sum(network.style_encoder.token_dims)
     motion = Graph(
         "motion",
         MotionGraph(model),
         {
             "features": features,
             "mask": torch.ones(batch, frames, dtype=torch.bool),
-            "style": torch.zeros(batch, sum(network.style_encoder.token_dims)),
+            "style": torch.zeros(batch, width),
         },
         {"features": FRAMES, "mask": FRAMES, "style": BATCH},
         ("offsets",),
     )
     return Graphs(
-        parts=[speech, motion],
+        parts=[speech, motion, *style_graphs(model, width)],
         equal_lengths=not network.audio_encoder.takes_padding,
         blending="motion",
         clock=model.clock,

@@ -1,0 +1,194 @@
+"""What is typed after ``--style``, and the files among it: mixtures of names with weights, motions, style vectors.
+
+For models with and without PyTorch alike. Libraries are imported inside the functions, so that splitting alone costs
+nothing.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from facediff.errors import FaceDiffError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+FILES = (".npy", ".npz")
+"""Suffixes of files that hold a style; anything else is the name of a clip."""
+CANCELLED = 1e-3
+"""Weights whose sum is less than this share of their sizes have nothing left to divide by."""
+OTHER_FACE = 0.25
+"""How far the stillest vertices may lie from the face, as a share of how far all vertices of a reference do."""
+NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)"
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """One style of a mixture.
+
+    Attributes:
+        name: a file or the name of a clip.
+        weight: None if none was given.
+    """
+
+    name: str
+    weight: float | None
+
+
+def split_styles(words: str, clips: Sequence[str] = ()) -> list[Weighted]:
+    r"""The styles of a mixture, split at commas; a weight is what follows the last colon, if that is a number.
+
+    Words that are a file, or the name of a clip, as a whole are taken as such: alone, a name may hold commas, or end in
+    a colon and a number.
+
+    >>> split_styles(r"C:\ann\x.npy:0.3,F1_e05:-1")
+    [Weighted(name='C:\\ann\\x.npy', weight=0.3), Weighted(name='F1_e05', weight=-1.0)]
+    """
+    # Before anything is split: a file or clip may have commas and colons in its name.
+    if words in clips or Path(words).is_file():
+        return [Weighted(words, None)]
+    parts = []
+    for word in words.split(","):
+        found = re.fullmatch(rf"(.*):\s*({NUMBER})\s*", word, re.IGNORECASE)
+        name = (found[1] if found else word).strip()
+        if not name:
+            raise FaceDiffError(f"--style {words}: expected names or files with weights, such as a.npy:0.3,b.npy:0.7")
+        parts.append(Weighted(name, float(found[2]) if found else None))
+    return parts
+
+
+def style_paths(words: str | None) -> list[Path]:
+    """The files among the words of ``--style``; if one of them has changed, so has the style."""
+    return [Path(part.name) for part in split_styles(words) if Path(part.name).is_file()] if words else []
+
+
+def normalised(words: str, weights: Sequence[float | None]) -> list[float]:
+    """Weights that sum to 1; a note is printed if that changed them.
+
+    Raises:
+        FaceDiffError: if only some are given, one is not finite, or their sum is too near to 0.
+    """
+    given = [weight for weight in weights if weight is not None]
+    if not given:
+        return [1.0 / len(weights)] * len(weights)
+    if len(given) < len(weights):
+        raise FaceDiffError(f"--style {words}: give every style a weight (A:0.3,B:0.7), or none of them")
+    total = math.fsum(given)
+    # Weights may be negative (to lead away from a style), so their sum may cancel to almost nothing; the mixture, which
+    # is divided by it, would be huge.
+    if not all(map(math.isfinite, given)) or not abs(total) > CANCELLED * math.fsum(map(abs, given)):
+        raise FaceDiffError(
+            f"--style {words}: expected finite weights whose sum is not 0, since they are divided by it"
+        )
+    shares = [weight / total for weight in given]
+    if abs(total - 1.0) > 1e-6:
+        print(f"note: --style: weights are divided by their sum: {', '.join(f'{share:.3g}' for share in shares)}")
+    return shares
+
+
+@dataclass(frozen=True)
+class StyleFile:
+    """A motion or a style vector as read from a file.
+
+    Attributes:
+        path: the file.
+        array: (T, V, 3) or (T, 3V) absolute vertices, or a style vector.
+        template: (V, 3) of an animation, in the motion's unit; None for a bare array.
+        frame_rate: likewise.
+        unit: likewise.
+    """
+
+    path: Path
+    array: npt.NDArray[np.generic]
+    template: npt.NDArray[np.float32] | None = None
+    frame_rate: float | None = None
+    unit: str | None = None
+
+
+def open_style(path: Path) -> StyleFile:
+    """A style's file, memory-mapped where it is an array."""
+    from facediff.animation import read_archive
+    from facediff.utils.arrays import open_array
+
+    if not path.is_file():
+        raise FaceDiffError(f"--style {path}: no such file")
+    if path.suffix == ".npz":
+        animation = read_archive(path)
+        return StyleFile(path, animation.vertices, animation.template, animation.frame_rate, animation.unit)
+    return StyleFile(path, open_array(path, kinds="fiu", name=f"--style {path}"))
+
+
+def frames_of(opened: StyleFile, vertices: int, stride: int) -> npt.NDArray[np.float32]:
+    """Absolute vertices (T, V, 3) of every ``stride``-th frame.
+
+    Args:
+        opened: the file.
+        vertices: V of the model's faces.
+        stride: from one frame to the next.
+
+    Raises:
+        FaceDiffError: if the file is of another topology, or not finite.
+    """
+    import numpy as np
+
+    array = opened.array
+    if array.ndim not in (2, 3) or not len(array) or array.shape[1:] not in ((vertices, 3), (3 * vertices,)):
+        raise FaceDiffError(
+            f"--style {opened.path}: has shape {array.shape}; the model's faces have {vertices} vertices, "
+            f"so (frames, {vertices}, 3) or (frames, {3 * vertices}) is expected"
+        )
+    motion = np.array(array[::stride], np.float32).reshape(-1, vertices, 3)
+    if not np.isfinite(motion).all():
+        raise FaceDiffError(f"--style {opened.path}: holds NaN or infinity")
+    return motion
+
+
+def stride_of(path: Path, stored: float, wanted: float) -> int:
+    """Every how many-th frame of a file is taken.
+
+    Raises:
+        FaceDiffError: if the file's frame rate is no whole multiple of the model's.
+    """
+    stride = round(stored / wanted)
+    if stride < 1 or abs(stride * wanted - stored) > 1e-6:
+        raise FaceDiffError(
+            f"--style {path}: has {stored:g} frames a second, the model {wanted:g}; give a motion at that rate"
+        )
+    return stride
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """Where a model's faces keep still when they speak: skull and neck.
+
+    Attributes:
+        vertices: the quarter of the vertices that move least in the stored references.
+        size: how far vertices move in these references, as a root mean square of offsets from the template.
+    """
+
+    vertices: npt.NDArray[np.int64]
+    size: float
+
+    def another_face(self, offsets: npt.NDArray[np.float32]) -> bool:
+        """Whether offsets (T, V, 3) from a template are of another face than the template's, or the head moves."""
+        import numpy as np
+
+        # Where faces keep still, offsets from one's own template are small. Those from another speaker's are not.
+        return float(np.sqrt(np.square(offsets[:, self.vertices]).mean())) > OTHER_FACE * self.size
+
+
+def stillness_of(motions: Sequence[npt.NDArray[np.float32]]) -> Stillness | None:
+    """Of reference motions, each (T, V, 3) from its template; None of no motions."""
+    import numpy as np
+
+    if not motions:
+        return None
+    reach = np.max([np.linalg.norm(motion, axis=-1).max(0) for motion in motions], 0)
+    still = np.argsort(reach, kind="stable")[: max(1, len(reach) // 4)]
+    return Stillness(still, max(float(np.sqrt(np.square(motion).mean())) for motion in motions))

@@ -1,0 +1,86 @@
+"""Speaking styles of an exported model: by name, from a file, from motion, and mixtures, as ``--style`` takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import metres_per_unit
+from facediff.animation.style_files import FILES, Stillness, frames_of, normalised, open_style, split_styles, stride_of
+from facediff.errors import FaceDiffError, choices
+
+if TYPE_CHECKING:
+    from facediff.runtime.model import RuntimeModel
+
+Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class RuntimeStyle:
+    """A style vector.
+
+    Attributes:
+        name: what it was made of.
+        vector: as the model's style encoder gives it, (S,).
+    """
+
+    name: str
+    vector: Array
+
+
+def read_style(words: str, model: RuntimeModel, identity: str) -> RuntimeStyle:
+    """The style that the words of ``--style`` ask for; the model's styles must be those of reference motion.
+
+    Args:
+        words: a style's name, a file, or several of them with weights, ``F1:0.3,b.npz:0.7``.
+        model: the model.
+        identity: whose motion a bare array (``.npy``) holds, where the file's name does not say it.
+
+    Raises:
+        FaceDiffError: if there is no such style, it cannot be read, or the weights make no mean.
+    """
+    parts = split_styles(words, model.description.styles)
+    if len(parts) == 1:
+        return single_style(parts[0].name, model, identity)
+    shares = normalised(words, [part.weight for part in parts])
+    styles = [single_style(part.name, model, identity) for part in parts]
+    vector = np.sum([np.float32(share) * style.vector for share, style in zip(shares, styles, strict=True)], 0)
+    name = " + ".join(f"{share:.3g} {style.name}" for share, style in zip(shares, styles, strict=True))
+    return RuntimeStyle(name, vector.astype(np.float32))
+
+
+def single_style(name: str, model: RuntimeModel, identity: str) -> RuntimeStyle:
+    """A style by its name in the folder, or from a file."""
+    about, vectors = model.description, model.arrays["styles"]
+    if name in about.styles:
+        return RuntimeStyle(name, vectors[about.styles.index(name)].astype(np.float32))
+    if not name.endswith(FILES):
+        raise FaceDiffError(f'style: there is no "{name}", and it is no file: {choices(name, about.styles)}')
+    path = Path(name)
+    opened = open_style(path)
+    if opened.array.ndim == 1:
+        vector = np.array(opened.array, np.float32)
+        if vector.shape != vectors.shape[1:] or not np.isfinite(vector).all():
+            raise FaceDiffError(
+                f"--style {path}: holds {len(vector)} numbers, but this model's style vectors have {vectors.shape[1]} "
+                f"(no NaN); make one with `facediff style extract` from the same checkpoint"
+            )
+        return RuntimeStyle(path.stem, vector)
+    templates, rate, scale = model.arrays["templates"], opened.frame_rate or about.frame_rate, 1.0
+    whose = next((each for each in (path.stem.rpartition("_")[0], identity) if each in about.faces), about.faces[0])
+    face = templates[about.faces.index(whose)] if opened.template is None else opened.template
+    if opened.unit not in (None, about.unit):
+        scale = metres_per_unit(str(opened.unit)) / metres_per_unit(about.unit)
+    motion = frames_of(opened, templates.shape[1], stride_of(path, rate, about.frame_rate))
+    offsets = (scale * (motion - face)).astype(np.float32)
+    if "still" in model.arrays and Stillness(model.arrays["still"], about.stillness).another_face(offsets):
+        face_of = f"the neutral face of {whose}" if opened.template is None else "its own template"
+        raise FaceDiffError(
+            f"--style {path}: does not lie on {face_of}, or the head moves; give an animation (.npz) of a head that "
+            f"keeps still, or an array that is named <identity>_<clip>.npy"
+        )
+    return model.encode_style(offsets, name=path.stem)
