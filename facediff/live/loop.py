@@ -270,7 +270,7 @@ class Loop:
         fed, made = 0, 0  # samples, and frames of the stream, which does not know of what was dropped
         gaps: deque[tuple[int, int]] = deque([(0, 0)])  # from which frame of the stream on how many were dropped before
         recent: deque[tuple[float, float]] = deque()  # seconds of computing, seconds of speech
-        while (taken := self._backlog.take(max(self.model.hop, 0.02))) is not None:
+        while (taken := self._backlog.take(max(self.model.hop, 0.02))) is not None and not self._abandoned:
             samples, dropped = taken
             if dropped != gaps[-1][1]:
                 gaps.append((math.ceil(fed * self.model.frame_rate / SAMPLE_RATE), dropped))

@@ -33,9 +33,13 @@ class SpokenClock:
 
     Samples arrive in blocks, and some of them late. A moment counts as spoken when its sample would have arrived
     without any such delay: by the earliest arrival of the last seconds, so that clocks of sound cards may drift.
+
+    Attributes:
+        offset: what is added to the latest moments; read by other threads.
     """
 
     def __init__(self) -> None:
+        self.offset = 0.0
         self._earliest: deque[tuple[float, float]] = deque()  # (when, arrival − moment), later ones larger
         self._before: deque[tuple[float, float]] = deque()  # (moment, offset) of speech before a pause of the source
 
@@ -50,6 +54,7 @@ class SpokenClock:
         self._earliest.append((at, offset))
         while self._earliest[0][0] < at - MEMORY:
             self._earliest.popleft()
+        self.offset = self._earliest[0][1]
         while self._before and self._before[0][0] < moment - 60:
             self._before.popleft()
 
@@ -67,11 +72,6 @@ class SpokenClock:
             if moment < until:
                 return moment + offset
         return moment + self.offset
-
-    @property
-    def offset(self) -> float:
-        """What is added to the latest moments."""
-        return self._earliest[0][1] if self._earliest else 0.0
 
 
 class Pacer:

@@ -115,7 +115,7 @@ def listen_page(port: int, heard: Heard) -> None:
 
 def connected(connect: Callable[[], Any]) -> Any:  # noqa: ANN401
     """A connection to a server that is about to listen."""
-    patience = time.monotonic() + 60
+    patience = time.monotonic() + 300
     while True:
         try:
             return connect()
@@ -276,13 +276,13 @@ def model(options: argparse.Namespace) -> Iterator[str]:
     """The tables of an exported model, line by line."""
     description = json.loads((options.model / "model.json").read_text())
     rate, seconds = float(description["frame_rate"]), 60 * options.minutes
+    samples, written, sizes = speech(seconds), list[float](), list[tuple[float, float]]()
     listeners = Listeners(rate)
     words = [sys.executable, "-m", "facediff.live.app", str(options.model), "-", "--shapes", str(options.shapes)]
     words += ["--low-latency"] if options.low_latency else []
     words += ["--window", str(options.window)] if options.window else []
     words += ["--threads", str(options.threads)] if options.threads else []
     words += [word for address in listeners.addresses for word in ("--to", address)]
-    samples, written, sizes = speech(seconds), list[float](), list[tuple[float, float]]()
     with subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None
         assert process.stderr is not None
@@ -338,9 +338,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--window", type=float)
     parser.add_argument("--threads", type=int)
     options = parser.parse_args(arguments)
-    print(f"{processor('cpu')}, {os.cpu_count()} cores\n\nA click track, and a face that follows its level:\n")
+    about = f"{processor('cpu')}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start"
+    print(f"{about}\n\nA click track, and a face that follows its level:\n")
     print(clicks(60.0 * min(options.minutes, 1.0)))
-    print("\nThe model, with speech:\n")
+    print(f"\nThe model, with speech (load {os.getloadavg()[0]:.1f} at the start):\n", flush=True)
     for line in model(options):
         print(line)
 
