@@ -150,23 +150,31 @@ def read_a_benchmark_plan(path: Path) -> object:
 
 def graphs_and_arrays(folder: Path) -> dict[str, int]:
     """What lies next to an exported model's description; the sizes of the files."""
-    from facediff.runtime.folder import ARRAYS, GRAPHS
+    from facediff.runtime.folder import ARRAYS, NEEDED
 
-    for graph in GRAPHS:
+    for graph in NEEDED["sampled"]:
         (folder / f"{graph}.onnx").write_bytes(b"graph")
     arrays = {"templates": np.zeros((1, 4, 3), np.float32), "styles": np.zeros((1, 2), np.float32)}
     np.savez(folder / ARRAYS, **arrays, rest_weights=np.ones((1, 4), np.float32))
-    return {name: (folder / name).stat().st_size for name in (*(f"{graph}.onnx" for graph in GRAPHS), ARRAYS)}
+    return {
+        name: (folder / name).stat().st_size for name in (*(f"{graph}.onnx" for graph in NEEDED["sampled"]), ARRAYS)
+    }
 
 
 def exported_model(path: Path) -> None:
-    from facediff.runtime.folder import Description
+    from facediff.runtime.folder import NEEDED, Description
 
     sizes = graphs_and_arrays(path.parent)
     windows = {"seconds": 4.0, "overlap": 1.0, "before": 2.0, "after": 0.5, "above": 10.0}
     description = Description(
         **{"model": "Model", "facediff": "1", "corpus": "tiny", "synthetic": True, "licences": {}, "opset": 20},
-        **{"precision": "float32", "sizes": sizes, "graphs": {}, "sample_rate": 16_000, "frame_rate": 25.0},
+        **{
+            "precision": "float32",
+            "sizes": sizes,
+            "graphs": dict.fromkeys(NEEDED["sampled"], {}),
+            "sample_rate": 16_000,
+            "frame_rate": 25.0,
+        },
         **{"unit": "m", "identities": ["A"], "faces": ["A"], "styles": ["A"], "windows": windows, "epsilon": 1e-7},
         **{"equal_lengths": False, "state": 8, "kept": 8, "sampler": "ddim", "steps": [0], "last_step": 0},
         **{"table": [[0.0, 1.0, 0.0, 0.0, 0.0]], "decoded": "sample"},
