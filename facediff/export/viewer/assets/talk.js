@@ -238,10 +238,24 @@ class TalkingPage {
     this.clear();
     if (file.size > MOST_FILE) throw new Error(`${file.name}: is larger than a page can hold; run facediff-run on it`);
     this.say(`reading ${file.name} …`);
-    // The browser decodes, and resamples to the rate of the model.
+    const samples = await this.speechOf(file);
+    const audio = find("sound");
+    if (audio.src) URL.revokeObjectURL(audio.src);
+    audio.src = URL.createObjectURL(file);
+    this.recording = { name: file.name.replace(/\.[^.]*$/, ""), samples };
+    await this.animate();
+  }
+
+  /** The samples of a recording, averaged to one channel, at the rate of the model. */
+  async speechOf(file) {
+    const bytes = await file.arrayBuffer();
+    try {
+      const { samples, rate } = readWav(bytes); // as exact as the file; browsers divide by 32767 and resample each in its own way
+      return resampled(samples, rate, SAMPLE_RATE);
+    } catch {} // any other file is the browser's
     let sound;
     try {
-      sound = await new OfflineAudioContext(1, 1, SAMPLE_RATE).decodeAudioData(await file.arrayBuffer());
+      sound = await new OfflineAudioContext(1, 1, SAMPLE_RATE).decodeAudioData(bytes);
     } catch {
       this.say("");
       throw new Error(`${file.name}: this browser cannot read it as sound; choose a .wav, .mp3, .ogg or .flac`);
@@ -251,11 +265,7 @@ class TalkingPage {
       const data = sound.getChannelData(channel);
       for (let i = 0; i < samples.length; i++) samples[i] += data[i] / sound.numberOfChannels;
     }
-    const audio = find("sound");
-    if (audio.src) URL.revokeObjectURL(audio.src);
-    audio.src = URL.createObjectURL(file);
-    this.recording = { name: file.name.replace(/\.[^.]*$/, ""), samples };
-    await this.animate();
+    return samples;
   }
 
   /** Animate the recording with what is chosen; resolves when it is done. */

@@ -1,17 +1,24 @@
 // The speech under the timeline: for each pixel the lowest and the highest sample in its time.
 
-/** Samples (S, −1 to 1) and their rate, of a mono WAV file of 16 bits, as the page holds it. */
+/** Samples (S, −1 to 1), all channels averaged, and their rate, of a WAV file of 16 bits. Throws if it is anything else. */
 function readWav(buffer) {
   const view = new DataView(buffer);
   const name = (at) => String.fromCharCode(...new Uint8Array(buffer, at, 4));
-  let rate = 0;
+  let rate = 0, channels = 0;
   for (let at = 12; at + 8 <= buffer.byteLength; at += 8 + view.getUint32(at + 4, true)) {
-    if (name(at) === "fmt ") rate = view.getUint32(at + 12, true);
-    if (name(at) !== "data") continue;
-    const samples = new Int16Array(buffer.slice(at + 8, at + 8 + (view.getUint32(at + 4, true) & ~1)));
-    return { rate, samples: Float32Array.from(samples, (value) => value / 32768) };
+    if (name(at) === "fmt ") {
+      rate = view.getUint32(at + 12, true);
+      // Format 1 is plain numbers; 65534 says the same in a longer form.
+      if ([1, 65534].includes(view.getUint16(at + 8, true)) && view.getUint16(at + 22, true) === 16) channels = view.getUint16(at + 10, true);
+    }
+    if (name(at) !== "data" || !channels) continue;
+    const bytes = Math.min(view.getUint32(at + 4, true), buffer.byteLength - at - 8);
+    const numbers = new Int16Array(buffer.slice(at + 8, at + 8 + (bytes & ~1)));
+    const samples = new Float32Array(Math.floor(numbers.length / channels));
+    for (let i = 0; i < samples.length * channels; i++) samples[Math.floor(i / channels)] += numbers[i] / 32768 / channels;
+    return { rate, samples };
   }
-  throw new Error("the page's sound holds no samples; write the page again");
+  throw new Error("the page's sound holds no samples of 16 bits; write the page again");
 }
 
 class Waveform extends Plot {
