@@ -26,18 +26,20 @@ async function clipMotion(model, heard, conditions, check) {
   return whole;
 }
 
-/** Motion of a window, which continues the one before it: { motion, kept }, of which the next one is given what is kept. */
+/** Motion of a window but for its past, and what the next window is given of it: { motion, kept }. */
 async function windowMotion(model, heard, window, conditions, before, check) {
-  const { about, size } = model, { context, frames, shared } = window;
+  const { about, size } = model, { context, frames } = window;
   if (about.blending === "motion") {
-    const motion = (await clipMotion(model, heard, conditions, check)).slice(context * size, (context + frames) * size);
+    const all = await clipMotion(model, heard, conditions, check);
+    const motion = all.slice((context + window.fixed) * size, (context + frames) * size);
     if (before) {
+      const shared = before[0].length / size;
       for (let frame = 0; frame < shared; frame++) {
-        const share = crossfade(frame, shared, window.fixed);
+        const share = crossfade(frame, shared, 0);
         for (let i = frame * size; i < (frame + 1) * size; i++) motion[i] = before[0][i] + share * (motion[i] - before[0][i]);
       }
     }
-    return { motion, kept: [lastOf(motion, window.kept * size)] };
+    return { motion, kept: [lastOf(motion, window.plan.overlap * size)] };
   }
   const { data, shape } = await model.features(heard, heard.frames);
   const width = data.length / heard.frames;
@@ -75,7 +77,7 @@ class Sampling {
     this.kept = []; // what the next window is blended with, one array for each evaluation
   }
 
-  /** Offsets from the template (frames · 3 V). */
+  /** Offsets from the template (frames · 3 V), but for those frames that are given out already. */
   async run(noise, ofMean) {
     const { about } = this.model, share = this.conditions.expressivity, width = about.drawn || about.state;
     let mean = null;
@@ -135,8 +137,11 @@ class Sampling {
   }
 
   async decoded({ prediction, kept }, unit) {
-    const { model, frames } = this, last = model.about.decoded === "kept" ? kept : prediction;
-    const shaped = (values) => ["float32", values, [1, frames, values.length / frames]];
+    const { model, frames } = this, last = model.about.decoded === "kept" ? kept : prediction, fixed = this.window?.fixed ?? 0;
+    const shaped = (values) => {
+      const width = values.length / frames;
+      return ["float32", values.subarray(fixed * width), [1, frames - fixed, width]];
+    };
     return (await model.run("motion", { sample: shaped(last), noise: shaped(unit) }))[0].data;
   }
 

@@ -97,19 +97,40 @@ class SeedNoise {
   }
 }
 
+const FIRST_DRAWS = 128;
+const firstDraws = new Map(); // the latest come last
+
+/** The first numbers of a stream: windows of low latency see those of some thirty windows before them again. */
+function firstDraw(name, seed, count) {
+  const key = `${name} ${seed} ${count}`, made = firstDraws.get(key) ?? streamOf(name, seed).draw(count);
+  firstDraws.delete(key);
+  firstDraws.set(key, made);
+  if (firstDraws.size > FIRST_DRAWS) firstDraws.delete(firstDraws.keys().next().value);
+  return made;
+}
+
 /** Noise of a window of long speech; frames that several windows have are given the same noise in all of them. */
 class WindowNoise {
   constructor(name, window, seed) {
-    this.window = window;
-    this.streams = window.origins.map((origin) => [streamOf(`${name}/${origin[0]}`, seed), ...origin]);
+    Object.assign(this, { window, seed, origins: window.origins });
+    this.names = this.origins.map(([index]) => `${name}/${index}`);
+    this.streams = null; // of a sampler that draws more than once
+    this.drawn = false;
   }
 
   /** The next noise (frames · width) of the window's frames. */
   draw(frames, width) {
-    const { plan } = this.window, made = new Float32Array(frames * width);
+    const { window: { plan }, names, origins, seed } = this, made = new Float32Array(frames * width);
+    const counts = origins.map(([index]) => (index ? plan.hop : plan.frames) * width);
+    const again = this.drawn;
+    if (again && !this.streams) {
+      this.streams = names.map((name) => streamOf(name, seed));
+      this.streams.forEach((stream, i) => stream.draw(counts[i])); // what the first call gave
+    }
+    this.drawn = true;
     let at = 0;
-    for (const [stream, index, from, to] of this.streams) {
-      const drawn = stream.draw((index ? plan.hop : plan.frames) * width);
+    for (const [i, [, from, to]] of origins.entries()) {
+      const drawn = again ? this.streams[i].draw(counts[i]) : firstDraw(names[i], seed, counts[i]);
       made.set(drawn.subarray(from * width, to * width), at);
       at += (to - from) * width;
     }

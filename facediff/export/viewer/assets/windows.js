@@ -84,7 +84,7 @@ function joined(first, second) {
  * Animates speech that arrives in pieces, window by window; memory does not grow with its length.
  *
  * Args: the plan in frames; frames a second; `generate(window, speech, frames, mean, deviation)`, which gives a window's
- * motion as an array (frames · size); the size of a frame.
+ * motion but for its past as an array (frames · size); the size of a frame.
  */
 class SpeechWindows {
   constructor(plan, frameRate, generate, size) {
@@ -126,19 +126,19 @@ class SpeechWindows {
     // What is left lies within the last window; if the window before has animated it already, it is certain now.
     const { fixed, index } = this.window, left = total - this.window.start - fixed;
     if (this.held && left <= this.plan.overlap) parts.push(this.held.subarray(0, left * this.size));
-    else parts.push((await this.make(new SpeechWindow(this.plan, index, left), total)).subarray(fixed * this.size));
+    else parts.push(await this.make(new SpeechWindow(this.plan, index, left), total));
     return this.counted(parts);
   }
 
   /** The window's frames before its overlap with the next, given speech up to frame `heard`; then advance. */
   async nextWindow(heard) {
-    const { fixed, index } = this.window, motion = await this.make(this.window, heard);
-    this.window = new SpeechWindow(this.plan, index + 1);
+    const motion = await this.make(this.window, heard);
+    this.window = new SpeechWindow(this.plan, this.window.index + 1);
     const needed = this.sample(this.window.start - this.window.context);
     const drop = Math.max(0, Math.min(needed, this.level.count) - this.dropped);
     this.speech = this.speech.slice(drop);
     this.dropped += drop;
-    return motion.subarray(fixed * this.size, (fixed + this.plan.hop) * this.size);
+    return motion.subarray(0, this.plan.hop * this.size);
   }
 
   async make(window, heard) {
