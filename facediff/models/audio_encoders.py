@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data.frame_clock import CONVOLUTIONS, convolved
@@ -250,17 +250,17 @@ def power_by_convolution(
 
     For graphs only: browsers' runtimes have no complex numbers, and every runtime has convolutions.
     """
-    kernel = fourier(len(window), len(window)).T.to(window) * window
+    kernel = fourier(len(window), len(window), np.float32).T * window
     real, imaginary = nn.functional.conv1d(padded[:, None], kernel[:, None], stride=hop).chunk(2, dim=1)
     return (real.square() + imaginary.square()).transpose(1, 2)
 
 
-def fourier(samples: int, length: int) -> Float64[Tensor, "samples twice_bins"]:
+def fourier(samples: int, length: int, kind: type[np.floating] = np.float64) -> Float[Tensor, "samples twice_bins"]:
     """Cosines, then negative sines, of a Fourier transform of ``length`` numbers, of which the first are not zero."""
     # Whole turns are taken away while the numbers are whole: sines of large angles would lose digits. By NumPy, so that
     # a graph holds the numbers and not their computation, which runtimes do not have in float64.
     angle = 2 * np.pi / length * (np.outer(np.arange(samples), np.arange(length // 2 + 1)) % length)
-    return torch.from_numpy(np.concatenate([np.cos(angle), -np.sin(angle)], 1))
+    return torch.from_numpy(np.concatenate([np.cos(angle), -np.sin(angle)], 1).astype(kind))
 
 
 class ConvBlock(nn.Module):
