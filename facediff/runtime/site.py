@@ -38,7 +38,7 @@ FORMAT = "facediff site 1"
 PAGE = "index.html"
 SCRIPTS = (
     *("motion", "surface", "clock", "camera", "scene", "stage", "plot", "waveform"),
-    *("dialogs", "report", "archive", "glb", "windows", "frame_clock", "resample", "talk"),
+    *("dialogs", "report", "archive", "glb", "windows", "frame_clock", "resample", "microphone", "talk"),
 )
 """Parts of the page's script; each uses only the parts before it."""
 WORKER = ("archive", "npz", "noise", "windows", "voice_gate", "frame_clock", "exported", "generating", "talk_worker")
