@@ -35,7 +35,7 @@ WIDEST = """(({ frames, offsets, size }) => {
 def served(words: list[str]) -> Iterator[str]:
     """The address of the page while the command serves it."""
     command = [sys.executable, "-m", "facediff", "serve", *words, "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         assert process.stdout is not None
         try:
             found = None
