@@ -19,6 +19,7 @@ def export_model(
     weights: Literal["float32", "float16", "int8"] = "float32",
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
     steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
+    quick_steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
     speech: File = None,
 ) -> None:
     """Write a model for ONNX Runtime: graphs, templates, styles, and a description.
@@ -36,6 +37,7 @@ def export_model(
         weights: how they are stored: float32, float16, or int8 (the audio encoder's in 8 bits, the others in 16)
         sampler: sampler of the exported model; the checkpoint's own by default
         steps: its denoising steps
+        quick_steps: its denoising steps at low latency (default: 2)
         speech: recording that the folder is compared with the model on; a made-up sound by default
     """
     if output.exists():
@@ -55,6 +57,10 @@ def export_model(
     loaded = load_model(model)
     if sampler is not None or steps is not None:
         loaded.choose_sampler(sampler, steps)
+    if quick_steps is not None:
+        if loaded.low_latency_steps is None:
+            raise FaceDiffError(f"--quick-steps: {type(loaded).__name__} keeps its steps at low latency; omit it")
+        loaded.low_latency_steps = quick_steps
     tell(f"recording the graphs of {type(loaded).__name__}, which takes a minute …")
     made = export(loaded, output, precision=weights, speech=samples)
     megabytes = sum(made.sizes.values()) / 1e6

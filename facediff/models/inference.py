@@ -90,6 +90,7 @@ class Inference(ABC):
         frame_rate: motion frames a second.
         windows: how speech is cut that is too long for one pass; may be changed at any time.
         expressivity: how far motion goes from the mean prediction to a sample, see :meth:`choose_expressivity`.
+        low_latency_steps: denoising steps at low latency; None for a model whose steps do not change then.
     """
 
     samples: ClassVar[bool] = False
@@ -98,6 +99,7 @@ class Inference(ABC):
     frame_rate: float
     windows: WindowPlan
     expressivity: Expressivity = 1.0
+    low_latency_steps: int | None = None
 
     def animate(
         self,

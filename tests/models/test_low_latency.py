@@ -129,6 +129,11 @@ def test_low_latency_takes_few_steps_and_is_forgotten(model: DualPathDiffusion) 
         model.choose_low_latency()
         assert (model.windows, model.sampler.steps) == (LOW_LATENCY, LOW_LATENCY_STEPS)
     assert (model.windows, model.sampler.steps) == before
+    model.low_latency_steps = 1
+    sampling = model.graphs().sampling
+    assert sampling is not None
+    assert (len(sampling.quick_steps), len(sampling.quick_table), len(sampling.steps)) == (1, 1, before[1])
+    assert (model.windows, model.sampler.steps) == before
 
 
 @pytest.mark.parametrize("rate", [24.0, 25.0, 29.97, 30.0, 48.0, 60.0, 120.0])

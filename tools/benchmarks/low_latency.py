@@ -178,8 +178,9 @@ def sizes(threads: int) -> str:
     """The cost of a frame at the size of VOCASET as Markdown."""
     rows = []
     for encoder in ("mel", "hubert base"):
-        for dim, layers in ((128, 4), (256, 4), (512, 8)):
+        for dim, layers, steps in ((128, 4, 2), (256, 4, 2), (512, 6, 2), (512, 6, 1)):
             model = random_model(encoder, dim, layers)
+            model.low_latency_steps = steps
             model.choose_low_latency()
             plan = model.windows.in_frames(model.frame_rate)
             waits = (plan.frames + plan.after) / model.frame_rate
@@ -188,7 +189,7 @@ def sizes(threads: int) -> str:
                 runtime = RuntimeModel.open(Path(name) / "model", threads=threads)
             runtime.choose_low_latency()
             speech = 0.2 * torch.randn(4 * SAMPLE_RATE, generator=torch.Generator().manual_seed(0))
-            row = [encoder, str(dim), str(layers), f"{waits * 1000:.0f}"]
+            row = [encoder, str(dim), str(layers), str(steps), f"{waits * 1000:.0f}"]
             for stream in (model.stream(identity="A"), runtime.stream(identity="A", gate=None)):
                 spent: list[float] = []
                 with torch.inference_mode():
@@ -198,8 +199,9 @@ def sizes(threads: int) -> str:
             row += [f"{total * 1000:.0f}", "yes" if np.median(spent[31:]) < 1 / model.frame_rate else "no"]
             rows.append(row)
             print(" | ".join(row), file=sys.stderr, flush=True)
-    head = ["audio encoder", "width", "blocks", "waits (ms)", "PyTorch (ms)", "95 % (ms)", "runtime (ms)", "95 % (ms)"]
-    return markdown_table([*head, "sound to frame (ms)", "keeps up"], rows)
+    network = ["audio encoder", "width", "blocks", "steps"]
+    computing = ["PyTorch (ms)", "95 % (ms)", "runtime (ms)", "95 % (ms)"]
+    return markdown_table([*network, "waits (ms)", *computing, "sound to frame (ms)", "keeps up"], rows)
 
 
 def random_model(encoder: str, dim: int, layers: int) -> DualPathDiffusion:

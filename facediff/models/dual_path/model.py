@@ -124,6 +124,7 @@ class DualPathDiffusion(AnimationModel):
     """
 
     samples: ClassVar[bool] = True
+    low_latency_steps = LOW_LATENCY_STEPS
     chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "_sampler_options", "guidance")
 
     def __init__(
@@ -274,9 +275,9 @@ class DualPathDiffusion(AnimationModel):
         self.sampler = chosen(process=self.process, **options)
 
     def choose_low_latency(self) -> None:
-        """Frame by frame, and in two denoising steps of the present sampler."""
+        """Frame by frame, and in :attr:`low_latency_steps` denoising steps of the present sampler."""
         super().choose_low_latency()
-        self.choose_sampler(steps=LOW_LATENCY_STEPS)
+        self.choose_sampler(steps=self.low_latency_steps)
 
     def choose_expressivity(self, expressivity: Expressivity) -> None:
         """Go from the mean prediction (0) to a sample (1) or beyond; checkpoints keep what the model was made with.
