@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from facediff import registry
-from facediff.data.windows import WindowPlan
+from facediff.data.windows import LOW_LATENCY, WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.graphs import Graph
@@ -162,3 +162,11 @@ def test_direct_model_has_no_samples_around_a_mean(tiny_root: Path) -> None:
     runtime = in_eager(ready("style content", tiny_root, {}))
     with pytest.raises(FaceDiffError, match="expressivity"):
         runtime.animate(sound(1.0), expressivity=0.5)
+
+
+@pytest.mark.parametrize("case", ["style content", "Voca"])
+def test_low_latency_is_that_of_the_model(case: str, tiny_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = ready(case, tiny_root, {})
+    runtime = in_eager(model)
+    monkeypatch.setattr(f"{__name__}.PLAN", LOW_LATENCY)
+    assert_alike(runtime, model, 2.513, "B", seed=1)
