@@ -113,7 +113,7 @@ def picture(rate: float, computing: float, usual: float) -> str:
         lines.append(f'<path d="M{x} 40 v-8 h{end - x} v8" fill="none" stroke="{LINE}"/>')
         lines.append(text((x + end) / 2, 26, name, 12, QUIET))
     lines.append(text(LEFT, 152, "From a sample that is spoken to the packet that leaves", 13, QUIET, anchor="start"))
-    lines += bar(185, f"with --low-latency, {rate:g} frames a second", parts_of(LOW_LATENCY, rate, computing))
+    lines += bar(185, f"low latency, as usual, {rate:g} frames a second", parts_of(LOW_LATENCY, rate, computing))
     short = WindowPlan().chosen(1.0, 0.4)
     lines += bar(285, "with --window 1 --overlap 0.4", parts_of(short, rate, usual))
     return "\n".join([*lines, "</svg>"]).replace('height="400"', 'height="370"').replace("1000 400", "1000 370") + "\n"
@@ -124,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path)
     parser.add_argument("--rate", type=float, default=25.0, help="frames a second (default: 25)")
-    parser.add_argument("--computing", type=float, default=25.0, help="ms of a window with --low-latency")
+    parser.add_argument("--computing", type=float, default=25.0, help="ms of a window at low latency")
     parser.add_argument("--usual", type=float, default=45.0, help="ms of a window of 1 s")
     options = parser.parse_args(arguments)
     options.output.write_text(picture(options.rate, options.computing, options.usual), encoding="utf-8")

@@ -31,7 +31,6 @@ def live(
     voice_gate: Annotated[str, Option(metavar="GATE")] = "energy",
     window: Annotated[ranges.Window | None, Option(metavar="S")] = None,
     overlap: Annotated[ranges.Window | None, Option(metavar="S")] = None,
-    low_latency: bool = False,
     shapes: Annotated[Path | None, Option(metavar="SHAPES", reads=True)] = None,
     sound: Annotated[str | None, Option(metavar="WHERE")] = None,
     seconds: Annotated[ranges.Duration | None, Option(metavar="S")] = None,
@@ -64,9 +63,8 @@ def live(
         expressivity: 0 for the mean of what the model finds possible, 1 for a sample, up to 2 for more than that
         voice_gate: what finds the pauses, in which the mouth comes to rest: energy (which waits no longer than the
             windows) or webrtc, with options (energy:ahead=0.3); off for the model's own motion there
-        window: seconds of a window; shorter ones answer sooner (default: the model's)
+        window: seconds of a window, where frames need not be made one by one at low latency
         overlap: seconds that neighbouring windows share
-        low_latency: answer at once: windows of one frame, 0.12 s of look-ahead, two denoising steps
         shapes: blendshapes for receivers that take weights: folder of meshes, .glb with targets, or "puppet" (built in)
         sound: where the speech is played, delayed to match: off, out (a sound device; out:NAME for one by its name), or
             receivers (the page in the browser) (default: receivers for a recording, else off)
@@ -101,7 +99,6 @@ def live(
         voice_gate=voice_gate,
         window=window,
         overlap=overlap,
-        low_latency=low_latency,
         shapes=shapes,
         sound=sound,
         seconds=seconds,

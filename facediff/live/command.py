@@ -45,7 +45,6 @@ class LiveOptions:
     voice_gate: str = USUAL_GATE
     window: ranges.Window | None = None
     overlap: ranges.Window | None = None
-    low_latency: bool = False
     shapes: Path | None = None
     sound: str | None = None
     seconds: ranges.Duration | None = None
@@ -64,10 +63,13 @@ class LiveOptions:
             raise FaceDiffError(f"{OPTION}: missing; give a receiver, one of {', '.join(receiver.names())}")
         if self.sound is not None and self.sound.partition(":")[0] not in (OFF, OUT, RECEIVERS):
             raise FaceDiffError(f"--sound {self.sound}: expected {OFF}, {OUT}, {OUT}:DEVICE or {RECEIVERS}")
-        if self.low_latency and (self.window is not None or self.overlap is not None):
-            raise FaceDiffError("--low-latency: chooses the windows; omit --window and --overlap")
         if self.voice_gate != USUAL_GATE:
             read_gate(self.voice_gate)
+
+    @property
+    def low_latency(self) -> bool:
+        """Whether frames are made one by one; whoever chooses windows wants something else."""
+        return self.window is None and self.overlap is None
 
     @property
     def plays(self) -> str:

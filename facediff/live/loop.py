@@ -308,8 +308,8 @@ class Loop:
             self._slow_told = True
             self._report(
                 f"the model takes {factor:.2f} s for a second of speech on this machine, so that speech is dropped: "
-                f"export it with fewer --steps, choose a longer --window or a shorter --overlap (or omit "
-                f"--low-latency), or end other programs"
+                f"export it with fewer --steps and --quick-steps, choose a longer --window or a shorter --overlap, or "
+                f"end other programs"
             )
 
     def _ready(self, vertices: Array, made: int, gaps: deque[tuple[int, int]], now: float) -> int:

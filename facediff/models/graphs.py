@@ -79,7 +79,8 @@ class SamplingLoop:
         decoded: what the last graph decodes: the ``sample``, or the ``kept`` numbers of the last step.
         noise: what unit noise is multiplied by before use, (state, state); None for nothing.
         noise_of: what noise depends on.
-        quick_steps: the steps that are visited at low latency (:meth:`Inference.choose_low_latency`).
+        quick_steps: the steps that are visited at low latency; see
+            :meth:`~facediff.models.inference.Inference.choose_low_latency`.
         quick_table: for each of them, as in ``table``.
     """
 

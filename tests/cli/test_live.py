@@ -55,7 +55,6 @@ def test_live_frames_are_those_of_a_stream(
     [
         (["--threads", "2"], "--threads"),
         (["--identity", "Z"], "Z"),
-        (["--low-latency", "--window", "1"], "--low-latency"),
         (["--window", "0.1"], "window"),
     ],
 )

@@ -1,6 +1,6 @@
 """The lag of live performances, from sample in to packet out, and whether it stays: by receiver, over minutes.
 
-    python tools/benchmarks/live.py puppet-onnx --shapes puppet --minutes 10 --low-latency
+    python tools/benchmarks/live.py puppet-onnx --shapes puppet --minutes 10
 
 First a click track through the loop with a face that only follows the level of the sound, so that nothing but the loop
 and the receivers is measured: from the moment that a click is written to standard input to the moment that the first
@@ -279,7 +279,6 @@ def model(options: argparse.Namespace) -> Iterator[str]:
     samples, written, sizes = speech(seconds), list[float](), list[tuple[float, float]]()
     listeners = Listeners(rate)
     words = [sys.executable, "-m", "facediff.live.app", str(options.model), "-", "--shapes", str(options.shapes)]
-    words += ["--low-latency"] if options.low_latency else []
     words += ["--window", str(options.window)] if options.window else []
     words += ["--threads", str(options.threads)] if options.threads else []
     words += [word for address in listeners.addresses for word in ("--to", address)]
@@ -334,7 +333,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("model", type=Path, help="folder of facediff export-model")
     parser.add_argument("--shapes", type=Path, default=Path("puppet"), help="blendshapes (default: puppet)")
     parser.add_argument("--minutes", type=float, default=1.0, help="of speech (default: 1)")
-    parser.add_argument("--low-latency", action="store_true")
     parser.add_argument("--window", type=float)
     parser.add_argument("--threads", type=int)
     options = parser.parse_args(arguments)

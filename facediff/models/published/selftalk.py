@@ -71,7 +71,7 @@ class SelfTalk(DirectModel):
         consistency_weight: factor of the squared distance of the lip reader's features from the recogniser's.
         ctc_weight: factor of the CTC loss of the lip reader's letters and the recogniser's transcript.
         unseen_identity: as for every model; the method knows no identities, so it is tested once.
-        options: those of :class:`PublishedModel`, and of every model.
+        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
     checkpoint_options = ("text_config",)  # without it, a file could have weights fetched from anywhere

@@ -52,7 +52,7 @@ class Voca(DirectModel):
         velocity_weight: of the error of differences between frames, next to that of the frames.
         shapes: how the linear shapes start: as ``principal`` components of the training motion as published, or
             ``random``.
-        options: those of :class:`PublishedModel`, and of every model.
+        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
     published_encoder: ClassVar[AudioEncoderFactory] = DeepSpeechEncoder
