@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import logging
 import warnings
@@ -26,6 +27,7 @@ from facediff.version import __version__
 
 if TYPE_CHECKING:
     import onnx
+    import torch
 
     from facediff.data.frame_clock import FrameClock
     from facediff.models.base import AnimationModel
@@ -41,6 +43,9 @@ SMALLEST = 4096
 
 ENDLESS = 1e9
 """Seconds that stand for no limit, since JSON knows no infinity."""
+
+LARGE = 1_000_000
+"""Numbers that are worth storing in fewer bits though nobody has learnt them, such as weights in another order."""
 
 TOLERANCE = 1e-4
 """Largest difference from PyTorch in float32, as a share of the motion's range."""
@@ -79,7 +84,7 @@ def export_model(
         sizes, described = {}, {}
         for part in graphs.parts:
             document = record(part)
-            store_weights(document, precision if part.name == "speech" else min_precision(precision))
+            store_weights(document, precision if part.name == "speech" else min_precision(precision), part.module)
             path = staged / f"{part.name}.onnx"
             path.write_bytes(document.SerializeToString())
             sizes[path.name] = path.stat().st_size
@@ -187,23 +192,29 @@ def min_precision(precision: Precision) -> Precision:
     return "float16" if precision == "int8" else precision
 
 
-def store_weights(document: onnx.ModelProto, precision: Precision) -> None:
+def store_weights(document: onnx.ModelProto, precision: Precision, module: torch.nn.Module) -> None:
     """Store large weights in fewer bits, each followed by a node that widens it.
+
+    Numbers that nobody has learnt, such as the kernel of spectra, stay as they are unless they take megabytes.
 
     Args:
         document: changed in place.
         precision: ``int8`` rounds to 255 steps for each output channel of a convolution or a linear map.
+        module: what the graph was recorded of.
     """
     from onnx import TensorProto, helper, numpy_helper
 
     if precision == "float32":
         return
-    graph = document.graph
+    graph, learnt = document.graph, digests(module)
     nodes = []
     for initializer in list(graph.initializer):
         if initializer.data_type != TensorProto.FLOAT or int(np.prod(initializer.dims)) < SMALLEST:
             continue
         weight, name = numpy_helper.to_array(initializer), initializer.name
+        # A logarithm follows the spectra: what eight bits do to its kernel drowns soft sounds.
+        if weight.size < LARGE and digest(weight) not in learnt:
+            continue
         if precision == "float16" or weight.ndim < 2:
             if float(np.abs(weight).max()) > float(np.finfo(np.float16).max):
                 continue
@@ -227,6 +238,17 @@ def store_weights(document: onnx.ModelProto, precision: Precision) -> None:
         graph.initializer.extend(stored)
     for node in reversed(nodes):
         graph.node.insert(0, node)
+
+
+def digests(module: torch.nn.Module) -> set[bytes]:
+    """The weights of a module and their transposes, which graphs hold of linear maps, as :func:`digest` gives them."""
+    weights = [weight.detach().float().cpu().numpy() for weight in module.parameters()]
+    return {digest(form) for weight in weights for form in (weight, weight.T)}
+
+
+def digest(array: npt.NDArray[Any]) -> bytes:
+    """What tells arrays apart by shape and content."""
+    return hashlib.sha256(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes()).digest()
 
 
 def described_ends(document: onnx.ModelProto) -> dict[str, list[dict[str, Any]]]:

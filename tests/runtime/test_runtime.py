@@ -27,7 +27,7 @@ from facediff.models.graphs import update_table
 from facediff.models.inference import ClipNoise as ModelNoise
 from facediff.models.inference import WindowNoise as ModelWindowNoise
 from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler
-from facediff.pipelines.export_model import export_model
+from facediff.pipelines.export_model import Precision, export_model, store_weights
 from facediff.runtime import RuntimeModel
 from facediff.runtime.app import main
 from facediff.runtime.gated import GatedStream
@@ -377,3 +377,22 @@ def test_model_that_cannot_be_exported_is_refused(tiny: Tiny, tmp_path: Path) ->
     with pytest.raises(FaceDiffError, match="Deaf"):
         export_model(made, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("precision", "stored"), [("float16", "FLOAT16"), ("int8", "INT8"), ("float32", "FLOAT")])
+def test_only_what_was_learnt_is_stored_in_fewer_bits(precision: Precision, stored: str) -> None:
+    """A linear map's weights are learnt, in a graph as their transpose; the kernel of a transform is not."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    module = torch.nn.Linear(64, 128, bias=False)
+    kernel = np.cos(np.outer(np.arange(128), np.arange(128))).astype(np.float32)
+    weight = module.weight.detach().numpy().T
+    named = {"weight": weight, "kernel": kernel}
+    nodes = [helper.make_node("MatMul", ["x", "weight"], ["y"]), helper.make_node("MatMul", ["y", "kernel"], ["z"])]
+    ends = [[helper.make_tensor_value_info(*end)] for end in (("x", TensorProto.FLOAT, [1, 64]), ("z", 1, [1, 128]))]
+    made = [numpy_helper.from_array(np.ascontiguousarray(value), name) for name, value in named.items()]
+    document = helper.make_model(helper.make_graph(nodes, "two maps", *ends, made))
+    store_weights(document, precision, module)
+    found = {each.name: each.data_type for each in document.graph.initializer}
+    assert found.pop("kernel") == TensorProto.FLOAT
+    assert {kind for name, kind in found.items() if "scale" not in name} == {getattr(TensorProto, stored)}
