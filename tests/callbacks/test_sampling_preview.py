@@ -121,6 +121,7 @@ class Broken(SamplingPreview):
         raise RuntimeError("the disk is full")
 
 
+@pytest.mark.slow
 def test_preview_with_two_processes(tiny: Tiny, tiny_root: Path, tmp_path: Path) -> None:
     """One process draws, and fails where it must; the other neither draws nor waits for ever."""
     here = "tests.callbacks.test_sampling_preview"

@@ -378,6 +378,7 @@ def test_a_closed_standard_input(
     assert "standard input is closed" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_microphone_gives_what_the_file_gives(checkpoint: Path, tmp_path: Path) -> None:
     """A real pipe: the file's samples, a few at a time."""
     samples = (0.1 * np.random.default_rng(0).normal(size=16000 * 11)).clip(-1, 1)

@@ -113,6 +113,7 @@ def test_a_run_without_a_checkpoint_begins_again_and_no_run_is_an_error(
 
 
 @pytest.mark.filterwarnings("ignore:The dirpath has changed")
+@pytest.mark.slow
 def test_the_last_run_is_one_of_the_same_experiment(
     fit: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
