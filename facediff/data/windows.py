@@ -90,16 +90,20 @@ class WindowPlan:
         Raises:
             FaceDiffError: if windows are too short for frames.
         """
-        frames, past = round(self.seconds * frame_rate), round(self.past * frame_rate)
+        frames, overlap, before, after, past = (
+            round(length * frame_rate) for length in (self.seconds, self.overlap, self.before, self.after, self.past)
+        )
+        if past:
+            frames = max(1, frames)
+            return FramePlan(frames, min(overlap, frames - 1), before, after, past)
         # Half of a window may be rounded up where the window is rounded down.
-        overlap = round(self.overlap * frame_rate)
-        overlap = min(overlap, frames - 1) if past else max(1, min(overlap, frames // 2))
-        if frames < (1 if past else 4):
+        overlap = max(1, min(overlap, frames // 2))
+        if frames < 4:
             raise FaceDiffError(
                 f"window: {self.seconds:g} s with an overlap of {self.overlap:g} s are too few frames at "
                 f"{frame_rate:g} a second; choose longer windows"
             )
-        return FramePlan(frames, overlap, round(self.before * frame_rate), round(self.after * frame_rate), past)
+        return FramePlan(frames, overlap, before, after, past)
 
     def chosen(self, seconds: float | None, overlap: float | None) -> WindowPlan:
         """The same with the lengths that somebody asked for; None keeps what is usual.

@@ -136,12 +136,12 @@ def test_low_latency_takes_few_steps_and_is_forgotten(model: DualPathDiffusion) 
     assert (model.windows, model.sampler.steps) == before
 
 
-@pytest.mark.parametrize("rate", [24.0, 25.0, 29.97, 30.0, 48.0, 60.0, 120.0])
+@pytest.mark.parametrize("rate", [12.0, 15.0, 24.0, 25.0, 29.97, 30.0, 48.0, 60.0, 120.0])
 def test_low_latency_waits_less_than_the_goal_at_every_rate(rate: float) -> None:
     plan = LOW_LATENCY.in_frames(rate)
     waited = (plan.frames + plan.after) / rate
     assert plan.overlap == 0
-    assert 0.1 < waited < 0.18
+    assert 0.1 < waited < (0.18 if rate >= 24 else 0.201)
     gate = read_gate(QUICK_GATE)
     assert gate is not None
     # A frame's middle lies half a frame after its start: the gate must be certain of it by then.
