@@ -90,6 +90,7 @@ def test_predict_writes_files(checkpoint: Path, tmp_path: Path, monkeypatch: pyt
     assert np.load(files[0]).shape[1] == 72
 
 
+@pytest.mark.slow
 def test_the_last_checkpoint_is_the_newest_runs(
     fitted: Path, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

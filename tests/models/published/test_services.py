@@ -70,11 +70,8 @@ def train_together(methods: list[str], root: Path, prior: Path, folder: Path) ->
     return [json.loads(out.read_text(encoding="utf-8")) for out in outs]
 
 
-@pytest.mark.parametrize(
-    "methods",
-    [["DiffSpeaker"], pytest.param(sorted(METHODS.keys() - {"DiffSpeaker"}), marks=pytest.mark.slow)],
-    ids=["one", "others"],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("methods", [["DiffSpeaker"], sorted(METHODS.keys() - {"DiffSpeaker"})], ids=["one", "others"])
 def test_two_processes_train_one_model(methods: list[str], tiny_root: Path, prior_file: Path, tmp_path: Path) -> None:
     """Though in each of them other layers are skipped and other steps are masked."""
     one, other = train_together(methods, tiny_root, prior_file, tmp_path)
