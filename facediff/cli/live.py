@@ -145,14 +145,13 @@ def trained_model(options: LiveOptions, steps: int | None, device: str) -> LiveM
     pipeline = AnimationPipeline(chosen, seed=options.seed, model=model)
     facts = facts_of(model.assets, pipeline.identity)
     corpus = model.assets.corpus
-    gate_ahead = 0.0 if pipeline.rest is None else pipeline.rest.openness().look_ahead
     return LiveModel(
         start=lambda: LiveAnimation(pipeline, seed=options.seed),
         frame_rate=model.frame_rate,
         neutral=facts["template"],
         faces=np.zeros((0, 3), np.int32) if facts["faces"] is None else facts["faces"],
         unit=facts["unit"],
-        look_ahead=max(plan.look_ahead, gate_ahead),
+        look_ahead=pipeline.look_ahead,
         hop=plan.in_frames(model.frame_rate).hop / model.frame_rate,
         colours=facts["colours"],
         metadata={

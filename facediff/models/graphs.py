@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -266,8 +266,7 @@ def style_graphs(model: AnimationModel, width: int) -> list[Graph]:
     return [made] if width else []
 
 
-def features_of(speech: Graph) -> Tensor:
-    """What the graph that hears makes of its example values."""
+def results_of(graph: Graph) -> Any:  # noqa: ANN401 - a tensor, or a tuple of them
+    """What a graph makes of its example values; what follows from weights alone is a constant of it from then on."""
     with torch.no_grad():
-        made: Tensor = speech.module.eval()(*speech.inputs.values())
-    return made
+        return graph.module.eval()(*graph.inputs.values())

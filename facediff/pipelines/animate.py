@@ -362,6 +362,15 @@ class AnimationPipeline:
         )
         return made
 
+    @property
+    def look_ahead(self) -> float:
+        """Seconds of speech, at most, that must be heard after an instant before its frame of a stream is certain."""
+        return max(
+            self.model.windows.look_ahead,
+            0.0 if self.acting is None else self.acting.look_ahead,
+            0.0 if self.rest is None else self.rest.openness().look_ahead,
+        )
+
     def performer(self, seed: int) -> Performer | None:
         """What acts to speech while it arrives; None without acting."""
         if self.acting is None:

@@ -45,13 +45,8 @@ def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_00
     busy, heard = 0.0, 0
     with sink(output, tuple(template.shape)) as write, ended_by_interrupt() as read:
         live = LiveAnimation(pipeline, rate=rate, seed=seed)
-        look_ahead = max(
-            plan.look_ahead,
-            0.0 if pipeline.acting is None else pipeline.acting.look_ahead,
-            0.0 if pipeline.rest is None else pipeline.rest.openness().look_ahead,
-        )
         report(
-            f"ready; look-ahead {look_ahead:.2f} s and the time that a window takes; "
+            f"ready; look-ahead {pipeline.look_ahead:.2f} s and the time that a window takes; "
             f"{plan.in_frames(model.frame_rate).hop} frames at a time, {model.frame_rate:g} a second, "
             f"{len(template)} vertices; reading {rate} Hz, 16 bit"
         )

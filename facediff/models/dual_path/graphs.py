@@ -11,7 +11,17 @@ from torch import Tensor, nn
 from facediff.errors import FaceDiffError
 from facediff.models.dual_path.network import Conditions
 from facediff.models.folding import unchanged
-from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, speech_graph, style_graphs, update_table
+from facediff.models.graphs import (
+    BATCH,
+    FRAMES,
+    Graph,
+    Graphs,
+    SamplingLoop,
+    results_of,
+    speech_graph,
+    style_graphs,
+    update_table,
+)
 
 if TYPE_CHECKING:
     from facediff.models.dual_path.model import DualPathDiffusion
@@ -114,9 +124,9 @@ def graphs_of(model: DualPathDiffusion) -> Graphs:
         },
         ("prediction", "kept"),
     )
+    results_of(step)  # what follows from the weights alone is computed here, not in the graph
+    root = None
     with torch.no_grad():
-        step.module(*step.inputs.values())  # what follows from the weights alone is computed here, not in the graph
-        root = None
         if folded:  # else noise is used as it is, and the unit matrix of all coordinates would take gigabytes
             space = model._space(_nothing(step.inputs), unchanged)  # noqa: SLF001 - a part of the model
             root = space.noise(torch.eye(state)[None])[0]

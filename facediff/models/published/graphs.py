@@ -21,7 +21,7 @@ from facediff.models.graphs import (
     SamplingLoop,
     Speech,
     StyleSource,
-    features_of,
+    results_of,
     speech_graph,
 )
 from facediff.models.published.diffspeaker import step_shares
@@ -71,8 +71,8 @@ def direct_graphs(model: DirectModel) -> Graphs:
         return model.hear(heard, frames)
 
     speech = speech_graph(model, hear, lambda frames: model.heard_steps * frames)
-    features = features_of(speech)
-    inputs: dict[str, Any] = {"features": features, "identity": torch.zeros(len(features), dtype=torch.long)}
+    features = results_of(speech)
+    inputs: dict[str, Any] = {"features": features, "identity": zeros(len(features))}
     motion = Graph("motion", DirectMotion(model), inputs, {"features": FRAMES, "identity": BATCH}, ("offsets",))
     return whole_model(model, [speech, motion])
 
@@ -132,7 +132,7 @@ class LastMap(nn.Module):
 def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
     """FaceDiffuser over all of its steps, with fresh noise in each but the last."""
     speech = heard_graph(model, 2)
-    features, space = features_of(speech), model.space(torch.zeros(1, 1, 3 * model.n_vertices))
+    features, space = results_of(speech), model.space(torch.zeros(1, 1, 3 * model.n_vertices))
     batch, frames, dim = features.shape
     step = Graph(
         "step",
@@ -151,10 +151,10 @@ def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
     if model.skip_steps:
         noise = {"noise": torch.zeros(batch, frames, space.width)}
         parts.append(Graph("start", DiffuserStart(model, visited[0]), noise, {"noise": FRAMES}, ("state",)))
-    with torch.no_grad():
-        step.module(*step.inputs.values())  # what follows from the weights alone is computed here, not in the graph
-        root = None
-        if model.sampling_space == "folded":
+    results_of(step)  # what follows from the weights alone is computed here, not in the graph
+    root = None
+    if model.sampling_space == "folded":
+        with torch.no_grad():
             root = space.noise(lambda like: like, torch.eye(space.width))
     loop = SamplingLoop(
         state=space.width,
@@ -251,7 +251,7 @@ def smoothed_whole(motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Te
 def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
     """DiffSpeaker with its present scheduler; its noise is drawn once, on the vertices."""
     speech = heard_graph(model, 1)
-    features = features_of(speech)
+    features = results_of(speech)
     batch, frames, dim = features.shape
     folded, coordinates = model.sampling_space == "folded", 3 * model.n_vertices
     width = 2 * dim + 2 if folded else coordinates
@@ -272,8 +272,7 @@ def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
     parts = [speech, step, Graph("motion", SpeakerMotion(model), last, dict.fromkeys(last, FRAMES), ("offsets",))]
     if folded:
         parts.append(Graph("start", SpeakerStart(model), {"noise": noise}, {"noise": FRAMES}, ("state",)))
-    with torch.no_grad():
-        step.module(*step.inputs.values())  # what follows from the weights alone is computed here, not in the graph
+    results_of(step)  # what follows from the weights alone is computed here, not in the graph
     loop = SamplingLoop(
         state=width,
         drawn=coordinates,

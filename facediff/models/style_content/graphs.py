@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, features_of, speech_graph, style_graphs
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, results_of, speech_graph, style_graphs
 
 if TYPE_CHECKING:
     from facediff.models.style_content.model import StyleContentDisentanglement
@@ -42,7 +42,7 @@ def graphs_of(model: StyleContentDisentanglement) -> Graphs:
         return frames * ratio.numerator // ratio.denominator + (ratio.denominator > 1)
 
     speech = speech_graph(model, network.content_of, steps_of)
-    features = features_of(speech)
+    features = results_of(speech)
     batch, frames = features.shape[:2]
     width = sum(network.style_encoder.token_dims)
     motion = Graph(
