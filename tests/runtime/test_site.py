@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import socket
-import threading
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -13,14 +12,14 @@ from unittest import mock
 
 import numpy as np
 import pytest
-import uvicorn
 
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.runtime import onnxruntime_web
 from facediff.runtime.site import Site, make_app, make_site, write_site
-from facediff.utils.server import LOOPBACK, make_server
+from facediff.utils.server import LOOPBACK
 from tests.fakes.exported import write_exported
+from tests.fakes.serving import servers
 
 Serve = Callable[[Site], str]
 
@@ -28,26 +27,8 @@ Serve = Callable[[Site], str]
 @pytest.fixture(scope="module")
 def serve() -> Iterator[Serve]:
     """Serves a site on a free port, and gives the address without a slash at its end."""
-    running: list[tuple[uvicorn.Server, threading.Thread, socket.socket]] = []
-
-    def start(site: Site) -> str:
-        listening = socket.create_server(("127.0.0.1", 0))
-        ready = threading.Event()
-        config = uvicorn.Config(
-            make_app(site, LOOPBACK), log_level="error", lifespan="off", ws="none", server_header=False
-        )
-        server = make_server(config, ready.set)
-        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
-        thread.start()
-        assert ready.wait(20)
-        running.append((server, thread, listening))
-        return f"http://127.0.0.1:{listening.getsockname()[1]}"
-
-    yield start
-    for server, thread, listening in running:
-        server.should_exit = True
-        thread.join(10)
-        listening.close()
+    with servers() as running:
+        yield lambda site: running.start(make_app(site, LOOPBACK))[0]
 
 
 @pytest.fixture

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import socket
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import uvicorn
 
 from facediff.study import StudyOptions, plan_study, read_study
 from facediff.study.definition import DATABASE
 from facediff.study.server import make_app
 from facediff.study.store import Store
-from facediff.utils.server import make_server
+from tests.fakes.serving import servers
 from tests.fakes.study import write_methods
 
 Serve = Callable[[Path], str]
@@ -23,26 +20,13 @@ Serve = Callable[[Path], str]
 @pytest.fixture
 def serve() -> Iterator[Serve]:
     """Serves a study's folder on a free port, and gives the address without a slash at its end."""
-    running: list[tuple[uvicorn.Server, threading.Thread, socket.socket]] = []
+    with servers() as running:
 
-    def start(folder: Path) -> str:
-        study = read_study(folder)
-        app = make_app(folder, study, Store(folder / DATABASE, study))
-        listening = socket.create_server(("127.0.0.1", 0))
-        ready = threading.Event()
-        config = uvicorn.Config(app, log_level="error", lifespan="off", ws="none", server_header=False)
-        server = make_server(config, ready.set)
-        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
-        thread.start()
-        assert ready.wait(20)
-        running.append((server, thread, listening))
-        return f"http://127.0.0.1:{listening.getsockname()[1]}"
+        def start(folder: Path) -> str:
+            study = read_study(folder)
+            return running.start(make_app(folder, study, Store(folder / DATABASE, study)))[0]
 
-    yield start
-    for server, thread, listening in running:
-        server.should_exit = True
-        thread.join(10)
-        listening.close()
+        yield start
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -27,8 +26,9 @@ from facediff.export.viewer.picking import MOST_BYTES, Picking, make_app, pick_l
 from facediff.mesh import Mesh
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import build_rig
-from facediff.utils.server import LOOPBACK, make_server, names_of
+from facediff.utils.server import LOOPBACK, names_of
 from tests.fakes.heads import LONG, talking
+from tests.fakes.serving import servers
 from tools.browser.chromium import Chromium, Page
 
 FACE, MARKS = build_face(), puppet_landmarks()
@@ -57,26 +57,17 @@ def picking(tmp_path: Path) -> Picking:
 @pytest.fixture
 def serve(picking: Picking) -> Iterator[Serve]:
     """Serves a page on a free port until it is stopped; gives its address without a slash at its end."""
-    running: list[tuple[uvicorn.Server, threading.Thread, socket.socket]] = []
+    with servers() as running:
 
-    def start(page: str) -> str:
-        listening = socket.create_server(("127.0.0.1", 0))
-        ready = threading.Event()
-        stops: list[uvicorn.Server] = []
-        app = make_app(picking, page, LOOPBACK, lambda: setattr(stops[0], "should_exit", True))
-        config = uvicorn.Config(app, log_level="error", lifespan="off", ws="none", server_header=False)
-        stops.append(make_server(config, ready.set))
-        thread = threading.Thread(target=stops[0].run, args=([listening],), daemon=True)
-        thread.start()
-        assert ready.wait(20)
-        running.append((stops[0], thread, listening))
-        return f"http://127.0.0.1:{listening.getsockname()[1]}"
+        def start(page: str) -> str:
+            stops: list[uvicorn.Server] = []
+            url, server = running.start(
+                make_app(picking, page, LOOPBACK, lambda: setattr(stops[0], "should_exit", True))
+            )
+            stops.append(server)
+            return url
 
-    yield start
-    for server, thread, listening in running:
-        server.should_exit = True
-        thread.join(10)
-        listening.close()
+        yield start
 
 
 def ask(url: str, content: object = None, *, raw: bytes | None = None, **headers: str) -> tuple[int, Any]:
